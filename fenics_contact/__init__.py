@@ -1,0 +1,30 @@
+"""Frictional contact for FEniCSx: contact as a boundary form, an answer that is checked."""
+
+from fenics_contact.contact import Contact, Resultants, Status
+from fenics_contact.laws import Coulomb, Frictionless, Scaled, Tresca
+from fenics_contact.problem import ContactProblem, Step
+from fenics_contact.stepping import increments
+from fenics_contact.supports import Ball, Cylinder, HalfSpace, Obstacle
+from fenics_contact.surface import ContactSurface
+from fenics_contact.verdict import NotConverged, Verdict
+
+__version__ = "0.1.0"
+__all__ = [
+    "Ball",
+    "Contact",
+    "ContactProblem",
+    "ContactSurface",
+    "Coulomb",
+    "Cylinder",
+    "Frictionless",
+    "HalfSpace",
+    "NotConverged",
+    "Obstacle",
+    "Resultants",
+    "Scaled",
+    "Status",
+    "Step",
+    "Tresca",
+    "Verdict",
+    "increments",
+]

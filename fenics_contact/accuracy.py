@@ -1,0 +1,149 @@
+"""What sets the accuracy of the regularisation: stiffness in units of E/h, taken from the bulk."""
+
+from __future__ import annotations
+
+import dolfinx.fem.petsc
+import numpy as np
+import ufl
+from dolfinx import fem, la
+from petsc4py import PETSc
+
+from fenics_contact import compat
+from fenics_contact.parallel import global_min
+from fenics_contact.surface import ContactSurface
+
+__all__ = ["cell_modulus", "modulus_over_height"]
+
+# Length over which E/h is smoothed, in facets.
+_SMOOTHING_FACETS = 4.0
+
+
+def cell_modulus(
+    bulk_tangent: ufl.Form, u: fem.Function, weight: ufl.core.expr.Expr
+) -> fem.Function:
+    """Young's modulus of every cell as the bulk form itself has it. Collective.
+
+    The energy of two homogeneous strains is measured cell by cell: simple shear u = (0, x, 0) gives
+    G, stretch u = (0, y, 0) gives M = λ + 2G; then E = G (3M - 4G)/(M - G). Exact for isotropic
+    solids and plane strain; within some per cent for plane stress; the stiffness along y for others.
+    Both fields have no radial part, so that they serve axisymmetric forms too.
+
+    Args:
+        bulk_tangent: Bilinear form of the bulk, by (trial, test) of ``u``'s space.
+        u: The displacement, where a nonlinear bulk is linearised.
+        weight: Factor of the volume measure that the bulk form carries (thickness, 2πr).
+
+    Returns:
+        A function, one value per cell (stress).
+    """
+    mesh = u.function_space.mesh
+    constants = fem.functionspace(mesh, ("DG", 0))
+    q = ufl.TestFunction(constants)
+    cells = [i for i in bulk_tangent.integrals() if i.integral_type() == "cell"]
+    field = fem.Function(u.function_space)
+    test, trial = bulk_tangent.arguments()
+    energy_form = compat.compile_form(
+        ufl.replace(ufl.Form(cells), {test: q * field, trial: field})
+    )
+    volume_form = compat.compile_form(weight * q * ufl.dx(mesh))
+
+    def energy(direction: int) -> np.ndarray:
+        field.interpolate(
+            lambda x: np.vstack([x[direction] if i == 1 else 0 * x[0] for i in range(mesh.geometry.dim)])
+        )
+        return _assemble(energy_form)
+
+    volume = _assemble(volume_form)
+    shear, stretch = energy(0) / volume, energy(1) / volume
+    isotropic = stretch > 1.2 * shear  # λ > -0.8 G: else no isotropic solid, and E is the stretch's
+    modulus = fem.Function(constants, name="modulus")
+    modulus.x.array[:] = stretch
+    modulus.x.array[isotropic] = (shear * (3 * stretch - 4 * shear))[isotropic] / (
+        stretch - shear
+    )[isotropic]
+    return modulus
+
+
+def modulus_over_height(surface: ContactSurface, modulus: fem.Function) -> fem.Function:
+    """E/h over Γc, h the height of the cell over the facet, smoothed over a few facets. Collective.
+
+    The smoothing matters: where a penalty jumps from facet to facet, so does the penetration, and
+    the body answers with pressure oscillations (10 % on an unstructured mesh of the half-cylinder,
+    whatever the penalty). It acts on the logarithm, so that the result is positive and a change of
+    units changes nothing else.
+
+    Args:
+        surface: Γc.
+        modulus: Young's modulus, one value per cell of the mesh (stress).
+
+    Returns:
+        A continuous function of degree 1 on the submesh of Γc (stress/length).
+
+    Raises:
+        ValueError: The modulus is not positive at some facet: the bulk form has no stiffness there.
+    """
+    mesh, submesh = surface.mesh, surface.submesh
+    cells = modulus.function_space
+    volume = _assemble(compat.compile_form(ufl.TestFunction(cells) * ufl.dx(mesh)))
+    # A simplex of height h over a facet of area A has the volume A h / d, a brick A h.
+    simplex = mesh.topology.cell_type in (
+        dolfinx.mesh.CellType.triangle,
+        dolfinx.mesh.CellType.tetrahedron,
+    )
+    per_volume = fem.Function(cells)
+    per_volume.x.array[:] = modulus.x.array / ((mesh.topology.dim if simplex else 1) * volume)
+    facets = fem.functionspace(submesh, ("DG", 0))
+    q = ufl.TestFunction(facets)
+    ds = surface.measure(2)
+    # ∫ E/(d V) over the facet is E A/(d V) = E/h.
+    ratio = _assemble(compat.compile_form(per_volume * q * ds, surface.entity_maps))
+    area = _assemble(compat.compile_form(q * ds, surface.entity_maps))
+    smallest = global_min(mesh.comm, ratio, empty=1.0)
+    if not smallest > 0.0:
+        raise ValueError(
+            f"the bulk form has no stiffness next to Γc (smallest E/h found: {smallest:g}); give "
+            "k_n and k_t as numbers or UFL expressions, in stress/length"
+        )
+    logarithm, length = fem.Function(facets), fem.Function(facets)
+    logarithm.x.array[:] = np.log(ratio)
+    length.x.array[:] = _SMOOTHING_FACETS * area ** (1 / (mesh.topology.dim - 1))
+    result = _smooth(logarithm, length)
+    result.x.array[:] = np.exp(result.x.array)
+    return result
+
+
+def _smooth(values: fem.Function, length: fem.Function) -> fem.Function:
+    """Solve w - ∇·(length² ∇w) = values with free edges, w continuous of degree 1. Collective."""
+    mesh = values.function_space.mesh
+    space = fem.functionspace(mesh, ("Lagrange", 1))
+    w, v = ufl.TrialFunction(space), ufl.TestFunction(space)
+    dx = ufl.dx(mesh)
+    matrix = fem.petsc.create_matrix(
+        form := compat.compile_form(
+            w * v * dx + length**2 * ufl.dot(ufl.grad(w), ufl.grad(v)) * dx
+        )
+    )
+    fem.petsc.assemble_matrix(matrix, form)
+    matrix.assemble()
+    result = fem.Function(space, name="modulus_over_height")
+    rhs = fem.Function(space)
+    fem.assemble_vector(rhs.x.array, compat.compile_form(values * v * dx))
+    rhs.x.scatter_reverse(la.InsertMode.add)
+    ksp = PETSc.KSP().create(mesh.comm)
+    ksp.setOperators(matrix)
+    ksp.setType(PETSc.KSP.Type.CG)
+    ksp.getPC().setType(PETSc.PC.Type.JACOBI)
+    ksp.setTolerances(rtol=1e-14, max_it=10_000)
+    ksp.solve(rhs.x.petsc_vec, result.x.petsc_vec)
+    result.x.scatter_forward()
+    ksp.destroy()
+    matrix.destroy()
+    return result
+
+
+def _assemble(form: fem.Form) -> np.ndarray:
+    """Assembled linear form, ghosts included. Collective."""
+    vector = fem.assemble_vector(form)
+    vector.scatter_reverse(la.InsertMode.add)
+    vector.scatter_forward()
+    return vector.array.copy()

@@ -1,0 +1,70 @@
+"""The one place that knows that DOLFINx releases differ (0.9, 0.10, 0.11), by feature, not number."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import dolfinx
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+
+__all__ = ["compile_form", "create_facet_submesh", "interpolation_points", "model_to_mesh"]
+
+
+def create_facet_submesh(
+    mesh: dolfinx.mesh.Mesh, facets: npt.NDArray[np.int32]
+) -> tuple[dolfinx.mesh.Mesh, Any, npt.NDArray[np.int32]]:
+    """Make a mesh of some facets of ``mesh``. Collective.
+
+    Args:
+        mesh: The parent mesh.
+        facets: Facets of this rank (local indices), shape (n_facets,).
+
+    Returns:
+        The submesh; what ``dolfinx.fem.form`` takes as ``entity_maps`` for it; and the parent
+        facet of each local cell of the submesh, shape (n_cells,).
+    """
+    fdim = mesh.topology.dim - 1
+    submesh, facet_map, *_ = dolfinx.mesh.create_submesh(mesh, fdim, facets)
+    cells = submesh.topology.index_map(fdim)
+    n_cells = cells.size_local + cells.num_ghosts
+    if isinstance(facet_map, np.ndarray):
+        parents = np.asarray(facet_map[:n_cells], dtype=np.int32)
+        index_map = mesh.topology.index_map(fdim)
+        parent_to_sub = np.full(index_map.size_local + index_map.num_ghosts, -1, dtype=np.int32)
+        parent_to_sub[parents] = np.arange(n_cells, dtype=np.int32)
+        return submesh, {submesh: parent_to_sub}, parents
+    local = np.arange(n_cells, dtype=np.int32)
+    return submesh, [facet_map], facet_map.sub_topology_to_topology(local, False)
+
+
+def merge_entity_maps(maps: list[Any]) -> Any:
+    """Join what several surfaces return from `create_facet_submesh` into one argument."""
+    if all(isinstance(m, dict) for m in maps):
+        return {sub: array for m in maps for sub, array in m.items()}
+    return [entity_map for m in maps for entity_map in m]
+
+
+def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:
+    """Compile a UFL form with the entity maps of its submeshes. Collective."""
+    return fem.form(form, entity_maps=entity_maps or None)
+
+
+def interpolation_points(element: Any) -> npt.NDArray[np.float64]:
+    """Interpolation points of a DOLFINx element: a method in 0.9, a property since."""
+    points = element.interpolation_points
+    return points() if callable(points) else points
+
+
+def model_to_mesh(model: Any, comm: Any, rank: int, gdim: int) -> tuple[Any, Any]:
+    """Distribute a gmsh model: the mesh and its facet tags. Collective; the model is on ``rank``."""
+    try:
+        from dolfinx.io import gmsh as gmshio  # DOLFINx >= 0.10
+    except ImportError:
+        from dolfinx.io import gmshio
+    data = gmshio.model_to_mesh(model, comm, rank, gdim=gdim)
+    if isinstance(data, tuple):
+        return data[0], data[2]
+    return data.mesh, data.facet_tags

@@ -1,0 +1,69 @@
+"""The committed state of a contact: fields at the quadrature points of Γc, as of the last commit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+
+from fenics_contact.surface import SurfaceQuadrature
+
+__all__ = ["History"]
+
+
+class History:
+    """Named fields in one quadrature function, changed by `commit` and by nothing else.
+
+    Attributes:
+        function: The function that holds all fields, for use in forms (a coefficient on the
+            submesh of Γc).
+    """
+
+    def __init__(self, quadrature: SurfaceQuadrature, fields: Mapping[str, int]) -> None:
+        """Zero fields: no traction, no slip. Collective.
+
+        Args:
+            quadrature: The points.
+            fields: Number of components by name; 0 stands for a scalar.
+        """
+        self._slices: dict[str, int | slice] = {}
+        size = 0
+        for name, components in fields.items():
+            self._slices[name] = slice(size, size + components) if components else size
+            size += max(components, 1)
+        self.function = fem.Function(quadrature.space(size), name="history")
+        self._n_owned = quadrature.n_points
+        self._size = size
+
+    def __contains__(self, name: str) -> bool:
+        """Whether there is such a field."""
+        return name in self._slices
+
+    def ufl(self, name: str) -> ufl.core.expr.Expr:
+        """The field as a UFL scalar or vector, for use in forms."""
+        place = self._slices[name]
+        if isinstance(place, int):
+            return self.function[place]
+        return ufl.as_vector([self.function[i] for i in range(place.start, place.stop)])
+
+    def values(self, name: str) -> npt.NDArray[np.float64]:
+        """Committed values at the owned points, (n_points,) or (n_points, d); a copy."""
+        rows = self.function.x.array.reshape(-1, self._size)
+        return rows[: self._n_owned, self._slices[name]].copy()
+
+    def commit(self, values: Mapping[str, npt.NDArray[np.float64]]) -> None:
+        """Replace every field by its values at the owned points. Collective.
+
+        Raises:
+            KeyError: A field is missing; nothing has changed then.
+            ValueError: A shape is wrong; nothing has changed then.
+        """
+        rows = np.empty((self._n_owned, self._size))
+        for name, place in self._slices.items():
+            rows[:, place] = values[name]
+        array = self.function.x.array.reshape(-1, self._size)
+        array[: self._n_owned] = rows
+        self.function.x.scatter_forward()

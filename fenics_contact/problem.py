@@ -1,0 +1,540 @@
+"""ContactProblem: one increment of a body in contact, solved by PETSc SNES and checked afterwards."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import dolfinx.fem.petsc
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from fenics_contact import accuracy, compat
+from fenics_contact.bulk import Bulk
+from fenics_contact.contact import Contact, Resultants, Status
+from fenics_contact.parallel import global_max, global_min, global_sum
+from fenics_contact.rigid import RigidMotions
+from fenics_contact.verdict import NotConverged, Verdict, check_laws
+
+__all__ = ["ContactProblem", "Step"]
+
+Array = npt.NDArray[np.float64]
+logger = logging.getLogger("fenics_contact")
+
+# An open point keeps this share of its stiffness in H₀: enough that a body held by contact alone
+# stays held when its whole surface is open, too little to be felt as a wrong tangent.
+_OPEN_SHARE = 1e-3
+# L-BFGS iterations after which H₀ is made anew from the present contact status. One iteration costs
+# 1/15 to 1/35 of a factorisation.
+_REFRESH_EVERY = 40
+# Solves in a row that end without lowering the residual before the increment is given up.
+_MAX_STALLS = 3
+
+_COMMON = {
+    "snes_rtol": 1e-9,
+    "snes_stol": 0.0,
+    "snes_max_it": 1000,
+    "ksp_type": "preonly",
+    "pc_factor_mat_solver_type": "mumps",
+    # `cp` takes |F·y| below this for convergence of the whole; the residual itself is tested here.
+    "snes_linesearch_atol": 1e-300,
+}
+_METHODS: dict[str, dict[str, Any]] = {
+    "lbfgs": {
+        "snes_type": "qn",
+        "snes_qn_type": "lbfgs",
+        "snes_qn_scale_type": "jacobian",
+        "snes_qn_restart_type": "none",  # Powell's uses K where K⁻¹ is meant
+        "snes_qn_m": 60,
+        "snes_linesearch_type": "cp",
+        "qn_mat_lmvm_eps": 0.0,  # else pairs are dropped by a test that depends on the units
+    },
+    "newton": {
+        "snes_type": "newtonls",
+        "snes_linesearch_type": "cp",
+        "snes_max_it": 100,
+    },
+}
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one solve did.
+
+    Attributes:
+        increment: Number of the increment, from 1.
+        reason: SNES reason of the last solve (positive: converged).
+        iterations: SNES iterations in all.
+        factorisations: Matrices factored.
+        verdict: The independent check.
+        contacts: Resultants of every contact, by name.
+        wall_seconds: Time of the solve on this rank.
+        load: Load parameter, where `increments` set one.
+    """
+
+    increment: int
+    reason: int
+    iterations: int
+    factorisations: int
+    verdict: Verdict
+    contacts: dict[str, Resultants]
+    wall_seconds: float
+    load: float | None = None
+
+    def summary(self) -> str:
+        """One line for people."""
+        parts = [f"increment {self.increment}"]
+        if self.load is not None:
+            parts.append(f"load {self.load:.6g}")
+        parts.append(f"{self.iterations} iterations, reason {self.reason}")
+        parts.append(f"residual {self.verdict.residual / self.verdict.force:.1e}")
+        for name, r in self.contacts.items():
+            parts.append(
+                f"{name}: force {r.normal_force:.6g}, friction {r.tangential_force:.6g}, area "
+                f"{r.area:.4g}, {r.stick} stick {r.slip} slip {r.open} open"
+            )
+        return "; ".join(parts)
+
+
+class ContactProblem:
+    """A body, its Dirichlet conditions and its contacts: one increment at a time.
+
+    SNES sees a dimensionless problem: displacements by the size of the mesh, stiffness by the
+    largest entry of the bulk's diagonal. The options database reaches everything under
+    ``prefix``, for example ``-contact_snes_monitor`` or ``-contact_snes_type newtonls``; what the
+    caller's ``petsc_options`` and the command line do not set comes from ``method``.
+
+    Attributes:
+        u: The displacement.
+        contacts: The contacts.
+        bulk: The bulk form.
+        snes: The PETSc solver.
+        increment: Number of committed increments.
+        initial_penetration: Largest penetration of the undeformed body (length), 0 if none.
+    """
+
+    def __init__(
+        self,
+        F: ufl.Form,
+        u: fem.Function,
+        *,
+        bcs: Sequence[fem.DirichletBC] = (),
+        contacts: Sequence[Contact] = (),
+        method: str = "lbfgs",
+        alpha: float = 1.0,
+        phi: float = 1.0,
+        petsc_options: Mapping[str, Any] | None = None,
+        prefix: str = "contact_",
+    ) -> None:
+        """Compile the forms, measure the scales and check the input. Collective.
+
+        Args:
+            F: Residual of the bulk in ``u`` and one test function, loads included, contact not.
+            u: Displacement; its values are the starting state.
+            bcs: Dirichlet conditions on ``u`` or its components.
+            contacts: Contacts of ``u``.
+            method: "lbfgs" (quasi-Newton, H₀ = (K + αK_n + φK_t)⁻¹) or "newton" (consistent
+                tangent).
+            alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
+            phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
+                paper has 0; 1 needs a third of the iterations once a point sticks.
+            petsc_options: Options without prefix; they win over the method's, the command line
+                over both.
+            prefix: Prefix of the options.
+
+        Raises:
+            ValueError: Input that has no sense; the text says what and what to do. On all ranks.
+        """
+        if method not in _METHODS:
+            raise ValueError(f"method is {method!r}; use one of {sorted(_METHODS)}")
+        for name, share in (("alpha", alpha), ("phi", phi)):
+            if not 0.0 <= share <= 1.0:
+                raise ValueError(f"{name} is {share!r}; it must lie between 0 and 1")
+        self.u = u
+        self.contacts = list(contacts)
+        self.bulk = Bulk(F, u)
+        self.increment = 0
+        self._comm = u.function_space.mesh.comm
+        self._bcs = list(bcs)
+        self._alpha, self._phi = alpha, phi
+        dofmap = u.function_space.dofmap
+        self._n_owned = dofmap.index_map.size_local * dofmap.index_map_bs
+        self._constrained = self._constrained_dofs()
+        self._check_contacts()
+
+        self.bulk.check_finite()
+        self.bulk.update()
+        waiting = [c for c in self.contacts if c.needs_modulus]
+        if waiting:
+            modulus = accuracy.cell_modulus(self.bulk.tangent_form, u, waiting[0].weight)
+            for contact in waiting:
+                contact.set_modulus(modulus)
+        self.initial_penetration = self._check_start()
+        self.motions = RigidMotions(u.function_space)
+        self.motions.find_free(self.bulk.stiffness, self._constrained)
+        self.motions.check_held(self.contacts)
+
+        v = ufl.TestFunction(u.function_space)
+        du = ufl.TrialFunction(u.function_space)
+        self._contact_forms = [
+            compat.compile_form(c.form(v), c.entity_maps) for c in self.contacts
+        ]
+        self._contact_vector = fem.Function(u.function_space)
+        self._trial_arguments = (v, du)
+        self._tangent_forms: list[fem.Form] | None = None
+        self._matrix = self.bulk.stiffness.duplicate()
+        self._matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
+        self._diagonal = np.zeros(self._n_owned)
+        self._length = self.motions.size
+        self._configure(method, dict(petsc_options or {}), prefix)
+
+        self._factorisations = 0
+        self._shares_used: list[Array] | None = None
+        self._norms = {"residual": 0.0, "force": 0.0, "floor": 0.0}
+
+    # ---- construction ----------------------------------------------------------------------------
+
+    def _constrained_dofs(self) -> npt.NDArray[np.bool_]:
+        mask = np.zeros(self._n_owned, dtype=np.bool_)
+        for bc in self._bcs:
+            dofs, n_owned = bc.dof_indices()
+            if self._comm.allreduce(int(dofs.size and dofs.max() >= self.u.x.array.size)):
+                raise ValueError("a Dirichlet condition is on another function space than u")
+            mask[dofs[:n_owned]] = True
+        return mask
+
+    def _check_contacts(self) -> None:
+        names = [c.name for c in self.contacts]
+        if len(set(names)) != len(names):
+            raise ValueError(f"contacts are named {names}; give every Contact a name of its own")
+        constrained = fem.Function(self.u.function_space)
+        constrained.x.array[: self._n_owned] = self._constrained
+        constrained.x.scatter_forward()
+        for contact in self.contacts:
+            if contact.u is not self.u:
+                raise ValueError(f"{contact.name}: its u is not the u of the problem")
+            held = _facets_held(contact, constrained.x.array)
+            n_held = self._comm.allreduce(held)
+            if n_held:
+                raise ValueError(
+                    f"{contact.name}: all displacements of {n_held} facets of Γc are prescribed by "
+                    "Dirichlet conditions; contact has nothing to decide there: take these facets "
+                    "out of Γc or out of the condition"
+                )
+
+    def _check_start(self) -> float:
+        worst = 0.0
+        for contact in self.contacts:
+            contact.check_input()
+            gap = global_min(self._comm, contact.values["gap"])
+            if gap < 0.0:
+                worst = max(worst, -gap)
+                if self._comm.rank == 0:
+                    logger.warning(
+                        "%s: the undeformed body penetrates its support by up to %g", contact.name, -gap
+                    )
+        return worst
+
+    def _configure(self, method: str, given: dict[str, Any], prefix: str) -> None:
+        symmetric = self.bulk.symmetric and (
+            method == "lbfgs" or all(c.law.has_potential for c in self.contacts)
+        )
+        defaults = _COMMON | _METHODS[method] | {"pc_type": "cholesky" if symmetric else "lu"}
+        database = PETSc.Options()
+        snes = PETSc.SNES().create(self._comm)
+        snes.setOptionsPrefix(prefix)
+        inserted = []
+        for name, value in (defaults | given).items():
+            key = prefix + name
+            if not database.hasName(key):
+                database.setValue(key, value)
+                inserted.append(key)
+        self._solution = self.u.x.petsc_vec.duplicate()
+        self._function = self.u.x.petsc_vec.duplicate()
+        snes.setFunction(self._compute_residual, self._function)
+        snes.setJacobian(self._compute_jacobian, self._matrix)
+        snes.setConvergenceTest(self._test_convergence)
+        snes.setFromOptions()
+        snes.setSolution(self._solution)
+        snes.setUp()
+        for key in inserted:
+            database.delValue(key)
+        self.snes = snes
+        self._rtol = snes.getTolerances()[0]
+        self._max_it = snes.getTolerances()[3]
+        self._quasi_newton = snes.getType() == PETSc.SNES.Type.QN
+        self._matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+        v, du = self._trial_arguments
+        if self._quasi_newton:
+            self._stiffness_forms = [
+                compat.compile_form(c.stiffness(v, du), c.entity_maps) for c in self.contacts
+            ]
+        else:
+            self._stiffness_forms = [
+                compat.compile_form(c.tangent(v, du), c.entity_maps) for c in self.contacts
+            ]
+
+    # ---- SNES callbacks --------------------------------------------------------------------------
+
+    def _set_u(self, x: PETSc.Vec) -> None:
+        self.u.x.array[: self._n_owned] = x.array_r * self._length
+        self.u.x.scatter_forward()
+
+    def _contact_force(self) -> Array:
+        """Contact part of the residual at the present u, owned dofs. Collective."""
+        vector = self._contact_vector.x
+        vector.array[:] = 0.0
+        for form in self._contact_forms:
+            fem.assemble_vector(vector.array, form)
+        vector.scatter_reverse(dolfinx.la.InsertMode.add)
+        return vector.array[: self._n_owned]
+
+    def _compute_residual(self, snes: PETSc.SNES | None, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        self._set_u(x)
+        contact = self._contact_force()
+        total = self.bulk.residual() + contact
+        self._measure_norms(total, contact)
+        total[self._constrained] = 0.0
+        f.array[:] = total / (self.bulk.scale * self._length)
+
+    def _measure_norms(self, total: Array, contact: Array) -> None:
+        """Norms in force: the free residual, the forces it is compared with, and round-off."""
+        reaction = total[self._constrained]
+        free = total[~self._constrained]
+        u = self.u.x.array[: self._n_owned]
+        squares = global_sum(
+            self._comm,
+            [
+                free @ free,
+                reaction @ reaction,
+                contact @ contact,
+                self._load @ self._load,
+                np.sum((self._diagonal * u) ** 2),
+            ],
+        )
+        residual, *forces, stiff = np.sqrt(squares)
+        self._norms = {
+            "residual": float(residual),
+            "force": float(max(forces)),
+            # Rounding of the product K u, which no iteration can undercut.
+            "floor": float(10 * np.finfo(float).eps * stiff),
+        }
+
+    def _tolerance(self) -> float:
+        return max(self._rtol * self._norms["force"], self._norms["floor"])
+
+    def _test_convergence(self, snes: PETSc.SNES, it: int, norms: tuple[float, ...]) -> int:
+        reasons = PETSc.SNES.ConvergedReason
+        if not np.isfinite(norms[2]):
+            return int(reasons.DIVERGED_FNORM_NAN)
+        if self._norms["residual"] <= self._tolerance():
+            return int(reasons.CONVERGED_FNORM_RELATIVE)
+        return int(reasons.ITERATING)
+
+    def _compute_jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
+        if self._quasi_newton:
+            return  # H₀ is made between the solves, and kept for all iterations
+        self._set_u(x)
+        self.bulk.update()
+        self._assemble_matrix()
+
+    def _assemble_matrix(self) -> None:
+        """Bulk tangent plus contact, conditions applied, dimensionless. Collective."""
+        matrix, scale = self._matrix, self.bulk.scale
+        self.bulk.stiffness.copy(matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        for form in self._stiffness_forms:
+            fem.petsc.assemble_matrix(matrix, form)
+        matrix.assemble()
+        start, _ = matrix.getOwnershipRange()
+        rows = (start + np.flatnonzero(self._constrained)).astype(PETSc.IntType)
+        matrix.zeroRowsColumns(rows, diag=scale)
+        diagonal = matrix.getDiagonal()
+        self._diagonal = diagonal.array.copy()
+        diagonal.destroy()
+        matrix.scale(1.0 / scale)
+        self._factorisations += 1
+
+    # ---- H₀ --------------------------------------------------------------------------------------
+
+    def _refresh_h0(self, *, everywhere: bool = False) -> None:
+        """Make H₀ = (K + αK_n + φK_t)⁻¹ from the present status of the points. Collective.
+
+        Args:
+            everywhere: Take all of Γc as closed and sticking, as the paper does, for a start from
+                which nothing can be told.
+        """
+        self.bulk.update()
+        for contact in self.contacts:
+            if everywhere:
+                contact.set_shares(self._alpha, self._phi)
+                continue
+            contact.evaluate()
+            status = contact.status
+            closed = np.where(status != Status.OPEN, 1.0, _OPEN_SHARE)
+            stick = np.where(status == Status.STICK, 1.0, _OPEN_SHARE)
+            contact.set_shares(self._alpha * closed, self._phi * stick)
+        self._assemble_matrix()
+
+    def _clear_pairs(self) -> None:
+        """Forget the pairs of L-BFGS and keep the factorisation, which reset() would drop too."""
+        ksp = self.snes.getKSP()
+        self.snes.setKSP(PETSc.KSP().create(self._comm))
+        self.snes.reset()
+        self.snes.setKSP(ksp)
+        self.snes.setFunction(self._compute_residual, self._function)
+        self.snes.setJacobian(self._compute_jacobian, self._matrix)
+
+    # ---- solving ---------------------------------------------------------------------------------
+
+    def solve(self) -> Step:
+        """Solve the next increment with the loads and conditions as they are now. Collective.
+
+        The history does not change: `commit` does that.
+
+        Returns:
+            What was done, the verdict included.
+
+        Raises:
+            NotConverged: No solution was found, or what was found failed the verdict; u and
+                history are as before.
+            ValueError: Input that is not finite, out of range, or a load that no contact force
+                can balance.
+        """
+        start = time.perf_counter()
+        saved = self.u.x.array.copy()
+        try:
+            step = self._solve(start)
+        except BaseException:
+            self.u.x.array[:] = saved
+            for contact in self.contacts:
+                contact._points = None
+            raise
+        return step
+
+    def _solve(self, start: float) -> Step:
+        self._check_before()
+        for bc in self._bcs:
+            bc.set(self.u.x.array)
+        self.u.x.scatter_forward()
+        self._factorisations = 0
+        stiffness_changed = self.bulk.update()
+        self._solution.array[:] = self.u.x.array[: self._n_owned] / self._length
+        if self._quasi_newton:
+            iterations, reason = self._solve_quasi_newton(stiffness_changed)
+        else:
+            self.snes.solve(None, self._solution)
+            iterations, reason = self.snes.getIterationNumber(), self.snes.getConvergedReason()
+        self._set_u(self._solution)
+        verdict = self._judge()
+        if reason <= 0 or verdict.failures:
+            raise NotConverged(self.increment + 1, int(reason), iterations, verdict)
+        return Step(
+            increment=self.increment + 1,
+            reason=int(reason),
+            iterations=iterations,
+            factorisations=self._factorisations,
+            verdict=verdict,
+            contacts={c.name: c.resultants() for c in self.contacts},
+            wall_seconds=time.perf_counter() - start,
+        )
+
+    def _check_before(self) -> None:
+        self.bulk.check_finite()
+        for contact in self.contacts:
+            contact.check_input()
+        self._load = -self.bulk.update_load()
+        size = global_max(self._comm, np.abs(self._load))
+        if not np.isfinite(size):
+            raise ValueError("the external load is not finite (NaN or inf) at some dof")
+        for number, bc in enumerate(self._bcs):
+            values = np.zeros_like(self.u.x.array)
+            bc.set(values)
+            if not np.isfinite(global_max(self._comm, np.abs(values))):
+                raise ValueError(f"Dirichlet condition number {number} has values that are not finite")
+        if self.bulk.linear:
+            self.motions.check_balance(self._load, self.contacts)
+
+    def _solve_quasi_newton(self, stiffness_changed: bool) -> tuple[int, int]:
+        """L-BFGS in rounds, H₀ made anew between them from the status reached. Collective."""
+        snes = self.snes
+        if self._shares_used is None or stiffness_changed:
+            self._refresh_h0(everywhere=True)
+            self._shares_used = []
+        iterations = stalls = 0
+        best = np.inf
+        while True:
+            self._clear_pairs()
+            snes.setTolerances(max_it=min(_REFRESH_EVERY, self._max_it - iterations))
+            snes.solve(None, self._solution)
+            iterations += snes.getIterationNumber()
+            reason = snes.getConvergedReason()
+            self._compute_residual(None, self._solution, self._function)
+            residual = self._norms["residual"]
+            if residual <= self._tolerance():
+                return iterations, max(reason, int(PETSc.SNES.ConvergedReason.CONVERGED_FNORM_RELATIVE))
+            if not np.isfinite(residual):
+                return iterations, int(PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN)
+            stalls = stalls + 1 if residual >= best else 0
+            best = min(best, residual)
+            if iterations >= self._max_it:
+                return iterations, int(PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT)
+            if stalls >= _MAX_STALLS:
+                return iterations, min(reason, int(PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH))
+            self._refresh_h0()
+
+    def _judge(self) -> Verdict:
+        """Recompute everything from u by assembly, past SNES and its residual. Collective."""
+        contact = self._contact_force()
+        bulk = self.bulk.assemble_residual()
+        total = bulk + contact
+        self._measure_norms(total, contact)
+        gdim = len(self.u)
+        reaction = np.where(self._constrained, total, 0.0)
+        by_component = np.stack([v.reshape(-1, gdim).sum(axis=0) for v in (bulk, reaction)])
+        bulk_sum, reaction_sum = global_sum(self._comm, by_component)
+        # ∑F(u) - ∫ (r_n n + τ) = reactions, the middle one by quadrature, not by assembly.
+        imbalance = bulk_sum - reaction_sum
+        for c in self.contacts:
+            c.evaluate()
+            imbalance = imbalance - c.resultants().force
+        absolute = float(global_sum(self._comm, np.abs(bulk).sum() + np.abs(contact).sum()))
+        n_dofs = float(global_sum(self._comm, self._n_owned))
+        return Verdict(
+            residual=self._norms["residual"],
+            force=self._norms["force"],
+            tolerance=self._tolerance(),
+            imbalance=float(np.abs(imbalance).max()),
+            imbalance_tolerance=np.sqrt(n_dofs) * 2 * self._tolerance() + 1e-12 * absolute,
+            laws={c.name: check_laws(c) for c in self.contacts},
+        )
+
+    def commit(self) -> None:
+        """Make the solved state the start of the next increment, history included. Collective."""
+        for contact in self.contacts:
+            contact.commit()
+        self.increment += 1
+
+
+def _facets_held(contact: Contact, constrained: Array) -> int:
+    """Number of this rank's facets of Γc all of whose displacements are prescribed."""
+    space = contact.u.function_space
+    mesh, dofmap = space.mesh, space.dofmap
+    tdim = mesh.topology.dim
+    mesh.topology.create_connectivity(tdim - 1, tdim)
+    mesh.topology.create_connectivity(tdim, tdim - 1)
+    to_cell = mesh.topology.connectivity(tdim - 1, tdim)
+    to_facet = mesh.topology.connectivity(tdim, tdim - 1)
+    held = constrained.reshape(-1, dofmap.bs).all(axis=1)
+    count = 0
+    for facet in contact.surface.facets:
+        cell = to_cell.links(facet)[0]
+        local = int(np.flatnonzero(to_facet.links(cell) == facet)[0])
+        closure = dofmap.dof_layout.entity_closure_dofs(tdim - 1, local)
+        count += bool(held[dofmap.cell_dofs(cell)[closure]].all())
+    return count

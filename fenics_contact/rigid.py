@@ -1,0 +1,226 @@
+"""Rigid motions that the Dirichlet conditions leave free: who holds them, can the load be balanced.
+
+A body held by contact alone is ordinary. One that nothing holds, or a load that pulls it off its
+support, has no solution: both are found here, before any iteration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import scipy.optimize
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from fenics_contact.contact import Contact
+from fenics_contact.parallel import gather_rows, global_sum
+
+__all__ = ["RigidMotions"]
+
+Array = npt.NDArray[np.float64]
+
+# Relative sizes below which an energy, a work or a share of a mode counts as zero. One clamped dof
+# among N gives 1/N, so that the first must lie below any 1/N; the others are far above round-off.
+_FREE = 1e-12
+_FELT = 1e-10
+_BALANCED = 1e-8
+# Directions by which the friction cone is enclosed in space: a polygon around the circle, so that a
+# balance that exists is never denied.
+_CONE_SIDES = 8
+
+
+class RigidMotions:
+    """Basis of the rigid motions of a displacement space, and those of them that are free.
+
+    Rotations are about the middle of the mesh and scaled by its size, so that every mode is a
+    displacement of order one.
+
+    Attributes:
+        size: Diagonal of the mesh's bounding box (length).
+        free: Coefficients of the free motions, shape (n_free, n_modes).
+    """
+
+    def __init__(self, space: fem.FunctionSpace) -> None:
+        """Make the modes at the owned dofs. Collective."""
+        self._comm = space.mesh.comm
+        self._gdim = space.mesh.geometry.dim
+        x = space.mesh.geometry.x
+        low, high = x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)
+        self._comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
+        self._comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
+        self._center = ((low + high) / 2)[: self._gdim]
+        self.size = float(np.linalg.norm(high - low))
+        self._n_owned = space.dofmap.index_map.size_local
+        dofs = space.tabulate_dof_coordinates()[: self._n_owned, : self._gdim]
+        self._modes = self.at(dofs).reshape(-1, self._n_owned * self._gdim)
+        self.free = np.zeros((0, len(self._modes)))
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the modes, in order."""
+        axes = "xyz"[: self._gdim]
+        turns = "z" if self._gdim == 2 else "xyz"
+        return [f"translation along {a}" for a in axes] + [f"rotation about {a}" for a in turns]
+
+    def at(self, points: Array) -> Array:
+        """All modes at points (n, gdim): shape (n_modes, n, gdim)."""
+        n, d = points.shape
+        arm = (points - self._center) / self.size
+        modes = np.zeros((3 if d == 2 else 6, n, d))
+        for i in range(d):
+            modes[i, :, i] = 1.0
+        if d == 2:
+            modes[2, :, 0], modes[2, :, 1] = -arm[:, 1], arm[:, 0]
+        else:
+            for i in range(3):
+                j, k = (i + 1) % 3, (i + 2) % 3
+                modes[3 + i, :, j], modes[3 + i, :, k] = -arm[:, k], arm[:, j]
+        return modes
+
+    def find_free(self, stiffness: PETSc.Mat, constrained: npt.NDArray[np.bool_]) -> None:
+        """Find the motions with no bulk energy that no Dirichlet condition holds. Collective.
+
+        Args:
+            stiffness: Bulk tangent without conditions.
+            constrained: Mask over this rank's owned dofs.
+        """
+        diagonal = stiffness.getDiagonal()
+        top = diagonal.norm(PETSc.NormType.NORM_INFINITY)
+        gram = np.zeros((2, len(self._modes), len(self._modes)))
+        work, image = stiffness.createVecs()
+        for j, mode in enumerate(self._modes):
+            work.array[:] = mode
+            stiffness.mult(work, image)
+            held = np.where(constrained, mode, 0.0)
+            gram[0, :, j] = self._modes @ (image.array / top + held)
+            gram[1, :, j] = self._modes @ mode
+        energy, mass = global_sum(self._comm, gram)
+        scale = 1 / np.sqrt(np.diag(mass))
+        values, vectors = np.linalg.eigh((energy + energy.T) / 2 * np.outer(scale, scale))
+        free = (vectors * scale[:, None])[:, values < _FREE]
+        self.free = (free / np.abs(free).max(axis=0)).T if free.size else free.T
+        for vector in (diagonal, work, image):
+            vector.destroy()
+
+    def _describe(self, coefficients: Array) -> str:
+        share = np.abs(coefficients) / np.abs(coefficients).max()
+        terms = [
+            name if s > 1 - 1e-6 else f"{s:.2g} of {name}"
+            for name, s in zip(self.names, share, strict=True)
+            if s > 1e-6
+        ]
+        return " with ".join(terms)
+
+    def check_held(self, contacts: Sequence[Contact]) -> None:
+        """Refuse a free motion that no contact feels, even if all of Γc were closed. Collective.
+
+        Raises:
+            ValueError: It names the motion.
+        """
+        if not len(self.free):
+            return
+        n_free = len(self.free)
+        gram = np.zeros((n_free, n_free))
+        for contact in contacts:
+            values = contact.values
+            modes = np.tensordot(self.free, self.at(contact.points), axes=1)
+            along = np.einsum("mqd,qd->mq", modes, values["normal"])
+            w = contact.quadrature.weights
+            if contact.law.unilateral:
+                gram += (along * w) @ along.T
+            if contact.law.has_friction:
+                grip = w * (values["parameter friction"] > 0)
+                across = modes - along[:, :, None] * values["normal"][None]
+                gram += np.einsum("mqd,q,nqd->mn", across, grip, across)
+        area = sum(float(global_sum(self._comm, c.quadrature.weights.sum())) for c in contacts)
+        gram = global_sum(self._comm, gram) / max(area, np.finfo(float).tiny)
+        values_, vectors = np.linalg.eigh(gram)
+        loose = vectors[:, values_ < _FELT]
+        if loose.size:
+            motions = "; ".join(self._describe(loose[:, i] @ self.free) for i in range(loose.shape[1]))
+            raise ValueError(
+                f"nothing will ever hold the body against this rigid motion: {motions}. Add a "
+                "Dirichlet condition on it, or friction"
+            )
+
+    def check_balance(self, load: Array, contacts: Sequence[Contact]) -> None:
+        """Refuse a load whose resultant no admissible contact forces can balance. Collective.
+
+        The contact may push anywhere on Γc, and rub within the friction cone: a necessary
+        condition only, but it finds a body pulled off its support, tipped over its edge or pushed
+        along it.
+
+        Args:
+            load: External forces at this rank's owned dofs (force).
+            contacts: Evaluated contacts.
+
+        Raises:
+            ValueError: It gives the resultant and the motion.
+        """
+        if not len(self.free):
+            return
+        free = self.free @ self._modes
+        resultant = global_sum(self._comm, free @ load)
+        # What the load could do at most, were all of it along the motion: the scale of "zero".
+        size = float(global_sum(self._comm, np.abs(free) @ np.abs(load)).max())
+        for contact in contacts:
+            if not contact.law.unilateral:  # a prescribed normal traction is a load
+                force = -contact.values["parameter pressure"][:, None] * contact.values["normal"]
+                modes = np.tensordot(self.free, self.at(contact.points), axes=1)
+                resultant += global_sum(
+                    self._comm, np.einsum("mqd,qd,q->m", modes, force, contact.measure)
+                )
+        if np.abs(resultant).max() <= _BALANCED * size:
+            return
+        rays = np.concatenate([self._rays(contact) for contact in contacts], axis=0)
+        # Unit columns: a ray's length has no meaning, and badly scaled ones spoil the solution.
+        length = np.linalg.norm(rays, axis=1)
+        rays = rays[length > 0] / length[length > 0, None]
+        rest = np.abs(resultant).max()
+        if len(rays):
+            rest = scipy.optimize.nnls(rays.T, -resultant / rest)[1] * rest
+        if rest > _BALANCED * max(size, np.abs(resultant).max()):
+            worst = int(np.argmax(np.abs(resultant)))
+            raise ValueError(
+                "no contact force can balance the load: its resultant along the free motion "
+                f"({self._describe(self.free[worst])}) is {resultant[worst]:.6g}, and the contact "
+                "can only push along its normals and rub within the friction cone. Check the sign "
+                "of the load and of the normals, or add a Dirichlet condition"
+            )
+
+    def _rays(self, contact: Contact) -> Array:
+        """Generalised forces of every admissible direction at every point: (n_rays, n_free)."""
+        values = contact.values
+        normal = values["normal"]
+        n, d = normal.shape
+        directions = []
+        if contact.law.has_friction:
+            if d == 2:
+                around = [np.column_stack([-normal[:, 1], normal[:, 0]])]
+                around.append(-around[0])
+            else:
+                around = _around(normal)
+            friction = values["parameter friction"][:, None]
+            if contact.law.unilateral and not contact.law.has_potential:
+                enlarge = 1.0 if d == 2 else 1 / np.cos(np.pi / _CONE_SIDES)
+                directions = [-normal + enlarge * friction * t for t in around]
+            else:  # Tresca: the tangential force does not need the normal one
+                directions = [np.where(friction > 0, t, 0.0) for t in around]
+        if contact.law.unilateral:
+            directions.append(-normal)
+        modes = np.tensordot(self.free, self.at(contact.points), axes=1)
+        rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
+        return gather_rows(self._comm, np.concatenate(rays).reshape(-1, len(self.free)))
+
+
+def _around(normal: Array) -> list[Array]:
+    """Unit vectors around each normal in space, `_CONE_SIDES` of them."""
+    least = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
+    first = np.cross(normal, least)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(normal, first)
+    angles = 2 * np.pi * np.arange(_CONE_SIDES) / _CONE_SIDES
+    return [np.cos(a) * first + np.sin(a) * second for a in angles]

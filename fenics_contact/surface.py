@@ -1,0 +1,234 @@
+"""ContactSurface: the facets of Γc, their submesh, and the quadrature points that carry history."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import basix.ufl
+import dolfinx
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem, la
+
+from fenics_contact import compat
+from fenics_contact.parallel import gather_rows
+
+__all__ = ["ContactSurface", "PointEvaluator", "SurfaceQuadrature"]
+
+_SCHEMES = ("default", "vertex")
+
+
+class ContactSurface:
+    """The potential contact surface Γc: exterior facets picked by their tags.
+
+    Collective. Works on triangles, quadrilaterals, tetrahedra and hexahedra of any geometric
+    order; a rank may hold none of the facets.
+
+    Attributes:
+        mesh: The mesh of the body.
+        facets: Owned facets of Γc on this rank, shape (n_facets,).
+        submesh: The mesh of Γc alone; history lives on it, so that nothing of it is stored inside
+            the body.
+        entity_maps: What ``dolfinx.fem.form`` needs to put functions of ``submesh`` into integrals
+            over ``mesh``.
+    """
+
+    def __init__(
+        self,
+        mesh: dolfinx.mesh.Mesh,
+        facet_tags: dolfinx.mesh.MeshTags,
+        tags: int | Sequence[int],
+        *,
+        quadrature_degree: int | None = None,
+        quadrature_scheme: str = "default",
+    ) -> None:
+        """Collect the facets and make their submesh. Collective.
+
+        Args:
+            mesh: Mesh of the body, topological dimension 2 or 3.
+            facet_tags: Tags on the facets of ``mesh``.
+            tags: The tag, or tags, that make up Γc.
+            quadrature_degree: Degree of the rule on Γc. By default twice the degree of the
+                displacement element (`SurfaceQuadrature.default_degree`).
+            quadrature_scheme: "default" (Gauss) or "vertex" (one point per facet vertex, the
+                contact springs of the paper's section 4).
+
+        Raises:
+            ValueError: Wrong dimension, a tag that no facet has, an interior facet with the tag.
+        """
+        wanted = np.unique(np.atleast_1d(np.asarray(tags, dtype=np.int32)))
+        tdim = mesh.topology.dim
+        if tdim not in (2, 3) or mesh.geometry.dim != tdim:
+            raise ValueError(
+                f"mesh has topological dimension {tdim} in a space of dimension "
+                f"{mesh.geometry.dim}; contact needs a solid: 2 in 2 or 3 in 3 dimensions"
+            )
+        if facet_tags.dim != tdim - 1:
+            raise ValueError(
+                f"facet_tags are on entities of dimension {facet_tags.dim}; a mesh of dimension "
+                f"{tdim} has facets of dimension {tdim - 1}: pass its facet tags, not its cell tags"
+            )
+        if quadrature_scheme not in _SCHEMES:
+            raise ValueError(f"quadrature_scheme is {quadrature_scheme!r}; use one of {_SCHEMES}")
+        if quadrature_degree is not None and quadrature_degree < 1:
+            raise ValueError(f"quadrature_degree is {quadrature_degree}; it must be at least 1")
+
+        mesh.topology.create_connectivity(tdim - 1, tdim)
+        exterior = dolfinx.mesh.exterior_facet_indices(mesh.topology)
+        n_owned = mesh.topology.index_map(tdim - 1).size_local
+        tagged = np.unique(facet_tags.indices[np.isin(facet_tags.values, wanted)])
+        tagged = tagged[tagged < n_owned]
+        interior = np.setdiff1d(tagged, exterior)
+        present = np.unique(gather_rows(mesh.comm, np.unique(facet_tags.values)))
+        missing = np.setdiff1d(wanted, present)
+        if missing.size:
+            raise ValueError(
+                f"no facet has the tag {missing.tolist()}; the tags on this mesh are "
+                f"{present.tolist()}"
+            )
+        n_interior = mesh.comm.allreduce(interior.size)
+        if n_interior:
+            raise ValueError(
+                f"{n_interior} of the facets tagged {wanted.tolist()} lie inside the body; "
+                "Γc must be a part of its boundary: tag exterior facets only"
+            )
+        if mesh.comm.allreduce(tagged.size) == 0:
+            raise ValueError(f"Γc is empty: no exterior facet has a tag in {wanted.tolist()}")
+
+        self.mesh = mesh
+        self.facets = tagged.astype(np.int32)
+        self.quadrature_degree = quadrature_degree
+        self.quadrature_scheme = quadrature_scheme
+        self.submesh, self.entity_maps, self._parent_facets = compat.create_facet_submesh(
+            mesh, self.facets
+        )
+        self._tags = dolfinx.mesh.meshtags(
+            mesh, tdim - 1, self.facets, np.ones(self.facets.size, dtype=np.int32)
+        )
+
+    def quadrature(self, element_degree: int) -> SurfaceQuadrature:
+        """The rule on Γc for a displacement element of this degree. Collective."""
+        degree = self.quadrature_degree or SurfaceQuadrature.default_degree(element_degree)
+        return SurfaceQuadrature(self, degree, self.quadrature_scheme)
+
+    def measure(self, degree: int, scheme: str = "default") -> ufl.Measure:
+        """The surface measure of Γc with a quadrature rule (all of Γc, nothing else)."""
+        metadata = {"quadrature_degree": degree, "quadrature_rule": scheme}
+        return ufl.Measure(
+            "ds", domain=self.mesh, subdomain_data=self._tags, subdomain_id=1, metadata=metadata
+        )
+
+
+class SurfaceQuadrature:
+    """A quadrature rule on Γc, its function spaces and its weights.
+
+    Attributes:
+        surface: The `ContactSurface`.
+        degree: Polynomial degree of the rule.
+        ds: The measure of Γc with this rule.
+        n_points: Quadrature points that this rank owns.
+        weights: Weight times surface Jacobian of the owned points, shape (n_points,), in
+            length^(gdim-1).
+    """
+
+    def __init__(self, surface: ContactSurface, degree: int, scheme: str) -> None:
+        """Make the rule. Collective."""
+        if scheme == "vertex":
+            degree = 1  # the rule of the vertices has no other
+        self.surface = surface
+        self.degree = degree
+        self.ds = surface.measure(degree, scheme)
+        self._cell = surface.submesh.topology.cell_name()
+        self._points_and_weights = _vertex_rule(self._cell) if scheme == "vertex" else None
+        space = self.space()
+        form = compat.compile_form(ufl.TestFunction(space) * self.ds, surface.entity_maps)
+        self._weights_with_ghosts = _assemble(form, la.vector(space.dofmap.index_map, 1))
+        self.n_points = space.dofmap.index_map.size_local
+        self.weights = self._weights_with_ghosts[: self.n_points]
+
+    @staticmethod
+    def default_degree(element_degree: int) -> int:
+        """Degree 2p: exact for the work of a contact traction of degree p on a facet all closed."""
+        return 2 * max(1, element_degree)
+
+    def space(self, size: int | None = None) -> fem.FunctionSpace:
+        """Space of functions at the quadrature points, scalar or with ``size`` components."""
+        shape = () if size is None else (size,)
+        if self._points_and_weights is None:
+            element = basix.ufl.quadrature_element(
+                self._cell, value_shape=shape, degree=self.degree
+            )
+        else:
+            points, weights = self._points_and_weights
+            element = basix.ufl.quadrature_element(
+                self._cell, value_shape=shape, points=points, weights=weights, degree=self.degree
+            )
+        return fem.functionspace(self.surface.submesh, element)
+
+
+class PointEvaluator:
+    """Evaluates named UFL expressions at the quadrature points of Γc, all in one compiled form.
+
+    By assembly, ∫ e q ds / ∫ q ds with q the test function of the quadrature space: exact for any
+    orientation of the facets, which the evaluation of expressions on facets is not in every
+    release of DOLFINx.
+    """
+
+    def __init__(
+        self, quadrature: SurfaceQuadrature, expressions: dict[str, ufl.core.expr.Expr]
+    ) -> None:
+        """Compile the form. Collective.
+
+        Args:
+            quadrature: The points.
+            expressions: Scalars and vectors by name.
+        """
+        components: list[ufl.core.expr.Expr] = []
+        self._columns: dict[str, int | slice] = {}
+        for name, expression in expressions.items():
+            expression = ufl.as_ufl(expression)
+            start = len(components)
+            if expression.ufl_shape == ():
+                components.append(expression)
+                self._columns[name] = start
+            else:
+                components += [expression[i] for i in range(expression.ufl_shape[0])]
+                self._columns[name] = slice(start, len(components))
+        self._size = len(components)
+        space = quadrature.space(self._size)
+        test = ufl.TestFunction(space)
+        self._form = compat.compile_form(
+            ufl.inner(ufl.as_vector(components), test) * quadrature.ds,
+            quadrature.surface.entity_maps,
+        )
+        self._vector = la.vector(space.dofmap.index_map, self._size)
+        self._weights = quadrature._weights_with_ghosts
+        self._n_owned = quadrature.n_points
+
+    def __call__(self) -> dict[str, npt.NDArray[np.float64]]:
+        """The values at the owned points by name, shape (n_points,) or (n_points, d). Collective.
+
+        The arrays are copies.
+        """
+        values = _assemble(self._form, self._vector).reshape(-1, self._size)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            values = values / self._weights[:, None]
+        return {name: values[: self._n_owned, c].copy() for name, c in self._columns.items()}
+
+
+def _assemble(form: fem.Form, vector: la.Vector) -> npt.NDArray[np.float64]:
+    """Assemble into ``vector``, ghosts consistent. Collective."""
+    vector.array[:] = 0.0
+    fem.assemble_vector(vector.array, form)
+    vector.scatter_reverse(la.InsertMode.add)
+    vector.scatter_forward()
+    return vector.array
+
+
+def _vertex_rule(cell: str) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Points and weights of the rule "vertex" as the form compiler has it."""
+    points = basix.geometry(basix.CellType[cell])
+    volume = {"interval": 1.0, "triangle": 0.5, "quadrilateral": 1.0}[cell]
+    return points, np.full(len(points), volume / len(points))
+
