@@ -1,5 +1,6 @@
 """Frictional contact for FEniCSx: contact as a boundary form, an answer that is checked."""
 
+from fenics_contact._version import __version__
 from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.laws import Coulomb, Frictionless, Scaled, Tresca
 from fenics_contact.problem import ContactProblem, Step
@@ -8,7 +9,7 @@ from fenics_contact.supports import Ball, Cylinder, HalfSpace, Obstacle
 from fenics_contact.surface import ContactSurface
 from fenics_contact.verdict import NotConverged, Verdict
 
-__version__ = "0.1.0"
+
 __all__ = [
     "Ball",
     "Contact",
@@ -26,5 +27,6 @@ __all__ = [
     "Step",
     "Tresca",
     "Verdict",
+    "__version__",
     "increments",
 ]

@@ -31,35 +31,38 @@ logger = logging.getLogger("fenics_contact")
 # stays held when its whole surface is open, too little to be felt as a wrong tangent.
 _OPEN_SHARE = 1e-3
 # L-BFGS iterations after which H₀ is made anew from the present contact status. One iteration costs
-# 1/15 to 1/35 of a factorisation.
-_REFRESH_EVERY = 40
-# Solves in a row that end without lowering the residual before the increment is given up.
-_MAX_STALLS = 3
+# 1/15 to 1/35 of a factorisation, and pairs taken across changes of status are worth little.
+_REFRESH_EVERY = 20
+# Rounds in a row that do not lower the residual before the increment is given up: the potential may
+# fall for long before the residual does.
+_MAX_STALLS = 10
+# Round-off in K u excuses a residual up to this share of the forces, not more: a displacement grown
+# without bounds would excuse anything.
+_MAX_FLOOR = 1e-5
 
 _COMMON = {
     "snes_rtol": 1e-9,
     "snes_stol": 0.0,
     "snes_max_it": 1000,
-    "ksp_type": "preonly",
-    "pc_factor_mat_solver_type": "mumps",
+    # The paper's line search: |ρ·Ψ(ΔU + sρ)| ≤ c_L |ρ·Ψ(ΔU)|. With the single secant step that is
+    # `cp`'s default it takes three times the iterations, and fails at stiffness it can solve.
+    "snes_linesearch_type": "cp",
+    "snes_linesearch_rtol": 0.1,
+    "snes_linesearch_max_it": 20,
     # `cp` takes |F·y| below this for convergence of the whole; the residual itself is tested here.
     "snes_linesearch_atol": 1e-300,
 }
+_LINEAR = {"ksp_type": "preonly", "pc_factor_mat_solver_type": "mumps"}
 _METHODS: dict[str, dict[str, Any]] = {
     "lbfgs": {
         "snes_type": "qn",
         "snes_qn_type": "lbfgs",
         "snes_qn_scale_type": "jacobian",
         "snes_qn_restart_type": "none",  # Powell's uses K where K⁻¹ is meant
-        "snes_qn_m": 60,
-        "snes_linesearch_type": "cp",
+        "snes_qn_m": 20,
         "qn_mat_lmvm_eps": 0.0,  # else pairs are dropped by a test that depends on the units
     },
-    "newton": {
-        "snes_type": "newtonls",
-        "snes_linesearch_type": "cp",
-        "snes_max_it": 100,
-    },
+    "newton": {"snes_type": "newtonls", "snes_max_it": 100},
 }
 
 
@@ -186,17 +189,15 @@ class ContactProblem:
             compat.compile_form(c.form(v), c.entity_maps) for c in self.contacts
         ]
         self._contact_vector = fem.Function(u.function_space)
-        self._trial_arguments = (v, du)
-        self._tangent_forms: list[fem.Form] | None = None
-        self._matrix = self.bulk.stiffness.duplicate()
-        self._matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
-        self._diagonal = np.zeros(self._n_owned)
+        self._arguments = (v, du)
+        self._matrix_forms: dict[bool, list[fem.Form]] = {}
         self._length = self.motions.size
-        self._configure(method, dict(petsc_options or {}), prefix)
-
+        self._diagonal = np.zeros(self._n_owned)
         self._factorisations = 0
-        self._shares_used: list[Array] | None = None
+        self._has_h0 = False
         self._norms = {"residual": 0.0, "force": 0.0, "floor": 0.0}
+        self._committed_force = 0.0
+        self._configure(method, dict(petsc_options or {}), prefix)
 
     # ---- construction ----------------------------------------------------------------------------
 
@@ -242,43 +243,59 @@ class ContactProblem:
         return worst
 
     def _configure(self, method: str, given: dict[str, Any], prefix: str) -> None:
-        symmetric = self.bulk.symmetric and (
-            method == "lbfgs" or all(c.law.has_potential for c in self.contacts)
-        )
-        defaults = _COMMON | _METHODS[method] | {"pc_type": "cholesky" if symmetric else "lu"}
+        """Set up SNES and its two linear solvers: for H₀, and for the consistent tangent."""
+        self._matrices: dict[bool, PETSc.Mat] = {}
+        self._solvers: dict[bool, PETSc.KSP] = {}
         database = PETSc.Options()
-        snes = PETSc.SNES().create(self._comm)
-        snes.setOptionsPrefix(prefix)
         inserted = []
-        for name, value in (defaults | given).items():
-            key = prefix + name
-            if not database.hasName(key):
-                database.setValue(key, value)
-                inserted.append(key)
+
+        def default(options: Mapping[str, Any], prefix: str) -> None:
+            for name, value in options.items():
+                if not database.hasName(prefix + name):
+                    database.setValue(prefix + name, value)
+                    inserted.append(prefix + name)
+
+        default(given, prefix)
+        default(_COMMON | _METHODS[method], prefix)
         self._solution = self.u.x.petsc_vec.duplicate()
         self._function = self.u.x.petsc_vec.duplicate()
-        snes.setFunction(self._compute_residual, self._function)
-        snes.setJacobian(self._compute_jacobian, self._matrix)
-        snes.setConvergenceTest(self._test_convergence)
-        snes.setFromOptions()
+        for consistent in (False, True):
+            symmetric = self.bulk.symmetric and (not consistent or self._has_potential)
+            matrix = self.bulk.stiffness.duplicate()
+            matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
+            matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+            ksp = PETSc.KSP().create(self._comm)
+            ksp.setOptionsPrefix(prefix + ("tangent_" if consistent else ""))
+            factorisation = {"pc_type": "cholesky" if symmetric else "lu"}
+            default(_LINEAR | factorisation, ksp.getOptionsPrefix())
+            ksp.setOperators(matrix)
+            ksp.setFromOptions()
+            self._matrices[consistent], self._solvers[consistent] = matrix, ksp
+        snes = PETSc.SNES().create(self._comm)
+        snes.setOptionsPrefix(prefix)
         snes.setSolution(self._solution)
+        snes.setConvergenceTest(self._test_convergence)
+        self.snes = snes
+        self._attach(consistent=False)
+        snes.setFromOptions()
+        self._quasi_newton = snes.getType() == PETSc.SNES.Type.QN
+        self._attach(consistent=not self._quasi_newton)
         snes.setUp()
         for key in inserted:
             database.delValue(key)
-        self.snes = snes
         self._rtol = snes.getTolerances()[0]
         self._max_it = snes.getTolerances()[3]
-        self._quasi_newton = snes.getType() == PETSc.SNES.Type.QN
-        self._matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
-        v, du = self._trial_arguments
-        if self._quasi_newton:
-            self._stiffness_forms = [
-                compat.compile_form(c.stiffness(v, du), c.entity_maps) for c in self.contacts
-            ]
-        else:
-            self._stiffness_forms = [
-                compat.compile_form(c.tangent(v, du), c.entity_maps) for c in self.contacts
-            ]
+
+    def _attach(self, *, consistent: bool) -> None:
+        """Give SNES its callbacks and the linear solver for H₀ or the consistent tangent."""
+        self._consistent = consistent
+        self.snes.setKSP(self._solvers[consistent])
+        self.snes.setFunction(self._compute_residual, self._function)
+        self.snes.setJacobian(self._compute_jacobian, self._matrices[consistent])
+
+    @property
+    def _has_potential(self) -> bool:
+        return all(c.law.has_potential for c in self.contacts)
 
     # ---- SNES callbacks --------------------------------------------------------------------------
 
@@ -319,11 +336,14 @@ class ContactProblem:
             ],
         )
         residual, *forces, stiff = np.sqrt(squares)
+        # With the committed forces: a body that is unloaded ends with none of its own.
+        force = float(max(*forces, self._committed_force))
+        # Rounding of the product K u, which no iteration can undercut.
+        floor = float(10 * np.finfo(float).eps * stiff)
         self._norms = {
             "residual": float(residual),
-            "force": float(max(forces)),
-            # Rounding of the product K u, which no iteration can undercut.
-            "floor": float(10 * np.finfo(float).eps * stiff),
+            "force": force,
+            "floor": min(floor, _MAX_FLOOR * force),
         }
 
     def _tolerance(self) -> float:
@@ -339,20 +359,33 @@ class ContactProblem:
 
     def _compute_jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
         if self._quasi_newton:
-            return  # H₀ is made between the solves, and kept for all iterations
+            return  # H₀ is made between the rounds, and kept for all iterations of one
         self._set_u(x)
         self.bulk.update()
-        self._assemble_matrix()
+        for contact in self.contacts:
+            contact.evaluate()
+        # Until enough points are closed to hold the body its tangent is singular: take H₀ of the
+        # whole surface, as for the start of the quasi-Newton iteration.
+        closed = self.motions.held(self.contacts, closed_only=True)
+        if not closed:
+            for contact in self.contacts:
+                contact.set_shares(self._alpha, self._phi)
+        self._assemble_matrix(J, consistent=closed)
 
-    def _assemble_matrix(self) -> None:
-        """Bulk tangent plus contact, conditions applied, dimensionless. Collective."""
-        matrix, scale = self._matrix, self.bulk.scale
+    def _assemble_matrix(self, matrix: PETSc.Mat, *, consistent: bool) -> None:
+        """Bulk tangent plus contact, conditions applied, dimensionless. Collective.
+
+        Args:
+            matrix: What to fill.
+            consistent: Whether contact enters with its tangent, or with its `Contact.stiffness`.
+        """
         self.bulk.stiffness.copy(matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        for form in self._stiffness_forms:
+        for form in self._contact_matrix_forms(consistent):
             fem.petsc.assemble_matrix(matrix, form)
         matrix.assemble()
         start, _ = matrix.getOwnershipRange()
         rows = (start + np.flatnonzero(self._constrained)).astype(PETSc.IntType)
+        scale = self.bulk.scale
         matrix.zeroRowsColumns(rows, diag=scale)
         diagonal = matrix.getDiagonal()
         self._diagonal = diagonal.array.copy()
@@ -360,35 +393,52 @@ class ContactProblem:
         matrix.scale(1.0 / scale)
         self._factorisations += 1
 
+    def _contact_matrix_forms(self, consistent: bool) -> list[fem.Form]:
+        """Compiled on first use: a scene that needs no consistent tangent compiles none."""
+        if consistent not in self._matrix_forms:
+            v, du = self._arguments
+            self._matrix_forms[consistent] = [
+                compat.compile_form(
+                    c.tangent(v, du) if consistent else c.stiffness(v, du), c.entity_maps
+                )
+                for c in self.contacts
+            ]
+        return self._matrix_forms[consistent]
+
     # ---- H₀ --------------------------------------------------------------------------------------
 
-    def _refresh_h0(self, *, everywhere: bool = False) -> None:
-        """Make H₀ = (K + αK_n + φK_t)⁻¹ from the present status of the points. Collective.
+    def _start_h0(self) -> None:
+        """H₀ = (K + αK_n + φK_t)⁻¹ with all of Γc closed and sticking, as in the paper. Collective."""
+        for contact in self.contacts:
+            contact.set_shares(self._alpha, self._phi)
+        self._clear_pairs(consistent=False)
+        self._assemble_matrix(self._matrices[False], consistent=False)
 
-        Args:
-            everywhere: Take all of Γc as closed and sticking, as the paper does, for a start from
-                which nothing can be told.
+    def _refresh_h0(self) -> None:
+        """Make H₀ anew from the status that the last round reached. Collective.
+
+        With Coulomb friction it is the consistent tangent: what L-BFGS cannot build from pairs is
+        the unsymmetric coupling of slip to pressure, and without it the residual wanders.
         """
+        self._set_u(self._solution)
         self.bulk.update()
         for contact in self.contacts:
-            if everywhere:
-                contact.set_shares(self._alpha, self._phi)
-                continue
             contact.evaluate()
-            status = contact.status
-            closed = np.where(status != Status.OPEN, 1.0, _OPEN_SHARE)
-            stick = np.where(status == Status.STICK, 1.0, _OPEN_SHARE)
-            contact.set_shares(self._alpha * closed, self._phi * stick)
-        self._assemble_matrix()
+        consistent = not self._has_potential and self.motions.held(self.contacts, closed_only=True)
+        if not consistent:
+            for contact in self.contacts:
+                status = contact.status
+                closed = np.where(status != Status.OPEN, 1.0, _OPEN_SHARE)
+                stick = np.where(status == Status.STICK, 1.0, _OPEN_SHARE)
+                contact.set_shares(self._alpha * closed, self._phi * stick)
+        self._clear_pairs(consistent=consistent)
+        self._assemble_matrix(self._matrices[consistent], consistent=consistent)
 
-    def _clear_pairs(self) -> None:
+    def _clear_pairs(self, *, consistent: bool | None = None) -> None:
         """Forget the pairs of L-BFGS and keep the factorisation, which reset() would drop too."""
-        ksp = self.snes.getKSP()
         self.snes.setKSP(PETSc.KSP().create(self._comm))
         self.snes.reset()
-        self.snes.setKSP(ksp)
-        self.snes.setFunction(self._compute_residual, self._function)
-        self.snes.setJacobian(self._compute_jacobian, self._matrix)
+        self._attach(consistent=self._consistent if consistent is None else consistent)
 
     # ---- solving ---------------------------------------------------------------------------------
 
@@ -461,31 +511,35 @@ class ContactProblem:
             self.motions.check_balance(self._load, self.contacts)
 
     def _solve_quasi_newton(self, stiffness_changed: bool) -> tuple[int, int]:
-        """L-BFGS in rounds, H₀ made anew between them from the status reached. Collective."""
-        snes = self.snes
-        if self._shares_used is None or stiffness_changed:
-            self._refresh_h0(everywhere=True)
-            self._shares_used = []
+        """L-BFGS in rounds, H₀ made anew between them from the status reached. Collective.
+
+        Returns:
+            Iterations and reason, the latter after a look at the residual itself.
+        """
+        snes, reasons = self.snes, PETSc.SNES.ConvergedReason
+        if not self._has_h0 or stiffness_changed:
+            self._start_h0()
+            self._has_h0 = True
+        else:
+            self._clear_pairs()
         iterations = stalls = 0
         best = np.inf
         while True:
-            self._clear_pairs()
             snes.setTolerances(max_it=min(_REFRESH_EVERY, self._max_it - iterations))
             snes.solve(None, self._solution)
             iterations += snes.getIterationNumber()
-            reason = snes.getConvergedReason()
             self._compute_residual(None, self._solution, self._function)
             residual = self._norms["residual"]
             if residual <= self._tolerance():
-                return iterations, max(reason, int(PETSc.SNES.ConvergedReason.CONVERGED_FNORM_RELATIVE))
+                return iterations, int(reasons.CONVERGED_FNORM_RELATIVE)
             if not np.isfinite(residual):
-                return iterations, int(PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN)
+                return iterations, int(reasons.DIVERGED_FNORM_NAN)
+            if iterations >= self._max_it:
+                return iterations, int(reasons.DIVERGED_MAX_IT)
             stalls = stalls + 1 if residual >= best else 0
             best = min(best, residual)
-            if iterations >= self._max_it:
-                return iterations, int(PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT)
             if stalls >= _MAX_STALLS:
-                return iterations, min(reason, int(PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH))
+                return iterations, int(reasons.DIVERGED_LINE_SEARCH)
             self._refresh_h0()
 
     def _judge(self) -> Verdict:
@@ -518,6 +572,7 @@ class ContactProblem:
         """Make the solved state the start of the next increment, history included. Collective."""
         for contact in self.contacts:
             contact.commit()
+        self._committed_force = self._norms["force"]
         self.increment += 1
 
 

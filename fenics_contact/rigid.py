@@ -15,7 +15,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from fenics_contact.contact import Contact
+from fenics_contact.contact import Contact, Status
 from fenics_contact.parallel import gather_rows, global_sum
 
 __all__ = ["RigidMotions"]
@@ -114,37 +114,50 @@ class RigidMotions:
         ]
         return " with ".join(terms)
 
+    def held(self, contacts: Sequence[Contact], *, closed_only: bool) -> bool:
+        """Whether contact holds every free motion. Collective.
+
+        Args:
+            contacts: Evaluated contacts.
+            closed_only: Count the points that are closed now, not all of Γc.
+        """
+        return not len(self.free) or not self._loose(contacts, closed_only).size
+
     def check_held(self, contacts: Sequence[Contact]) -> None:
         """Refuse a free motion that no contact feels, even if all of Γc were closed. Collective.
 
         Raises:
             ValueError: It names the motion.
         """
-        if not len(self.free):
-            return
-        n_free = len(self.free)
-        gram = np.zeros((n_free, n_free))
-        for contact in contacts:
-            values = contact.values
-            modes = np.tensordot(self.free, self.at(contact.points), axes=1)
-            along = np.einsum("mqd,qd->mq", modes, values["normal"])
-            w = contact.quadrature.weights
-            if contact.law.unilateral:
-                gram += (along * w) @ along.T
-            if contact.law.has_friction:
-                grip = w * (values["parameter friction"] > 0)
-                across = modes - along[:, :, None] * values["normal"][None]
-                gram += np.einsum("mqd,q,nqd->mn", across, grip, across)
-        area = sum(float(global_sum(self._comm, c.quadrature.weights.sum())) for c in contacts)
-        gram = global_sum(self._comm, gram) / max(area, np.finfo(float).tiny)
-        values_, vectors = np.linalg.eigh(gram)
-        loose = vectors[:, values_ < _FELT]
+        loose = self._loose(contacts, closed_only=False)
         if loose.size:
-            motions = "; ".join(self._describe(loose[:, i] @ self.free) for i in range(loose.shape[1]))
+            motions = "; ".join(self._describe(row) for row in loose)
             raise ValueError(
                 f"nothing will ever hold the body against this rigid motion: {motions}. Add a "
                 "Dirichlet condition on it, or friction"
             )
+
+    def _loose(self, contacts: Sequence[Contact], closed_only: bool) -> Array:
+        """Coefficients of the free motions that no contact feels: (n_loose, n_modes). Collective."""
+        n_free = len(self.free)
+        gram, area = np.zeros((n_free, n_free)), 0.0
+        for contact in contacts:
+            values = contact.values
+            modes = np.tensordot(self.free, self.at(contact.points), axes=1)
+            along = np.einsum("mqd,qd->mq", modes, values["normal"])
+            weights = contact.quadrature.weights
+            if closed_only:
+                weights = weights * (contact.status != Status.OPEN)
+            area += contact.quadrature.weights.sum()
+            if contact.law.unilateral:
+                gram += (along * weights) @ along.T
+            if contact.law.has_friction:
+                grip = weights * (values["parameter friction"] > 0)
+                across = modes - along[:, :, None] * values["normal"][None]
+                gram += np.einsum("mqd,q,nqd->mn", across, grip, across)
+        gram = global_sum(self._comm, gram) / max(float(global_sum(self._comm, area)), 1e-300)
+        sizes, vectors = np.linalg.eigh(gram)
+        return vectors[:, sizes < _FELT].T @ self.free
 
     def check_balance(self, load: Array, contacts: Sequence[Contact]) -> None:
         """Refuse a load whose resultant no admissible contact forces can balance. Collective.
