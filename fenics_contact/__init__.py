@@ -9,7 +9,6 @@ from fenics_contact.supports import Ball, Cylinder, HalfSpace, Obstacle
 from fenics_contact.surface import ContactSurface
 from fenics_contact.verdict import NotConverged, Verdict
 
-
 __all__ = [
     "Ball",
     "Contact",

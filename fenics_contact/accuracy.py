@@ -23,9 +23,10 @@ def cell_modulus(
 ) -> fem.Function:
     """Young's modulus of every cell as the bulk form itself has it. Collective.
 
-    The energy of two homogeneous strains is measured cell by cell: simple shear u = (0, x, 0) gives
-    G, stretch u = (0, y, 0) gives M = λ + 2G; then E = G (3M - 4G)/(M - G). Exact for isotropic
-    solids and plane strain; within some per cent for plane stress; the stiffness along y for others.
+    The energy of two homogeneous strains is measured cell by cell: simple shear u = (0, x, 0)
+    gives G, stretch u = (0, y, 0) gives M = λ + 2G; then E = G (3M - 4G)/(M - G). Exact for
+    isotropic solids and plane strain; within some per cent for plane stress; the stiffness along
+    y for others.
     Both fields have no radial part, so that they serve axisymmetric forms too.
 
     Args:
@@ -42,14 +43,14 @@ def cell_modulus(
     cells = [i for i in bulk_tangent.integrals() if i.integral_type() == "cell"]
     field = fem.Function(u.function_space)
     test, trial = bulk_tangent.arguments()
-    energy_form = compat.compile_form(
-        ufl.replace(ufl.Form(cells), {test: q * field, trial: field})
-    )
+    energy_form = compat.compile_form(ufl.replace(ufl.Form(cells), {test: q * field, trial: field}))
     volume_form = compat.compile_form(weight * q * ufl.dx(mesh))
 
     def energy(direction: int) -> np.ndarray:
         field.interpolate(
-            lambda x: np.vstack([x[direction] if i == 1 else 0 * x[0] for i in range(mesh.geometry.dim)])
+            lambda x: np.vstack(
+                [x[direction] if i == 1 else 0 * x[0] for i in range(mesh.geometry.dim)]
+            )
         )
         return _assemble(energy_form)
 
@@ -58,9 +59,9 @@ def cell_modulus(
     isotropic = stretch > 1.2 * shear  # λ > -0.8 G: else no isotropic solid, and E is the stretch's
     modulus = fem.Function(constants, name="modulus")
     modulus.x.array[:] = stretch
-    modulus.x.array[isotropic] = (shear * (3 * stretch - 4 * shear))[isotropic] / (
-        stretch - shear
-    )[isotropic]
+    modulus.x.array[isotropic] = (shear * (3 * stretch - 4 * shear))[isotropic] / (stretch - shear)[
+        isotropic
+    ]
     return modulus
 
 
@@ -119,9 +120,7 @@ def _smooth(values: fem.Function, length: fem.Function) -> fem.Function:
     w, v = ufl.TrialFunction(space), ufl.TestFunction(space)
     dx = ufl.dx(mesh)
     matrix = fem.petsc.create_matrix(
-        form := compat.compile_form(
-            w * v * dx + length**2 * ufl.dot(ufl.grad(w), ufl.grad(v)) * dx
-        )
+        form := compat.compile_form(w * v * dx + length**2 * ufl.dot(ufl.grad(w), ufl.grad(v)) * dx)
     )
     fem.petsc.assemble_matrix(matrix, form)
     matrix.assemble()

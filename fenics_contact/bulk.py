@@ -1,4 +1,4 @@
-"""The user's bulk form as a nonlinear map u -> F(u) with a tangent, treated once where it is linear."""
+"""The user's bulk form as a map u -> F(u) with a tangent, treated once where it is linear."""
 
 from __future__ import annotations
 
@@ -51,7 +51,9 @@ class Bulk:
         if space != u.function_space:
             raise ValueError("the TestFunction of F and u are of different function spaces")
         if u not in form.coefficients():
-            raise ValueError("F does not depend on u: write the residual with the Function u itself")
+            raise ValueError(
+                "F does not depend on u: write the residual with the Function u itself"
+            )
         self._u = u
         self.form = form
         derivative = ufl.derivative(form, u, ufl.TrialFunction(u.function_space))
@@ -73,7 +75,10 @@ class Bulk:
             ValueError: It names the coefficient.
         """
         comm = self._u.function_space.mesh.comm
-        for kind, items in (("function", self.form.coefficients()), ("constant", self.form.constants())):
+        for kind, items in (
+            ("function", self.form.coefficients()),
+            ("constant", self.form.constants()),
+        ):
             for position, item in enumerate(items):
                 array = item.x.array if kind == "function" else np.ravel(item.value)
                 if not np.isfinite(global_max(comm, np.abs(array))):

@@ -1,4 +1,4 @@
-"""The one place that knows that DOLFINx releases differ (0.9, 0.10, 0.11), by feature, not number."""
+"""The one place that knows that DOLFINx releases differ (0.9 to 0.11), by feature."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def interpolation_points(element: Any) -> npt.NDArray[np.float64]:
 
 
 def model_to_mesh(model: Any, comm: Any, rank: int, gdim: int) -> tuple[Any, Any]:
-    """Distribute a gmsh model: the mesh and its facet tags. Collective; the model is on ``rank``."""
+    """Distribute the gmsh model of ``rank``: the mesh and its facet tags. Collective."""
     try:
         from dolfinx.io import gmsh as gmshio  # DOLFINx >= 0.10
     except ImportError:

@@ -1,4 +1,4 @@
-"""Contact: binds a displacement, a surface, a support and a law; the boundary form and its results."""
+"""Contact: binds displacement, surface, support and law; the boundary form and its results."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Resultants:
     """Integrals over Γc and counts of its points, the same on every rank.
 
     Attributes:
-        force: Contact force on the body, ∫ (r_n n + τ), shape (gdim,), in force (2D: per thickness).
+        force: Contact force on the body, ∫ (r_n n + τ), shape (gdim,) (2D: per thickness).
         normal_force: ∫ -r_n ≥ 0.
         tangential_force: ∫ |τ|.
         area: Measure of the closed part.
@@ -191,7 +191,7 @@ class Contact:
     # ---- forms -----------------------------------------------------------------------------------
 
     def form(self, v: ufl.Argument) -> ufl.Form:
-        """Virtual work of the contact, to be **added** to a residual: -∫ (r_n v_n + τ·v_t) (46, 55).
+        """Virtual work of contact, to be **added** to a residual: -∫ (r_n v_n + τ·v_t) (46, 55).
 
         Args:
             v: Test function of ``u``'s space. Compile with ``entity_maps=contact.entity_maps``.
@@ -217,7 +217,7 @@ class Contact:
         return self.weight * density * self.quadrature.ds
 
     def tangent(self, v: ufl.Argument, du: ufl.Argument) -> ufl.Form:
-        """Consistent tangent: the derivative of `form`, unsymmetric where Coulomb friction slips."""
+        """Consistent tangent, the derivative of `form`; unsymmetric where Coulomb slips."""
         return ufl.derivative(self.form(v), self.u, du)
 
     def stiffness(self, v: ufl.Argument, du: ufl.Argument) -> ufl.Form:
@@ -232,7 +232,7 @@ class Contact:
         return self.weight * integrand * self.quadrature.ds
 
     def set_shares(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> None:
-        """Set the shares a, b of `stiffness`, numbers or arrays over the owned points. Collective."""
+        """Set the shares a, b of `stiffness`: numbers or arrays over owned points. Collective."""
         rows = self._shares.x.array.reshape(-1, 2)[: self.quadrature.n_points]
         rows[:, 0], rows[:, 1] = normal, tangential
         self._shares.x.scatter_forward()
@@ -364,7 +364,7 @@ class Contact:
 
     @property
     def gap(self) -> Array:
-        """s - u_n = δ₊ - δ₋ (eq. 6), shape (n_points,), in length."""
+        """Open distance s - u_n = δ₊ - δ₋ (eq. 6), shape (n_points,), in length."""
         return self._values["opening"] - self._values["penetration"]
 
     @property

@@ -1,4 +1,4 @@
-"""The committed state of a contact: fields at the quadrature points of Γc, as of the last commit."""
+"""The committed state of a contact: fields at the quadrature points of Γc."""
 
 from __future__ import annotations
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import ufl
 
 __all__ = ["Coulomb", "Frictionless", "Kinematics", "Law", "Response", "Scaled", "Tresca"]
 
-Expr = ufl.core.expr.Expr
+Expr: TypeAlias = ufl.core.expr.Expr
 
 
 @dataclass(frozen=True)
@@ -133,9 +133,7 @@ def _tangent_2d(normal: Expr) -> Expr:
     return ufl.as_vector([-normal[1], normal[0]])
 
 
-def return_map(
-    kinematics: Kinematics, limit: Expr, k_t: Expr
-) -> tuple[Expr, tuple[Expr, ...]]:
+def return_map(kinematics: Kinematics, limit: Expr, k_t: Expr) -> tuple[Expr, tuple[Expr, ...]]:
     """Traction and slip of the increment, eq. (41-45), given the largest |τ|.
 
     In the plane the two modes g = (τ - limit, -τ - limit), eq. (29), which needs no norm and is
@@ -251,9 +249,9 @@ class Tresca(Law):
         trial = _trial_traction(kinematics, k_t)
         squared = ufl.dot(trial, trial)
         slips = ufl.gt(squared, limit**2)
-        tangential = ufl.conditional(
-            slips, limit * ufl.sqrt(squared) - limit**2 / 2, squared / 2
-        ) / k_t
+        tangential = (
+            ufl.conditional(slips, limit * ufl.sqrt(squared) - limit**2 / 2, squared / 2) / k_t
+        )
         if not self.unilateral:
             return tangential + parameters["pressure"] * kinematics.normal_displacement
         return tangential + signorini_potential(kinematics, parameters["k_n"])

@@ -1,4 +1,4 @@
-"""ContactProblem: one increment of a body in contact, solved by PETSc SNES and checked afterwards."""
+"""ContactProblem: one increment of a body in contact, solved by PETSc SNES, then checked."""
 
 from __future__ import annotations
 
@@ -185,9 +185,7 @@ class ContactProblem:
 
         v = ufl.TestFunction(u.function_space)
         du = ufl.TrialFunction(u.function_space)
-        self._contact_forms = [
-            compat.compile_form(c.form(v), c.entity_maps) for c in self.contacts
-        ]
+        self._contact_forms = [compat.compile_form(c.form(v), c.entity_maps) for c in self.contacts]
         self._contact_vector = fem.Function(u.function_space)
         self._arguments = (v, du)
         self._matrix_forms: dict[bool, list[fem.Form]] = {}
@@ -238,7 +236,9 @@ class ContactProblem:
                 worst = max(worst, -gap)
                 if self._comm.rank == 0:
                     logger.warning(
-                        "%s: the undeformed body penetrates its support by up to %g", contact.name, -gap
+                        "%s: the undeformed body penetrates its support by up to %g",
+                        contact.name,
+                        -gap,
                     )
         return worst
 
@@ -408,7 +408,7 @@ class ContactProblem:
     # ---- H₀ --------------------------------------------------------------------------------------
 
     def _start_h0(self) -> None:
-        """H₀ = (K + αK_n + φK_t)⁻¹ with all of Γc closed and sticking, as in the paper. Collective."""
+        """H₀ = (K + αK_n + φK_t)⁻¹, all of Γc closed and sticking (section 5). Collective."""
         for contact in self.contacts:
             contact.set_shares(self._alpha, self._phi)
         self._clear_pairs(consistent=False)
@@ -506,7 +506,9 @@ class ContactProblem:
             values = np.zeros_like(self.u.x.array)
             bc.set(values)
             if not np.isfinite(global_max(self._comm, np.abs(values))):
-                raise ValueError(f"Dirichlet condition number {number} has values that are not finite")
+                raise ValueError(
+                    f"Dirichlet condition number {number} has values that are not finite"
+                )
         if self.bulk.linear:
             self.motions.check_balance(self._load, self.contacts)
 
@@ -585,7 +587,7 @@ def _facets_held(contact: Contact, constrained: Array) -> int:
     mesh.topology.create_connectivity(tdim, tdim - 1)
     to_cell = mesh.topology.connectivity(tdim - 1, tdim)
     to_facet = mesh.topology.connectivity(tdim, tdim - 1)
-    held = constrained.reshape(-1, dofmap.bs).all(axis=1)
+    held: npt.NDArray[np.bool_] = np.all(constrained.reshape(-1, dofmap.bs), axis=1)
     count = 0
     for facet in contact.surface.facets:
         cell = to_cell.links(facet)[0]

@@ -138,7 +138,7 @@ class RigidMotions:
             )
 
     def _loose(self, contacts: Sequence[Contact], closed_only: bool) -> Array:
-        """Coefficients of the free motions that no contact feels: (n_loose, n_modes). Collective."""
+        """Free motions that no contact feels, (n_loose, n_modes). Collective."""
         n_free = len(self.free)
         gram, area = np.zeros((n_free, n_free)), 0.0
         for contact in contacts:
@@ -155,8 +155,8 @@ class RigidMotions:
                 grip = weights * (values["parameter friction"] > 0)
                 across = modes - along[:, :, None] * values["normal"][None]
                 gram += np.einsum("mqd,q,nqd->mn", across, grip, across)
-        gram = global_sum(self._comm, gram) / max(float(global_sum(self._comm, area)), 1e-300)
-        sizes, vectors = np.linalg.eigh(gram)
+        mean = global_sum(self._comm, gram) / max(float(global_sum(self._comm, area)), 1e-300)
+        sizes, vectors = np.linalg.eigh(mean)
         return vectors[:, sizes < _FELT].T @ self.free
 
     def check_balance(self, load: Array, contacts: Sequence[Contact]) -> None:
@@ -208,7 +208,7 @@ class RigidMotions:
         """Generalised forces of every admissible direction at every point: (n_rays, n_free)."""
         values = contact.values
         normal = values["normal"]
-        n, d = normal.shape
+        d = normal.shape[1]
         directions = []
         if contact.law.has_friction:
             if d == 2:

@@ -1,8 +1,8 @@
 """What Γc presses on. A support says, by UFL alone, the gap s and the normal n at a point of Γc.
 
-n points **from the body to the support** (formulation, section Kinematics); s ≥ 0 is the distance
-along n that is still open. A support knows no mesh: numbers become constants of the mesh through the
-function that is passed in, so that a new value never compiles a new form.
+n points **from the body to the support**; s ≥ 0 is the distance along n that is still open. A
+support knows no mesh: numbers become constants of the mesh through the function that is passed in,
+so that a new value never compiles a new form.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class HalfSpace(Support):
 
 @dataclass(frozen=True)
 class Ball(Support):
-    """A rigid ball (a disc in 2D), or with ``inside=True`` the cavity of that shape around the body."""
+    """A rigid ball (a disc in 2D), or with ``inside=True`` the cavity around the body."""
 
     center: Sequence[float]
     radius: float

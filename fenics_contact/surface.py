@@ -211,9 +211,9 @@ class PointEvaluator:
 
         The arrays are copies.
         """
-        values = _assemble(self._form, self._vector).reshape(-1, self._size)
+        weighted = _assemble(self._form, self._vector).reshape(-1, self._size)
         with np.errstate(invalid="ignore", divide="ignore"):
-            values = values / self._weights[:, None]
+            values = weighted / self._weights[:, None]
         return {name: values[: self._n_owned, c].copy() for name, c in self._columns.items()}
 
 
@@ -231,4 +231,3 @@ def _vertex_rule(cell: str) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.flo
     points = basix.geometry(basix.CellType[cell])
     volume = {"interval": 1.0, "triangle": 0.5, "quadrilateral": 1.0}[cell]
     return points, np.full(len(points), volume / len(points))
-

@@ -63,9 +63,9 @@ def check_laws(contact: Contact) -> dict[str, float]:
 
     Returns:
         Largest violations, relative to the largest value concerned: "complementarity"
-        (eq. 6-11: r_n ≤ 0, δ± ≥ 0, δ₊δ₋ = 0, r_n δ₊ = 0, s - u_n = δ₊ - δ₋, r_n = -k_n δ₋) and, with
-        friction, "cone" (|τ| ≤ limit), "slip" (eq. 44: Δτ = -k_t (Δu_t + g_τ·Δβ), Δβ ≥ 0) and
-        "dissipation" (Δβ·g = 0, slip against τ). NaN where something is not finite.
+        (eq. 6-11: r_n ≤ 0, δ± ≥ 0, δ₊δ₋ = 0, r_n δ₊ = 0, s - u_n = δ₊ - δ₋, r_n = -k_n δ₋) and,
+        with friction, "cone" (|τ| ≤ limit), "slip" (eq. 44: Δτ = -k_t (Δu_t + g_τ·Δβ), Δβ ≥ 0)
+        and "dissipation" (Δβ·g = 0, slip against τ). NaN where something is not finite.
     """
     comm = contact.surface.mesh.comm
     v = contact.values

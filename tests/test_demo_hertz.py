@@ -1,0 +1,124 @@
+"""The half-cylinder demo, run as its user runs it, against its references."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mpi4py import MPI
+
+ROOT = Path(__file__).parent.parent
+DEMO = ROOT / "demos" / "hertz.py"
+
+pytestmark = [
+    pytest.mark.demo,
+    pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own"),
+]
+
+
+def run(folder: Path, *options: str, ranks: int = 1) -> dict[str, Any]:
+    """Run the demo in a process (or several) of its own and return its result.json."""
+    command = [sys.executable, str(DEMO), *options, "--output", str(folder)]
+    if ranks > 1:
+        command = ["mpirun", "--oversubscribe", "-n", str(ranks), *command]
+    # What mpirun left in the environment of this process would make the new one join it.
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
+    environment["PYTHONPATH"] = str(ROOT)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "%|" not in done.stderr, "the progress bar must be silent when not on a terminal"
+    return json.loads((folder / "result.json").read_text())
+
+
+def test_paper_mesh_writes_everything(tmp_path: Path) -> None:
+    """The plain command: both frictions, pictures, ParaView files, the documented keys."""
+    result = run(tmp_path)
+    keys = (
+        "peak_pressure half_width tangential_resultant stick_half_width max_tangential_traction "
+        "top_centre_displacement top_corner_displacement iterations converged_reasons "
+        "wall_seconds dofs references"
+    ).split()
+    assert [case["friction"] for case in result["runs"]] == [0.0, 0.2]
+    for case in result["runs"]:
+        assert set(keys) <= set(case)
+        assert all(reason > 0 for reason in case["converged_reasons"])
+        assert all(entry["passed"] for entry in case["references"].values())
+    for friction in ("0", "0.2"):
+        folder = tmp_path / f"friction-{friction}"
+        for name in ("traction.png", "mesh.png"):
+            assert (folder / name).read_bytes()[:4] == b"\x89PNG"
+        for name in ("displacement", "stress", "contact"):
+            assert (folder / f"{name}.pvd").exists()
+
+
+def test_frictionless_against_exact_contact(tmp_path: Path) -> None:
+    """Within 1 % of the converged solution with exact complementarity (a = 2.127, p0 = 142.6)."""
+    result = run(tmp_path, "--h", "0.05", "--degree", "2", "--friction", "0")
+    assert result["half_width"] == pytest.approx(2.127, rel=0.01)
+    assert result["peak_pressure"] == pytest.approx(142.6, rel=0.01)
+    # Displacements converge twice as fast as tractions: the digits the reference has.
+    assert result["top_centre_displacement"][1] == pytest.approx(-0.5181, rel=1e-3)
+    assert result["top_corner_displacement"] == pytest.approx([0.3332, -0.9947], rel=2e-3)
+
+
+def test_friction_against_exact_contact(tmp_path: Path) -> None:
+    """Within 2 % of the incremental solution with exact complementarity; its stick zone, too."""
+    result = run(
+        tmp_path, "--h", "0.05", "--degree", "2", "--friction", "0.2", "--increments", "80"
+    )
+    assert result["tangential_resultant"] == pytest.approx(34.17, rel=0.02)
+    assert result["peak_pressure"] == pytest.approx(150.8, rel=0.02)
+    assert result["half_width"] == pytest.approx(2.0855, rel=0.02)
+    assert result["stick_half_width"] == pytest.approx(0.737 * 2.0855, rel=0.02)
+
+
+def test_one_increment_is_another_history(tmp_path: Path) -> None:
+    """The load in one increment: T = 38.99 and a stick zone of 0.23 a, 14 % from the history."""
+    result = run(tmp_path, "--h", "0.1", "--degree", "2", "--friction", "0.2", "--increments", "1")
+    assert result["tangential_resultant"] == pytest.approx(38.99, rel=0.01)
+    assert result["max_tangential_traction"] == pytest.approx(29.3, rel=0.02)
+    # 0.23 is given with two digits; half the spacing of the points is 0.017 mm.
+    assert result["stick_half_width"] / result["half_width"] == pytest.approx(0.23, abs=0.015)
+
+
+def test_thin_contact_is_hertz(tmp_path: Path) -> None:
+    """a/R = 0.048: Hertz's own half-width and peak pressure within 1 %."""
+    result = run(tmp_path, "--load", "1", "--h", "0.02", "--degree", "2", "--friction", "0")
+    reference = {k: v["value"] for k, v in result["references"].items()}
+    assert reference["half_width"] / 8 < 0.05
+    for name in ("half_width", "peak_pressure"):
+        assert result[name] == pytest.approx(reference[name], rel=0.01)
+
+
+def test_pressure_error_falls_with_h(tmp_path: Path) -> None:
+    """The convergence run prints a rate; a pressure that ends like a square root allows 1."""
+    folder = tmp_path
+    command = [sys.executable, str(DEMO), "--convergence", "--degree", "2", "--output", str(folder)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "fitted rate" in done.stdout
+    study = json.loads((folder / "convergence.json").read_text())
+    errors = [row["pressure_error"] for row in study["rows"]]
+    assert all(fine < coarse for coarse, fine in itertools.pairwise(errors))
+    assert 0.7 < study["rate"] < 1.3
+
+
+@pytest.mark.parametrize("ranks", [2, 3])
+def test_ranks_agree(tmp_path: Path, ranks: int) -> None:
+    """The same numbers to 1e-6 on 2 and 3 ranks, and the same iterations."""
+    options = ("--h", "0.2", "--degree", "2", "--friction", "0.2", "--increments", "10")
+    serial = run(tmp_path / "serial", *options)
+    parallel = run(tmp_path / "parallel", *options, ranks=ranks)
+    for name in (
+        "peak_pressure half_width tangential_resultant stick_half_width max_tangential_traction "
+        "top_centre_displacement top_corner_displacement"
+    ).split():
+        assert parallel[name] == pytest.approx(serial[name], rel=1e-6, abs=1e-9), name
+    assert parallel["dofs"] == serial["dofs"]
