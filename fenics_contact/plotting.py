@@ -119,7 +119,10 @@ def plot_tractions(
         axes.plot(
             x[near], size[near], "-", color=_COLOURS["tangential"], label="|tangential traction|"
         )
-        for state, marker in ((Status.STICK, "o"), (Status.SLIP, "x")):
+        for state, marker, name in (
+            (Status.STICK, "o", "sticking"),
+            (Status.SLIP, "x", "slipping"),
+        ):
             mask = near & (status == state)
             axes.plot(
                 x[mask],
@@ -127,7 +130,7 @@ def plot_tractions(
                 marker,
                 color=_COLOURS["tangential"],
                 markersize=4,
-                label=f"{state.name.lower()}ing points".replace("slipi", "slippi"),
+                label=f"{name} points",
             )
     styles = ("--", ":", "-.")
     for i, (label, (xs, ys)) in enumerate((curves or {}).items()):
