@@ -107,17 +107,16 @@ def check_laws(contact: Contact) -> dict[str, float]:
         slipped = -(beta[:, 0] - beta[:, 1])[:, None] * tangent
     else:
         slipped = -beta * tau / np.where(size > 0, size, 1)[:, None]
-    travel = (v["increment"], (tau - old) / k_t[:, None])
+    # Round-off in the increments is that of the displacements they are differences of.
+    travel = (v["jump"], v["increment"], (tau - old) / k_t[:, None])
     found["cone"] = relative(worst(np.maximum(size - limit, 0)), limit)
-    found["slip"] = relative(
-        worst(np.minimum(beta, 0), (missing - slipped)[bears]), *(t[bears] for t in travel)
-    )
+    found["slip"] = relative(worst(np.minimum(beta, 0), (missing - slipped)[bears]), *travel)
     found["dissipation"] = relative(
         worst(
             beta.sum(axis=1) * (limit - size) * bears,
             np.maximum(np.sum(tau * missing, axis=1) * bears, 0),
         ),
-        limit * np.linalg.norm(missing, axis=1),
+        np.array([worst(limit) * worst(*travel)]),
     )
     return found
 
