@@ -3,6 +3,7 @@
 from fenics_contact._version import __version__
 from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.laws import Coulomb, Frictionless, Scaled, Tresca
+from fenics_contact.pairing import DeformableBody
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.stepping import increments
 from fenics_contact.supports import Ball, Cylinder, HalfSpace, Obstacle
@@ -16,6 +17,7 @@ __all__ = [
     "ContactSurface",
     "Coulomb",
     "Cylinder",
+    "DeformableBody",
     "Frictionless",
     "HalfSpace",
     "NotConverged",

@@ -102,8 +102,8 @@ def modulus_over_height(surface: ContactSurface, modulus: fem.Function) -> fem.F
     smallest = global_min(mesh.comm, ratio, empty=1.0)
     if not smallest > 0.0:
         raise ValueError(
-            f"the bulk form has no stiffness next to Γc (smallest E/h found: {smallest:g}); give "
-            "k_n and k_t as numbers or UFL expressions, in stress/length"
+            f"Young's modulus next to Γc is not positive (smallest E/h: {smallest:g}): check the "
+            "modulus, or the bulk form it was measured in; or give k_n and k_t in stress/length"
         )
     logarithm, length = fem.Function(facets), fem.Function(facets)
     logarithm.x.array[:] = np.log(ratio)

@@ -103,12 +103,19 @@ class Bulk:
         self.scale = diagonal.norm(PETSc.NormType.NORM_INFINITY)
         self.symmetric = self._is_symmetric(diagonal)
         diagonal.destroy()
+        return True
+
+    def check_elastic(self) -> None:
+        """Refuse a tangent without stiffness, after `update`.
+
+        Raises:
+            ValueError: It says what was found.
+        """
         if not (np.isfinite(self.scale) and self.scale > 0):
             raise ValueError(
                 f"the largest entry on the diagonal of the bulk stiffness is {self.scale:g}: F has "
                 "no elastic part, or a modulus is zero or not finite"
             )
-        return True
 
     def update_load(self) -> Array:
         """Assemble F(0), minus the external forces, at this rank's owned dofs. Collective."""

@@ -52,6 +52,18 @@ def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:
     return fem.form(form, entity_maps=entity_maps or None)
 
 
+def coordinate_element(mesh: dolfinx.mesh.Mesh) -> Any:
+    """The coordinate element, with ``degree`` and ``variant``."""
+    geometry = mesh.geometry
+    return geometry.cmaps[0] if hasattr(geometry, "cmaps") else geometry.cmap
+
+
+def geometry_dofmap(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:
+    """Geometry nodes of every local cell, shape (n_cells, n_nodes)."""
+    geometry = mesh.geometry
+    return geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
+
+
 def interpolation_points(element: Any) -> npt.NDArray[np.float64]:
     """Interpolation points of a DOLFINx element: a method in 0.9, a property since."""
     points = element.interpolation_points

@@ -7,16 +7,19 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
+import basix
 import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
+from petsc4py import PETSc
 
 from fenics_contact import accuracy
 from fenics_contact.history import History
 from fenics_contact.laws import Kinematics, Law, Scaled
+from fenics_contact.pairing import DeformableBody, Opposite
 from fenics_contact.parallel import gather_rows, global_max, global_min, global_sum
-from fenics_contact.supports import Support
+from fenics_contact.supports import Placement, Support
 from fenics_contact.surface import ContactSurface, PointEvaluator
 
 __all__ = ["Contact", "Resultants", "Status"]
@@ -69,6 +72,9 @@ class Contact:
             by name ("friction", "k_n", "displacement" …): set ``.value`` to change it.
         entity_maps: For compiling `form` in a problem of one's own.
         name: In messages and files.
+        gap_prescribed: Whether the gap was given apart from the geometry.
+        n_unpaired: Points whose normal meets no opposite surface (deformable support).
+        pairings: How often opposites were found: the couplings change with each.
     """
 
     def __init__(
@@ -113,14 +119,13 @@ class Contact:
         degree = _displacement_degree(u, mesh, name)
         self.quadrature = surface.quadrature(degree)
 
-        self.weight = self._to_ufl("weight", 1.0 if weight is None else weight)
+        self.weight = self._scalar("weight", 1.0 if weight is None else weight)
         self._scale: fem.Function | None = None  # E/h, if a stiffness is Scaled
         self._scale_known = False
         parameters = {n: self._parameter(n, v) for n, v in law.parameters().items()}
         if modulus is not None:
             self.set_modulus(modulus)
 
-        x = ufl.SpatialCoordinate(mesh)
         shift = support.displacement
         if shift is not None:
             shift = self._to_ufl("displacement", shift)
@@ -129,45 +134,43 @@ class Contact:
                     f"{name}: displacement of the support has shape {shift.ufl_shape}; the mesh "
                     f"needs ({gdim},)"
                 )
-        placement = support.place(x, shift, lambda v: self._to_ufl("support", v))
+        x = ufl.SpatialCoordinate(mesh)
+        self._opposite: Opposite | None = None
+        if isinstance(support, DeformableBody):
+            self._opposite = Opposite(support, self.quadrature, u.function_space)
+            self._distance = fem.Function(self.quadrature.space(), name="distance")
+            placement = Placement(self._distance, ufl.FacetNormal(mesh))
+        else:
+            placement = support.place(x, shift, lambda v: self._to_ufl("support", v))
         length = ufl.sqrt(ufl.dot(placement.direction, placement.direction))
-        normal = placement.direction / length
-        opening = placement.gap
+        self._normal = placement.direction / length
+        self._gap = placement.gap
+        self.gap_prescribed = gap is not None
         if gap is not None:
-            opening = self._to_ufl("gap", gap)
+            self._gap = self._scalar("gap", gap)
             if shift is not None:
-                opening = opening + ufl.dot(shift, normal)
+                self._gap = self._gap + ufl.dot(shift, self._normal)
+        self._shift = shift
+        self._law_parameters = parameters
 
-        m = law.n_modes(gdim)
         fields = {"opening": 0, "penetration": 0, "normal_traction": 0}
         if law.has_friction:
-            fields |= {"traction": gdim, "jump": gdim, "slip": m}
+            fields |= {"traction": gdim, "jump": gdim, "slip": law.n_modes(gdim)}
         self.history = History(self.quadrature, fields)
 
-        jump = u if shift is None else u - shift
-        increment = traction = None
-        if law.has_friction:
-            # The old traction and displacement are taken along the present normal: the support
-            # may have moved on since the last commit.
-            moved = jump - self.history.ufl("jump")
-            increment = moved - ufl.dot(moved, normal) * normal
-            traction = self.history.ufl("traction")
-            traction = traction - ufl.dot(traction, normal) * normal
-        kinematics = Kinematics(opening, ufl.dot(u, normal), normal, increment, traction)
+        # All of contact is a sparse map from u to the jump at the points, and the law there.
+        self._own_map = self.quadrature.interpolation_matrix(u.function_space)
+        self._map = self._own_map
+        self._jump = fem.Function(self.quadrature.space(gdim), name="jump")
+        self._reaction = self._map.createVecLeft()
+        kinematics = self._kinematics(self._jump)
         response = law.response(kinematics, parameters)
-        self._kinematics, self._parameters_ufl = kinematics, parameters
-        self._normal = normal
-        total = response.normal_traction * normal
-        if response.traction is not None:
-            total = total + response.traction
-        self._traction = total
-
         expressions = {
             "x": x,
-            "normal": normal,
+            "normal": self._normal,
             "direction_length": length,
             "weight": self.weight,
-            "gap": opening,
+            "gap": self._gap,
             "normal_displacement": kinematics.normal_displacement,
             "opening": response.opening,
             "penetration": response.penetration,
@@ -175,18 +178,46 @@ class Contact:
         } | {f"parameter {n}": v for n, v in parameters.items()}
         if law.has_friction:
             expressions |= {
-                "increment": increment,
-                "old_traction": traction,
+                "increment": kinematics.tangential_increment,
+                "old_traction": kinematics.traction,
                 "traction": response.traction,
                 "limit": response.limit,
-                "jump": jump,
+                "jump": self._relative(self._jump),
                 "slip_increment": ufl.as_vector(response.slip),
             }
-        self._evaluator = PointEvaluator(self.quadrature, expressions)
+        self._evaluate_points = PointEvaluator(self.quadrature, expressions)
+        self._evaluate_traction = PointEvaluator(
+            self.quadrature, {"traction": self.weight * self._total_traction(self._jump)}
+        )
+        self._evaluate_tangent: PointEvaluator | None = None
         self._points: dict[str, Array] | None = None
-        # Which share of k_n and k_t enters the approximate tangent at each point.
-        self._shares = fem.Function(self.quadrature.space(2), name="shares")
-        self._shares.x.array[:] = 1.0
+        self.n_unpaired = 0
+        self.pairings = 0
+        if self._opposite is not None:
+            self.pair()
+
+    def _relative(self, jump: Any) -> Any:
+        """Displacement of the body relative to the support (UFL)."""
+        return jump if self._shift is None else jump - self._shift
+
+    def _kinematics(self, jump: Any) -> Kinematics:
+        """What the law sees of a displacement of the body at the points (UFL)."""
+        normal = self._normal
+        increment = traction = None
+        if self.law.has_friction:
+            # The old traction and displacement are taken along the present normal: the support
+            # may have moved on since the last commit.
+            moved = self._relative(jump) - self.history.ufl("jump")
+            increment = moved - ufl.dot(moved, normal) * normal
+            traction = self.history.ufl("traction")
+            traction = traction - ufl.dot(traction, normal) * normal
+        return Kinematics(self._gap, ufl.dot(jump, normal), normal, increment, traction)
+
+    def _total_traction(self, jump: Any) -> Any:
+        """r_n n + τ on the body (UFL)."""
+        response = self.law.response(self._kinematics(jump), self._law_parameters)
+        total = response.normal_traction * self._normal
+        return total if response.traction is None else total + response.traction
 
     # ---- forms -----------------------------------------------------------------------------------
 
@@ -199,13 +230,18 @@ class Contact:
         Raises:
             ValueError: A stiffness is `Scaled` and the modulus is not known.
         """
-        if self._scale is not None and not self._scale_known:
+        if not self.rigid:
+            raise ValueError(
+                f"{self.name}: the form on Γc cannot reach the opposite body's unknowns; use "
+                "ContactProblem, or add_force and tangent_matrix"
+            )
+        if self.needs_modulus:
             raise ValueError(
                 f"{self.name}: k_n or k_t is a multiple of E/h, and E is not known; give "
                 "Contact(modulus=...), give k_n and k_t in stress/length, or use ContactProblem, "
                 "which measures E in the bulk form"
             )
-        return -self.weight * ufl.dot(self._traction, v) * self.quadrature.ds
+        return -self.weight * ufl.dot(self._total_traction(self.u), v) * self.quadrature.ds
 
     def potential(self) -> ufl.Form:
         """Energy whose derivative by ``u`` is `form` (eq. 19, 43).
@@ -213,29 +249,91 @@ class Contact:
         Raises:
             ValueError: The law has none (Coulomb).
         """
-        density = self.law.potential(self._kinematics, self._parameters_ufl)
+        density = self.law.potential(self._kinematics(self.u), self._law_parameters)
         return self.weight * density * self.quadrature.ds
 
     def tangent(self, v: ufl.Argument, du: ufl.Argument) -> ufl.Form:
         """Consistent tangent, the derivative of `form`; unsymmetric where Coulomb slips."""
         return ufl.derivative(self.form(v), self.u, du)
 
-    def stiffness(self, v: ufl.Argument, du: ufl.Argument) -> ufl.Form:
-        """Symmetric stiffness a K_n + b K_t of section 5, a and b set by `set_shares`."""
-        v_n, du_n = ufl.dot(v, self._normal), ufl.dot(du, self._normal)
-        integrand = 0
-        if self.law.unilateral:
-            integrand += self._shares[0] * self._parameters_ufl["k_n"] * v_n * du_n
-        if self.law.has_friction:
-            tangential = ufl.dot(v, du) - v_n * du_n
-            integrand += self._shares[1] * self._parameters_ufl["k_t"] * tangential
-        return self.weight * integrand * self.quadrature.ds
+    # ---- the same, point by point ----------------------------------------------------------------
 
-    def set_shares(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> None:
-        """Set the shares a, b of `stiffness`: numbers or arrays over owned points. Collective."""
-        rows = self._shares.x.array.reshape(-1, 2)[: self.quadrature.n_points]
-        rows[:, 0], rows[:, 1] = normal, tangential
-        self._shares.x.scatter_forward()
+    def add_force(self, residual: PETSc.Vec) -> None:
+        """Add `form`, assembled at the present ``u``, to a vector over the dofs. Collective.
+
+        The integrals are sums over the points, -Dᵀ w t with D the map from u to the points: the
+        law is evaluated on Γc alone, whatever the element of the bulk.
+        """
+        self._update_jump()
+        traction = self._evaluate_traction()["traction"]
+        self._reaction.array[:] = -(self.quadrature.weights[:, None] * traction).ravel()
+        self._map.multTransposeAdd(self._reaction, residual, residual)
+
+    def tangent_matrix(self) -> PETSc.Mat:
+        """`tangent`, assembled at the present ``u``, as a new matrix over the dofs. Collective."""
+        d = self._gdim
+        if self._evaluate_tangent is None:
+            jump = ufl.variable(self._jump)
+            derivative = ufl.diff(self._total_traction(jump), jump)
+            rows = {f"{i}": self.weight * derivative[i, :] for i in range(d)}
+            self._evaluate_tangent = PointEvaluator(self.quadrature, rows)
+        self._update_jump()
+        rows = self._evaluate_tangent()
+        return self._matrix(-np.stack([rows[f"{i}"] for i in range(d)], axis=1))
+
+    def stiffness_matrix(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> PETSc.Mat:
+        """Symmetric stiffness a K_n + b K_t of section 5 as a new matrix. Collective.
+
+        Args:
+            normal: a, a number or one per owned point.
+            tangential: b, likewise.
+        """
+        values, d = self._values, self._gdim
+        n = self.quadrature.n_points
+        along = np.einsum("qi,qj->qij", values["normal"], values["normal"])
+        blocks = np.zeros((n, d, d))
+        if self.law.unilateral:
+            blocks += (np.asarray(normal) * values["parameter k_n"])[:, None, None] * along
+        if self.law.has_friction:
+            across = np.eye(d) - along
+            blocks += (np.asarray(tangential) * values["parameter k_t"])[:, None, None] * across
+        return self._matrix(values["weight"][:, None, None] * blocks)
+
+    def at_points(self, displacement: Array) -> Array:
+        """Jump that a displacement makes at the points: (n_owned_dofs,) to (n_points, gdim).
+
+        Collective.
+        """
+        vector = self._map.createVecRight()
+        vector.array[:] = displacement
+        self._map.mult(vector, self._reaction)
+        vector.destroy()
+        return self._reaction.array.reshape(-1, self._gdim).copy()
+
+    def _update_jump(self) -> None:
+        self._map.mult(self.u.x.petsc_vec, self._jump.x.petsc_vec)
+        self._jump.x.scatter_forward()
+
+    def _matrix(self, blocks: Array) -> PETSc.Mat:
+        """Dᵀ C D with C block-diagonal, one block per point: (n_points, gdim, gdim)."""
+        n, d = self.quadrature.n_points, self._gdim
+        first, _ = self._map.getOwnershipRange()
+        blocks = self.quadrature.weights[:, None, None] * blocks
+        columns = first + d * np.arange(n)[:, None, None] + np.arange(d)[None, None, :]
+        columns = np.broadcast_to(columns, (n, d, d))
+        size = self._map.getSizes()[0]
+        matrix = PETSc.Mat().createAIJ(
+            (size, size),
+            csr=(
+                np.arange(0, n * d * d + 1, d, dtype=PETSc.IntType),
+                columns.ravel().astype(PETSc.IntType),
+                blocks.ravel(),
+            ),
+            comm=self.surface.mesh.comm,
+        )
+        product = matrix.ptap(self._map)
+        matrix.destroy()
+        return product
 
     # ---- parameters ------------------------------------------------------------------------------
 
@@ -271,6 +369,9 @@ class Contact:
             bad = not np.isfinite(value) or value < 0 or (positive and value == 0)
             if bad:
                 raise ValueError(_range_error(self.name, name, float(value)))
+        return self._scalar(name, value)
+
+    def _scalar(self, name: str, value: Any) -> ufl.core.expr.Expr:
         expression = self._to_ufl(name, value)
         if expression.ufl_shape != ():
             raise ValueError(
@@ -294,11 +395,44 @@ class Contact:
             self.parameters[name] = constant
         return constant
 
+    # ---- pairs -----------------------------------------------------------------------------------
+
+    @property
+    def rigid(self) -> bool:
+        """Whether the support is rigid: its reactions are then external to the mesh."""
+        return self._opposite is None
+
+    def pair(self) -> None:
+        """Find the opposites of all points in the undeformed bodies. Collective.
+
+        Points that find none are open, whatever they do, and counted in ``n_unpaired``.
+        """
+        assert self._opposite is not None
+        mesh, d = self.surface.mesh, self._gdim
+        points = self._evaluate_points()
+        opposite, distance = self._opposite.pair(points["x"], points["normal"], None)
+        paired = ~np.isnan(distance)
+        extent = global_max(mesh.comm, mesh.geometry.x) - global_min(mesh.comm, mesh.geometry.x)
+        self._distance.x.array[: len(paired)] = np.where(paired, distance, 10 * extent)
+        self._distance.x.scatter_forward()
+        relative = self._own_map.copy()
+        mask = relative.createVecLeft()
+        mask.array[:] = np.repeat(paired, d)
+        relative.diagonalScale(mask, None)
+        relative.axpy(-1.0, opposite, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        opposite.destroy()
+        mask.destroy()
+        self._map = relative
+        self._points = None
+        self.n_unpaired = int(global_sum(mesh.comm, np.count_nonzero(~paired)))
+        self.pairings += 1
+
     # ---- state -----------------------------------------------------------------------------------
 
     def evaluate(self) -> None:
         """Evaluate gap, reactions and slip at the present ``u``; the history stays. Collective."""
-        self._points = self._evaluator()
+        self._update_jump()
+        self._points = self._evaluate_points()
 
     def check_input(self) -> None:
         """Refuse parameters that are out of range or not finite at some point of Γc. Collective.
@@ -503,6 +637,10 @@ def _displacement_degree(u: fem.Function, mesh: Any, name: str) -> int:
             f"{name}: u is in {element}; it must be in a vector-valued Lagrange space, "
             f'functionspace(mesh, ("Lagrange", degree, ({gdim},)))'
         )
-    if element.degree < 1:
-        raise ValueError(f"{name}: u has degree {element.degree}; a displacement needs degree 1 up")
-    return int(element.degree)
+    basis = u.function_space.element.basix_element
+    if basis.family != basix.ElementFamily.P or basis.discontinuous or basis.degree < 1:
+        raise ValueError(
+            f"{name}: u is in {element}, of degree {basis.degree}; it must be continuous, a "
+            "Lagrange element of degree 1 or higher"
+        )
+    return int(basis.degree)

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import dolfinx.fem.petsc
 import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact import accuracy, compat
+from fenics_contact import accuracy
 from fenics_contact.bulk import Bulk
 from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.parallel import global_max, global_min, global_sum
@@ -36,9 +35,14 @@ _REFRESH_EVERY = 20
 # Rounds in a row that do not lower the residual before the increment is given up: the potential may
 # fall for long before the residual does.
 _MAX_STALLS = 10
-# Round-off in K u excuses a residual up to this share of the forces, not more: a displacement grown
-# without bounds would excuse anything.
+# A round that ends with more than this times the lowest residual, or none, has gone astray: the
+# next one starts where that was.
+_ASTRAY = 1e3
+# Round-off in K u excuses a residual up to this share of the forces (or of the residual before the
+# first iteration), not more: a displacement grown without bounds would excuse anything.
 _MAX_FLOOR = 1e-5
+# Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
+_TOUCHING = 1e-12
 
 _COMMON = {
     "snes_rtol": 1e-9,
@@ -49,6 +53,8 @@ _COMMON = {
     "snes_linesearch_type": "cp",
     "snes_linesearch_rtol": 0.1,
     "snes_linesearch_max_it": 20,
+    # Bodies without contact are led to it before: no step of the iteration needs to be long.
+    "snes_linesearch_maxstep": 100.0,
     # `cp` takes |F·y| below this for convergence of the whole; the residual itself is tested here.
     "snes_linesearch_atol": 1e-300,
 }
@@ -119,7 +125,8 @@ class ContactProblem:
         bulk: The bulk form.
         snes: The PETSc solver.
         increment: Number of committed increments.
-        initial_penetration: Largest penetration of the undeformed body (length), 0 if none.
+        initial_penetration: Largest penetration of the undeformed body (length), 0 if none; an
+            interference by a prescribed gap is none.
     """
 
     def __init__(
@@ -173,28 +180,23 @@ class ContactProblem:
 
         self.bulk.check_finite()
         self.bulk.update()
+        self.bulk.check_elastic()
         waiting = [c for c in self.contacts if c.needs_modulus]
         if waiting:
             modulus = accuracy.cell_modulus(self.bulk.tangent_form, u, waiting[0].weight)
             for contact in waiting:
                 contact.set_modulus(modulus)
-        self.initial_penetration = self._check_start()
         self.motions = RigidMotions(u.function_space)
+        self.initial_penetration = self._check_start()
         self.motions.find_free(self.bulk.stiffness, self._constrained)
         self.motions.check_held(self.contacts)
 
-        v = ufl.TestFunction(u.function_space)
-        du = ufl.TrialFunction(u.function_space)
-        self._contact_forms = [compat.compile_form(c.form(v), c.entity_maps) for c in self.contacts]
         self._contact_vector = fem.Function(u.function_space)
-        self._arguments = (v, du)
-        self._matrix_forms: dict[bool, list[fem.Form]] = {}
         self._length = self.motions.size
         self._diagonal = np.zeros(self._n_owned)
         self._factorisations = 0
-        self._has_h0 = False
         self._norms = {"residual": 0.0, "force": 0.0, "floor": 0.0}
-        self._committed_force = 0.0
+        self._committed_force = self._start_residual = 0.0
         self._configure(method, dict(petsc_options or {}), prefix)
 
     # ---- construction ----------------------------------------------------------------------------
@@ -232,7 +234,7 @@ class ContactProblem:
         for contact in self.contacts:
             contact.check_input()
             gap = global_min(self._comm, contact.values["gap"])
-            if gap < 0.0:
+            if gap < -_TOUCHING * self.motions.size and not contact.gap_prescribed:
                 worst = max(worst, -gap)
                 if self._comm.rank == 0:
                     logger.warning(
@@ -244,7 +246,6 @@ class ContactProblem:
 
     def _configure(self, method: str, given: dict[str, Any], prefix: str) -> None:
         """Set up SNES and its two linear solvers: for H₀, and for the consistent tangent."""
-        self._matrices: dict[bool, PETSc.Mat] = {}
         self._solvers: dict[bool, PETSc.KSP] = {}
         database = PETSc.Options()
         inserted = []
@@ -260,17 +261,13 @@ class ContactProblem:
         self._solution = self.u.x.petsc_vec.duplicate()
         self._function = self.u.x.petsc_vec.duplicate()
         for consistent in (False, True):
-            symmetric = self.bulk.symmetric and (not consistent or self._has_potential)
-            matrix = self.bulk.stiffness.duplicate()
-            matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
-            matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
             ksp = PETSc.KSP().create(self._comm)
             ksp.setOptionsPrefix(prefix + ("tangent_" if consistent else ""))
-            factorisation = {"pc_type": "cholesky" if symmetric else "lu"}
+            factorisation = {"pc_type": "cholesky" if self._symmetric(consistent) else "lu"}
             default(_LINEAR | factorisation, ksp.getOptionsPrefix())
-            ksp.setOperators(matrix)
             ksp.setFromOptions()
-            self._matrices[consistent], self._solvers[consistent] = matrix, ksp
+            self._solvers[consistent] = ksp
+        self._make_matrices()
         snes = PETSc.SNES().create(self._comm)
         snes.setOptionsPrefix(prefix)
         snes.setSolution(self._solution)
@@ -285,6 +282,31 @@ class ContactProblem:
             database.delValue(key)
         self._rtol = snes.getTolerances()[0]
         self._max_it = snes.getTolerances()[3]
+
+    def _symmetric(self, consistent: bool) -> bool:
+        return self.bulk.symmetric and (not consistent or self._has_potential)
+
+    def _make_matrices(self) -> None:
+        """Allocate the matrices of H₀ and of the consistent tangent. Collective.
+
+        Their pattern is that of the bulk and, with deformable supports, of the pairs.
+        """
+        self._pairings = [c.pairings for c in self.contacts]
+        self._matrices: dict[bool, PETSc.Mat] = {}
+        different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
+        for consistent, ksp in self._solvers.items():
+            matrix = self.bulk.stiffness.copy()
+            for contact in self.contacts:
+                if not contact.rigid:
+                    part = contact.stiffness_matrix(1.0, 1.0)
+                    matrix.axpy(1.0, part, different)
+                    part.destroy()
+            matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
+            matrix.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric(consistent))
+            ksp.reset()
+            ksp.setOperators(matrix)
+            self._matrices[consistent] = matrix
+        self._has_h0 = False
 
     def _attach(self, *, consistent: bool) -> None:
         """Give SNES its callbacks and the linear solver for H₀ or the consistent tangent."""
@@ -307,18 +329,19 @@ class ContactProblem:
         """Contact part of the residual at the present u, owned dofs. Collective."""
         vector = self._contact_vector.x
         vector.array[:] = 0.0
-        for form in self._contact_forms:
-            fem.assemble_vector(vector.array, form)
-        vector.scatter_reverse(dolfinx.la.InsertMode.add)
+        for contact in self.contacts:
+            contact.add_force(vector.petsc_vec)
         return vector.array[: self._n_owned]
 
     def _compute_residual(self, snes: PETSc.SNES | None, x: PETSc.Vec, f: PETSc.Vec) -> None:
         self._set_u(x)
-        contact = self._contact_force()
-        total = self.bulk.residual() + contact
-        self._measure_norms(total, contact)
-        total[self._constrained] = 0.0
-        f.array[:] = total / (self.bulk.scale * self._length)
+        # A trial of the line search may overflow; the convergence test sees it.
+        with np.errstate(all="ignore"):
+            contact = self._contact_force()
+            total = self.bulk.residual() + contact
+            self._measure_norms(total, contact)
+            total[self._constrained] = 0.0
+            f.array[:] = total / (self.bulk.scale * self._length)
 
     def _measure_norms(self, total: Array, contact: Array) -> None:
         """Norms in force: the free residual, the forces it is compared with, and round-off."""
@@ -343,7 +366,7 @@ class ContactProblem:
         self._norms = {
             "residual": float(residual),
             "force": force,
-            "floor": min(floor, _MAX_FLOOR * force),
+            "floor": min(floor, _MAX_FLOOR * max(force, self._start_residual)),
         }
 
     def _tolerance(self) -> float:
@@ -366,23 +389,27 @@ class ContactProblem:
             contact.evaluate()
         # Until enough points are closed to hold the body its tangent is singular: take H₀ of the
         # whole surface, as for the start of the quasi-Newton iteration.
-        closed = self.motions.held(self.contacts, closed_only=True)
-        if not closed:
-            for contact in self.contacts:
-                contact.set_shares(self._alpha, self._phi)
-        self._assemble_matrix(J, consistent=closed)
+        if self.motions.held(self.contacts, closed_only=True):
+            self._assemble_matrix(J, self._tangents())
+        else:
+            self._assemble_matrix(J, self._stiffnesses(everywhere=True))
 
-    def _assemble_matrix(self, matrix: PETSc.Mat, *, consistent: bool) -> None:
+    def _assemble_matrix(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> None:
         """Bulk tangent plus contact, conditions applied, dimensionless. Collective.
 
         Args:
             matrix: What to fill.
-            consistent: Whether contact enters with its tangent, or with its `Contact.stiffness`.
+            contacts: Contact's part, used up.
         """
-        self.bulk.stiffness.copy(matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        for form in self._contact_matrix_forms(consistent):
-            fem.petsc.assemble_matrix(matrix, form)
-        matrix.assemble()
+        subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
+        if all(c.rigid for c in self.contacts):
+            self.bulk.stiffness.copy(matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        else:
+            matrix.zeroEntries()
+            matrix.axpy(1.0, self.bulk.stiffness, subset)
+        for part in contacts:
+            matrix.axpy(1.0, part, subset)
+            part.destroy()
         start, _ = matrix.getOwnershipRange()
         rows = (start + np.flatnonzero(self._constrained)).astype(PETSc.IntType)
         scale = self.bulk.scale
@@ -393,46 +420,47 @@ class ContactProblem:
         matrix.scale(1.0 / scale)
         self._factorisations += 1
 
-    def _contact_matrix_forms(self, consistent: bool) -> list[fem.Form]:
-        """Compiled on first use: a scene that needs no consistent tangent compiles none."""
-        if consistent not in self._matrix_forms:
-            v, du = self._arguments
-            self._matrix_forms[consistent] = [
-                compat.compile_form(
-                    c.tangent(v, du) if consistent else c.stiffness(v, du), c.entity_maps
-                )
-                for c in self.contacts
-            ]
-        return self._matrix_forms[consistent]
+    def _tangents(self) -> Iterator[PETSc.Mat]:
+        return (contact.tangent_matrix() for contact in self.contacts)
+
+    def _stiffnesses(self, *, everywhere: bool) -> Iterator[PETSc.Mat]:
+        """The shares αK_n + φK_t of the contacts, as evaluated.
+
+        Args:
+            everywhere: Take all of Γc as closed and sticking, as the paper does, where nothing
+                can be told from the status.
+        """
+        for contact in self.contacts:
+            normal = tangential = np.ones(contact.quadrature.n_points)
+            if not everywhere:
+                normal = np.where(contact.status != Status.OPEN, 1.0, _OPEN_SHARE)
+                tangential = np.where(contact.status == Status.STICK, 1.0, _OPEN_SHARE)
+            yield contact.stiffness_matrix(self._alpha * normal, self._phi * tangential)
 
     # ---- H₀ --------------------------------------------------------------------------------------
 
     def _start_h0(self) -> None:
         """H₀ = (K + αK_n + φK_t)⁻¹, all of Γc closed and sticking (section 5). Collective."""
-        for contact in self.contacts:
-            contact.set_shares(self._alpha, self._phi)
         self._clear_pairs(consistent=False)
-        self._assemble_matrix(self._matrices[False], consistent=False)
+        self._assemble_matrix(self._matrices[False], self._stiffnesses(everywhere=True))
 
-    def _refresh_h0(self) -> None:
-        """Make H₀ anew from the status that the last round reached. Collective.
+    def _refresh_h0(self) -> bool:
+        """Make H₀ anew from the status that the last round reached; False if none. Collective.
 
         With Coulomb friction it is the consistent tangent: what L-BFGS cannot build from pairs is
         the unsymmetric coupling of slip to pressure, and without it the residual wanders.
         """
         self._set_u(self._solution)
         self.bulk.update()
+        if not np.isfinite(self.bulk.scale):
+            return False
         for contact in self.contacts:
             contact.evaluate()
         consistent = not self._has_potential and self.motions.held(self.contacts, closed_only=True)
-        if not consistent:
-            for contact in self.contacts:
-                status = contact.status
-                closed = np.where(status != Status.OPEN, 1.0, _OPEN_SHARE)
-                stick = np.where(status == Status.STICK, 1.0, _OPEN_SHARE)
-                contact.set_shares(self._alpha * closed, self._phi * stick)
+        parts = self._tangents() if consistent else self._stiffnesses(everywhere=False)
         self._clear_pairs(consistent=consistent)
-        self._assemble_matrix(self._matrices[consistent], consistent=consistent)
+        self._assemble_matrix(self._matrices[consistent], parts)
+        return True
 
     def _clear_pairs(self, *, consistent: bool | None = None) -> None:
         """Forget the pairs of L-BFGS and keep the factorisation, which reset() would drop too."""
@@ -474,7 +502,13 @@ class ContactProblem:
         self.u.x.scatter_forward()
         self._factorisations = 0
         stiffness_changed = self.bulk.update()
+        if self._pairings != [c.pairings for c in self.contacts]:
+            self._make_matrices()
+        self._approach()
         self._solution.array[:] = self.u.x.array[: self._n_owned] / self._length
+        self._start_residual = 0.0
+        self._compute_residual(None, self._solution, self._function)
+        self._start_residual = self._norms["residual"]
         if self._quasi_newton:
             iterations, reason = self._solve_quasi_newton(stiffness_changed)
         else:
@@ -512,6 +546,18 @@ class ContactProblem:
         if self.bulk.linear:
             self.motions.check_balance(self._load, self.contacts)
 
+    def _approach(self) -> None:
+        """Move bodies that nothing holds yet to first touch, along their load. Collective."""
+        for contact in self.contacts:
+            contact.evaluate()
+        touching = [bool(np.any(c.status != Status.OPEN)) for c in self.contacts]
+        if not len(self.motions.free) or self._comm.allreduce(any(touching)):
+            return
+        way = self.motions.approach(self._load, self.contacts)
+        if way is not None:
+            self.u.x.array[: self._n_owned] += way
+            self.u.x.scatter_forward()
+
     def _solve_quasi_newton(self, stiffness_changed: bool) -> tuple[int, int]:
         """L-BFGS in rounds, H₀ made anew between them from the status reached. Collective.
 
@@ -525,7 +571,7 @@ class ContactProblem:
         else:
             self._clear_pairs()
         iterations = stalls = 0
-        best = np.inf
+        best, kept = self._start_residual, self._solution.copy()
         while True:
             snes.setTolerances(max_it=min(_REFRESH_EVERY, self._max_it - iterations))
             snes.solve(None, self._solution)
@@ -534,15 +580,21 @@ class ContactProblem:
             residual = self._norms["residual"]
             if residual <= self._tolerance():
                 return iterations, int(reasons.CONVERGED_FNORM_RELATIVE)
-            if not np.isfinite(residual):
-                return iterations, int(reasons.DIVERGED_FNORM_NAN)
             if iterations >= self._max_it:
                 return iterations, int(reasons.DIVERGED_MAX_IT)
-            stalls = stalls + 1 if residual >= best else 0
-            best = min(best, residual)
+            if residual < best:
+                stalls, best = 0, residual
+                self._solution.copy(kept)
+            else:
+                stalls += 1
+                if not residual <= _ASTRAY * best:
+                    kept.copy(self._solution)
             if stalls >= _MAX_STALLS:
-                return iterations, int(reasons.DIVERGED_LINE_SEARCH)
-            self._refresh_h0()
+                lost = not np.isfinite(residual)
+                failure = reasons.DIVERGED_FNORM_NAN if lost else reasons.DIVERGED_LINE_SEARCH
+                return iterations, int(failure)
+            if not self._refresh_h0():
+                return iterations, int(reasons.DIVERGED_FNORM_NAN)
 
     def _judge(self) -> Verdict:
         """Recompute everything from u by assembly, past SNES and its residual. Collective."""
@@ -558,7 +610,8 @@ class ContactProblem:
         imbalance = bulk_sum - reaction_sum
         for c in self.contacts:
             c.evaluate()
-            imbalance = imbalance - c.resultants().force
+            if c.rigid:  # between two bodies of the mesh contact forces are internal
+                imbalance = imbalance - c.resultants().force
         absolute = float(global_sum(self._comm, np.abs(bulk).sum() + np.abs(contact).sum()))
         n_dofs = float(global_sum(self._comm, self._n_owned))
         return Verdict(

@@ -11,12 +11,13 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 import scipy.optimize
+import scipy.sparse.csgraph
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact.contact import Contact, Status
-from fenics_contact.parallel import gather_rows, global_sum
+from fenics_contact.parallel import gather_rows, global_min, global_sum
 
 __all__ = ["RigidMotions"]
 
@@ -33,52 +34,40 @@ _CONE_SIDES = 8
 
 
 class RigidMotions:
-    """Basis of the rigid motions of a displacement space, and those of them that are free.
+    """The rigid motions of every body of a mesh, and those of them that are free.
 
-    Rotations are about the middle of the mesh and scaled by its size, so that every mode is a
-    displacement of order one.
+    A body is a part of the mesh connected by its displacements. Rotations are about the body's
+    middle and scaled by its size, so that every motion is a displacement of order one.
 
     Attributes:
         size: Diagonal of the mesh's bounding box (length).
-        free: Coefficients of the free motions, shape (n_free, n_modes).
+        names: Name of every motion.
+        free: Coefficients of the free motions, shape (n_free, n_motions).
     """
 
     def __init__(self, space: fem.FunctionSpace) -> None:
-        """Make the modes at the owned dofs. Collective."""
+        """Make the motions at the owned dofs. Collective."""
         self._comm = space.mesh.comm
-        self._gdim = space.mesh.geometry.dim
-        x = space.mesh.geometry.x
-        low, high = x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)
+        gdim = space.mesh.geometry.dim
+        n_owned = space.dofmap.index_map.size_local
+        x = space.tabulate_dof_coordinates()[:n_owned, :gdim]
+        n_bodies, body = _bodies(space)
+        low, high = np.full((n_bodies, gdim), np.inf), np.full((n_bodies, gdim), -np.inf)
+        np.minimum.at(low, body, x)
+        np.maximum.at(high, body, x)
         self._comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
         self._comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
-        self._center = ((low + high) / 2)[: self._gdim]
-        self.size = float(np.linalg.norm(high - low))
-        self._n_owned = space.dofmap.index_map.size_local
-        dofs = space.tabulate_dof_coordinates()[: self._n_owned, : self._gdim]
-        self._modes = self.at(dofs).reshape(-1, self._n_owned * self._gdim)
-        self.free = np.zeros((0, len(self._modes)))
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the modes, in order."""
-        axes = "xyz"[: self._gdim]
-        turns = "z" if self._gdim == 2 else "xyz"
-        return [f"translation along {a}" for a in axes] + [f"rotation about {a}" for a in turns]
-
-    def at(self, points: Array) -> Array:
-        """All modes at points (n, gdim): shape (n_modes, n, gdim)."""
-        n, d = points.shape
-        arm = (points - self._center) / self.size
-        modes = np.zeros((3 if d == 2 else 6, n, d))
-        for i in range(d):
-            modes[i, :, i] = 1.0
-        if d == 2:
-            modes[2, :, 0], modes[2, :, 1] = -arm[:, 1], arm[:, 0]
-        else:
-            for i in range(3):
-                j, k = (i + 1) % 3, (i + 2) % 3
-                modes[3 + i, :, j], modes[3 + i, :, k] = -arm[:, k], arm[:, j]
-        return modes
+        self.size = float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
+        self.names: list[str] = []
+        modes = []
+        for b in range(n_bodies):
+            of = f" of body {b + 1}, near {np.round((low[b] + high[b]) / 2, 6).tolist()}"
+            kinds = _motions(x - (low[b] + high[b]) / 2, float(np.linalg.norm(high[b] - low[b])))
+            for name, mode in kinds.items():
+                self.names.append(name + (of if n_bodies > 1 else ""))
+                modes.append(np.where(body[:, None] == b, mode, 0.0).ravel())
+        self._modes = np.array(modes)
+        self.free = np.zeros((0, len(modes)))
 
     def find_free(self, stiffness: PETSc.Mat, constrained: npt.NDArray[np.bool_]) -> None:
         """Find the motions with no bulk energy that no Dirichlet condition holds. Collective.
@@ -104,6 +93,12 @@ class RigidMotions:
         self.free = (free / np.abs(free).max(axis=0)).T if free.size else free.T
         for vector in (diagonal, work, image):
             vector.destroy()
+
+    def _at_points(self, contact: Contact) -> Array:
+        """Jumps of the free motions at a contact's points: (n_free, n_points, gdim). Collective."""
+        gdim = contact.surface.mesh.geometry.dim
+        jumps = [contact.at_points(c @ self._modes) for c in self.free]
+        return np.array(jumps).reshape(len(self.free), contact.quadrature.n_points, gdim)
 
     def _describe(self, coefficients: Array) -> str:
         share = np.abs(coefficients) / np.abs(coefficients).max()
@@ -143,7 +138,7 @@ class RigidMotions:
         gram, area = np.zeros((n_free, n_free)), 0.0
         for contact in contacts:
             values = contact.values
-            modes = np.tensordot(self.free, self.at(contact.points), axes=1)
+            modes = self._at_points(contact)
             along = np.einsum("mqd,qd->mq", modes, values["normal"])
             weights = contact.quadrature.weights
             if closed_only:
@@ -158,6 +153,35 @@ class RigidMotions:
         mean = global_sum(self._comm, gram) / max(float(global_sum(self._comm, area)), 1e-300)
         sizes, vectors = np.linalg.eigh(mean)
         return vectors[:, sizes < _FELT].T @ self.free
+
+    def approach(self, load: Array, contacts: Sequence[Contact]) -> Array | None:
+        """Rigid motion to first touch, where the load sets free bodies moving. Collective.
+
+        Args:
+            load: External forces at this rank's owned dofs (force).
+            contacts: Evaluated contacts, all of them open.
+
+        Returns:
+            Displacement to add at the owned dofs, or None: nothing moves, or it meets nothing.
+        """
+        if not len(self.free):
+            return None
+        free = self.free @ self._modes
+        drive = global_sum(self._comm, free @ load)
+        mass = global_sum(self._comm, free @ free.T)
+        if not np.abs(drive).max() > 0:
+            return None
+        coefficients = np.linalg.solve(mass, drive)
+        coefficients /= np.abs(coefficients).max()
+        way = np.inf
+        for contact in contacts:
+            values = contact.values
+            jump = np.tensordot(coefficients, self._at_points(contact), axes=1)
+            closing = np.einsum("qd,qd->q", jump, values["normal"])
+            nearing = closing > _FELT
+            ways = values["opening"][nearing] / closing[nearing]
+            way = min(way, global_min(self._comm, ways, empty=np.inf))
+        return None if way == np.inf else way * coefficients @ free
 
     def check_balance(self, load: Array, contacts: Sequence[Contact]) -> None:
         """Refuse a load whose resultant no admissible contact forces can balance. Collective.
@@ -182,10 +206,8 @@ class RigidMotions:
         for contact in contacts:
             if not contact.law.unilateral:  # a prescribed normal traction is a load
                 force = -contact.values["parameter pressure"][:, None] * contact.values["normal"]
-                modes = np.tensordot(self.free, self.at(contact.points), axes=1)
-                resultant += global_sum(
-                    self._comm, np.einsum("mqd,qd,q->m", modes, force, contact.measure)
-                )
+                work = np.einsum("mqd,qd,q->m", self._at_points(contact), force, contact.measure)
+                resultant += global_sum(self._comm, work)
         if np.abs(resultant).max() <= _BALANCED * size:
             return
         rays = np.concatenate([self._rays(contact) for contact in contacts], axis=0)
@@ -224,9 +246,56 @@ class RigidMotions:
                 directions = [np.where(friction > 0, t, 0.0) for t in around]
         if contact.law.unilateral:
             directions.append(-normal)
-        modes = np.tensordot(self.free, self.at(contact.points), axes=1)
+        modes = self._at_points(contact)
         rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
         return gather_rows(self._comm, np.concatenate(rays).reshape(-1, len(self.free)))
+
+
+def _motions(arm: Array, size: float) -> dict[str, Array]:
+    """Rigid motions of points at ``arm`` from the centre, (n, gdim), by name."""
+    n, d = arm.shape
+    motions = {}
+    for i, axis in enumerate("xyz"[:d]):
+        motions[f"translation along {axis}"] = np.broadcast_to(np.eye(d)[i], (n, d))
+    for i, axis in enumerate("xyz"):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        if max(j, k) < d:
+            turn = np.zeros((n, d))
+            turn[:, j], turn[:, k] = -arm[:, k] / size, arm[:, j] / size
+            motions[f"rotation about {axis}"] = turn
+    return motions
+
+
+def _bodies(space: fem.FunctionSpace) -> tuple[int, npt.NDArray[np.intp]]:
+    """Number of connected parts of the mesh, and the part of every owned node. Collective."""
+    comm, dofmap = space.mesh.comm, space.dofmap
+    n_owned = dofmap.index_map.size_local
+    n_nodes = n_owned + dofmap.index_map.num_ghosts
+    cells = dofmap.list
+    first = np.repeat(cells[:, 0], cells.shape[1] - 1)
+    links = scipy.sparse.coo_matrix(
+        (np.ones(first.size, dtype=np.int8), (first, cells[:, 1:].ravel())), (n_nodes, n_nodes)
+    )
+    n_parts, part = scipy.sparse.csgraph.connected_components(links, directed=False)
+    offset = comm.scan(n_parts) - n_parts
+    # A ghost belongs to a part here and to one on its owner: the two are one body.
+    label = fem.Function(space)
+    label.x.array.reshape(n_nodes, -1)[:, 0] = offset + part
+    label.x.scatter_forward()
+    owner = label.x.array.reshape(n_nodes, -1)[n_owned:, 0].astype(np.int64)
+    pairs = np.unique(np.column_stack([owner, offset + part[n_owned:]]), axis=0)
+    pairs = np.concatenate(comm.allgather(pairs))
+    total = comm.allreduce(n_parts)
+    graph = scipy.sparse.coo_matrix((np.ones(len(pairs)), pairs.T), (total, total))
+    _, merged = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    # Nodes that no cell here has are parts of their own; owned ones there are none.
+    used = np.zeros(total, dtype=np.int64)
+    np.add.at(used, offset + part[:n_owned], 1)
+    comm.Allreduce(MPI.IN_PLACE, used, op=MPI.SUM)
+    bodies, numbered = np.unique(merged[used > 0], return_inverse=True)
+    of_part = np.zeros(total, dtype=np.intp)
+    of_part[used > 0] = numbered
+    return len(bodies), of_part[offset + part[:n_owned]]
 
 
 def _around(normal: Array) -> list[Array]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import basix.ufl
-import dolfinx
+import dolfinx.fem.petsc
 import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem, la
+from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.parallel import gather_rows
@@ -57,55 +58,19 @@ class ContactSurface:
         Raises:
             ValueError: Wrong dimension, a tag that no facet has, an interior facet with the tag.
         """
-        wanted = np.unique(np.atleast_1d(np.asarray(tags, dtype=np.int32)))
-        tdim = mesh.topology.dim
-        if tdim not in (2, 3) or mesh.geometry.dim != tdim:
-            raise ValueError(
-                f"mesh has topological dimension {tdim} in a space of dimension "
-                f"{mesh.geometry.dim}; contact needs a solid: 2 in 2 or 3 in 3 dimensions"
-            )
-        if facet_tags.dim != tdim - 1:
-            raise ValueError(
-                f"facet_tags are on entities of dimension {facet_tags.dim}; a mesh of dimension "
-                f"{tdim} has facets of dimension {tdim - 1}: pass its facet tags, not its cell tags"
-            )
         if quadrature_scheme not in _SCHEMES:
             raise ValueError(f"quadrature_scheme is {quadrature_scheme!r}; use one of {_SCHEMES}")
         if quadrature_degree is not None and quadrature_degree < 1:
             raise ValueError(f"quadrature_degree is {quadrature_degree}; it must be at least 1")
-
-        mesh.topology.create_connectivity(tdim - 1, tdim)
-        exterior = dolfinx.mesh.exterior_facet_indices(mesh.topology)
-        n_owned = mesh.topology.index_map(tdim - 1).size_local
-        tagged = np.unique(facet_tags.indices[np.isin(facet_tags.values, wanted)])
-        tagged = tagged[tagged < n_owned]
-        interior = np.setdiff1d(tagged, exterior)
-        present = np.unique(gather_rows(mesh.comm, np.unique(facet_tags.values)))
-        missing = np.setdiff1d(wanted, present)
-        if missing.size:
-            raise ValueError(
-                f"no facet has the tag {missing.tolist()}; the tags on this mesh are "
-                f"{present.tolist()}"
-            )
-        n_interior = mesh.comm.allreduce(interior.size)
-        if n_interior:
-            raise ValueError(
-                f"{n_interior} of the facets tagged {wanted.tolist()} lie inside the body; "
-                "Γc must be a part of its boundary: tag exterior facets only"
-            )
-        if mesh.comm.allreduce(tagged.size) == 0:
-            raise ValueError(f"Γc is empty: no exterior facet has a tag in {wanted.tolist()}")
-
         self.mesh = mesh
-        self.facets = tagged.astype(np.int32)
+        self.facets = tagged_facets(mesh, facet_tags, tags)
         self.quadrature_degree = quadrature_degree
         self.quadrature_scheme = quadrature_scheme
         self.submesh, self.entity_maps, self._parent_facets = compat.create_facet_submesh(
             mesh, self.facets
         )
-        self._tags = dolfinx.mesh.meshtags(
-            mesh, tdim - 1, self.facets, np.ones(self.facets.size, dtype=np.int32)
-        )
+        self._facet_tags = facet_tags
+        self._ids = tuple(int(tag) for tag in np.unique(np.atleast_1d(np.asarray(tags))))
 
     def quadrature(self, element_degree: int) -> SurfaceQuadrature:
         """The rule on Γc for a displacement element of this degree. Collective."""
@@ -115,9 +80,58 @@ class ContactSurface:
     def measure(self, degree: int, scheme: str = "default") -> ufl.Measure:
         """The surface measure of Γc with a quadrature rule (all of Γc, nothing else)."""
         metadata = {"quadrature_degree": degree, "quadrature_rule": scheme}
+        # The caller's own tags: forms on one mesh must agree in them to be added.
         return ufl.Measure(
-            "ds", domain=self.mesh, subdomain_data=self._tags, subdomain_id=1, metadata=metadata
+            "ds",
+            domain=self.mesh,
+            subdomain_data=self._facet_tags,
+            subdomain_id=self._ids,
+            metadata=metadata,
         )
+
+
+def tagged_facets(
+    mesh: dolfinx.mesh.Mesh, facet_tags: dolfinx.mesh.MeshTags, tags: int | Sequence[int]
+) -> npt.NDArray[np.int32]:
+    """Owned exterior facets with the tags, ascending. Collective.
+
+    Raises:
+        ValueError: Wrong dimension, a tag that no facet has, an interior facet with the tag.
+    """
+    wanted = np.unique(np.atleast_1d(np.asarray(tags, dtype=np.int32)))
+    tdim = mesh.topology.dim
+    if tdim not in (2, 3) or mesh.geometry.dim != tdim:
+        raise ValueError(
+            f"mesh has topological dimension {tdim} in a space of dimension "
+            f"{mesh.geometry.dim}; contact needs a solid: 2 in 2 or 3 in 3 dimensions"
+        )
+    if facet_tags.dim != tdim - 1:
+        raise ValueError(
+            f"facet_tags are on entities of dimension {facet_tags.dim}; a mesh of dimension "
+            f"{tdim} has facets of dimension {tdim - 1}: pass its facet tags, not its cell tags"
+        )
+
+    mesh.topology.create_connectivity(tdim - 1, tdim)
+    exterior = dolfinx.mesh.exterior_facet_indices(mesh.topology)
+    n_owned = mesh.topology.index_map(tdim - 1).size_local
+    tagged = np.unique(facet_tags.indices[np.isin(facet_tags.values, wanted)])
+    tagged = tagged[tagged < n_owned]
+    interior = np.setdiff1d(tagged, exterior)
+    present = np.unique(gather_rows(mesh.comm, np.unique(facet_tags.values)))
+    missing = np.setdiff1d(wanted, present)
+    if missing.size:
+        raise ValueError(
+            f"no facet has the tag {missing.tolist()}; the tags on this mesh are {present.tolist()}"
+        )
+    n_interior = mesh.comm.allreduce(interior.size)
+    if n_interior:
+        raise ValueError(
+            f"{n_interior} of the facets tagged {wanted.tolist()} lie inside the body; "
+            "Γc must be a part of its boundary: tag exterior facets only"
+        )
+    if mesh.comm.allreduce(tagged.size) == 0:
+        raise ValueError(f"Γc is empty: no exterior facet has a tag in {wanted.tolist()}")
+    return tagged.astype(np.int32)
 
 
 class SurfaceQuadrature:
@@ -165,6 +179,38 @@ class SurfaceQuadrature:
                 self._cell, value_shape=shape, points=points, weights=weights, degree=self.degree
             )
         return fem.functionspace(self.surface.submesh, element)
+
+    def point_rows(self) -> npt.NDArray[np.int32]:
+        """Points of every facet of this rank, (n_facets, n_points_per_facet).
+
+        Row i is that of ``surface.facets[i]``.
+        """
+        submesh = self.surface.submesh
+        n_cells = submesh.topology.index_map(submesh.topology.dim).size_local
+        rows = self.space().dofmap.list[:n_cells]
+        return rows[np.argsort(self.surface._parent_facets[:n_cells])]
+
+    def interpolation_matrix(self, space: fem.FunctionSpace) -> PETSc.Mat:
+        """Sparse matrix from the dofs of a displacement to its values at the points. Collective.
+
+        Args:
+            space: Vector-valued space on the mesh of the body, block size d.
+
+        Returns:
+            Matrix with d rows per point, (d n_points, n_dofs).
+        """
+        values = self.space(space.dofmap.bs)
+        form = compat.compile_form(
+            ufl.inner(ufl.TrialFunction(space), ufl.TestFunction(values)) * self.ds,
+            self.surface.entity_maps,
+        )
+        matrix = fem.petsc.assemble_matrix(form)
+        matrix.assemble()
+        inverse = matrix.createVecLeft()
+        inverse.array[:] = np.repeat(1.0 / self.weights, space.dofmap.bs)
+        matrix.diagonalScale(inverse, None)
+        inverse.destroy()
+        return matrix
 
 
 class PointEvaluator:

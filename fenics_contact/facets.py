@@ -1,0 +1,239 @@
+"""Geometry of a set of facets: places on them, and where rays meet them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import basix
+import numpy as np
+import numpy.typing as npt
+import scipy.spatial
+from dolfinx import fem
+
+from fenics_contact import compat
+
+__all__ = ["FacetSet", "tabulate"]
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.integer[Any]]
+
+# Facets tried first for every point, nearest first; only points that meet none of them see all.
+_NEAREST = 12
+# How far outside its facet, in its reference coordinates, a point may be met: neighbours overlap by
+# this much, so that no ray slips through between them.
+_OVERLAP = 1e-6
+_NEWTON_STEPS = 25
+# Pairs of points and facets looked at in one go, to bound the memory.
+_CHUNK = 2_000_000
+
+
+class FacetSet:
+    """Facets of this rank, with reference coordinates of their own, of dimension d - 1.
+
+    Attributes:
+        cells: Cell of every facet, (n_facets,).
+        outward: Sign by which the facet's own orientation points out of the body, (n_facets,).
+    """
+
+    def __init__(self, space: fem.FunctionSpace, facets: Index) -> None:
+        """Collect cells, elements and orientation of the facets.
+
+        Args:
+            space: Displacement space, for displaced places and its basis.
+            facets: Facets of this rank, (n_facets,).
+        """
+        mesh = space.mesh
+        self.space, self._x, self._d = space, mesh.geometry.x, mesh.topology.dim
+        d = self._d
+        mesh.topology.create_connectivity(d - 1, d)
+        mesh.topology.create_connectivity(d, d - 1)
+        to_cell = mesh.topology.connectivity(d - 1, d)
+        to_facet = mesh.topology.connectivity(d, d - 1)
+        self.cells = np.array([to_cell.links(f)[0] for f in facets], dtype=np.int32)
+        local = [
+            int(np.flatnonzero(to_facet.links(c) == f)[0])
+            for c, f in zip(self.cells, facets, strict=True)
+        ]
+        cell_type = basix.CellType[mesh.topology.cell_name()]
+        geometry, topology = basix.geometry(cell_type), basix.topology(cell_type)
+        corners = np.array([geometry[vertices] for vertices in topology[d - 1]])
+        origins = corners[:, 0]
+        edges = np.swapaxes(corners[:, 1:d] - corners[:, :1], 1, 2)
+        self._origin, self._edges = origins[local], edges[local]
+        self.simplex = cell_type in (basix.CellType.triangle, basix.CellType.tetrahedron)
+        cmap = compat.coordinate_element(mesh)
+        self._geometry_basis = basix.create_element(
+            basix.ElementFamily.P, cell_type, cmap.degree, basix.LagrangeVariant(cmap.variant)
+        )
+        self._basis = space.element.basix_element
+        self._nodes = compat.geometry_dofmap(mesh)[self.cells]
+        self._dofs = space.dofmap.list[self.cells]
+        middle = 1 / d if self.simplex else 0.5
+        self._middle = np.full((1, d - 1), middle)
+        self._corners = np.vstack([np.zeros(d - 1), np.eye(d - 1)])
+        if not self.simplex and d == 3:
+            self._corners = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+        every = np.arange(len(self.cells))
+        on_facet, tangents = self.positions(every, self._middle.repeat(len(every), axis=0))
+        table = tabulate(self._geometry_basis, 0, geometry.mean(axis=0)[None])[0, 0, :, 0]
+        inside = np.einsum("k,pkd->pd", table, self._x[self._nodes][:, :, :d])
+        self.outward = _side(tangents, on_facet - inside)
+
+    def _in_cell(self, facet: Index, place: Array) -> Array:
+        """Reference coordinates of the cell from those of the facet: (n, d)."""
+        return self._origin[facet] + np.einsum("pij,pj->pi", self._edges[facet], place)
+
+    def positions(
+        self, facet: Index, place: Array, u: fem.Function | None = None
+    ) -> tuple[Array, Array]:
+        """Places in space, (n, d), and their derivatives by the coordinates, (n, d, d - 1).
+
+        Args:
+            facet: Facet of every point, (n,).
+            place: Reference coordinates on it, (n, d - 1).
+            u: Displacement to add; none: the undeformed body.
+        """
+        points = self._in_cell(facet, place)
+        table = tabulate(self._geometry_basis, 1, points)[..., 0]
+        nodes = self._x[self._nodes[facet]][:, :, : self._d]
+        position = np.einsum("pk,pkd->pd", table[0], nodes)
+        gradient = np.einsum("jpk,pkd->pdj", table[1:], nodes)
+        if u is not None:
+            table = tabulate(self._basis, 1, points)[..., 0]
+            values = u.x.array.reshape(-1, self.space.dofmap.bs)[self._dofs[facet]]
+            position = position + np.einsum("pk,pkd->pd", table[0], values)
+            gradient = gradient + np.einsum("jpk,pkd->pdj", table[1:], values)
+        return position, np.einsum("pdj,pjk->pdk", gradient, self._edges[facet])
+
+    def normals(self, facet: Index, place: Array) -> Array:
+        """Outward unit normals of the undeformed body, (n, d)."""
+        _, tangents = self.positions(facet, place)
+        if self._d == 2:
+            across: Array = np.column_stack([tangents[:, 1, 0], -tangents[:, 0, 0]])
+        else:
+            across = np.asarray(np.cross(tangents[:, :, 0], tangents[:, :, 1]), dtype=np.float64)
+        outward = across * (self.outward[facet] * _side(tangents, across))[:, None]
+        return outward / np.linalg.norm(outward, axis=1, keepdims=True)
+
+    def moved_corners(self, u: fem.Function | None) -> Array:
+        """Corners displaced by ``u``, (n_facets, n_corners, d)."""
+        every = np.arange(len(self.cells))
+        at = [self.positions(every, np.tile(p, (len(every), 1)), u)[0] for p in self._corners]
+        return np.stack(at, axis=1)
+
+    def mean_normals(self) -> Array:
+        """Outward unit normals at the facets' middles, (n_facets, d)."""
+        every = np.arange(len(self.cells))
+        return self.normals(every, self._middle.repeat(len(every), axis=0))
+
+    def interpolation(self, facet: Index, place: Array) -> tuple[Index, Array]:
+        """Global nodes and weights of the displacement at places: (n, n_basis) each."""
+        weights = tabulate(self._basis, 0, self._in_cell(facet, place))[0, :, :, 0]
+        local = self._dofs[facet].ravel().astype(np.int32)
+        nodes = self.space.dofmap.index_map.local_to_global(local)
+        return nodes.reshape(weights.shape), weights
+
+    def search(
+        self, x: Array, ray: Array, reach: float, u: fem.Function | None
+    ) -> tuple[Index, Array, Array]:
+        """The nearest facet of this rank that looks back along each ray.
+
+        Args:
+            x: Points, (n, d).
+            ray: Unit directions, (n, d); facets behind the point are met too.
+            reach: Largest distance.
+            u: Displacement of the facets; none: they are undeformed.
+
+        Returns:
+            Facet or -1, (n,); place on it, (n, d - 1); signed distance along the ray, (n,).
+        """
+        n, d, n_facets = len(x), self._d, len(self.cells)
+        best = (np.full(n, -1), np.zeros((n, d - 1)), np.full(n, np.inf))
+        if n_facets == 0 or n == 0:
+            return best
+        every = np.arange(n_facets)
+        middle, tangents = self.positions(every, self._middle.repeat(n_facets, axis=0), u)
+        radius = 1.5 * np.linalg.norm(tangents, axis=1).max(axis=1)
+        near = min(_NEAREST, n_facets)
+        _, candidates = scipy.spatial.cKDTree(middle).query(x, k=near)
+        self._keep_nearest(
+            x, ray, (np.repeat(np.arange(n), near), candidates.reshape(-1)), reach, u, best
+        )
+        # The nearest need not be the ones ahead: a long facet, or a far one.
+        missed = np.flatnonzero(best[0] < 0)
+        step = max(1, _CHUNK // n_facets)
+        for i in range(0, len(missed), step):
+            rows = missed[i : i + step]
+            arm = middle[None] - x[rows, None]
+            along = np.einsum("pfd,pd->pf", arm, ray[rows])
+            off = np.linalg.norm(arm - along[..., None] * ray[rows, None], axis=2)
+            row, facet = np.nonzero(off <= radius[None])
+            self._keep_nearest(x, ray, (rows[row], facet), reach, u, best)
+        return best
+
+    def _keep_nearest(
+        self, x: Array, ray: Array, pairs: tuple[Index, Index], reach: float, u: Any, best: Any
+    ) -> None:
+        """Meet the facets of some pairs and keep the nearest hits in ``best``."""
+        point, facet = pairs
+        place, distance, met = self.meet(facet, x[point], ray[point], u)
+        _, tangents = self.positions(facet, place, u)
+        # Only a facet that looks back at the point can be opposite.
+        facing = self.outward[facet] * _side(tangents, ray[point]) < 0
+        good = met & facing & (np.abs(distance) <= reach)
+        point, facet, place, distance = point[good], facet[good], place[good], distance[good]
+        order = np.lexsort((facet, np.abs(distance), point))
+        chosen = order[np.append(True, np.diff(point[order]) > 0)[: len(order)]]
+        chosen = chosen[np.abs(distance[chosen]) < np.abs(best[2][point[chosen]])]
+        for target, values in zip(best, (facet, place, distance), strict=True):
+            target[point[chosen]] = values[chosen]
+
+    def meet(
+        self, facet: Index, x: Array, ray: Array, u: fem.Function | None = None
+    ) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+        """Where rays meet given facets, by Newton's method, all at once.
+
+        Returns:
+            Places, (n, d - 1); signed distances, (n,); whether the facet itself was met, (n,).
+        """
+        d = self._d
+        place: Array = self._middle.repeat(len(facet), axis=0)
+        distance: Array = np.zeros(len(facet))
+        singular = np.zeros(len(facet), dtype=bool)
+        for _ in range(_NEWTON_STEPS):
+            position, tangents = self.positions(facet, place, u)
+            rest = position - x - distance[:, None] * ray
+            system = np.concatenate([tangents, -ray[:, :, None]], axis=2)
+            # A facet along the ray is never met; its singular system must not stop the others.
+            size = np.prod(np.linalg.norm(system, axis=1), axis=1)
+            singular = np.abs(np.linalg.det(system)) < 1e-12 * size
+            system[singular] = np.eye(d)
+            rest[singular] = 0.0
+            step = np.linalg.solve(system, -rest[..., None])[..., 0]
+            # Far outside, a curved facet may bend any way: stay near it.
+            place = np.clip(place + step[:, :-1], -1.0, 2.0)
+            distance = distance + step[:, -1]
+            if np.all(np.abs(step[:, :-1]) < 1e-13):
+                break
+        position, tangents = self.positions(facet, place, u)
+        rest = np.linalg.norm(position - x - distance[:, None] * ray, axis=1)
+        size = np.linalg.norm(tangents, axis=1).max(axis=1, initial=0.0)
+        met = ~singular & (rest <= 1e-10 * size) & np.all(place >= -_OVERLAP, axis=1)
+        if self.simplex:
+            met &= place.sum(axis=1) <= 1 + _OVERLAP
+        else:
+            met &= np.all(place <= 1 + _OVERLAP, axis=1)
+        return place, distance, met
+
+
+def tabulate(element: Any, derivatives: int, points: Array) -> Array:
+    """Tabulate a basix element, also at no points at all, where basix aborts."""
+    if len(points):
+        return element.tabulate(derivatives, points)
+    n_tables = (1, 1 + points.shape[1])[derivatives]
+    return np.zeros((n_tables, 0, element.dim, 1))
+
+
+def _side(tangents: Array, direction: Array) -> Array:
+    """Sign of directions against oriented facets: (n,)."""
+    return np.sign(np.linalg.det(np.concatenate([tangents, direction[:, :, None]], axis=2)))

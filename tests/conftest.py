@@ -1,0 +1,33 @@
+"""Teardown that all ranks go through together, as in DOLFINx's own tests; an end to deadlocks."""
+
+import faulthandler
+import gc
+import os
+from collections.abc import Iterator
+
+import pytest
+from mpi4py import MPI
+
+# Where traces go: the error stream as it is before pytest captures it.
+_STDERR = os.dup(2)
+# A rank that waits for another inside C++ holds the interpreter's lock, so that no other timeout
+# gets to act. Four times the longest test.
+_DEADLOCK_SECONDS = 300
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol() -> Iterator[None]:
+    """In parallel, show where every rank hangs and end the run, instead of waiting forever."""
+    if MPI.COMM_WORLD.size > 1:
+        faulthandler.dump_traceback_later(_DEADLOCK_SECONDS, exit=True, file=_STDERR)
+    try:
+        return (yield)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    """Destroy objects on all ranks at once: destructors of PETSc and DOLFINx may be collective."""
+    gc.collect()
+    MPI.COMM_WORLD.barrier()

@@ -1,0 +1,687 @@
+"""Bad input: an error that names the thing, on every rank."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import (
+    BOTTOM,
+    LEFT,
+    RIGHT,
+    TOP,
+    Block,
+    block,
+    displacement_space,
+    raised_everywhere,
+    strain,
+    stress,
+)
+
+import fenics_contact as fc
+from fenics_contact import parallel
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+COMM = MPI.COMM_WORLD
+
+# Four layers of cells, so that on two and three ranks some rank has no part in a fault.
+MESH = {"n": (2, 4)}
+
+
+def pressed(**kwargs) -> Block:
+    """A block pressed down with a pressure of one."""
+    return block("quadrilateral", up=-1.0, **MESH, **kwargs)
+
+
+def coulomb(friction=0.3, k_n=1e4, k_t=1e3) -> fc.Coulomb:
+    return fc.Coulomb(friction, k_n=k_n, k_t=k_t)
+
+
+def build_and_solve(scene: Block, law=None, bcs=None, contact=None, **kwargs) -> Callable:
+    """A call that makes the problem and solves it once."""
+
+    def call() -> fc.Step:
+        conditions = scene.rollers() if bcs is None else bcs
+        problem, _ = scene.problem(law or coulomb(), conditions, contact=contact, **kwargs)
+        return problem.solve()
+
+    return call
+
+
+def test_the_good_scene_is_solved():
+    """What the tests below spoil in one respect is sound otherwise: it carries its load, 1."""
+    step = build_and_solve(pressed())()
+    # Equilibrium to the solver's tolerance, 1e-9 of the forces.
+    assert step.contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
+
+
+# ---- parameters of the law -----------------------------------------------------------------------
+
+BAD_NUMBERS = [
+    ("friction", -0.1),
+    ("friction", np.nan),
+    ("friction", np.inf),
+    ("k_n", 0.0),
+    ("k_n", -1.0),
+    ("k_n", np.nan),
+    ("k_n", np.inf),
+    ("k_t", 0.0),
+    ("k_t", -1.0),
+    ("k_t", np.nan),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), BAD_NUMBERS)
+def test_parameter_out_of_range_by_number(name, value):
+    """μ < 0, k_n ≤ 0, k_t ≤ 0 and what is not finite, as numbers: refused by `Contact`."""
+    scene = pressed()
+    raised_everywhere(lambda: scene.contact(coulomb(**{name: value})), ValueError, name, "contact")
+
+
+@pytest.mark.parametrize(("name", "value"), BAD_NUMBERS)
+def test_parameter_out_of_range_by_constant(name, value):
+    """The same as a ``fem.Constant``: refused by `ContactProblem`."""
+    scene = pressed()
+    law = coulomb(**{name: fem.Constant(scene.mesh, float(value))})
+    raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
+
+
+@pytest.mark.parametrize(("name", "value"), BAD_NUMBERS)
+def test_parameter_changed_to_out_of_range(name, value):
+    """The same after a change of ``contact.parameters``: refused by the next solve, u unchanged."""
+    scene = pressed()
+    problem, contact = scene.problem(coulomb(), scene.rollers())
+    problem.solve()
+    before = scene.u.x.array.copy()
+    contact.parameters[name].value = value
+    raised_everywhere(problem.solve, ValueError, name)
+    assert all(COMM.allgather(bool(np.array_equal(scene.u.x.array, before))))
+
+
+@pytest.mark.parametrize(
+    ("name", "expression"),
+    [
+        ("friction", lambda x: x[0] - 0.5),
+        ("k_n", lambda x: 1e4 * (x[0] - 0.5)),
+        ("k_t", lambda x: 1e3 * (0.5 - x[0])),
+        ("friction", lambda x: ufl.sqrt(x[0] - 0.5)),
+        ("k_n", lambda x: 1e4 / x[1]),
+    ],
+    ids=["friction", "k_n", "k_t", "friction nan", "k_n inf"],
+)
+def test_parameter_out_of_range_by_ufl(name, expression):
+    """The same by UFL, at some points only; in parallel on some ranks only."""
+    scene = pressed()
+    law = coulomb(**{name: expression(ufl.SpatialCoordinate(scene.mesh))})
+    raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan])
+def test_parameter_out_of_range_at_one_point(value):
+    """A function that is bad in one cell, so on one rank: all ranks raise."""
+    scene = pressed()
+    mu = fem.Function(fem.functionspace(scene.mesh, ("DG", 0)))
+    mu.x.array[:] = 0.3
+    centers = mu.function_space.tabulate_dof_coordinates()
+    mu.x.array[(centers[:, 0] < 0.5) & (centers[:, 1] < 0.25)] = value
+    raised_everywhere(lambda: scene.problem(coulomb(mu), scene.rollers()), ValueError, "friction")
+
+
+@pytest.mark.parametrize("pressure", [-1.0, np.nan])
+def test_tresca_pressure_out_of_range(pressure):
+    """The prescribed pressure of Tresca's law is a pressure."""
+    scene = pressed()
+    law = fc.Tresca(0.3, pressure, k_n=1e4, k_t=1e3)
+    raised_everywhere(lambda: scene.contact(law), ValueError, "pressure")
+
+
+@pytest.mark.parametrize("value", ["rough", {}, ["a", "b"]])
+def test_parameter_of_a_wrong_type(value):
+    """What cannot be a coefficient is a TypeError that names the parameter."""
+    scene = pressed()
+    raised_everywhere(lambda: scene.contact(coulomb(value)), TypeError, "friction")
+
+
+def test_parameter_none():
+    """None is no friction coefficient."""
+    scene = pressed()
+    raised_everywhere(
+        lambda: scene.problem(coulomb(None), scene.rollers()), (ValueError, TypeError), "friction"
+    )
+
+
+def test_parameter_of_a_wrong_shape():
+    """A vector is no friction coefficient."""
+    scene = pressed()
+    raised_everywhere(lambda: scene.contact(coulomb((0.1, 0.2))), ValueError, "friction", "scalar")
+    x = ufl.SpatialCoordinate(scene.mesh)
+    raised_everywhere(lambda: scene.contact(coulomb(x)), ValueError, "friction", "scalar")
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, np.nan, np.inf])
+def test_scaled_factor_out_of_range(factor):
+    """A factor of E/h is a positive number."""
+    raised_everywhere(lambda: fc.Scaled(factor), ValueError, "factor")
+
+
+# ---- gap, normal, weight, modulus ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["number", "constant", "ufl"])
+@pytest.mark.parametrize("name", ["gap", "weight"])
+def test_gap_or_weight_not_finite(name, kind):
+    """NaN in the prescribed gap or in the weight."""
+    scene = pressed()
+    x = ufl.SpatialCoordinate(scene.mesh)
+    value = {
+        "number": np.nan,
+        "constant": fem.Constant(scene.mesh, np.nan),
+        "ufl": ufl.sqrt(x[0] - 0.5),
+    }[kind]
+    raised_everywhere(
+        lambda: scene.problem(coulomb(), scene.rollers(), contact={name: value}), ValueError, name
+    )
+
+
+def test_negative_weight():
+    """A thickness is not negative, at any point."""
+    scene = pressed()
+    weight = ufl.SpatialCoordinate(scene.mesh)[0] - 0.5
+    raised_everywhere(
+        lambda: scene.problem(coulomb(), scene.rollers(), contact={"weight": weight}),
+        ValueError,
+        "weight",
+    )
+
+
+@pytest.mark.parametrize("support", ["obstacle", "half-space"])
+def test_normal_of_length_zero_at_a_point(support):
+    """A normal by UFL that vanishes over one half of Γc: refused, as a normal of length zero."""
+    scene = pressed()
+    x = ufl.SpatialCoordinate(scene.mesh)
+    normal = ufl.as_vector([0, ufl.conditional(ufl.gt(x[0], 0.5), -1.0, 0.0)])
+    made = {"obstacle": fc.Obstacle(0.0, normal), "half-space": fc.HalfSpace((0, 0), -normal)}
+    raised_everywhere(
+        lambda: scene.problem(coulomb(), scene.rollers(), contact={"support": made[support]}),
+        ValueError,
+        "normal",
+        "length",
+    )
+
+
+def test_normal_not_finite():
+    """A normal by UFL that is NaN somewhere."""
+    scene = pressed()
+    x = ufl.SpatialCoordinate(scene.mesh)
+    obstacle = fc.Obstacle(0.0, ufl.as_vector([ufl.sqrt(x[0] - 0.5), -1.0]))
+    raised_everywhere(
+        lambda: scene.problem(coulomb(), scene.rollers(), contact={"support": obstacle}),
+        ValueError,
+        "normal",
+    )
+
+
+def test_gap_of_a_wrong_shape():
+    """A prescribed gap is a scalar."""
+    scene = pressed()
+    raised_everywhere(lambda: scene.contact(coulomb(), gap=(0.1, 0.2)), ValueError, "gap")
+
+
+def test_weight_of_a_wrong_shape():
+    """A weight is a scalar."""
+    scene = pressed()
+    raised_everywhere(
+        lambda: scene.problem(coulomb(), scene.rollers(), contact={"weight": (1.0, 2.0)}),
+        ValueError,
+        "weight",
+    )
+
+
+def test_missing_modulus():
+    """A stiffness in units of E/h without E: `form` says so, with all the ways out."""
+    scene = pressed()
+    contact = scene.contact(fc.Coulomb(0.3))
+    v = ufl.TestFunction(scene.u.function_space)
+    raised_everywhere(lambda: contact.form(v), ValueError, "modulus", "k_n")
+
+
+@pytest.mark.parametrize("modulus", [0.0, -1.0, np.nan, np.inf])
+def test_modulus_out_of_range(modulus):
+    """A modulus is positive and finite."""
+    scene = pressed()
+    raised_everywhere(
+        lambda: scene.contact(fc.Coulomb(0.3), modulus=modulus), ValueError, "modulus"
+    )
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
+def test_modulus_function_out_of_range(value):
+    """The same for a function that is bad in one cell at Γc."""
+    scene = pressed()
+    modulus = fem.Function(fem.functionspace(scene.mesh, ("DG", 0)))
+    modulus.x.array[:] = 1000.0
+    centers = modulus.function_space.tabulate_dof_coordinates()
+    modulus.x.array[(centers[:, 0] < 0.5) & (centers[:, 1] < 0.25)] = value
+    raised_everywhere(
+        lambda: scene.contact(fc.Coulomb(0.3), modulus=modulus), ValueError, "modulus"
+    )
+
+
+# ---- the displacement ----------------------------------------------------------------------------
+
+
+def contact_with(u, scene: Block) -> Callable:
+    return lambda: fc.Contact(u, scene.surface, scene.floor(), coulomb())
+
+
+@pytest.mark.parametrize(
+    ("element", "words"),
+    [
+        (("Lagrange", 1), ("u has shape ()",)),
+        (("Lagrange", 1, (3,)), ("u has shape (3,)",)),
+        (("Lagrange", 1, (2, 2)), ("u has shape (2, 2)",)),
+        (("RT", 1), ("Lagrange",)),
+        (("N1curl", 1), ("Lagrange",)),
+        (("DG", 0, (2,)), ("degree 0",)),
+        (("DG", 1, (2,)), ("Lagrange",)),
+    ],
+    ids=["scalar", "three components", "tensor", "RT", "N1curl", "DG0", "DG1"],
+)
+def test_displacement_of_a_wrong_space(element, words):
+    """A u that is no continuous vector-valued Lagrange function of the mesh's dimension."""
+    scene = block("triangle", **MESH)
+    u = fem.Function(fem.functionspace(scene.mesh, element))
+    raised_everywhere(contact_with(u, scene), ValueError, "u ", *words)
+
+
+def test_displacement_of_crouzeix_raviart():
+    """Continuity at the middle of facets alone is not enough for a displacement on Γc."""
+    scene = block("triangle", **MESH)
+    u = fem.Function(fem.functionspace(scene.mesh, ("CR", 1, (2,))))
+    raised_everywhere(contact_with(u, scene), ValueError, "u ", "Lagrange")
+
+
+def test_displacement_on_another_mesh():
+    """A u of a mesh that is not that of the surface."""
+    scene, other = pressed(), pressed()
+    raised_everywhere(contact_with(other.u, scene), ValueError, "mesh")
+
+
+def test_displacement_that_is_no_function():
+    """A trial function, an expression or an array is no u."""
+    scene = pressed()
+    for u in (ufl.TrialFunction(scene.u.function_space), 2 * scene.u, scene.u.x.array):
+        raised_everywhere(contact_with(u, scene), ValueError, "u is a")
+
+
+def test_displacement_of_another_problem():
+    """The contact's u and the problem's are the same function, not two of one space."""
+    scene = pressed()
+    other = fem.Function(scene.u.function_space)
+    contact = fc.Contact(other, scene.surface, scene.floor(), coulomb())
+    raised_everywhere(
+        lambda: fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=[contact]),
+        ValueError,
+        "contact: its u",
+    )
+
+
+# ---- the form ------------------------------------------------------------------------------------
+
+
+def with_form(scene: Block, F) -> Callable:
+    return lambda: fc.ContactProblem(
+        F, scene.u, bcs=scene.rollers(), contacts=[scene.contact(coulomb())]
+    )
+
+
+def test_forms_with_wrong_arguments():
+    """F is a residual in u and one test function of u's space; everything else is named."""
+    scene = pressed()
+    space = scene.u.function_space
+    v, du = ufl.TestFunction(space), ufl.TrialFunction(space)
+    dx = ufl.dx(scene.mesh)
+    bilinear = ufl.inner(stress(du, scene.E, scene.nu), strain(v)) * dx
+    energy = ufl.inner(stress(scene.u, scene.E, scene.nu), strain(scene.u)) * dx
+    load = ufl.dot(scene.traction, v) * dx
+    raised_everywhere(with_form(scene, bilinear), ValueError, "F ", "2 arguments")
+    raised_everywhere(with_form(scene, energy), ValueError, "F ", "0 arguments")
+    raised_everywhere(with_form(scene, load), ValueError, "F ", "does not depend on u")
+    raised_everywhere(with_form(scene, 0), ValueError, "F ", "int")
+    raised_everywhere(with_form(scene, ufl.lhs(bilinear) == load), ValueError, "F ")
+    other = ufl.TestFunction(displacement_space(scene.mesh, 2))
+    mixed = ufl.inner(stress(scene.u, scene.E, scene.nu), strain(other)) * dx
+    raised_everywhere(with_form(scene, mixed), ValueError, "TestFunction")
+
+
+def test_form_in_another_function():
+    """F written with a function of the same space that is not u."""
+    scene = pressed()
+    other = fem.Function(scene.u.function_space)
+    raised_everywhere(
+        with_form(scene, ufl.replace(scene.F, {scene.u: other})), ValueError, "depend on u"
+    )
+
+
+def test_form_without_stiffness():
+    """A modulus of zero is found before it becomes a singular matrix."""
+    scene = pressed(E=0.0)
+    raised_everywhere(build_and_solve(scene), ValueError, "stiffness")
+
+
+# ---- not finite ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("name", ["traction", "body_force", "E", "nu"])
+def test_constants_not_finite(name, value):
+    """A load or modulus constant that is not finite: refused at once, and by a later solve."""
+    scene = pressed()
+    constant = getattr(scene, name)
+    good = constant.value.copy()
+    constant.value = np.full_like(constant.value, value)
+    raised_everywhere(build_and_solve(scene), ValueError, "finite", "constant")
+    constant.value = good
+    problem, _ = scene.problem(coulomb(), scene.rollers())
+    problem.solve()
+    problem.commit()
+    before = scene.u.x.array.copy()
+    constant.value = np.full_like(constant.value, value)
+    raised_everywhere(problem.solve, ValueError, "finite", "constant")
+    assert all(COMM.allgather(bool(np.array_equal(scene.u.x.array, before))))
+    # Once it is mended the problem goes on.
+    constant.value = good
+    problem.solve()
+
+
+@pytest.mark.parametrize("what", ["load", "modulus"])
+def test_function_not_finite_on_one_rank(what):
+    """One NaN in a coefficient function, in one cell of one rank: named, on all ranks."""
+    scene = pressed()
+    field = fem.Function(fem.functionspace(scene.mesh, ("DG", 0)), name=f"the {what}")
+    field.x.array[:] = 1.0
+    centers = field.function_space.tabulate_dof_coordinates()
+    field.x.array[(centers[:, 0] > 0.5) & (centers[:, 1] > 0.75)] = np.nan
+    v = ufl.TestFunction(scene.u.function_space)
+    dx = ufl.dx(scene.mesh)
+    if what == "load":
+        scene.F -= field * v[1] * dx
+    else:
+        scene.F += ufl.inner(field * strain(scene.u), strain(v)) * dx
+    raised_everywhere(build_and_solve(scene), ValueError, f"the {what}", "finite")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("kind", ["constant", "function"])
+def test_dirichlet_value_not_finite(kind, value):
+    """A prescribed displacement that is not finite; by a function at one dof, so on one rank."""
+    scene = pressed()
+    if kind == "constant":
+        bc = scene.hold(TOP, 1, value)
+    else:
+        given = fem.Function(scene.u.function_space)
+        x = scene.u.function_space.tabulate_dof_coordinates()
+        corner = np.flatnonzero(np.isclose(x[:, 0], 1.0) & np.isclose(x[:, 1], 1.0))
+        given.x.array[2 * corner] = value
+        bc = fem.dirichletbc(given, scene.facet_dofs(TOP))
+    raised_everywhere(
+        build_and_solve(scene, bcs=[*scene.rollers(), bc]), ValueError, "Dirichlet", "finite"
+    )
+
+
+def test_start_not_finite_on_one_rank():
+    """A u that starts with one NaN."""
+    scene = pressed()
+    x = scene.u.function_space.tabulate_dof_coordinates()
+    corner = np.flatnonzero(np.isclose(x[:, 0], 1.0) & np.isclose(x[:, 1], 1.0))
+    scene.u.x.array[2 * corner] = np.nan
+    raised_everywhere(build_and_solve(scene), ValueError, "'u'", "finite")
+
+
+def test_displacement_of_the_support_not_finite():
+    """A support moved to NaN between two increments."""
+    scene = pressed()
+    motion = fem.Constant(scene.mesh, np.zeros(2))
+    problem, _ = scene.problem(coulomb(), scene.rollers(), contact={"displacement": motion})
+    problem.solve()
+    motion.value[1] = np.nan
+    raised_everywhere(problem.solve, ValueError, "gap", "finite")
+
+
+def test_tangential_displacement_of_the_support_not_finite():
+    """A support moved to NaN along itself only: the gap does not show it in every arrangement."""
+    scene = pressed()
+    motion = fem.Constant(scene.mesh, np.zeros(2))
+    problem, _ = scene.problem(coulomb(), scene.rollers(), contact={"displacement": motion})
+    problem.solve()
+    motion.value[0] = np.nan
+    raised_everywhere(problem.solve, ValueError, "finite")
+
+
+# ---- Dirichlet conditions on Γc ------------------------------------------------------------------
+
+
+def test_contact_surface_clamped():
+    """Γc with all displacements prescribed, by one condition or by components: refused."""
+    scene = pressed()
+    dofs = scene.facet_dofs(BOTTOM)
+    clamp = fem.dirichletbc(np.zeros(2), dofs, scene.u.function_space)
+    for bcs in ([clamp], [scene.hold(BOTTOM, 0), scene.hold(BOTTOM, 1)]):
+        raised_everywhere(
+            lambda bcs=bcs: scene.problem(coulomb(), bcs), ValueError, "contact", "Dirichlet"
+        )
+
+
+def test_contact_surface_overlapping_in_part():
+    """One facet of Γc clamped, on one rank: found by all."""
+    scene = pressed()
+    surface = fc.ContactSurface(scene.mesh, scene.tags, [BOTTOM, RIGHT])
+    contact = fc.Contact(scene.u, surface, scene.floor(), coulomb())
+    x = scene.u.function_space.tabulate_dof_coordinates()
+    n_owned = scene.u.function_space.dofmap.index_map.size_local
+    ends = np.flatnonzero((x[:n_owned, 1] > 0.7) & (x[:n_owned, 0] > 0.9)).astype(np.int32)
+    clamp = fem.dirichletbc(np.zeros(2), ends, scene.u.function_space)
+    raised_everywhere(
+        lambda: fc.ContactProblem(scene.F, scene.u, bcs=[clamp], contacts=[contact]),
+        ValueError,
+        "1 facets",
+    )
+
+
+def test_contact_surface_held_in_one_component():
+    """Γc held along itself only is ordinary, and so is one that shares an edge with a clamp."""
+    scene = pressed()
+    problem, _ = scene.problem(coulomb(), [scene.hold(BOTTOM, 0)])
+    step = problem.solve()
+    assert step.contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
+    scene = pressed()
+    clamp = fem.dirichletbc(np.zeros(2), scene.facet_dofs(LEFT), scene.u.function_space)
+    problem, _ = scene.problem(coulomb(), [clamp])
+    problem.solve()
+
+
+def test_condition_on_another_space():
+    """A Dirichlet condition of another, larger space is refused."""
+    scene = pressed()
+    other = displacement_space(scene.mesh, 3)
+    facets = scene.tags.find(TOP)
+    dofs = fem.locate_dofs_topological(other, 1, facets)
+    bc = fem.dirichletbc(np.zeros(2), dofs, other)
+    raised_everywhere(lambda: scene.problem(coulomb(), [bc]), ValueError, "Dirichlet", "space")
+
+
+# ---- loads and motions that nothing can hold -----------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_load_that_pulls_the_body_off(cell):
+    """A load away from the support, nothing else holding: no contact force can balance it."""
+    scene = block(cell, up=1.0)
+    raised_everywhere(build_and_solve(scene), ValueError, "balance", "translation along")
+    scene = block(cell, up=1.0)
+    raised_everywhere(build_and_solve(scene, bcs=[]), ValueError, "balance")
+    # Held at the top it is a matter of elasticity.
+    scene = block(cell, up=1.0)
+    held = [*scene.rollers(), scene.hold(TOP, scene.dim - 1)]
+    step = build_and_solve(scene, bcs=held)()
+    assert step.contacts["contact"].normal_force <= 1e-8
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_no_friction_against_a_free_motion(cell):
+    """A body that can slide: the motions that nothing will ever hold are named."""
+    scene = block(cell, up=-1.0, side=0.1)
+    words = ["translation along x"] + (["translation along y"] if scene.dim == 3 else [])
+    frictionless = fc.Frictionless(k_n=1e4)
+    raised_everywhere(lambda: scene.problem(frictionless, []), ValueError, "hold", *words)
+    # μ = 0 is no friction either.
+    raised_everywhere(lambda: scene.problem(coulomb(0.0), []), ValueError, "hold", *words)
+    problem, _ = scene.problem(coulomb(0.3), [])
+    problem.solve()
+
+
+def test_a_motion_along_a_cavity():
+    """A body inside a round cavity without friction can turn about the axis: named."""
+    scene = pressed()
+    # The cavity's axis is the middle of the block: turning about it is felt by no point.
+    cavity = fc.Ball((0.5, 0.5), 2.0, inside=True)
+    raised_everywhere(
+        lambda: scene.problem(fc.Frictionless(k_n=1e4), [], contact={"support": cavity}),
+        ValueError,
+        "rotation about z",
+    )
+
+
+def test_a_body_without_contact_or_conditions():
+    """Nothing holds it at all: every motion is named."""
+    scene = pressed()
+    raised_everywhere(
+        lambda: fc.ContactProblem(scene.F, scene.u),
+        ValueError,
+        "translation along x",
+        "translation along y",
+        "rotation about z",
+    )
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_load_that_slides_the_body(cell):
+    """A tangential load beyond μ times the normal one, nothing else holding; below it is held.
+
+    By a sixth beyond: in space the check encloses the cone by a polygon that is 8 % too wide.
+    """
+    scene = block(cell, up=-1.0, side=0.35)
+    problem, _ = scene.problem(coulomb(0.3), [])
+    raised_everywhere(problem.solve, ValueError, "balance", "translation along x")
+    # By more friction, not by less load: the load at the top turns the block over (0.35 < 0.5).
+    held, _ = scene.problem(coulomb(0.5), [])
+    step = held.solve()
+    resultants = step.contacts["contact"]
+    # Equilibrium; 1e-7 is a hundred times the solver's tolerance on forces.
+    assert resultants.force == pytest.approx(-scene.vector(side=0.35, up=-1.0), abs=1e-7)
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_load_that_tips_the_body(cell):
+    """A load whose line of action leaves the base, with friction enough: the rotation is named.
+
+    On a unit block the side force H at the top tips it over the edge from H = V/2 on.
+    """
+    scene = block(cell, up=-1.0, side=0.6)
+    problem, _ = scene.problem(coulomb(2.0), [])
+    raised_everywhere(problem.solve, ValueError, "balance", "rotation")
+
+
+def test_balanced_after_a_bad_load():
+    """A refused load leaves no trace: the next, sound one is solved."""
+    scene = block("quadrilateral", up=1.0)
+    problem, _ = scene.problem(coulomb(), scene.rollers())
+    raised_everywhere(problem.solve, ValueError, "balance")
+    assert all(COMM.allgather(bool(np.all(scene.u.x.array == 0.0))))
+    scene.load(up=-1.0)
+    step = problem.solve()
+    assert step.contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
+
+
+# ---- the problem ---------------------------------------------------------------------------------
+
+
+def test_two_contacts_of_one_name():
+    """Results are by name, so names are unique."""
+    scene = pressed()
+    contacts = [scene.contact(coulomb(), name="foot") for _ in range(2)]
+    raised_everywhere(
+        lambda: fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=contacts),
+        ValueError,
+        "foot",
+        "name",
+    )
+
+
+def test_unknown_method():
+    """The message lists the methods there are."""
+    scene = pressed()
+    raised_everywhere(
+        lambda: scene.problem(coulomb(), scene.rollers(), method="bfgs"),
+        ValueError,
+        "'bfgs'",
+        "lbfgs",
+        "newton",
+    )
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.1, np.nan])
+@pytest.mark.parametrize("name", ["alpha", "phi"])
+def test_shares_out_of_range(name, value):
+    """α and φ are shares, 0 to 1 (section 5)."""
+    scene = pressed()
+    raised_everywhere(
+        lambda: scene.problem(coulomb(), scene.rollers(), **{name: value}), ValueError, name
+    )
+
+
+def test_increments_out_of_range():
+    """`increments` needs a scalar constant and at least one step."""
+    scene = pressed()
+    problem, _ = scene.problem(coulomb(), scene.rollers())
+    raised_everywhere(
+        lambda: list(fc.increments(problem, scene.traction, 0, 1)), ValueError, "load"
+    )
+    raised_everywhere(
+        lambda: list(fc.increments(problem, scene.E, 1, 2, steps=0)), ValueError, "steps"
+    )
+
+
+def test_collective_errors_on_one_rank():
+    """An error of one rank reaches all of them, kind and text; without one nothing happens."""
+    last = COMM.size - 1
+
+    def fail(kind):
+        with parallel.collective_errors(COMM):
+            if COMM.rank == last:
+                raise kind("here only")
+
+    raised_everywhere(lambda: fail(ValueError), ValueError, "here only")
+    raised_everywhere(lambda: fail(TypeError), TypeError, "here only")
+    raised_everywhere(lambda: fail(OSError), (OSError, RuntimeError), "here only")
+    with parallel.collective_errors(COMM):
+        pass
+
+
+def test_reductions_over_ranks():
+    """NaN on one rank wins, a rank without entries does not count, none at all gives ``empty``."""
+    one = np.array([1.0 + COMM.rank])
+    assert parallel.global_max(COMM, one) == COMM.size
+    assert parallel.global_min(COMM, one) == 1.0
+    nothing = np.zeros(0)
+    some = one if COMM.rank == 0 else nothing
+    assert parallel.global_max(COMM, some) == parallel.global_min(COMM, some) == 1.0
+    assert parallel.global_max(COMM, nothing, empty=7.0) == 7.0
+    assert parallel.global_min(COMM, nothing, empty=7.0) == 7.0
+    bad = np.array([np.nan]) if COMM.rank == COMM.size - 1 else one
+    assert np.isnan(parallel.global_max(COMM, bad))
+    assert np.isnan(parallel.global_min(COMM, bad))
+    rows = parallel.gather_rows(COMM, np.full((COMM.rank + 1, 2), float(COMM.rank)))
+    assert rows.shape == (COMM.size * (COMM.size + 1) // 2, 2)

@@ -1,0 +1,355 @@
+"""The laws: residual and tangent as derivatives, parameters, and what is symmetric."""
+
+from dataclasses import dataclass
+
+import dolfinx
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+from scenes import (
+    BOTTOM,
+    CELLS,
+    GRID,
+    RIGHT,
+    assemble_matrix,
+    assemble_number,
+    assemble_owned,
+    block_mesh,
+    close,
+    compiled,
+    dimension,
+    displacement_space,
+    gathered,
+    owned,
+    polynomial,
+    raised_everywhere,
+    set_owned,
+    wave,
+)
+
+import fenics_contact as fc
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+COMM = MPI.COMM_WORLD
+
+K_N, K_T, FRICTION, PRESSURE = 100.0, 60.0, 0.3, 9.0
+NORMAL = {2: np.array([0.3, -1.0]), 3: np.array([0.3, -0.2, -1.0])}
+
+LAWS = {
+    "frictionless": fc.Frictionless(k_n=K_N),
+    "tresca": fc.Tresca(FRICTION, PRESSURE, k_n=K_N, k_t=K_T),
+    "prescribed": fc.Tresca(FRICTION, PRESSURE, k_t=K_T, unilateral=False),
+    "coulomb": fc.Coulomb(FRICTION, k_n=K_N, k_t=K_T),
+}
+
+
+@dataclass(frozen=True)
+class State:
+    """Displacement along the normal and across it; the same of the last commit, if there is one."""
+
+    name: str
+    normal: float
+    tangential: float
+    committed: tuple[float, float] | None = None
+
+
+# The gap is 0.1 to 0.14 and the polynomial part about 0.01: δ₋ is 0.05 to 0.11 where closed, the
+# friction limit 1.5 to 3.3 (Coulomb) or 2.7 (Tresca), that is 0.025 to 0.055 of elastic slip.
+STATES = [
+    State("open", -0.2, 0.004),
+    State("stick", 0.2, 0.004),
+    State("slip", 0.2, 0.3),
+    # Traction of the last commit: 60 * 0.012 = 0.7; then back through zero, or on.
+    State("stick with history", 0.2, -0.006, (0.2, 0.012)),
+    State("slip with history", 0.2, -0.3, (0.2, 0.012)),
+    # Committed while slipping, so that β and a traction on the cone are in the history.
+    State("stick after slip", 0.2, 0.29, (0.2, 0.3)),
+    State("open after slip", -0.2, 0.29, (0.2, 0.3)),
+]
+
+
+class Scene:
+    """An oblique obstacle over two sides of a shuffled mesh, and one law."""
+
+    def __init__(self, cell: str, degree: int, law: fc.laws.Law) -> None:
+        """Make the contact; u is zero."""
+        self.d = dimension(cell)
+        self.degree = degree
+        mesh, tags = block_mesh(cell, shuffled=True)
+        self.space = displacement_space(mesh, degree)
+        self.u = fem.Function(self.space)
+        surface = fc.ContactSurface(mesh, tags, [BOTTOM, RIGHT])
+        x = ufl.SpatialCoordinate(mesh)
+        obstacle = fc.Obstacle(0.1 + 0.04 * x[0], NORMAL[self.d])
+        self.contact = fc.Contact(self.u, surface, obstacle, law)
+
+    def displace(self, normal: float, tangential: float, seed: int) -> None:
+        """Set u to a mean along and across the normal, and a small polynomial."""
+        n = NORMAL[self.d] / np.linalg.norm(NORMAL[self.d])
+        t = np.linalg.svd(n[None])[2][1]
+        t *= np.sign(t[0])  # the sign of a null vector is not defined
+        mean = normal * n + tangential * t
+        field = polynomial(self.d, self.degree, seed, 0.002)
+        self.u.interpolate(lambda x: mean[:, None] + field(x))
+
+    def enter(self, state: State) -> None:
+        """Put every point in the state, which is checked."""
+        self.contact.history.function.x.array[:] = 0.0
+        if state.committed is not None:
+            self.displace(*state.committed, seed=1)
+            self.contact.commit()
+        self.displace(state.normal, state.tangential, seed=2)
+        self.contact.evaluate()
+        contact = self.contact
+        kind = state.name.split()[0]
+        opened = gathered(COMM, contact.gap > 0)
+        assert np.all(opened) if kind == "open" else not np.any(opened)
+        if contact.law.has_friction and kind != "open":
+            slips = gathered(COMM, np.any(contact.slip_increment > 0, axis=1))
+            assert np.all(slips) if kind == "slip" else not np.any(slips)
+
+
+def central(scene: Scene, direction: np.ndarray, evaluate, h: float = 1e-5):
+    """Central difference of ``evaluate()`` at u along a direction."""
+    at = owned(scene.u).copy()
+    ends = []
+    for sign in (1, -1):
+        set_owned(scene.u, at + sign * h * direction)
+        ends.append(evaluate())
+    set_owned(scene.u, at)
+    return (ends[0] - ends[1]) / (2 * h)
+
+
+def directions(scene: Scene) -> list[np.ndarray]:
+    found = []
+    for seed in (11, 12):
+        f = fem.Function(scene.space)
+        f.interpolate(wave(scene.d, seed))
+        found.append(owned(f).copy())
+    return found
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(("cell", "degree"), GRID)
+def test_residual_and_tangent_are_derivatives(cell, degree, law):
+    """δΠ = residual and δ(residual) = tangent, by central differences, in every state.
+
+    Tolerance 1e-6: with h = 1e-5 and states of size 0.1 the truncation is h²/0.1² = 1e-8 where the
+    law is curved (the cone) and none elsewhere; rounding is 1e-16/h = 1e-11.
+    """
+    scene = Scene(cell, degree, LAWS[law])
+    contact, space = scene.contact, scene.space
+    v, du = ufl.TestFunction(space), ufl.TrialFunction(space)
+    residual = compiled(contact.form(v), contact)
+    tangent_form = compiled(contact.tangent(v, du), contact)
+    potential = None
+    if law == "coulomb":
+        raised_everywhere(contact.potential, ValueError, "Coulomb", "potential")
+    else:
+        potential = compiled(contact.potential(), contact)
+    for state in STATES:
+        scene.enter(state)
+        tangent = assemble_matrix(tangent_form)
+        r = assemble_owned(residual, space)
+        x, y = tangent.createVecs()
+        for direction in directions(scene):
+            if potential is not None:
+                difference = central(scene, direction, lambda: assemble_number(potential, COMM))
+                exact = COMM.allreduce(float(r @ direction))
+                # In size the work could be as large as all its parts.
+                size = COMM.allreduce(float(np.abs(r * direction).sum()))
+                assert abs(difference - exact) <= 1e-6 * size, state.name
+            x.array[:] = direction
+            tangent.mult(x, y)
+            difference = central(scene, direction, lambda: assemble_owned(residual, space))
+            difference, exact = gathered(COMM, difference), gathered(COMM, y.array)
+            # Where the tangent vanishes, rounding of the residual over h is what is left.
+            assert close(difference, exact, 1e-6, scale=max(np.abs(exact).max(), 1e-4)), state.name
+        check_shape(scene, state, law, gathered(COMM, r), tangent)
+        for thing in (tangent, x, y):
+            thing.destroy()
+
+
+def check_shape(scene: Scene, state: State, law: str, r: np.ndarray, tangent: PETSc.Mat) -> None:
+    """What vanishes and what is symmetric: without this 0 = 0 would pass as a derivative."""
+    kind = state.name.split()[0]
+    size = tangent.norm(PETSc.NormType.FROBENIUS)
+    if kind == "open" and law in ("frictionless", "coulomb"):
+        assert np.all(r == 0.0) and size == 0.0, state.name
+        return
+    assert np.abs(r).max() > 1e-3, state.name
+    if law == "prescribed" and kind == "slip" and scene.d == 2:
+        # The traction is constant then, and so is the normal one.
+        assert size <= 1e-12 * K_N
+        return
+    assert size > 1.0, state.name
+    transposed = tangent.transpose(PETSc.Mat())
+    transposed.axpy(-1.0, tangent)
+    skew = transposed.norm(PETSc.NormType.FROBENIUS) / size
+    transposed.destroy()
+    if law == "coulomb" and kind == "slip":
+        assert skew > 1e-2, state.name
+    else:
+        assert skew <= 1e-13, state.name
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_stiffness_is_the_tangent_of_closed_and_sticking(cell):
+    """`stiffness_matrix` with full shares equals the consistent tangent where all points stick.
+
+    Round-off: two ways of summing the same products.
+    """
+    scene = Scene(cell, 1, LAWS["coulomb"])
+    scene.enter(STATES[1])
+    v, du = ufl.TestFunction(scene.space), ufl.TrialFunction(scene.space)
+    tangent = assemble_matrix(compiled(scene.contact.tangent(v, du), scene.contact))
+    scene.contact.evaluate()
+    stiffness = scene.contact.stiffness_matrix(1.0, 1.0)
+    size = tangent.norm()
+    stiffness.axpy(-1.0, tangent, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+    assert size > 1.0 and stiffness.norm() <= 1e-13 * size
+    for matrix in (tangent, stiffness):
+        matrix.destroy()
+
+
+# ---- parameters ----------------------------------------------------------------------------------
+
+
+def traction_by_hand(scene: Scene, mu, k_n, k_t) -> np.ndarray:
+    """Return map of one increment from no history, in numpy, at the points of all ranks."""
+    x = gathered(COMM, scene.contact.points)
+    field = polynomial(scene.d, scene.degree, 2, 0.002)
+    n = NORMAL[scene.d] / np.linalg.norm(NORMAL[scene.d])
+    t = np.linalg.svd(n[None])[2][1]
+    u = 0.2 * n + 0.03 * np.sign(t[0]) * t + field(x.T).T
+    u_n = u @ n
+    r_n = -k_n(x) * np.maximum(u_n - 0.1 - 0.04 * x[:, 0], 0)
+    trial = -k_t(x)[:, None] * (u - np.outer(u_n, n))
+    size = np.linalg.norm(trial, axis=1)
+    tau = trial * np.minimum(1.0, -mu(x) * r_n / size)[:, None]
+    return np.outer(r_n, n) + tau
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_parameters_vary_over_the_surface(cell):
+    """μ, k_n and k_t as UFL of x: the traction is the return map with their values at each point.
+
+    Reference: numpy. Tolerance 1e-12: round-off of some ten operations on each point.
+    """
+    scene = Scene(cell, 1, LAWS["frictionless"])
+    mesh = scene.space.mesh
+    x = ufl.SpatialCoordinate(mesh)
+    law = fc.Coulomb(0.2 + 0.3 * x[0] ** 2, k_n=80 + 40 * x[1], k_t=ufl.exp(4 + x[0] * x[1]))
+    surface, support = scene.contact.surface, scene.contact.support
+    scene.contact = fc.Contact(scene.u, surface, support, law)
+    scene.displace(0.2, 0.03, seed=2)
+    scene.contact.evaluate()
+    expected = traction_by_hand(
+        scene,
+        lambda x: 0.2 + 0.3 * x[:, 0] ** 2,
+        lambda x: 80 + 40 * x[:, 1],
+        lambda x: np.exp(4 + x[:, 0] * x[:, 1]),
+    )
+    status = set(gathered(COMM, scene.contact.status).tolist())
+    assert status == {fc.Status.STICK, fc.Status.SLIP}
+    assert close(gathered(COMM, scene.contact.traction), expected, 1e-12)
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_parameters_change_without_compiling(cell, monkeypatch):
+    """``contact.parameters[name].value`` takes effect in values, form and tangent; no compilation.
+
+    Reference: numpy, and for the tangent that it scales with both stiffnesses. Round-off 1e-12.
+    """
+    scene = Scene(cell, 1, LAWS["coulomb"])
+    contact, space = scene.contact, scene.space
+    assert {"friction", "k_n", "k_t"} <= set(contact.parameters)
+    v, du = ufl.TestFunction(space), ufl.TrialFunction(space)
+    form = compiled(contact.form(v), contact)
+    tangent = compiled(contact.tangent(v, du), contact)
+
+    def refuse(*args, **kwargs):
+        raise AssertionError("a form was compiled")
+
+    monkeypatch.setattr(dolfinx.jit, "ffcx_jit", refuse)
+    # The guard itself works: a new form does not get through.
+    with pytest.raises(AssertionError, match="compiled"):
+        fem.form(contact.form(v), entity_maps=contact.entity_maps)
+    scene.displace(0.2, 0.03, seed=2)
+    sizes = []
+    for mu, k_n, k_t in ((FRICTION, K_N, K_T), (0.1, 2 * K_N, 3 * K_T), (0.0, 50.0, 40.0)):
+        for name, value in zip(("friction", "k_n", "k_t"), (mu, k_n, k_t), strict=True):
+            contact.parameters[name].value = value
+        contact.evaluate()
+        expected = traction_by_hand(
+            scene,
+            lambda x, mu=mu: np.full(len(x), mu),
+            lambda x, k_n=k_n: np.full(len(x), k_n),
+            lambda x, k_t=k_t: np.full(len(x), k_t),
+        )
+        assert close(gathered(COMM, contact.traction), expected, 1e-12)
+        # The assembled form sums minus the traction over Γc.
+        measure = gathered(COMM, contact.measure)
+        force = COMM.allreduce(assemble_owned(form, space).reshape(-1, scene.d).sum(axis=0))
+        assert close(-force, measure @ expected, 1e-12)
+        matrix = assemble_matrix(tangent)
+        sizes.append(matrix.norm())
+        matrix.destroy()
+    assert len(set(np.round(sizes, 6))) == 3
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_weight_multiplies_the_form_and_the_resultants(cell):
+    """``weight`` enters form, potential and resultants alike, and leaves tractions as they are.
+
+    Reference: the same contact with weight one; a weight of 2.5 is exact but for round-off.
+    """
+    plain = Scene(cell, 1, LAWS["tresca"])
+    contacts = [plain.contact]
+    contacts.append(
+        fc.Contact(
+            plain.u, plain.contact.surface, plain.contact.support, LAWS["tresca"], weight=2.5
+        )
+    )
+    plain.displace(0.2, 0.3, seed=2)
+    v = ufl.TestFunction(plain.space)
+    forces, energies, tractions, resultants = [], [], [], []
+    for contact in contacts:
+        contact.evaluate()
+        forces.append(
+            gathered(COMM, assemble_owned(compiled(contact.form(v), contact), plain.space))
+        )
+        energies.append(assemble_number(compiled(contact.potential(), contact), COMM))
+        tractions.append(gathered(COMM, contact.traction))
+        resultants.append(contact.resultants())
+    assert close(forces[1], 2.5 * forces[0], 1e-13)
+    assert abs(energies[1] - 2.5 * energies[0]) <= 1e-13 * energies[1]
+    assert close(tractions[1], tractions[0], 1e-13)
+    assert close(resultants[1].force, 2.5 * resultants[0].force, 1e-13)
+    assert resultants[1].normal_force == pytest.approx(2.5 * resultants[0].normal_force, rel=1e-13)
+    assert resultants[1].max_pressure == pytest.approx(resultants[0].max_pressure, rel=1e-13)
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_scaled_stiffness_is_a_multiple_of_modulus_over_height(cell):
+    """`Scaled` with a given modulus: k_n = factor E/h, h the height of the cells; here 1/3.
+
+    Tolerance 1e-9: the E/h field is smoothed by an iterative solve (1e-14) of its logarithm.
+    """
+    d = dimension(cell)
+    mesh, tags = block_mesh(cell, n=3)
+    u = fem.Function(displacement_space(mesh, 1))
+    surface = fc.ContactSurface(mesh, tags, BOTTOM)
+    law = fc.Frictionless(k_n=fc.Scaled(3.0))
+    up = np.eye(d)[-1]
+    contact = fc.Contact(u, surface, fc.HalfSpace(0 * up, up), law, modulus=210.0)
+    u.interpolate(lambda x: np.outer(-0.01 * up, np.ones(x.shape[1])))
+    contact.evaluate()
+    pressure = gathered(COMM, contact.pressure)
+    assert close(pressure, np.full(len(pressure), 3.0 * 210.0 * 3 * 0.01), 1e-9)
+    contact.parameters["k_n"].value = 6.0  # the factor
+    contact.evaluate()
+    assert close(gathered(COMM, contact.pressure), 2 * pressure, 1e-9)

@@ -1,0 +1,302 @@
+"""Supports: gap and normal at the points of Γc against formulas in numpy."""
+
+import logging
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import (
+    BOTTOM,
+    LEFT,
+    RIGHT,
+    block,
+    block_mesh,
+    close,
+    displacement_space,
+    gathered,
+    raised_everywhere,
+)
+
+import fenics_contact as fc
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+COMM = MPI.COMM_WORLD
+
+# Gap and normal are a handful of operations on coordinates of size one, evaluated by a quotient of
+# assembled sums: round-off is some 1e-15, and 1e-12 leaves room for the sums alone.
+EXACT = 1e-12
+
+CELL = {2: "triangle", 3: "tetrahedron"}
+
+
+def scene(d: int) -> tuple[fc.ContactSurface, fem.Function]:
+    mesh, tags = block_mesh(CELL[d], shuffled=True)
+    surface = fc.ContactSurface(mesh, tags, [BOTTOM, RIGHT])
+    return surface, fem.Function(displacement_space(mesh, 1))
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def half_space(x, shift, point, normal):
+    n = unit(np.asarray(normal, dtype=float))
+    return (x - point - shift) @ n, np.broadcast_to(-n, x.shape)
+
+
+def ball(x, shift, center, radius, inside):
+    arm = x - center - shift
+    distance = np.linalg.norm(arm, axis=1)
+    if inside:
+        return radius - distance, unit(arm)
+    return distance - radius, -unit(arm)
+
+
+def cylinder(x, shift, point, radius, inside, axis=None):
+    arm = x - point - shift
+    if axis is not None:
+        a = unit(np.asarray(axis, dtype=float))
+        arm = arm - np.outer(arm @ a, a)
+    distance = np.linalg.norm(arm, axis=1)
+    if inside:
+        return radius - distance, unit(arm)
+    return distance - radius, -unit(arm)
+
+
+def check(contact: fc.Contact, reference, shift=0.0) -> None:
+    """Gap, normal and normal displacement, all points of all ranks together."""
+    contact.evaluate()
+    x = gathered(COMM, contact.points)
+    gap, normal = reference(x, shift)
+    assert close(gathered(COMM, contact.values["gap"]), gap, EXACT, scale=1.0)
+    assert close(gathered(COMM, contact.values["normal"]), normal, EXACT, scale=1.0)
+    # u = 0 here, so that what is open is the initial gap (eq. 6).
+    assert close(gathered(COMM, contact.gap), gap, EXACT, scale=1.0)
+
+
+POINT = {2: (0.2, -0.4), 3: (0.2, 0.1, -0.4)}
+SLOPE = {2: (0.3, 2.0), 3: (0.3, -0.2, 2.0)}
+SHIFT = {2: (0.03, 0.11), 3: (0.03, -0.05, 0.11)}
+AXIS = {2: None, 3: (0.2, 2.0, 0.3)}
+
+
+def supports(d: int) -> dict:
+    p, n, axis = POINT[d], SLOPE[d], AXIS[d]
+    named = {
+        "half-space": (
+            lambda s: fc.HalfSpace(p, n, displacement=s),
+            lambda x, s: half_space(x, s, p, n),
+        )
+    }
+    for inside in (False, True):
+        r = 3.0 if inside else 0.25
+        place = " around" if inside else ""
+        named["ball" + place] = (
+            lambda s, r=r, inside=inside: fc.Ball(p, r, inside=inside, displacement=s),
+            lambda x, s, r=r, inside=inside: ball(x, s, p, r, inside),
+        )
+        named["cylinder" + place] = (
+            lambda s, r=r, inside=inside: fc.Cylinder(
+                p, r, axis=axis, inside=inside, displacement=s
+            ),
+            lambda x, s, r=r, inside=inside: cylinder(x, s, p, r, inside, axis),
+        )
+    return named
+
+
+@pytest.mark.parametrize("kind", supports(2))
+@pytest.mark.parametrize("d", [2, 3])
+def test_gap_and_normal(d, kind):
+    """Gap and normal of every support, at rest and displaced by a tuple."""
+    make, reference = supports(d)[kind]
+    surface, u = scene(d)
+    law = fc.Frictionless(k_n=1.0)
+    check(fc.Contact(u, surface, make(None), law), reference)
+    shift = np.array(SHIFT[d])
+    moved = fc.Contact(u, surface, make(SHIFT[d]), law)
+    check(moved, reference, shift)
+    # The displacement given by numbers is a parameter: a new value moves the support.
+    moved.parameters["displacement"].value[:] = -2 * shift
+    check(moved, reference, -2 * shift)
+
+
+@pytest.mark.parametrize("kind", supports(2))
+@pytest.mark.parametrize("d", [2, 3])
+def test_displacement_by_a_constant(d, kind):
+    """A ``fem.Constant`` changed between two evaluations moves the support."""
+    make, reference = supports(d)[kind]
+    surface, u = scene(d)
+    motion = fem.Constant(surface.mesh, np.zeros(d))
+    contact = fc.Contact(u, surface, make(motion), fc.Frictionless(k_n=1.0))
+    for shift in (np.zeros(d), np.array(SHIFT[d]), -np.array(SHIFT[d])):
+        motion.value[:] = shift
+        check(contact, reference, shift)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_obstacle_by_ufl(d):
+    """A gap and a normal of any length given by UFL are taken as they are, the normal made unit."""
+    surface, u = scene(d)
+    x = ufl.SpatialCoordinate(surface.mesh)
+    normal = ufl.as_vector([0.3 * x[0], *([x[0] * x[1]] if d == 3 else []), -4.0 - x[0]])
+    gap = 0.1 + x[0] ** 2
+
+    def reference(x, shift):
+        columns = [0.3 * x[:, 0], *([x[:, 0] * x[:, 1]] if d == 3 else []), -4.0 - x[:, 0]]
+        n = unit(np.column_stack(columns))
+        return 0.1 + x[:, 0] ** 2 + n @ np.broadcast_to(shift, d), n
+
+    motion = fem.Constant(surface.mesh, np.zeros(d))
+    obstacle = fc.Obstacle(gap, normal, displacement=motion)
+    contact = fc.Contact(u, surface, obstacle, fc.Frictionless(k_n=1.0))
+    check(contact, reference)
+    motion.value[:] = SHIFT[d]
+    check(contact, reference, np.array(SHIFT[d]))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_obstacle_by_a_function(d):
+    """A gap given by a finite element function is evaluated at the points."""
+    surface, u = scene(d)
+    gap = fem.Function(fem.functionspace(surface.mesh, ("Lagrange", 1)))
+    gap.interpolate(lambda x: 0.2 + 0.5 * x[0] - 0.1 * x[1])
+    obstacle = fc.Obstacle(gap, np.eye(d)[-1] * -3.0)
+    contact = fc.Contact(u, surface, obstacle, fc.Frictionless(k_n=1.0))
+    check(contact, lambda x, s: (0.2 + 0.5 * x[:, 0] - 0.1 * x[:, 1], 0 * x - np.eye(d)[-1]))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("kind", ["half-space", "ball", "cylinder"])
+def test_prescribed_gap_does_not_depend_on_the_geometry(d, kind):
+    """``gap=`` replaces the distance (paper, footnote 1); the support's motion along n adds."""
+    make, reference = supports(d)[kind]
+    surface, u = scene(d)
+    motion = fem.Constant(surface.mesh, np.zeros(d))
+    contact = fc.Contact(u, surface, make(motion), fc.Frictionless(k_n=1.0), gap=0.07)
+
+    def prescribed(value):
+        # The normal is that of the geometry, the gap is not.
+        def expected(x, shift):
+            normal = reference(x, shift)[1]
+            return value + normal @ np.broadcast_to(shift, d), normal
+
+        return expected
+
+    check(contact, prescribed(0.07))
+    contact.parameters["gap"].value = 0.21
+    check(contact, prescribed(0.21))
+    motion.value[:] = SHIFT[d]
+    check(contact, prescribed(0.21), np.array(SHIFT[d]))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_length_of_the_normal_does_not_matter(d):
+    """A normal a million times longer gives the same gap and unit normal to round-off."""
+    surface, u = scene(d)
+    law = fc.Frictionless(k_n=1.0)
+    one = fc.Contact(u, surface, fc.HalfSpace(POINT[d], SLOPE[d]), law)
+    long = fc.Contact(u, surface, fc.HalfSpace(POINT[d], 1e6 * np.array(SLOPE[d])), law)
+    for name in ("gap", "normal"):
+        a, b = (gathered(COMM, c.values[name]) for c in (one, long))
+        assert close(a, b, EXACT, scale=1.0)
+    assert close(
+        np.linalg.norm(gathered(COMM, one.values["normal"]), axis=1), a[:, 0] * 0 + 1, EXACT
+    )
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_rigid_motion_of_body_and_support_together(d):
+    """Body and support moved alike: gap as before, and no tangential jump. Round-off of the sum."""
+    surface, u = scene(d)
+    shift = np.array(SHIFT[d])
+    support = fc.HalfSpace(POINT[d], SLOPE[d], displacement=SHIFT[d])
+    contact = fc.Contact(u, surface, support, fc.Coulomb(0.3, k_n=1.0, k_t=1.0))
+    u.x.array[:] = np.tile(shift, u.x.array.size // d)
+    contact.evaluate()
+    gap, _ = half_space(gathered(COMM, contact.points), 0.0, POINT[d], SLOPE[d])
+    assert close(gathered(COMM, contact.gap), gap, EXACT, scale=1.0)
+    jump = gathered(COMM, contact.tangential_displacement)
+    assert close(jump, 0 * jump, EXACT, scale=1.0)
+
+
+def test_a_body_that_starts_inside_its_support_is_reported(caplog):
+    """The largest initial penetration is on the problem, and in one warning on rank 0 alone.
+
+    Reference: a disc of radius 2 whose top lies 0.125 above the bottom: deepest at the point
+    nearest to its axis, R - |x - c|. Tolerance: round-off.
+    """
+    scene = block("quadrilateral")
+    disc = fc.Ball((0.5, 0.125 - 2.0), 2.0)
+    with caplog.at_level(logging.WARNING, logger="fenics_contact"):
+        problem, contact = scene.problem(
+            fc.Frictionless(k_n=1e3), [scene.hold(LEFT, 0)], contact={"support": disc}
+        )
+    x = gathered(COMM, contact.points)
+    deepest = (2.0 - np.linalg.norm(x - [0.5, -1.875], axis=1)).max()
+    assert 0.1 < deepest < 0.125
+    assert abs(problem.initial_penetration - deepest) <= EXACT
+    warnings = [r for r in caplog.records if r.name == "fenics_contact"]
+    texts = COMM.allgather([r.getMessage() for r in warnings])
+    assert len(texts[0]) == 1
+    assert "penetrates" in texts[0][0] and f"{deepest:g}" in texts[0][0]
+    assert not any(texts[1:])
+
+
+def test_a_body_that_touches_does_not_penetrate(caplog):
+    """A gap of zero or more is no initial penetration, and nothing is logged."""
+    scene = block("quadrilateral")
+    with caplog.at_level(logging.WARNING, logger="fenics_contact"):
+        problem, _ = scene.problem(fc.Frictionless(k_n=1e3), scene.rollers())
+    assert problem.initial_penetration == 0.0
+    assert not COMM.allreduce(len([r for r in caplog.records if r.name == "fenics_contact"]))
+
+
+# ---- bad input -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("support", "words"),
+    [
+        (fc.HalfSpace((0, 0, 0), (0, 1)), ("point", "HalfSpace")),
+        (fc.HalfSpace((0, 0), (0, 0, 1)), ("normal", "HalfSpace")),
+        (fc.HalfSpace((0, 0), (0, 0)), ("normal", "zero")),
+        (fc.HalfSpace((0, np.nan), (0, 1)), ("point", "finite")),
+        (fc.HalfSpace((0, 0), (0, np.inf)), ("normal", "finite")),
+        (fc.Ball((0, 0, 0), 1.0), ("center", "Ball")),
+        (fc.Ball((0, 0), 0.0), ("radius", "Ball")),
+        (fc.Ball((0, 0), -1.0), ("radius", "Ball")),
+        (fc.Ball((0, 0), np.nan), ("radius", "Ball")),
+        (fc.Cylinder((0, 0), -1.0), ("radius", "Cylinder")),
+        (fc.Cylinder((0, 0), 1.0, axis=(0, 0, 1)), ("axis",)),
+        (fc.Obstacle(0.1, (0, 0)), ("normal", "zero")),
+        (fc.Obstacle((0.1, 0.2), (0, -1)), ("gap", "scalar")),
+        (fc.HalfSpace((0, 0), (0, 1), displacement=(0, 0, 0)), ("displacement",)),
+        (fc.HalfSpace((0, 0), (0, 1), displacement=1.0), ("displacement",)),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, fc.supports.Support) else None,
+)
+def test_bad_support_in_the_plane(support, words):
+    """Data of the wrong dimension, without length or not finite: the message names them."""
+    surface, u = scene(2)
+    raised_everywhere(
+        lambda: fc.Contact(u, surface, support, fc.Frictionless(k_n=1.0)), ValueError, *words
+    )
+
+
+@pytest.mark.parametrize(
+    ("support", "words"),
+    [
+        (fc.Cylinder((0, 0, 0), 1.0), ("axis",)),
+        (fc.Cylinder((0, 0, 0), 1.0, axis=(0, 0, 0)), ("axis", "zero")),
+        (fc.HalfSpace((0, 0), (0, 0, 1)), ("point",)),
+        (fc.Ball((0, 0), 1.0), ("center",)),
+    ],
+)
+def test_bad_support_in_space(support, words):
+    """As in the plane, and the axis of a cylinder is needed."""
+    surface, u = scene(3)
+    raised_everywhere(
+        lambda: fc.Contact(u, surface, support, fc.Frictionless(k_n=1.0)), ValueError, *words
+    )

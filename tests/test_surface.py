@@ -1,0 +1,296 @@
+"""ContactSurface: facets, measure, quadrature points; ghosts and ranks without contact."""
+
+import basix
+import dolfinx
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import GhostMode
+from mpi4py import MPI
+from scenes import (
+    BACK,
+    BOTTOM,
+    CELLS,
+    FRONT,
+    GRID,
+    LEFT,
+    RIGHT,
+    TOP,
+    assemble_number,
+    block_mesh,
+    close,
+    compiled,
+    dimension,
+    displacement_space,
+    gathered,
+    layers,
+    raised_everywhere,
+)
+
+import fenics_contact as fc
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+COMM = MPI.COMM_WORLD
+
+
+def contact_on(surface: fc.ContactSurface, degree: int) -> fc.Contact:
+    """The cheapest contact: its evaluation gives the coordinates of the points."""
+    d = surface.mesh.geometry.dim
+    u = fem.Function(displacement_space(surface.mesh, degree))
+    up = np.eye(d)[-1]
+    return fc.Contact(u, surface, fc.HalfSpace(np.zeros(d), up), fc.Frictionless(k_n=1.0))
+
+
+def facet_rule(cell: str, degree: int) -> tuple[np.ndarray, np.ndarray, basix.CellType]:
+    """Gauss points and weights on the reference facet, straight from basix."""
+    facet = {"triangle": "interval", "quadrilateral": "interval"}.get(
+        cell, {"tetrahedron": "triangle", "hexahedron": "quadrilateral"}.get(cell)
+    )
+    kind = basix.CellType[facet]
+    points, weights = basix.make_quadrature(kind, degree)
+    return points, weights, kind
+
+
+def facet_vertices(mesh: dolfinx.mesh.Mesh, facets: np.ndarray) -> np.ndarray:
+    """Coordinates of the vertices of facets, shape (n_facets, n_vertices, gdim)."""
+    d = mesh.geometry.dim
+    mesh.topology.create_connectivity(d - 1, d)
+    mesh.topology.create_connectivity(d, d - 1)
+    if not facets.size:  # DOLFINx 0.9 does not survive an empty list
+        return np.zeros((0, 2, d))
+    return mesh.geometry.x[dolfinx.mesh.entities_to_geometry(mesh, d - 1, facets), :d]
+
+
+def expected_points(
+    mesh: dolfinx.mesh.Mesh, facets: np.ndarray, rule: tuple
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rule pushed to flat facets by their vertices, in numpy: points and weights of this rank."""
+    points, weights, kind = rule
+    d = mesh.geometry.dim
+    shape = basix.create_element(basix.ElementFamily.P, kind, 1).tabulate(1, points)
+    nodes = facet_vertices(mesh, facets)
+    x, w = [], []
+    for vertices in nodes:
+        x.append(shape[0, :, :, 0] @ vertices)
+        jacobian = np.stack([shape[1 + i, :, :, 0] @ vertices for i in range(d - 1)], axis=-1)
+        gram = np.einsum("qia,qib->qab", jacobian, jacobian)
+        w.append(weights * np.sqrt(np.linalg.det(gram)))
+    n = len(points)
+    return np.reshape(x, (len(nodes) * n, d)), np.reshape(w, len(nodes) * n)
+
+
+def ordered(points: np.ndarray, *columns: np.ndarray) -> np.ndarray:
+    """Rows sorted by rounded coordinates."""
+    order = np.lexsort(np.round(points, 9).T)
+    return np.column_stack([points, *columns])[order]
+
+
+@pytest.mark.parametrize("ghost_mode", [GhostMode.none, GhostMode.shared_facet])
+@pytest.mark.parametrize(("cell", "degree"), GRID)
+def test_points_and_weights_are_those_of_gauss(cell, degree, ghost_mode):
+    """The points are the Gauss points of degree 2p, each once; reference: basix pushed by numpy.
+
+    Tolerance 1e-12: round-off of a quotient of two assembled sums of size one.
+    """
+    mesh, tags = block_mesh(cell, shuffled=True, ghost_mode=ghost_mode)
+    surface = fc.ContactSurface(mesh, tags, [BOTTOM, RIGHT])
+    contact = contact_on(surface, degree)
+    assert contact.quadrature.degree == 2 * degree
+    rule = facet_rule(cell, 2 * degree)
+    x, w = expected_points(mesh, surface.facets, rule)
+    assert COMM.allreduce(contact.quadrature.n_points) == COMM.allreduce(len(w))
+    actual = ordered(gathered(COMM, contact.points), gathered(COMM, contact.quadrature.weights))
+    expected = ordered(gathered(COMM, x), gathered(COMM, w))
+    assert close(actual, expected, 1e-12, scale=1.0)
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_facets_are_those_with_the_tags(cell):
+    """Every facet with one of the tags is owned by one rank; the area is that of the sides."""
+    mesh, tags = block_mesh(cell, shuffled=True, ghost_mode=GhostMode.shared_facet)
+    sides = {2: [BOTTOM, LEFT, RIGHT, TOP], 3: [BOTTOM, LEFT, RIGHT, TOP, FRONT, BACK]}
+    per_side = {"triangle": 2, "quadrilateral": 2, "tetrahedron": 8, "hexahedron": 4}[cell]
+    d = dimension(cell)
+    n_owned = mesh.topology.index_map(d - 1).size_local
+    for tags_wanted in (sides[d][:1], sides[d][1:3], sides[d]):
+        surface = fc.ContactSurface(mesh, tags, tags_wanted)
+        assert all(COMM.allgather(bool(np.all(surface.facets < n_owned))))
+        assert COMM.allreduce(surface.facets.size) == per_side * len(tags_wanted)
+        one = fem.Constant(mesh, 1.0)
+        area = assemble_number(compiled(one * surface.measure(2)), COMM)
+        assert abs(area - len(tags_wanted)) <= 1e-13 * len(tags_wanted)
+        weights = gathered(COMM, surface.quadrature(1).weights)
+        # The weights sum to the area: 1e-13 is the round-off of a sum of 50 terms.
+        assert abs(weights.sum() - len(tags_wanted)) <= 1e-13 * len(tags_wanted)
+
+
+def test_one_tag_and_a_list_of_it_are_the_same():
+    """``tags`` may be a number or a sequence."""
+    mesh, tags = block_mesh("triangle")
+    one = fc.ContactSurface(mesh, tags, BOTTOM)
+    listed = fc.ContactSurface(mesh, tags, [BOTTOM])
+    assert all(COMM.allgather(bool(np.array_equal(one.facets, listed.facets))))
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_quadrature_degree_is_settable(cell):
+    """A degree given by the user replaces the default, and is exact for its polynomials.
+
+    Reference: the integral of x^5 over the unit side, 1/6, by the weights; round-off 1e-13. The
+    facets are affine here, so that the integrand has the degree of the polynomial.
+    """
+    mesh, tags = block_mesh(cell)
+    contact = contact_on(fc.ContactSurface(mesh, tags, BOTTOM, quadrature_degree=5), 1)
+    assert contact.quadrature.degree == 5
+    rule = facet_rule(cell, 5)
+    n_facets = COMM.allreduce(contact.surface.facets.size)
+    assert COMM.allreduce(contact.quadrature.n_points) == len(rule[1]) * n_facets
+    moment = COMM.allreduce(float(contact.quadrature.weights @ contact.points[:, 0] ** 5))
+    assert abs(moment - 1 / 6) <= 1e-13
+    # The default rule of degree 2 cannot do that: the degree has an effect.
+    coarse = contact_on(fc.ContactSurface(mesh, tags, BOTTOM), 1)
+    moment = COMM.allreduce(float(coarse.quadrature.weights @ coarse.points[:, 0] ** 5))
+    assert abs(moment - 1 / 6) > 1e-5
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_vertex_scheme_has_its_points_at_the_vertices(cell):
+    """Scheme "vertex": each facet has one point at each of its vertices, with equal weights."""
+    mesh, tags = block_mesh(cell, shuffled=True)
+    surface = fc.ContactSurface(mesh, tags, BOTTOM, quadrature_scheme="vertex")
+    contact = contact_on(surface, 1)
+    d = dimension(cell)
+    vertices = facet_vertices(mesh, surface.facets).reshape(-1, d)
+    actual = ordered(gathered(COMM, contact.points))
+    assert close(actual, ordered(gathered(COMM, vertices)), 1e-12, scale=1.0)
+    weights = gathered(COMM, contact.quadrature.weights)
+    assert abs(weights.sum() - 1.0) <= 1e-12
+    assert weights.min() > 0
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
+def test_ranks_without_contact_facets(cell):
+    """Γc on the first rank only: the others hold no point, and all results are the same there."""
+    d = dimension(cell)
+    counts = (1, 6) if d == 2 else (1, 1, 6)
+    mesh, tags = block_mesh(cell, n=counts, partitioner=layers(cell))
+    surface = fc.ContactSurface(mesh, tags, BOTTOM)
+    contact = contact_on(surface, 1)
+    holders = COMM.allgather(contact.quadrature.n_points)
+    assert sorted(holders) == [0] * (COMM.size - 1) + [2 if d == 2 else 4]
+    contact.u.interpolate(lambda x: np.vstack([0 * x[0]] * (d - 1) + [0 * x[0] - 0.25]))
+    contact.evaluate()
+    # Pressure k_n * 0.25 on the unit side; exact but for the sum of the weights.
+    results = COMM.allgather(contact.resultants())
+    for r in results:
+        assert abs(r.normal_force - 0.25) <= 1e-14
+        assert abs(r.area - 1.0) <= 1e-14
+        assert r.max_penetration == pytest.approx(0.25, rel=1e-14)
+    contact.commit()
+    form = compiled(contact.form(ufl.TestFunction(contact.u.function_space)), contact)
+    vector = fem.Function(contact.u.function_space)
+    fem.assemble_vector(vector.x.array, form)
+    # The residual holds minus the force on the body.
+    total = COMM.allreduce(float(vector.x.array.reshape(-1, d)[:, -1].sum()))
+    assert abs(total + 0.25) <= 1e-14
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_curved_geometry(cell):
+    """Cells of geometric degree 2 over a parabolic bottom: the points lie on it, the area is its.
+
+    Height y = c x² is what quadratic cells of equal width represent, so that the points are exact,
+    1e-12; the arc length by the rule of degree 12 against the formula: 1e-6, the error of the rule.
+    """
+    c, d = 0.3, dimension(cell)
+
+    def bend(x):
+        x = x.copy()
+        x[:, -1] += c * (1 - x[:, -1]) * x[:, 0] ** 2
+        return x
+
+    mesh, tags = block_mesh(cell, bend=bend)
+    surface = fc.ContactSurface(mesh, tags, BOTTOM, quadrature_degree=12)
+    contact = contact_on(surface, 2)
+    x = gathered(COMM, contact.points)
+    assert close(x[:, -1], c * x[:, 0] ** 2, 1e-12, scale=1.0)
+    assert 0 < x[:, 0].min() < 0.1 and 0.9 < x[:, 0].max() < 1
+    slope = 2 * c
+    arc = (np.sqrt(1 + slope**2) + np.arcsinh(slope) / slope) / 2
+    area = COMM.allreduce(float(contact.quadrature.weights.sum()))
+    assert abs(area - arc) <= 1e-6
+    # The gap above the floor y = 0 is the height, and a displacement is evaluated at the points.
+    assert close(gathered(COMM, contact.gap), x[:, -1], 1e-12, scale=1.0)
+    contact.u.interpolate(lambda x: np.vstack([0.1 * x[0]] * d))
+    contact.evaluate()
+    assert close(gathered(COMM, contact.gap), x[:, -1] + 0.1 * x[:, 0], 1e-12, scale=1.0)
+
+
+# ---- bad input -----------------------------------------------------------------------------------
+
+
+def test_a_tag_that_exists_nowhere():
+    """The message names the tag and those that there are."""
+    mesh, tags = block_mesh("triangle")
+    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, 99), ValueError, "99", "[1, 2, 3, 4]")
+    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, [BOTTOM, 99]), ValueError, "99")
+
+
+def test_no_tags_at_all():
+    """An empty list of tags is an empty Γc."""
+    mesh, tags = block_mesh("triangle")
+    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, []), ValueError, "empty")
+
+
+@pytest.mark.parametrize("ghost_mode", [GhostMode.none, GhostMode.shared_facet])
+@pytest.mark.parametrize("cell", CELLS)
+def test_interior_facets_are_refused(cell, ghost_mode):
+    """Facets inside the body are no contact surface, wherever in parallel they lie."""
+    mesh, _ = block_mesh(cell, ghost_mode=ghost_mode)
+    d = dimension(cell)
+    facets = dolfinx.mesh.locate_entities(mesh, d - 1, lambda x: np.isclose(x[d - 1], 0.5))
+    values = np.full(facets.size, 7, dtype=np.int32)
+    tags = dolfinx.mesh.meshtags(mesh, d - 1, np.sort(facets), values)
+    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, 7), ValueError, "inside", "7")
+
+
+def test_one_interior_facet_on_one_rank_only():
+    """One interior facet among exterior ones, tagged on its owner alone, is found by all ranks."""
+    mesh, tags = block_mesh("quadrilateral", n=(2, 6), ghost_mode=GhostMode.shared_facet)
+    inside = dolfinx.mesh.locate_entities(
+        mesh, 1, lambda x: np.isclose(x[1], 5 / 6) & (x[0] < 0.5 + 1e-9)
+    )
+    inside = inside[inside < mesh.topology.index_map(1).size_local]
+    facets = np.concatenate([tags.find(BOTTOM), inside]).astype(np.int32)
+    assert COMM.allreduce(inside.size) == 1
+    tags = dolfinx.mesh.meshtags(mesh, 1, np.sort(facets), np.full(facets.size, 7, dtype=np.int32))
+    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, 7), ValueError, "inside")
+
+
+def test_wrong_surface_arguments():
+    """Cell tags, an unknown scheme and a degree below one are named in the message."""
+    mesh, tags = block_mesh("triangle")
+    n_cells = mesh.topology.index_map(2).size_local
+    cells = np.arange(n_cells, dtype=np.int32)
+    cell_tags = dolfinx.mesh.meshtags(mesh, 2, cells, np.full(n_cells, BOTTOM, dtype=np.int32))
+    surface = fc.ContactSurface
+    raised_everywhere(lambda: surface(mesh, cell_tags, BOTTOM), ValueError, "facet_tags")
+    raised_everywhere(
+        lambda: surface(mesh, tags, BOTTOM, quadrature_scheme="lobatto"), ValueError, "lobatto"
+    )
+    raised_everywhere(
+        lambda: surface(mesh, tags, BOTTOM, quadrature_degree=0), ValueError, "quadrature_degree"
+    )
+
+
+def test_a_shell_is_no_body():
+    """A surface mesh in space has no contact with its edges."""
+    mesh, _ = block_mesh("tetrahedron")
+    mesh.topology.create_connectivity(2, 3)
+    facets = dolfinx.mesh.exterior_facet_indices(mesh.topology)
+    shell = dolfinx.mesh.create_submesh(mesh, 2, facets)[0]
+    shell.topology.create_entities(1)
+    edges = np.arange(shell.topology.index_map(1).size_local, dtype=np.int32)
+    tags = dolfinx.mesh.meshtags(shell, 1, edges, np.full(edges.size, BOTTOM, dtype=np.int32))
+    raised_everywhere(lambda: fc.ContactSurface(shell, tags, BOTTOM), ValueError, "dimension")

@@ -1,0 +1,313 @@
+"""Two deformable bodies in one mesh: pairs, patch tests, action and reaction, a shrink fit."""
+
+from __future__ import annotations
+
+import basix.ufl
+import dolfinx
+import gmsh
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import CellType
+from mpi4py import MPI
+from scenes import CELLS, dimension
+
+import fenics_contact as fc
+from fenics_contact import compat
+
+COMM = MPI.COMM_WORLD
+BOTTOM, TOP, LOWER, UPPER = 1, 2, 3, 4
+E = 1e6
+
+pytestmark = pytest.mark.mpi
+
+
+def two_blocks(cell: str, n: tuple[int, int], widths: tuple[float, float] = (1.0, 1.0)):
+    """Two stacked blocks of height 1/2 whose meshes do not match, and their tags."""
+    d = dimension(cell)
+    x, cells, offset = [], [], 0
+    for count, width, low in zip(n, widths, (0.0, 0.5), strict=True):
+        counts = (count,) * (d - 1) + (max(1, count // 2),)
+        make = dolfinx.mesh.create_rectangle if d == 2 else dolfinx.mesh.create_box
+        corners = [np.r_[np.zeros(d - 1), low], np.r_[np.full(d - 1, width), low + 0.5]]
+        block = make(MPI.COMM_SELF, corners, counts, CellType[cell])
+        x.append(block.geometry.x[:, :d])
+        cells.append(block.geometry.dofmap.astype(np.int64) + offset)
+        offset += len(x[-1])
+    x, cells = np.concatenate(x), np.concatenate(cells)
+    if COMM.rank:
+        x, cells = x[:0], cells[:0]
+    element = ufl.Mesh(basix.ufl.element("Lagrange", cell, 1, shape=(d,)))
+    mesh = dolfinx.mesh.create_mesh(COMM, cells=cells, x=x, e=element)
+    mesh.topology.create_connectivity(d - 1, d)
+    to_cell = mesh.topology.connectivity(d - 1, d)
+    found = {}
+    for tag, height in ((BOTTOM, 0.0), (TOP, 1.0), (LOWER, 0.5)):
+        found[tag] = dolfinx.mesh.locate_entities_boundary(
+            mesh, d - 1, lambda x, h=height: np.isclose(x[d - 1], h)
+        )
+    middle = found[LOWER]
+    owner = np.array([to_cell.links(f)[0] for f in middle], dtype=np.int32)
+    above = dolfinx.mesh.compute_midpoints(mesh, d, owner)[:, d - 1] > 0.5 if len(owner) else []
+    found[LOWER], found[UPPER] = middle[~np.array(above, bool)], middle[np.array(above, bool)]
+    facets = np.concatenate(list(found.values()))
+    values = np.concatenate([np.full(len(f), t, dtype=np.int32) for t, f in found.items()])
+    order = np.argsort(facets)
+    return mesh, dolfinx.mesh.meshtags(mesh, d - 1, facets[order], values[order])
+
+
+def elasticity(u, v, nu: float):
+    """Plane strain or 3D; the residual without loads."""
+    G, lam = E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
+    epsilon = ufl.sym(ufl.grad(u))
+    stress = 2 * G * epsilon + lam * ufl.tr(epsilon) * ufl.Identity(len(u))
+    return ufl.inner(stress, ufl.sym(ufl.grad(v))) * ufl.dx
+
+
+def pressed(cell, degree, nu, law, *, n=(3, 4), surface=LOWER, confined=True, **options):
+    """Two blocks on rollers, the top moved down by 0.01; the sides held if confined."""
+    mesh, tags = two_blocks(cell, n)
+    d = mesh.geometry.dim
+    V = fem.functionspace(mesh, ("Lagrange", degree, (d,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    down = fem.Constant(mesh, -0.01)
+    fixed = fem.Constant(mesh, 0.0)
+
+    def hold(i, value, facets):
+        return fem.dirichletbc(
+            value, fem.locate_dofs_topological(V.sub(i), d - 1, facets), V.sub(i)
+        )
+
+    bcs = [hold(d - 1, fixed, tags.find(BOTTOM)), hold(d - 1, down, tags.find(TOP))]
+    for i in range(d - 1):
+        for at in (0.0, 1.0) if confined else (0.0,):
+            side = dolfinx.mesh.locate_entities_boundary(
+                mesh, d - 1, lambda x, i=i, at=at: np.isclose(x[i], at)
+            )
+            bcs.append(hold(i, fixed, side))
+    opposite = UPPER if surface == LOWER else LOWER
+    contact = fc.Contact(
+        u, fc.ContactSurface(mesh, tags, surface), fc.DeformableBody(tags, opposite), law
+    )
+    problem = fc.ContactProblem(elasticity(u, v, nu), u, bcs=bcs, contacts=[contact], **options)
+    return problem, contact, down
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.3])
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", CELLS)
+def test_patch(cell: str, degree: int, nu: float) -> None:
+    """Non-matching meshes carry a uniform pressure exactly, and the interface jumps by p/k_n.
+
+    Reference: p = 0.01 / (1/M + 1/k_n), M the confined modulus of height 1. To 1e-9: the solver's
+    tolerance.
+    """
+    k_n = 1e7
+    problem, contact, _ = pressed(cell, degree, nu, fc.Coulomb(0.3, k_n=k_n, k_t=1e6))
+    problem.solve()
+    confined = E * (1 - nu) / (1 + nu) / (1 - 2 * nu)
+    p = 0.01 / (1 / confined + 1 / k_n)
+    points = contact.gather()
+    assert points["pressure"] == pytest.approx(np.full(len(points["pressure"]), p), rel=1e-9)
+    assert points["gap"] == pytest.approx(np.full(len(points["gap"]), -p / k_n), rel=1e-9)
+    assert contact.n_unpaired == 0
+
+
+def test_exact_contact_pressure() -> None:
+    """E = 1e6, ν = 0, the top moved by 0.01: p → 1e4 with the stiffness; free sides."""
+    problem, contact, _ = pressed(
+        "quadrilateral", 1, 0.0, fc.Frictionless(k_n=1e12), confined=False, method="newton"
+    )
+    problem.solve()
+    # p/k_n = 1e-8 of the 0.01 m: the jump takes 1e-6 of the pressure.
+    assert contact.gather()["pressure"] == pytest.approx(1e4, rel=2e-6)
+
+
+@pytest.mark.parametrize("surface", [LOWER, UPPER])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_forces_and_moments_cancel(cell: str, surface: int) -> None:
+    """Contact forces of a rough state: sum zero to round-off, moment zero as the gap is zero."""
+    problem, contact, _ = pressed(cell, 1, 0.3, fc.Coulomb(0.3, k_n=1e6, k_t=1e6), surface=surface)
+    u, d = problem.u, len(problem.u)
+    u.interpolate(
+        lambda x: np.vstack(
+            [0.01 * np.sin(3 * x[0] + 5 * x[d - 1] + i) * (x[d - 1] < 0.5 + 1e-9) for i in range(d)]
+        )
+    )
+    force = fem.Function(u.function_space)
+    contact.add_force(force.x.petsc_vec)
+    n_owned = u.function_space.dofmap.index_map.size_local
+    f = force.x.array.reshape(-1, d)[:n_owned]
+    x = u.function_space.tabulate_dof_coordinates()[:n_owned, :d]
+    size = COMM.allreduce(np.abs(f).sum())
+    assert size > 0
+    total = COMM.allreduce(f.sum(axis=0))
+    assert np.abs(total).max() <= 1e-12 * size
+    i, j = (0, 1) if d == 2 else (0, 2)
+    moment = COMM.allreduce(np.sum(x[:, i] * f[:, j] - x[:, j] * f[:, i]))
+    assert abs(moment) <= 1e-12 * size
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_tangent_is_the_derivative_of_the_force(cell: str) -> None:
+    """Central differences, 1e-6, away from kinks: all points closed and slipping."""
+    problem, contact, _ = pressed(cell, 1, 0.3, fc.Coulomb(0.1, k_n=1e6, k_t=1e6))
+    u, d = problem.u, len(problem.u)
+    # The lower block moved up into the upper one, and along it: closed and slipping everywhere.
+    mesh = u.function_space.mesh
+    upper = fem.Function(fem.functionspace(mesh, ("DG", 0)))
+    mids = upper.function_space.tabulate_dof_coordinates()[:, d - 1]
+    upper.x.array[:] = mids > 0.5
+    cells = np.flatnonzero(upper.x.array < 0.5).astype(np.int32)
+    u.interpolate(
+        lambda x: np.vstack([0.02 + 0.001 * x[0] if i == 0 else 0.01 + 0 * x[0] for i in range(d)]),
+        cells0=cells,
+    )
+    contact.evaluate()
+    counts = contact.resultants()
+    assert counts.open == counts.stick == 0
+    matrix = contact.tangent_matrix()
+    direction = fem.Function(u.function_space)
+    direction.interpolate(lambda x: np.vstack([np.sin(4 * x[i] + i + x[0]) for i in range(d)]))
+    image = matrix.createVecLeft()
+    matrix.mult(direction.x.petsc_vec, image)
+    base, eps, forces = u.x.array.copy(), 1e-6, []
+    for sign in (1, -1):
+        u.x.array[:] = base + sign * eps * direction.x.array
+        force = fem.Function(u.function_space)
+        contact.add_force(force.x.petsc_vec)
+        forces.append(force.x.petsc_vec.copy())
+    difference = (forces[0] - forces[1]) * (0.5 / eps)
+    size = image.norm()
+    difference.axpy(-1.0, image)
+    assert size > 0 and difference.norm() <= 1e-6 * size
+
+
+def test_points_that_look_past_the_other_body() -> None:
+    """A wider lower block: points beyond the upper one are open, and counted."""
+    mesh, tags = two_blocks("quadrilateral", (8, 3), widths=(2.0, 1.0))
+    V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
+    u = fem.Function(V)
+    surface = fc.ContactSurface(mesh, tags, LOWER)
+    contact = fc.Contact(u, surface, fc.DeformableBody(tags, UPPER), fc.Frictionless(k_n=1e6))
+    # Eight facets of 1/4 with two points each: four look past the block of width 1.
+    assert contact.n_unpaired == 8
+    x = contact.gather()["x"][:, 0]
+    status = contact.gather()["status"]
+    assert np.all(status[x > 1.0] == fc.Status.OPEN)
+
+
+def test_reach() -> None:
+    """Opposites farther than ``reach`` are none."""
+    mesh, tags = two_blocks("quadrilateral", (4, 3))
+    u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (2,))))
+    surface = fc.ContactSurface(mesh, tags, BOTTOM)
+    # From the bottom outwards nothing is met within 0.1; the rays of LOWER meet UPPER at once.
+    far = fc.Contact(u, surface, fc.DeformableBody(tags, TOP, reach=0.1), fc.Frictionless(1e6))
+    assert far.n_unpaired == 8
+    with pytest.raises(ValueError, match="reach"):
+        fc.DeformableBody(tags, TOP, reach=-1.0)
+
+
+def test_form_alone_says_what_it_lacks() -> None:
+    """The boundary form cannot reach the opposite body's unknowns, and says so."""
+    problem, contact, _ = pressed("triangle", 1, 0.0, fc.Frictionless(k_n=1e6))
+    with pytest.raises(ValueError, match="opposite body"):
+        contact.form(ufl.TestFunction(problem.u.function_space))
+
+
+def rings(h: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
+    """Quarters of two rings, 10/20 and 20/40, curved cells, meshes that do not match."""
+    gmsh.initialize()
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.model.add("rings")
+        if COMM.rank == 0:
+            occ = gmsh.model.occ
+            centre = occ.addPoint(0, 0, 0)
+            inner_lines, parts = [], []
+            for low, high in ((10, 20), (20, 40)):
+                points = [
+                    occ.addPoint(r * np.cos(a), r * np.sin(a), 0)
+                    for r in (low, high)
+                    for a in (0, np.pi / 2)
+                ]
+                inside = occ.addCircleArc(points[0], centre, points[1])
+                outside = occ.addCircleArc(points[2], centre, points[3])
+                flat, upright = occ.addLine(points[0], points[2]), occ.addLine(points[1], points[3])
+                face = occ.addPlaneSurface([occ.addCurveLoop([flat, outside, upright, inside])])
+                parts.append((face, inside, outside, flat, upright))
+                inner_lines += [inside, outside, flat, upright] if low == 10 else []
+            occ.synchronize()
+            for tag, face in enumerate((parts[0][0], parts[1][0]), start=1):
+                gmsh.model.addPhysicalGroup(2, [face], tag)
+            sides = ([parts[0][2]], [parts[1][1]], [p[3] for p in parts], [p[4] for p in parts])
+            for tag, lines in enumerate(sides, start=1):
+                gmsh.model.addPhysicalGroup(1, lines, tag)
+
+            def size(dim, tag, x, y, z, lc):
+                own = tag == parts[0][0] if dim == 2 else tag in inner_lines
+                return h if own else 1.31 * h
+
+            gmsh.model.mesh.setSizeCallback(size)
+            gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
+            gmsh.model.mesh.generate(2)
+            gmsh.model.mesh.setOrder(2)
+        return compat.model_to_mesh(gmsh.model, COMM, 0, 2)
+    finally:
+        gmsh.finalize()
+
+
+def test_shrink_fit() -> None:
+    """Lamé: radii 10/20/40, interference 0.02, plane strain: p = 69.231 within 0.5 %."""
+    mesh, tags = rings(2.0)
+    V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    steel, nu = 210e3, 0.3
+    F = fem.Constant(mesh, steel / E) * elasticity(u, v, nu)
+    zero = fem.Constant(mesh, 0.0)
+    bcs = [
+        fem.dirichletbc(zero, fem.locate_dofs_topological(V.sub(i), 1, tags.find(tag)), V.sub(i))
+        for i, tag in ((1, 3), (0, 4))
+    ]
+    contact = fc.Contact(
+        u,
+        fc.ContactSurface(mesh, tags, 1),
+        fc.DeformableBody(tags, 2),
+        fc.Frictionless(k_n=fc.Scaled(30)),
+        gap=-0.02,
+    )
+    problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
+    assert problem.initial_penetration == 0.0  # an interference by intent is no accident
+    problem.solve()
+    points = contact.gather()
+    mean = points["pressure"] @ points["measure"] / points["measure"].sum()
+    assert mean == pytest.approx(69.231, rel=0.005)
+    # Quadratic cells of a tenth of the radius: the pressure is uniform to 1 %.
+    assert points["pressure"] == pytest.approx(np.full(len(points["x"]), mean), rel=0.01)
+    assert contact.n_unpaired == 0
+
+
+def test_bodies_are_told_apart() -> None:
+    """A body that nothing holds is named, where the other is held."""
+    mesh, tags = two_blocks("triangle", (3, 4))
+    V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    zero = fem.Constant(mesh, np.zeros(2))
+    clamp = fem.dirichletbc(zero, fem.locate_dofs_topological(V, 1, tags.find(BOTTOM)), V)
+    surface = fc.ContactSurface(mesh, tags, UPPER)
+    contact = fc.Contact(u, surface, fc.DeformableBody(tags, LOWER), fc.Frictionless(k_n=1e6))
+    with pytest.raises(ValueError, match="translation along x of body"):
+        fc.ContactProblem(elasticity(u, v, 0.0), u, bcs=[clamp], contacts=[contact])
+
+
+def test_matrix_reproduces_rigid_motions() -> None:
+    """The jump of a rigid motion of both bodies is zero at every point, to round-off."""
+    _, contact, _ = pressed("tetrahedron", 1, 0.3, fc.Frictionless(k_n=1e6), n=(3, 5))
+    space = contact.u.function_space
+    motion = fem.Function(space)
+    motion.interpolate(lambda x: np.vstack([1 - 2 * x[1] + x[2], 2 * x[0], 3 - x[0]]))
+    n_owned = space.dofmap.index_map.size_local * 3
+    jump = contact.at_points(motion.x.array[:n_owned])
+    assert COMM.allreduce(np.abs(jump).max(initial=0.0), op=MPI.MAX) <= 1e-12
