@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import logging
+from pathlib import Path
 from typing import Any
 
 import dolfinx
@@ -40,11 +43,18 @@ def create_facet_submesh(
     return submesh, [facet_map], facet_map.sub_topology_to_topology(local, False)
 
 
-def merge_entity_maps(maps: list[Any]) -> Any:
-    """Join what several surfaces return from `create_facet_submesh` into one argument."""
-    if all(isinstance(m, dict) for m in maps):
-        return {sub: array for m in maps for sub, array in m.items()}
-    return [entity_map for m in maps for entity_map in m]
+@functools.cache
+def warn_of_slow_blas() -> None:
+    """Log once if the process runs on the reference BLAS, as Debian's packages do by default."""
+    try:
+        libraries = Path("/proc/self/maps").read_text()
+    except OSError:
+        return  # no Linux: nothing to tell from
+    if "/blas/libblas.so" in libraries:
+        logging.getLogger("fenics_contact").warning(
+            "the reference BLAS is in use: factorisations take up to eight times longer than with "
+            "OpenBLAS (Debian: apt install libopenblas0-pthread)"
+        )
 
 
 def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:

@@ -423,7 +423,7 @@ class Contact:
         opposite.destroy()
         mask.destroy()
         self._map = relative
-        self._points = None
+        self.forget()
         self.n_unpaired = int(global_sum(mesh.comm, np.count_nonzero(~paired)))
         self.pairings += 1
 
@@ -433,6 +433,10 @@ class Contact:
         """Evaluate gap, reactions and slip at the present ``u``; the history stays. Collective."""
         self._update_jump()
         self._points = self._evaluate_points()
+
+    def forget(self) -> None:
+        """Drop what was evaluated: the next look at a result evaluates the present ``u``."""
+        self._points = None
 
     def check_input(self) -> None:
         """Refuse parameters that are out of range or not finite at some point of Γc. Collective.

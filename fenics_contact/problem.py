@@ -14,7 +14,7 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact import accuracy
+from fenics_contact import accuracy, compat
 from fenics_contact.bulk import Bulk
 from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.parallel import global_max, global_min, global_sum
@@ -166,6 +166,7 @@ class ContactProblem:
         for name, share in (("alpha", alpha), ("phi", phi)):
             if not 0.0 <= share <= 1.0:
                 raise ValueError(f"{name} is {share!r}; it must lie between 0 and 1")
+        compat.warn_of_slow_blas()
         self.u = u
         self.contacts = list(contacts)
         self.bulk = Bulk(F, u)
@@ -197,6 +198,7 @@ class ContactProblem:
         self._factorisations = 0
         self._norms = {"residual": 0.0, "force": 0.0, "floor": 0.0}
         self._committed_force = self._start_residual = 0.0
+        self._committed_u = u.x.array.copy()
         self._configure(method, dict(petsc_options or {}), prefix)
 
     # ---- construction ----------------------------------------------------------------------------
@@ -491,7 +493,7 @@ class ContactProblem:
         except BaseException:
             self.u.x.array[:] = saved
             for contact in self.contacts:
-                contact._points = None
+                contact.forget()
             raise
         return step
 
@@ -627,8 +629,18 @@ class ContactProblem:
         """Make the solved state the start of the next increment, history included. Collective."""
         for contact in self.contacts:
             contact.commit()
+        self._committed_u[:] = self.u.x.array
         self._committed_force = self._norms["force"]
         self.increment += 1
+
+    def restore(self) -> None:
+        """Drop a solved increment that was not committed: u is that of the last commit again.
+
+        The history needs no restoring: it changes at `commit` alone.
+        """
+        self.u.x.array[:] = self._committed_u
+        for contact in self.contacts:
+            contact.forget()
 
 
 def _facets_held(contact: Contact, constrained: Array) -> int:

@@ -1219,3 +1219,20 @@ def test_silence(caplog):
         made = rub(fc.Frictionless(k_n=2e4))
         walk(made, path=PATH[:1])
     assert not [r for r in caplog.records if r.name.startswith("fenics_contact")]
+
+
+def test_restore_drops_what_was_not_committed() -> None:
+    """A solved increment that is not committed leaves nothing: u and history of the last commit."""
+    made = rub()
+    made.move(*PATH[1])
+    made.problem.solve()
+    made.problem.commit()
+    before, u = snapshot(made), made.scene.u.x.array.copy()
+    made.move(*PATH[2])
+    made.problem.solve()
+    assert not np.array_equal(
+        gathered(COMM, owned(made.scene.u)), gathered(COMM, u[: len(owned(made.scene.u))])
+    )
+    made.problem.restore()
+    assert identical(snapshot(made), before)
+    assert np.array_equal(made.scene.u.x.array, u)
