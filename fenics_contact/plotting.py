@@ -26,15 +26,17 @@ def plot_deformation(
     *,
     unit: str = "mm",
     title: str = "",
+    magnification: float = 1.0,
     support: Sequence[Sequence[float]] | None = None,
 ) -> None:
     """Draw the original and the deformed mesh of a plane problem over each other. Collective.
 
     Args:
         path: PNG or PDF to write.
-        u: Displacement, gdim 2; drawn at its true size.
+        u: Displacement, gdim 2.
         unit: Unit of length, for the axes.
         title: Title.
+        magnification: Factor by which the displacement is drawn.
         support: End points of a line to draw as the rigid support, shape (2, 2).
 
     Raises:
@@ -51,7 +53,7 @@ def plot_deformation(
     order = [0, 1, 3, 2] if mesh.topology.cell_type == CellType.quadrilateral else [0, 1, 2]
     cells = corners.dofmap.list[: mesh.topology.index_map(2).size_local][:, order]
     original = corners.tabulate_dof_coordinates()[:, :2][cells]
-    deformed = original + at_corners.x.array.reshape(-1, 2)[cells]
+    deformed = original + magnification * at_corners.x.array.reshape(-1, 2)[cells]
     gathered = mesh.comm.gather((original, deformed))
     if gathered is None:
         return
@@ -70,7 +72,9 @@ def plot_deformation(
         )
     )
     axes.plot([], [], color=_COLOURS["mesh"], label="original")
-    axes.plot([], [], color=_COLOURS["pressure"], label="deformed (true scale)")
+    true = magnification == 1.0
+    label = "deformed (true scale)" if true else f"displacement × {magnification:g}"
+    axes.plot([], [], color=_COLOURS["pressure"], label=label)
     if support is not None:
         ends = np.asarray(support)
         axes.plot(ends[:, 0], ends[:, 1], color="black", linewidth=2, label="rigid support")
@@ -109,7 +113,8 @@ def plot_tractions(
     figure, axes = plt.subplots(figsize=(7.6, 4.8), layout="constrained")
     x, status = points["x"][:, 0], points["status"]
     closed = status != Status.OPEN
-    reach = 1.15 * np.abs(x[closed]).max(initial=0.0) or 1.0
+    # Somewhat beyond the contact, but not beyond Γc.
+    reach = min(1.15 * np.abs(x[closed]).max(initial=0.0), np.abs(x).max(initial=0.0)) or 1.0
     near = np.abs(x) <= reach
     axes.plot(x[near], points["pressure"][near], ".-", color=_COLOURS["pressure"], label="pressure")
     # The shear on the body, along x: the direction in which the support holds it.

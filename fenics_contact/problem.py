@@ -199,6 +199,7 @@ class ContactProblem:
         self._norms = {"residual": 0.0, "force": 0.0, "floor": 0.0}
         self._committed_force = self._start_residual = 0.0
         self._committed_u = u.x.array.copy()
+        self._rate: Array | None = None
         self._configure(method, dict(petsc_options or {}), prefix)
 
     # ---- construction ----------------------------------------------------------------------------
@@ -507,15 +508,17 @@ class ContactProblem:
         if self._pairings != [c.pairings for c in self.contacts]:
             self._make_matrices()
         self._approach()
-        self._solution.array[:] = self.u.x.array[: self._n_owned] / self._length
-        self._start_residual = 0.0
-        self._compute_residual(None, self._solution, self._function)
-        self._start_residual = self._norms["residual"]
-        if self._quasi_newton:
-            iterations, reason = self._solve_quasi_newton(stiffness_changed)
-        else:
-            self.snes.solve(None, self._solution)
-            iterations, reason = self.snes.getIterationNumber(), self.snes.getConvergedReason()
+        iterations = 0
+        for guess in self._starts():
+            self._solution.array[:] = guess / self._length
+            if self._quasi_newton:
+                made, reason = self._solve_quasi_newton(stiffness_changed)
+            else:
+                self.snes.solve(None, self._solution)
+                made, reason = self.snes.getIterationNumber(), self.snes.getConvergedReason()
+            iterations += made
+            if reason > 0:
+                break
         self._set_u(self._solution)
         verdict = self._judge()
         if reason <= 0 or verdict.failures:
@@ -548,6 +551,29 @@ class ContactProblem:
         if self.bulk.linear:
             self.motions.check_balance(self._load, self.contacts)
 
+    def _starts(self) -> list[Array]:
+        """Displacements to start from, the one nearest to equilibrium first. Collective.
+
+        The present state, and that state moved on by as much as the last increment moved it: in
+        proportional loading that is the solution.
+        """
+        present = self.u.x.array[: self._n_owned].copy()
+        starts = [present]
+        if self._rate is not None:
+            moved = self.u.x.array
+            moved += self._rate
+            for bc in self._bcs:
+                bc.set(moved)
+            starts.append(moved[: self._n_owned].copy())
+        residuals = []
+        self._start_residual = 0.0
+        for guess in starts:
+            self._solution.array[:] = guess / self._length
+            self._compute_residual(None, self._solution, self._function)
+            residuals.append(self._norms["residual"])
+        self._start_residual = residuals[0]
+        return [starts[i] for i in np.argsort(residuals, kind="stable")]
+
     def _approach(self) -> None:
         """Move bodies that nothing holds yet to first touch, along their load. Collective."""
         for contact in self.contacts:
@@ -573,7 +599,7 @@ class ContactProblem:
         else:
             self._clear_pairs()
         iterations = stalls = 0
-        best, kept = self._start_residual, self._solution.copy()
+        best, kept = np.inf, self._solution.copy()
         while True:
             snes.setTolerances(max_it=min(_REFRESH_EVERY, self._max_it - iterations))
             snes.solve(None, self._solution)
@@ -629,6 +655,7 @@ class ContactProblem:
         """Make the solved state the start of the next increment, history included. Collective."""
         for contact in self.contacts:
             contact.commit()
+        self._rate = self.u.x.array - self._committed_u
         self._committed_u[:] = self.u.x.array
         self._committed_force = self._norms["force"]
         self.increment += 1

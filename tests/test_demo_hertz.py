@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import itertools
-import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from mpi4py import MPI
-
-ROOT = Path(__file__).parent.parent
-DEMO = ROOT / "demos" / "hertz.py"
+from running import run_demo
 
 pytestmark = [
     pytest.mark.demo,
@@ -23,17 +17,7 @@ pytestmark = [
 
 
 def run(folder: Path, *options: str, ranks: int = 1) -> dict[str, Any]:
-    """Run the demo in a process (or several) of its own and return its result.json."""
-    command = [sys.executable, str(DEMO), *options, "--output", str(folder)]
-    if ranks > 1:
-        command = ["mpirun", "--oversubscribe", "-n", str(ranks), *command]
-    # What mpirun left in the environment of this process would make the new one join it.
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
-    environment["PYTHONPATH"] = str(ROOT)
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "%|" not in done.stderr, "the progress bar must be silent when not on a terminal"
-    return json.loads((folder / "result.json").read_text())
+    return run_demo("hertz", folder, *options, ranks=ranks)
 
 
 def test_paper_mesh_writes_everything(tmp_path: Path) -> None:
@@ -98,13 +82,8 @@ def test_thin_contact_is_hertz(tmp_path: Path) -> None:
 
 def test_pressure_error_falls_with_h(tmp_path: Path) -> None:
     """The convergence run prints a rate; a pressure that ends like a square root allows 1."""
-    folder = tmp_path
-    command = [sys.executable, str(DEMO), "--convergence", "--degree", "2", "--output", str(folder)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "fitted rate" in done.stdout
-    study = json.loads((folder / "convergence.json").read_text())
+    study = run(tmp_path, "--convergence", "--degree", "2")
+    assert "fitted rate" in study["stdout"]
     errors = [row["pressure_error"] for row in study["rows"]]
     assert all(fine < coarse for coarse, fine in itertools.pairwise(errors))
     assert 0.7 < study["rate"] < 1.3
