@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -207,10 +208,11 @@ class ContactProblem:
     def _constrained_dofs(self) -> npt.NDArray[np.bool_]:
         mask = np.zeros(self._n_owned, dtype=np.bool_)
         for bc in self._bcs:
-            dofs, n_owned = bc.dof_indices()
+            dofs, _ = bc.dof_indices()
             if self._comm.allreduce(int(dofs.size and dofs.max() >= self.u.x.array.size)):
                 raise ValueError("a Dirichlet condition is on another function space than u")
-            mask[dofs[:n_owned]] = True
+            # Their number of owned dofs, which comes with them, is wrong for blocked conditions.
+            mask[dofs[dofs < self._n_owned]] = True
         return mask
 
     def _check_contacts(self) -> None:
@@ -274,7 +276,6 @@ class ContactProblem:
         snes = PETSc.SNES().create(self._comm)
         snes.setOptionsPrefix(prefix)
         snes.setSolution(self._solution)
-        snes.setConvergenceTest(self._test_convergence)
         self.snes = snes
         self._attach(consistent=False)
         snes.setFromOptions()
@@ -314,9 +315,16 @@ class ContactProblem:
     def _attach(self, *, consistent: bool) -> None:
         """Give SNES its callbacks and the linear solver for H₀ or the consistent tangent."""
         self._consistent = consistent
+        # Weak, so that SNES does not keep the problem that keeps SNES: the garbage collector would
+        # free such a cycle, at another time on every rank, and to free a factorisation is
+        # collective.
+        this: ContactProblem = weakref.proxy(self)
         self.snes.setKSP(self._solvers[consistent])
-        self.snes.setFunction(self._compute_residual, self._function)
-        self.snes.setJacobian(self._compute_jacobian, self._matrices[consistent])
+        self.snes.setFunction(lambda _, x, f: this._compute_residual(x, f), self._function)
+        self.snes.setJacobian(
+            lambda _, x, J, P: this._compute_jacobian(x, J), self._matrices[consistent]
+        )
+        self.snes.setConvergenceTest(lambda _, it, norms: this._test_convergence(norms))
 
     @property
     def _has_potential(self) -> bool:
@@ -336,7 +344,7 @@ class ContactProblem:
             contact.add_force(vector.petsc_vec)
         return vector.array[: self._n_owned]
 
-    def _compute_residual(self, snes: PETSc.SNES | None, x: PETSc.Vec, f: PETSc.Vec) -> None:
+    def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         self._set_u(x)
         # A trial of the line search may overflow; the convergence test sees it.
         with np.errstate(all="ignore"):
@@ -375,7 +383,7 @@ class ContactProblem:
     def _tolerance(self) -> float:
         return max(self._rtol * self._norms["force"], self._norms["floor"])
 
-    def _test_convergence(self, snes: PETSc.SNES, it: int, norms: tuple[float, ...]) -> int:
+    def _test_convergence(self, norms: tuple[float, ...]) -> int:
         reasons = PETSc.SNES.ConvergedReason
         if not np.isfinite(norms[2]):
             return int(reasons.DIVERGED_FNORM_NAN)
@@ -383,7 +391,7 @@ class ContactProblem:
             return int(reasons.CONVERGED_FNORM_RELATIVE)
         return int(reasons.ITERATING)
 
-    def _compute_jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
+    def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
         if self._quasi_newton:
             return  # H₀ is made between the rounds, and kept for all iterations of one
         self._set_u(x)
@@ -569,7 +577,7 @@ class ContactProblem:
         self._start_residual = 0.0
         for guess in starts:
             self._solution.array[:] = guess / self._length
-            self._compute_residual(None, self._solution, self._function)
+            self._compute_residual(self._solution, self._function)
             residuals.append(self._norms["residual"])
         self._start_residual = residuals[0]
         return [starts[i] for i in np.argsort(residuals, kind="stable")]
@@ -604,7 +612,7 @@ class ContactProblem:
             snes.setTolerances(max_it=min(_REFRESH_EVERY, self._max_it - iterations))
             snes.solve(None, self._solution)
             iterations += snes.getIterationNumber()
-            self._compute_residual(None, self._solution, self._function)
+            self._compute_residual(self._solution, self._function)
             residual = self._norms["residual"]
             if residual <= self._tolerance():
                 return iterations, int(reasons.CONVERGED_FNORM_RELATIVE)

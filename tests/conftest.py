@@ -31,3 +31,9 @@ def pytest_runtest_teardown(item: pytest.Item) -> None:
     """Destroy objects on all ranks at once: destructors of PETSc and DOLFINx may be collective."""
     gc.collect()
     MPI.COMM_WORLD.barrier()
+
+
+def pytest_sessionstart() -> None:
+    """In parallel, collect garbage between tests alone: what errors keep is freed there."""
+    if MPI.COMM_WORLD.size > 1:
+        gc.disable()

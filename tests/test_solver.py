@@ -1,6 +1,8 @@
 """ContactProblem: equilibrium, failures, units, methods, options, ranks, verdict, bulk forms."""
 
+import gc
 import logging
+import weakref
 from dataclasses import dataclass
 
 import dolfinx
@@ -1219,6 +1221,22 @@ def test_silence(caplog):
         made = rub(fc.Frictionless(k_n=2e4))
         walk(made, path=PATH[:1])
     assert not [r for r in caplog.records if r.name.startswith("fenics_contact")]
+
+
+def test_a_problem_is_freed_without_the_garbage_collector() -> None:
+    """No cycle of references: ranks free their factorisations together, where the name goes."""
+    made = rub()
+    made.move(*PATH[1])
+    made.problem.solve()
+    gc.collect()
+    gc.disable()
+    try:
+        alive = weakref.ref(made.problem)
+        made.problem = None
+        assert alive() is None
+    finally:
+        if COMM.size == 1:
+            gc.enable()
 
 
 def test_restore_drops_what_was_not_committed() -> None:
