@@ -280,9 +280,9 @@ def _bodies(space: fem.FunctionSpace) -> tuple[int, npt.NDArray[np.intp]]:
     offset = comm.scan(n_parts) - n_parts
     # A ghost belongs to a part here and to one on its owner: the two are one body.
     label = fem.Function(space)
-    label.x.array.reshape(n_nodes, -1)[:, 0] = offset + part
+    label.x.array.reshape(n_nodes, dofmap.bs)[:, 0] = offset + part
     label.x.scatter_forward()
-    owner = label.x.array.reshape(n_nodes, -1)[n_owned:, 0].astype(np.int64)
+    owner = label.x.array.reshape(n_nodes, dofmap.bs)[n_owned:, 0].astype(np.int64)
     pairs = np.unique(np.column_stack([owner, offset + part[n_owned:]]), axis=0)
     pairs = np.concatenate(comm.allgather(pairs))
     total = comm.allreduce(n_parts)
