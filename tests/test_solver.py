@@ -722,7 +722,6 @@ def test_a_wrong_contact_residual_is_caught(method, factor):
     assert any("balance" in f for f in caught.value.verdict.failures)
 
 
-@pytest.mark.skipif(COMM.size > 1, reason="patches the solver from inside: one process is enough")
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_a_premature_end_is_caught(method, monkeypatch):
     """SNES that claims convergence at its first look is not believed; the state is as before."""
