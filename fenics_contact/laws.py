@@ -101,6 +101,24 @@ class Law:
             f"{type(self).__name__} has no potential: its slip is not associated (eq. 46)"
         )
 
+    def stored(self, response: Response, parameters: Mapping[str, Expr]) -> Expr:
+        """Energy per area in the springs, r_n²/2k_n + |τ|²/2k_t."""
+        stored = ufl.as_ufl(0.0)
+        if self.unilateral:
+            stored += response.normal_traction**2 / (2 * parameters["k_n"])
+        if response.traction is not None:
+            stored += ufl.dot(response.traction, response.traction) / (2 * parameters["k_t"])
+        return stored
+
+    def dissipated(
+        self, kinematics: Kinematics, response: Response, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """Work per area of friction on the slip of the increment, -τ·(Δu_t + Δτ/k_t) ≥ 0."""
+        assert response.traction is not None
+        assert kinematics.traction is not None and kinematics.tangential_increment is not None
+        stretched = (response.traction - kinematics.traction) / parameters["k_t"]
+        return -ufl.dot(response.traction, kinematics.tangential_increment + stretched)
+
     @staticmethod
     def n_modes(gdim: int) -> int:
         """Slip modes: ± in the plane (eq. 29), the one cone in space."""
