@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.spatial
 from dolfinx import fem, la
+from mpi4py import MPI
 
 from fenics_contact.contact import Contact
 from fenics_contact.parallel import collective_errors, gather_rows
@@ -44,7 +45,7 @@ def save(problem: ContactProblem, path: str | Path, numbers: Sequence[float] = (
     The file is complete or as before, whenever the program is ended: it is written under another
     name, and then renamed. What the solver knows from earlier increments is dropped, here as in a
     program that starts from the file, so that both go on with the same digits (on several ranks
-    but for the last: there MUMPS adds in the order in which messages come).
+    to the solver's tolerance: there MUMPS adds in the order in which messages come).
 
     Args:
         problem: At a committed state.
@@ -95,16 +96,15 @@ def load(problem: ContactProblem, path: str | Path) -> list[float]:
             f"{path} holds {sorted(arrays)}, this problem has {sorted(wanted)}: it is the file of "
             "another problem; remove it to start anew"
         )
-    with collective_errors(comm):
-        nodes = _find(arrays["nodes"], _node_places(space), problem.motions.size, str(path))
+    size = problem.motions.size
+    nodes = _find(comm, arrays["nodes"], _node_places(space), size, path)
     dofs = nodes.reshape(len(nodes), 2, -1)
     state, rate = (
         problem.unknowns.joined(dofs[:, i].ravel(), arrays["motions"][i]) for i in range(2)
     )
     for contact in problem.contacts:
-        places = _point_places(contact)
-        with collective_errors(comm):
-            rows = _find(arrays[f"contact {contact.name}"], places, problem.motions.size, str(path))
+        stored = arrays[f"contact {contact.name}"]
+        rows = _find(comm, stored, _point_places(contact), size, path)
         contact.history.set_rows(rows)
     increment, force, *numbers = (float(value) for value in arrays["numbers"])
     problem.set_committed(state, rate, int(increment), force)
@@ -131,16 +131,18 @@ def _gather(problem: ContactProblem, places: Array, values: list[Array]) -> Arra
     return gather_rows(problem.u.function_space.mesh.comm, np.hstack([places, *columns]))
 
 
-def _find(stored: Array, places: Array, size: float, path: str) -> Array:
-    """The stored values at given places, (n, n_values)."""
+def _find(comm: MPI.Comm, stored: Array, places: Array, size: float, path: str | Path) -> Array:
+    """The stored values at given places, (n, n_values). Collective."""
     width = places.shape[1]
-    if stored.shape[1] < width:
-        raise ValueError(f"{path} is of another problem: its places have other dimensions")
-    distance, row = scipy.spatial.cKDTree(stored[:, :width]).query(places)
-    if np.any(distance > _SAME * size):
+    missing, row = len(places), np.zeros(0, dtype=np.int64)
+    if stored.shape[1] > width and len(stored):
+        distance, row = scipy.spatial.cKDTree(stored[:, :width]).query(places)
+        missing = int(np.count_nonzero(distance > _SAME * size))
+    missing = comm.allreduce(missing)
+    if missing:
         raise ValueError(
-            f"{path} is of another mesh, element or quadrature rule: {np.sum(distance > _SAME)} "
-            "places of this problem are not in it; remove it to start anew"
+            f"{path} is of another mesh, element or quadrature rule: {missing} places of this "
+            "problem are not in it; remove it to start anew"
         )
     return stored[row, width:]
 
