@@ -79,6 +79,8 @@ class Contact:
         gap_prescribed: Whether the gap was given apart from the geometry.
         n_unpaired: Points whose normal meets no opposite surface (deformable support).
         pairings: How often opposites were found: the couplings change with each.
+        committed_jump: Displacement relative to the support at the last commit, (n_points, gdim),
+            between the places that are opposite each other from then on.
     """
 
     def __init__(
@@ -513,15 +515,18 @@ class Contact:
         """Whether contact ties unknowns together that the bulk does not."""
         return not self.rigid or bool(self.free_motion)
 
-    def pair(self) -> None:
-        """Find the opposites of all points in the undeformed bodies. Collective.
+    def pair(self, u: fem.Function | None = None) -> None:
+        """Find the opposites of all points. Collective.
+
+        Args:
+            u: Displacement of the bodies in which to find them; none: the undeformed bodies.
 
         Points that find none are open, whatever they do, and counted in ``n_unpaired``.
         """
         assert self._opposite is not None
         mesh, d = self.surface.mesh, self._gdim
         points = self._evaluate_points()
-        opposite, distance = self._opposite.pair(points["x"], points["normal"], None)
+        opposite, distance = self._opposite.pair(points["x"], points["normal"], u)
         paired = ~np.isnan(distance)
         extent = global_max(mesh.comm, mesh.geometry.x) - global_min(mesh.comm, mesh.geometry.x)
         self._distance.x.array[: len(paired)] = np.where(paired, distance, 10 * extent)
@@ -592,6 +597,14 @@ class Contact:
                 "slip": self.history.values("slip") + points["slip_increment"],
             }
         self.history.commit(values)
+        self.committed_jump = points["jump"]
+        if isinstance(self.support, DeformableBody) and self.support.update == "increment":
+            # The traction stays with the points of Γc; what they slip over has moved on.
+            self.pair(self.u)
+            self.committed_jump = self._values["jump"]
+            if self.law.has_friction:
+                self.history.commit(values | {"jump": self.committed_jump})
+            self._points = points  # results stay those of the solution
 
     @property
     def _values(self) -> dict[str, Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -75,6 +76,11 @@ class EnergyState:
         ways = [np.stack([c.traction, c.values["jump"], c.values["shift"]]) for c in contacts]
         springs = sum(float(c.measure @ c.values["stored"]) for c in contacts)
         return cls(unknowns, internal, external, ways, springs)
+
+    def between(self, jumps: Sequence[Array]) -> EnergyState:
+        """The same state with the displacements relative to supports taken between new pairs."""
+        ways = [np.stack([w[0], jump, w[2]]) for w, jump in zip(self.contacts, jumps, strict=True)]
+        return dataclasses.replace(self, contacts=ways)
 
     def since(self, before: EnergyState, contacts: Sequence[Contact], comm: MPI.Comm) -> Energy:
         """Energies on the way from ``before`` to here. Collective."""

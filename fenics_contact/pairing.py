@@ -50,16 +50,22 @@ class DeformableBody(Support):
         facet_tags: Tags on the facets of the mesh.
         tags: Tag, or tags, of the opposite surface.
         reach: Points whose opposite lies farther (length) than this have none; no limit by default.
+        update: "never": the pairs are those of the undeformed bodies; "increment": they are found
+            anew in the deformed bodies at every commit, for slip over many facets. Normals stay
+            those of the undeformed Γc (small rotations).
     """
 
     facet_tags: dolfinx.mesh.MeshTags
     tags: int | Sequence[int]
     reach: float = np.inf
+    update: str = "never"
 
     def __post_init__(self) -> None:
         """Refuse what has no sense."""
         if not self.reach > 0:
             raise ValueError(f"reach is {self.reach!r}; it must be a length greater than zero")
+        if self.update not in ("never", "increment"):
+            raise ValueError(f"update is {self.update!r}; use 'never' or 'increment'")
 
 
 class Opposite:

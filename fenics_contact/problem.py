@@ -293,7 +293,7 @@ class ContactProblem:
             default(_LINEAR | factorisation, ksp.getOptionsPrefix())
             ksp.setFromOptions()
             self._solvers[consistent] = ksp
-        self._make_matrices()
+        self._allocate_matrices()
         snes = PETSc.SNES().create(self._comm)
         snes.setOptionsPrefix(prefix)
         snes.setSolution(self._solution)
@@ -312,6 +312,11 @@ class ContactProblem:
         return self.bulk.symmetric and (not consistent or self._has_potential)
 
     def _make_matrices(self) -> None:
+        """New matrices for new couplings, or to forget all that was factored. Collective."""
+        self._allocate_matrices()
+        self._attach(consistent=not self._quasi_newton)
+
+    def _allocate_matrices(self) -> None:
         """Allocate the matrices of H₀ and of the consistent tangent. Collective.
 
         Their pattern is that of the bulk and, with deformable or moving supports, of the pairs.
@@ -718,7 +723,7 @@ class ContactProblem:
         state = self._state()
         self._rate = state - self._committed
         self._committed = state
-        self._committed_energy = self._energy
+        self._committed_energy = self._energy.between([c.committed_jump for c in self.contacts])
         self.committed_force = self._norms["force"]
         self.increment += 1
 

@@ -216,9 +216,9 @@ def test_going_on_gives_the_same_digits(cell, method, every, tmp_path):
     """A history broken off after 5 of 8 increments and taken up by a new problem, bit for bit.
 
     On several ranks MUMPS adds in the order in which messages come: no two runs agree in the last
-    bit, and the solver's tolerance stands for the same digits.
+    bit, and two solutions within the tolerance of 1e-9 on the residual are compared.
     """
-    same = 0.0 if COMM.size == 1 else 1e-9
+    same = 0.0 if COMM.size == 1 else 1e-7
     folder = shared_folder(tmp_path)
     whole, broken, after = (Rub(cell, method=method) for _ in range(3))
     options = {"steps": 8, "checkpoint_every": every}

@@ -23,16 +23,24 @@ E = 1e6
 pytestmark = pytest.mark.mpi
 
 
-def two_blocks(cell: str, n: tuple[int, int], widths: tuple[float, float] = (1.0, 1.0)):
-    """Two stacked blocks of height 1/2 whose meshes do not match, and their tags."""
+def two_blocks(
+    cell: str, n: tuple[int, int], widths: tuple[float, float] = (1.0, 1.0), shift: float = 0.0
+):
+    """Two stacked blocks of height 1/2 whose meshes do not match, and their tags.
+
+    The upper one stands ``shift`` along x, and in its middle across.
+    """
     d = dimension(cell)
     x, cells, offset = [], [], 0
     for count, width, low in zip(n, widths, (0.0, 0.5), strict=True):
-        counts = (count,) * (d - 1) + (max(1, count // 2),)
+        counts = (count,) * (d - 1) + (max(1, round(count / width) // 2),)
         make = dolfinx.mesh.create_rectangle if d == 2 else dolfinx.mesh.create_box
         corners = [np.r_[np.zeros(d - 1), low], np.r_[np.full(d - 1, width), low + 0.5]]
         block = make(MPI.COMM_SELF, corners, counts, CellType[cell])
-        x.append(block.geometry.x[:, :d])
+        x.append(block.geometry.x[:, :d].copy())
+        if low > 0 and shift > 0:
+            x[-1][:, 0] += shift
+            x[-1][:, 1 : d - 1] += (widths[0] - width) / 2
         cells.append(block.geometry.dofmap.astype(np.int64) + offset)
         offset += len(x[-1])
     x, cells = np.concatenate(x), np.concatenate(cells)

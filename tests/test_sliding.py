@@ -1,0 +1,124 @@
+"""Slip over many facets of the opposite body: the pairs are found anew at every increment."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import close, gathered, owned, raised_everywhere
+from test_two_bodies import BOTTOM, LOWER, TOP, UPPER, elasticity, two_blocks
+
+import fenics_contact as fc
+
+COMM = MPI.COMM_WORLD
+K_N = 1e7
+
+pytestmark = pytest.mark.mpi
+
+
+class Slider:
+    """A block of width 1 that stands at ``start`` on one of width 4, its top moved."""
+
+    def __init__(self, cell, law, *, start, update="increment", method="lbfgs", n=(14, 4)):
+        """Make it, unloaded."""
+        mesh, tags = two_blocks(cell, n, (4.0, 1.0), start)
+        d = mesh.geometry.dim
+        V = fem.functionspace(mesh, ("Lagrange", 1, (d,)))
+        self.u, v = fem.Function(V), ufl.TestFunction(V)
+        self.move = [fem.Constant(mesh, 0.0) for _ in range(d)]
+        fixed = fem.Constant(mesh, 0.0)
+        bcs = []
+        for tag, values in ((BOTTOM, [fixed] * d), (TOP, self.move)):
+            for i, value in enumerate(values):
+                dofs = fem.locate_dofs_topological(V.sub(i), d - 1, tags.find(tag))
+                bcs.append(fem.dirichletbc(value, dofs, V.sub(i)))
+        surface = fc.ContactSurface(mesh, tags, UPPER)
+        base = fc.DeformableBody(tags, LOWER, update=update)
+        self.contact = fc.Contact(self.u, surface, base, law)
+        F = elasticity(self.u, v, 0.3)
+        self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=[self.contact], method=method)
+
+    def step(self, down, along) -> fc.Step:
+        """Move the top, solve and commit."""
+        self.move[-1].value, self.move[0].value = -down, along
+        step = self.problem.solve()
+        self.problem.commit()
+        return step
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
+def test_found_where_the_body_has_gone(cell):
+    """A block that was carried over the base and then pressed is one that stood there before.
+
+    Both solve the same equations, to the solver's tolerance.
+    """
+    n = (14, 4) if cell in ("triangle", "quadrilateral") else (7, 2)
+    law = fc.Frictionless(k_n=K_N)
+    carried, standing = (Slider(cell, law, start=s, n=n) for s in (0.4, 1.73))
+    carried.step(-0.01, 1.33)  # lifted, so that nothing touches
+    assert carried.contact.resultants().normal_force == 0.0
+    carried.step(0.002, 1.33)
+    standing.step(0.002, 0.0)
+    assert standing.contact.resultants().normal_force > 0
+    a, b = carried.contact.gather(), standing.contact.gather()
+    assert close(a["pressure"], b["pressure"], 1e-7)
+    # Without the update the pairs would still be those of the start.
+    held = Slider(cell, law, start=0.4, n=n, update="never")
+    held.step(-0.01, 1.33)
+    held.step(0.002, 1.33)
+    assert not close(held.contact.gather()["pressure"], b["pressure"], 1e-3)
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_steady_sliding(cell, method):
+    """Dragged over five facets of the base: T = μN at every step, and N hardly changes.
+
+    So far from its ends N would not change at all but for the facets of the base: 1 %.
+    """
+    made = Slider(cell, fc.Coulomb(0.3, k_n=K_N, k_t=K_N), start=0.8, method=method)
+    made.step(0.002, 0.0)
+    normal = []
+    for along in np.linspace(0.1, 1.5, 15):
+        step = made.step(0.002, along)
+        r = step.contacts["contact"]
+        assert r.stick == 0
+        assert close(r.tangential_force, 0.3 * r.normal_force, 1e-9)
+        normal.append(r.normal_force)
+        assert step.energy.dissipation > 0
+    normal = np.array(normal[3:])
+    assert np.abs(normal / normal.mean() - 1).max() < 0.01
+    # The friction's work over each step is T times the way, slip being all of it when steady.
+    assert close(step.energy.dissipation, 0.3 * normal[-1] * 0.1, 0.01)
+
+
+def test_traction_stays_with_the_points():
+    """Sticking points whose pairs are found anew keep their traction: nothing creeps."""
+    made = Slider("quadrilateral", fc.Coulomb(5.0, k_n=K_N, k_t=K_N), start=1.1)
+    made.step(0.002, 0.0)
+    made.step(0.002, 1e-4)
+    before = owned(made.u).copy()
+    shear = made.contact.resultants().force[0]
+    for _ in range(3):
+        made.step(0.002, 1e-4)
+    assert close(gathered(COMM, owned(made.u)), gathered(COMM, before), 1e-3)
+    assert close(made.contact.resultants().force[0], shear, 1e-2)
+    assert made.contact.resultants().stick > 0
+
+
+def test_off_the_edge_points_are_open_and_counted():
+    """Points pushed past the end of the base have no opposite any more."""
+    made = Slider("quadrilateral", fc.Frictionless(k_n=K_N), start=2.7)
+    made.step(0.002, 0.0)
+    assert made.contact.n_unpaired == 0
+    for along in (0.3, 0.6):
+        made.step(0.002, along)
+    assert made.contact.n_unpaired > 0
+    assert made.contact.resultants().normal_force > 0
+
+
+def test_update_has_two_values():
+    """Anything else is refused."""
+    mesh, tags = two_blocks("triangle", (3, 4))
+    assert mesh is not None
+    raised_everywhere(lambda: fc.DeformableBody(tags, LOWER, update="step"), ValueError, "update")
