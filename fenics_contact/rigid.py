@@ -144,10 +144,10 @@ class RigidMotions:
             if closed_only:
                 weights = weights * (contact.status != Status.OPEN)
             area += contact.quadrature.weights.sum()
-            if contact.law.unilateral:
+            if contact.law.has_normal_stiffness:
                 gram += (along * weights) @ along.T
-            if contact.law.has_friction:
-                grip = weights * (values["parameter friction"] > 0)
+            if contact.law.has_tangential:
+                grip = weights * (values["grip"] > 0)
                 across = modes - along[:, :, None] * values["normal"][None]
                 gram += np.einsum("mqd,q,nqd->mn", across, grip, across)
         mean = global_sum(self._comm, gram) / max(float(global_sum(self._comm, area)), 1e-300)
@@ -204,7 +204,7 @@ class RigidMotions:
         # What the load could do at most, were all of it along the motion: the scale of "zero".
         size = float(global_sum(self._comm, np.abs(free) @ np.abs(load)).max())
         for contact in contacts:
-            if not contact.law.unilateral:  # a prescribed normal traction is a load
+            if not contact.law.has_normal_stiffness:  # a prescribed normal traction is a load
                 force = -contact.values["parameter pressure"][:, None] * contact.values["normal"]
                 work = np.einsum("mqd,qd,q->m", self._at_points(contact), force, contact.measure)
                 resultant += global_sum(self._comm, work)
@@ -232,20 +232,23 @@ class RigidMotions:
         normal = values["normal"]
         d = normal.shape[1]
         directions = []
-        if contact.law.has_friction:
+        law = contact.law
+        if law.has_tangential:
             if d == 2:
                 around = [np.column_stack([-normal[:, 1], normal[:, 0]])]
                 around.append(-around[0])
             else:
                 around = _around(normal)
-            friction = values["parameter friction"][:, None]
-            if contact.law.unilateral and not contact.law.has_potential:
+            friction = values["grip"][:, None]
+            if law.has_friction and not law.has_potential:
                 enlarge = 1.0 if d == 2 else 1 / np.cos(np.pi / _CONE_SIDES)
                 directions = [-normal + enlarge * friction * t for t in around]
-            else:  # Tresca: the tangential force does not need the normal one
+            else:  # Tresca, foundation: the tangential force does not need the normal one
                 directions = [np.where(friction > 0, t, 0.0) for t in around]
-        if contact.law.unilateral:
+        if law.has_normal_stiffness:
             directions.append(-normal)
+        if law.has_tension:
+            directions.append(normal)
         modes = self._at_points(contact)
         rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
         return gather_rows(self._comm, np.concatenate(rays).reshape(-1, len(self.free)))
