@@ -432,8 +432,9 @@ class FrictionLaw(Law):
         return super().positive | axes
 
     def _friction_parameters(self) -> dict[str, Any]:
-        names = ("friction", "k_t", "transverse_friction", "direction")
-        return {n: getattr(self, n) for n in names if getattr(self, n) is not None}
+        optional = {"transverse_friction": self.transverse_friction, "direction": self.direction}
+        given = {name: value for name, value in optional.items() if value is not None}
+        return {"friction": self.friction, "k_t": self.k_t} | given
 
     def check_dimension(self, gdim: int) -> None:
         """See `Law.check_dimension`."""

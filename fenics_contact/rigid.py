@@ -211,9 +211,11 @@ class RigidMotions:
         if np.abs(resultant).max() <= _BALANCED * size:
             return
         rays = np.concatenate([self._rays(contact) for contact in contacts], axis=0)
-        # Unit columns: a ray's length has no meaning, and badly scaled ones spoil the solution.
+        # Unit columns: a ray's length has no meaning, and badly scaled ones spoil the solution. One
+        # of rounding only, such as that of tangential forces on a motion across them, is none.
         length = np.linalg.norm(rays, axis=1)
-        rays = rays[length > 0] / length[length > 0, None]
+        felt = length > _FELT
+        rays = rays[felt] / length[felt, None]
         rest = np.abs(resultant).max()
         if len(rays):
             rest = scipy.optimize.nnls(rays.T, -resultant / rest)[1] * rest
