@@ -304,3 +304,47 @@ def test_sliding_aslant(cell, kind, method):
     assert found.slip > 0 and found.stick == 0
     assert close(found.force[:2] / found.normal_force, -expected, 1e-6)
     assert {"cone", "slip", "dissipation"} <= set(step.verdict.laws["contact"])
+
+
+@pytest.mark.parametrize(
+    ("what", "claim"),
+    [("nothing", ""), ("metric", "slip"), ("friction", "cone"), ("modes", "dissipation")],
+)
+def test_an_anisotropic_law_that_lies_is_caught(what, claim):
+    """Traction and slip of the ellipse, or of a polygon, against another surface or metric."""
+    options = {"modes": 5} if what == "modes" else {"transverse_friction": 0.1}
+
+    class Changed(fc.Coulomb):
+        """A law whose return map is not that of what it claims."""
+
+        def parameters(self):
+            """Those of Coulomb's law."""
+            return fc.Coulomb(
+                self.friction, self.k_n, self.k_t, direction=self.direction, **options
+            ).parameters()
+
+        def tangential_stiffness(self, kinematics, parameters):
+            """In one case as without the stretch."""
+            if what == "metric":
+                return fc.laws.Law.tangential_stiffness(self, kinematics, parameters)
+            return super().tangential_stiffness(kinematics, parameters)
+
+        def yield_functions(self, kinematics, traction, limit, parameters):
+            """In two cases of less friction across, or of other sides."""
+            if what == "friction":
+                less = 0.9 * parameters["transverse_friction"]
+                parameters = dict(parameters) | {"transverse_friction": less}
+            found = super().yield_functions(kinematics, traction, limit, parameters)
+            return (*found[1:], found[0]) if what == "modes" else found
+
+    scene = block("tetrahedron")
+    law = Changed(0.3, 1e4, 1e3, direction=(1.0, 0.0, 0.0), **options)
+    contact = scene.contact(law)
+    scene.u.interpolate(lambda x: np.vstack([0.1 + 0 * x[0], 0.07 + 0 * x[0], -0.01 + 0 * x[0]]))
+    contact.evaluate()
+    assert np.all(gathered(COMM, contact.status) == fc.Status.SLIP)
+    found = fc.verdict.check_laws(contact)
+    if claim:
+        assert found[claim] > 1e-3
+    else:
+        assert max(found.values()) <= 1e-13
