@@ -6,7 +6,7 @@ from fenics_contact.laws import Coulomb, Foundation, Frictionless, Scaled, Sprin
 from fenics_contact.pairing import DeformableBody
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.stepping import increments
-from fenics_contact.supports import Ball, Cylinder, HalfSpace, Obstacle
+from fenics_contact.supports import Ball, Cylinder, HalfSpace, Motion, Obstacle
 from fenics_contact.surface import ContactSurface
 from fenics_contact.verdict import NotConverged, Verdict
 
@@ -21,6 +21,7 @@ __all__ = [
     "Foundation",
     "Frictionless",
     "HalfSpace",
+    "Motion",
     "NotConverged",
     "Obstacle",
     "Resultants",

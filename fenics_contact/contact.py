@@ -19,8 +19,9 @@ from fenics_contact.history import History
 from fenics_contact.laws import Kinematics, Law, Scaled, Springs
 from fenics_contact.pairing import DeformableBody, Opposite
 from fenics_contact.parallel import gather_rows, global_max, global_min, global_sum
-from fenics_contact.supports import Placement, Support, nonzero_vector
+from fenics_contact.supports import Motion, Placement, Support, nonzero_vector
 from fenics_contact.surface import ContactSurface, PointEvaluator, VertexAreas
+from fenics_contact.unknowns import Unknowns
 
 __all__ = ["Contact", "Resultants", "Status"]
 
@@ -75,6 +76,9 @@ class Contact:
             by name ("friction", "k_n", "displacement" …): set ``.value`` to change it.
         entity_maps: For compiling `form` in a problem of one's own.
         name: In messages and files.
+        free_motion: Components of the support's displacement that follow from the force on it, as
+            scalar constants by number of the component: their values are results (length).
+        applied_force: The forces on it, likewise (force).
         gap_prescribed: Whether the gap was given apart from the geometry.
         n_unpaired: Points whose normal meets no opposite surface (deformable support).
         pairings: How often opposites were found: the couplings change with each.
@@ -135,8 +139,14 @@ class Contact:
             self.set_modulus(modulus)
 
         shift = support.displacement
-        if shift is not None:
+        self.free_motion: dict[int, fem.Constant] = {}
+        self.applied_force: dict[int, Any] = {}
+        self._free_shift: dict[int, ufl.core.expr.Expr] = {}
+        if isinstance(shift, Motion):
+            shift = self._moving(shift)
+        elif shift is not None:
             shift = self._to_ufl("displacement", shift)
+        if shift is not None:
             if shift.ufl_shape != (gdim,):
                 raise ValueError(
                     f"{name}: displacement of the support has shape {shift.ufl_shape}; the mesh "
@@ -169,6 +179,9 @@ class Contact:
         # All of contact is a sparse map from u to the jump at the points, and the law there.
         self._own_map = self.quadrature.interpolation_matrix(u.function_space)
         self._map = self._own_map
+        self._unknowns = Unknowns(u.function_space)
+        self._first_motion = 0
+        self._felt_map = self._map
         self._jump = fem.Function(self.quadrature.space(gdim), name="jump")
         self._reaction = self._map.createVecLeft()
         kinematics = self._kinematics(self._jump)
@@ -183,12 +196,14 @@ class Contact:
             "opening": response.opening,
             "penetration": response.penetration,
             "normal_traction": response.normal_traction,
+            "jump": self._relative(self._jump),
+            "shift": self._prescribed_shift(),
+            "stored": law.stored(kinematics, response, parameters),
         } | {f"parameter {n}": v for n, v in parameters.items()}
         if law.has_tangential:
             stiffness = law.tangential_stiffness(kinematics, parameters)
             expressions |= {
                 "traction": response.traction,
-                "jump": self._relative(self._jump),
                 "grip": law.grip(parameters),
             } | {f"tangential_stiffness {i}": stiffness[i, :] for i in range(gdim)}
         if law.has_friction:
@@ -196,6 +211,7 @@ class Contact:
                 "increment": kinematics.tangential_increment,
                 "old_traction": kinematics.traction,
                 "limit": response.limit,
+                "dissipated": law.dissipated(kinematics, response, parameters),
                 "slip_increment": ufl.as_vector(response.slip),
             }
         self._evaluate_points = PointEvaluator(self.quadrature, expressions)
@@ -213,6 +229,13 @@ class Contact:
     def _relative(self, jump: Any) -> Any:
         """Displacement of the body relative to the support (UFL)."""
         return jump if self._shift is None else jump - self._shift
+
+    def _prescribed_shift(self) -> Any:
+        """Displacement of the support without its free components (UFL)."""
+        none = ufl.as_vector([0.0] * self._gdim)
+        if self._shift is None:
+            return none
+        return ufl.replace(self._shift, {c: ufl.as_ufl(0.0) for c in self.free_motion.values()})
 
     def _kinematics(self, jump: Any) -> Kinematics:
         """What the law sees of a displacement of the body at the points (UFL)."""
@@ -248,6 +271,11 @@ class Contact:
         Raises:
             ValueError: A stiffness is `Scaled` and the modulus is not known.
         """
+        if self.free_motion:
+            raise ValueError(
+                f"{self.name}: the form on Γc cannot hold the unknown motion of the support; use "
+                "ContactProblem, or prescribe the displacement"
+            )
         if not self.rigid:
             raise ValueError(
                 f"{self.name}: the form on Γc cannot reach the opposite body's unknowns; use "
@@ -276,31 +304,93 @@ class Contact:
 
     # ---- the same, point by point ----------------------------------------------------------------
 
-    def add_force(self, residual: PETSc.Vec) -> None:
-        """Add `form`, assembled at the present ``u``, to a vector over the dofs. Collective.
+    def set_unknowns(self, unknowns: Unknowns, first_motion: int) -> None:
+        """Say where the unknowns lie that the vectors and matrices below are over. Collective.
 
-        The integrals are sums over the points, -Dᵀ w t with D the map from u to the points: the
-        law is evaluated on Γc alone, whatever the element of the bulk.
+        By default they are the dofs of ``u`` alone.
+
+        Args:
+            unknowns: Those of the problem.
+            first_motion: Number of this contact's first free motion among all.
+        """
+        self._unknowns, self._first_motion = unknowns, first_motion
+        self._make_felt_map()
+
+    def _make_felt_map(self) -> None:
+        """The map from the unknowns to the body's displacement relative to the support."""
+        self._felt_map = self._unknowns.widened(self._map)
+        if self.free_motion:
+            self._felt_map = self._felt_map.copy()
+            motions = self._motion_map()
+            self._felt_map.axpy(-1.0, motions, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+            motions.destroy()
+
+    def _motion_map(self) -> PETSc.Mat:
+        """The map from the unknowns to the free displacement of the support. Collective."""
+        n, d, components = self.quadrature.n_points, self._gdim, list(self.free_motion)
+        first = self._unknowns.first_motion + self._first_motion
+        counts = np.tile(np.isin(np.arange(d), components), n)
+        columns = np.tile(first + np.arange(len(components)), n)
+        return PETSc.Mat().createAIJ(
+            ((n * d, None), (self._unknowns.n_local, None)),
+            csr=(
+                np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType),
+                columns.astype(PETSc.IntType),
+                np.ones(columns.size),
+            ),
+            comm=self.surface.mesh.comm,
+        )
+
+    def add_force(self, residual: PETSc.Vec) -> None:
+        """Add `form`, assembled at the present ``u``, to a vector over the unknowns. Collective.
+
+        The integrals are sums over the points, -Dᵀ w t with D the map from the unknowns to the
+        points: the law is evaluated on Γc alone, whatever the element of the bulk.
         """
         self._update_jump()
         traction = self._evaluate_traction()["traction"]
         self._reaction.array[:] = -(self.quadrature.weights[:, None] * traction).ravel()
-        self._map.multTransposeAdd(self._reaction, residual, residual)
+        self._felt_map.multTransposeAdd(self._reaction, residual, residual)
 
     def tangent_matrix(self) -> PETSc.Mat:
-        """`tangent`, assembled at the present ``u``, as a new matrix over the dofs. Collective."""
-        d = self._gdim
+        """`tangent`, assembled at the present ``u``, a new matrix over the unknowns. Collective."""
         if self._evaluate_tangent is None:
-            jump = ufl.variable(self._jump)
-            derivative = ufl.diff(self._total_traction(jump), jump)
-            rows = {f"{i}": self.weight * derivative[i, :] for i in range(d)}
-            self._evaluate_tangent = PointEvaluator(self.quadrature, rows)
+            self._evaluate_tangent = self._tangent_evaluator()
         self._update_jump()
         rows = self._evaluate_tangent()
-        return self._matrix(-np.stack([rows[f"{i}"] for i in range(d)], axis=1))
+        by_jump = -np.stack([rows[f"jump {i}"] for i in range(self._gdim)], axis=1)
+        if not self.free_motion:
+            return self._matrix(by_jump)
+        # Where the support moves its normals may turn: more than the opposite of ∂/∂jump.
+        by_shift = -np.stack([rows[f"shift {i}"] for i in range(self._gdim)], axis=1)
+        wide, motions = self._unknowns.widened(self._map), self._motion_map()
+        jumps, shifts = self._block_diagonal(by_jump), self._block_diagonal(by_shift)
+        right, turned = jumps.matMult(wide), shifts.matMult(motions)
+        right.axpy(1.0, turned, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        product = self._felt_map.transposeMatMult(right)
+        for item in (wide, motions, jumps, shifts, right, turned):
+            item.destroy()
+        return product
+
+    def _tangent_evaluator(self) -> PointEvaluator:
+        """Derivatives of the traction by the jump and the free motion of the support."""
+        d = self._gdim
+        jump = ufl.variable(self._jump)
+        derivative = ufl.diff(self._total_traction(jump), jump)
+        rows = {f"jump {i}": self.weight * derivative[i, :] for i in range(d)}
+        if self.free_motion:
+            traction, none = self._total_traction(self._jump), ufl.as_vector([0.0] * d)
+            by_shift = [
+                ufl.diff(traction, self._free_shift[i]) if i in self._free_shift else none
+                for i in range(d)
+            ]
+            for i in range(d):
+                row = ufl.as_vector([column[i] for column in by_shift])
+                rows[f"shift {i}"] = self.weight * row
+        return PointEvaluator(self.quadrature, rows)
 
     def stiffness_matrix(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> PETSc.Mat:
-        """Symmetric stiffness a K_n + b K_t of section 5 as a new matrix. Collective.
+        """Symmetric stiffness a K_n + b K_t of section 5, new, over the unknowns. Collective.
 
         Args:
             normal: a, a number or one per owned point.
@@ -318,13 +408,13 @@ class Contact:
         return self._matrix(values["weight"][:, None, None] * blocks)
 
     def at_points(self, displacement: Array) -> Array:
-        """Jump that a displacement makes at the points: (n_owned_dofs,) to (n_points, gdim).
+        """Displacement relative to the support: (n_local_unknowns,) to (n_points, gdim).
 
         Collective.
         """
-        vector = self._map.createVecRight()
+        vector = self._felt_map.createVecRight()
         vector.array[:] = displacement
-        self._map.mult(vector, self._reaction)
+        self._felt_map.mult(vector, self._reaction)
         vector.destroy()
         return self._reaction.array.reshape(-1, self._gdim).copy()
 
@@ -334,13 +424,20 @@ class Contact:
 
     def _matrix(self, blocks: Array) -> PETSc.Mat:
         """Dᵀ C D with C block-diagonal, one block per point: (n_points, gdim, gdim)."""
+        matrix = self._block_diagonal(blocks)
+        product = matrix.ptap(self._felt_map)
+        matrix.destroy()
+        return product
+
+    def _block_diagonal(self, blocks: Array) -> PETSc.Mat:
+        """One block per point, (n_points, gdim, gdim), times the points' weights."""
         n, d = self.quadrature.n_points, self._gdim
         first, _ = self._map.getOwnershipRange()
         blocks = self.quadrature.weights[:, None, None] * blocks
         columns = first + d * np.arange(n)[:, None, None] + np.arange(d)[None, None, :]
         columns = np.broadcast_to(columns, (n, d, d))
         size = self._map.getSizes()[0]
-        matrix = PETSc.Mat().createAIJ(
+        return PETSc.Mat().createAIJ(
             (size, size),
             csr=(
                 np.arange(0, n * d * d + 1, d, dtype=PETSc.IntType),
@@ -349,9 +446,6 @@ class Contact:
             ),
             comm=self.surface.mesh.comm,
         )
-        product = matrix.ptap(self._map)
-        matrix.destroy()
-        return product
 
     # ---- parameters ------------------------------------------------------------------------------
 
@@ -421,12 +515,29 @@ class Contact:
             self.parameters[name] = constant
         return constant
 
+    def _moving(self, motion: Motion) -> ufl.core.expr.Expr:
+        """The displacement of a support some components of which are unknown (UFL)."""
+        forces, given = motion.components(self._gdim)
+        shift: list[Any] = [None] * self._gdim
+        for i, value in given.items():
+            shift[i] = self._scalar(f"displacement {i}", value)
+        for i, value in forces.items():
+            self.applied_force[i] = value
+            self.free_motion[i] = fem.Constant(self.surface.mesh, 0.0)
+            shift[i] = self._free_shift[i] = ufl.variable(self.free_motion[i])
+        return ufl.as_vector(shift)
+
     # ---- pairs -----------------------------------------------------------------------------------
 
     @property
     def rigid(self) -> bool:
         """Whether the support is rigid: its reactions are then external to the mesh."""
         return self._opposite is None
+
+    @property
+    def couples(self) -> bool:
+        """Whether contact ties unknowns together that the bulk does not."""
+        return not self.rigid or bool(self.free_motion)
 
     def pair(self) -> None:
         """Find the opposites of all points in the undeformed bodies. Collective.
@@ -449,6 +560,7 @@ class Contact:
         opposite.destroy()
         mask.destroy()
         self._map = relative
+        self._make_felt_map()
         self.forget()
         self.n_unpaired = int(global_sum(mesh.comm, np.count_nonzero(~paired)))
         self.pairings += 1

@@ -54,6 +54,24 @@ class History:
         rows = self.function.x.array.reshape(-1, self._size)
         return rows[: self._n_owned, self._slices[name]].copy()
 
+    def rows(self) -> npt.NDArray[np.float64]:
+        """All fields at the owned points, (n_points, n_components); a copy."""
+        return self.function.x.array.reshape(-1, self._size)[: self._n_owned].copy()
+
+    def set_rows(self, rows: npt.NDArray[np.float64]) -> None:
+        """Put back what `rows` gave. Collective.
+
+        Raises:
+            ValueError: The shape is another.
+        """
+        array = self.function.x.array.reshape(-1, self._size)
+        if rows.shape != (self._n_owned, self._size):
+            raise ValueError(
+                f"history has shape {rows.shape}; this contact's is {(self._n_owned, self._size)}"
+            )
+        array[: self._n_owned] = rows
+        self.function.x.scatter_forward()
+
     def commit(self, values: Mapping[str, npt.NDArray[np.float64]]) -> None:
         """Replace every field by its values at the owned points. Collective.
 
@@ -64,6 +82,4 @@ class History:
         rows = np.empty((self._n_owned, self._size))
         for name, place in self._slices.items():
             rows[:, place] = values[name]
-        array = self.function.x.array.reshape(-1, self._size)
-        array[: self._n_owned] = rows
-        self.function.x.scatter_forward()
+        self.set_rows(rows)

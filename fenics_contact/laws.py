@@ -185,6 +185,12 @@ class Law:
         n = kinematics.normal
         return parameters["k_t"] * (ufl.Identity(len(n)) - ufl.outer(n, n))
 
+    def elastic_displacement(
+        self, kinematics: Kinematics, traction: Expr, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """K_t⁻¹ τ (length), shape (gdim,): minus the displacement v_e of eq. (24) without slip."""
+        return traction / parameters["k_t"]
+
     def yield_functions(
         self, kinematics: Kinematics, traction: Expr, limit: Expr, parameters: Mapping[str, Expr]
     ) -> tuple[Expr, ...]:
@@ -193,6 +199,28 @@ class Law:
         Slip is associated with them: K_t⁻¹ Δτ = -(Δu_t + Σ Δβ_j ∂g_j/∂τ), eq. (44).
         """
         return ()
+
+    def stored(
+        self, kinematics: Kinematics, response: Response, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """Energy per area in the springs, r_n²/2k_n + τ·K_t⁻¹τ/2."""
+        stored = ufl.as_ufl(0.0)
+        if self.has_normal_stiffness:
+            stored += response.normal_traction**2 / (2 * parameters["k_n"])
+        if response.traction is not None:
+            stretched = self.elastic_displacement(kinematics, response.traction, parameters)
+            stored += ufl.dot(response.traction, stretched) / 2
+        return stored
+
+    def dissipated(
+        self, kinematics: Kinematics, response: Response, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """Work per area of friction on the slip of the increment, -τ·(Δu_t + K_t⁻¹ Δτ) ≥ 0."""
+        assert response.traction is not None
+        assert kinematics.traction is not None and kinematics.tangential_increment is not None
+        change = response.traction - kinematics.traction
+        stretched = self.elastic_displacement(kinematics, change, parameters)
+        return -ufl.dot(response.traction, kinematics.tangential_increment + stretched)
 
 
 def positive_part(value: Expr) -> Expr:
@@ -365,6 +393,16 @@ class Foundation(Law):
         traction = -k_t * kinematics.tangential_displacement
         return Response(r_n, opening, penetration, traction)
 
+    def stored(
+        self, kinematics: Kinematics, response: Response, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """See `Law.stored`; by displacements, since k_t may be zero."""
+        closing = kinematics.normal_displacement - kinematics.gap
+        stored = -response.normal_traction * closing / 2
+        if response.traction is not None:
+            stored -= ufl.dot(response.traction, kinematics.tangential_displacement) / 2
+        return stored
+
     def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
         """½ k_n (u_n - s)² + ½ k_t |u_t|², or eq. (19) without tension."""
         if not self.has_potential:
@@ -501,6 +539,12 @@ class FrictionLaw(Law):
         first, second = self._frame(kinematics.normal, parameters)
         ratio = parameters["transverse_friction"] / parameters["friction"]
         return parameters["k_t"] * (ufl.outer(first, first) + ratio**2 * ufl.outer(second, second))
+
+    def elastic_displacement(
+        self, kinematics: Kinematics, traction: Expr, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """See `Law.elastic_displacement`: B⁻² τ/k_t."""
+        return self._stretched(traction, -2, kinematics.normal, parameters) / parameters["k_t"]
 
     def yield_functions(
         self, kinematics: Kinematics, traction: Expr, limit: Expr, parameters: Mapping[str, Expr]

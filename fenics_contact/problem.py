@@ -18,8 +18,10 @@ from petsc4py import PETSc
 from fenics_contact import accuracy, compat
 from fenics_contact.bulk import Bulk
 from fenics_contact.contact import Contact, Resultants, Status
+from fenics_contact.energy import Energy, EnergyState
 from fenics_contact.parallel import global_max, global_min, global_sum
 from fenics_contact.rigid import RigidMotions
+from fenics_contact.unknowns import Unknowns
 from fenics_contact.verdict import NotConverged, Verdict, check_laws
 
 __all__ = ["ContactProblem", "Step"]
@@ -84,6 +86,7 @@ class Step:
         factorisations: Matrices factored.
         verdict: The independent check.
         contacts: Resultants of every contact, by name.
+        energy: Works and energies of the increment.
         wall_seconds: Time of the solve on this rank.
         load: Load parameter, where `increments` set one.
     """
@@ -94,6 +97,7 @@ class Step:
     factorisations: int
     verdict: Verdict
     contacts: dict[str, Resultants]
+    energy: Energy
     wall_seconds: float
     load: float | None = None
 
@@ -126,6 +130,7 @@ class ContactProblem:
         bulk: The bulk form.
         snes: The PETSc solver.
         increment: Number of committed increments.
+        committed_force: Size of the forces at the last commit (force).
         initial_penetration: Largest penetration of the undeformed body (length), 0 if none; an
             interference by a prescribed gap is none.
     """
@@ -175,10 +180,15 @@ class ContactProblem:
         self._comm = u.function_space.mesh.comm
         self._bcs = list(bcs)
         self._alpha, self._phi = alpha, phi
-        dofmap = u.function_space.dofmap
-        self._n_owned = dofmap.index_map.size_local * dofmap.index_map_bs
-        self._constrained = self._constrained_dofs()
+        self._motions = [c for contact in self.contacts for c in contact.free_motion.values()]
+        self.unknowns = Unknowns(u.function_space, len(self._motions))
+        self._n_owned = self.unknowns.n_dofs
+        self._constrained = self._constrained_unknowns()
         self._check_contacts()
+        first = 0
+        for contact in self.contacts:
+            contact.set_unknowns(self.unknowns, first)
+            first += len(contact.free_motion)
 
         self.bulk.check_finite()
         self.bulk.update()
@@ -188,25 +198,37 @@ class ContactProblem:
             modulus = accuracy.cell_modulus(self.bulk.tangent_form, u, waiting[0].weight)
             for contact in waiting:
                 contact.set_modulus(modulus)
-        self.motions = RigidMotions(u.function_space)
+        self.motions = RigidMotions(u.function_space, self.unknowns, self._motion_names())
         self.initial_penetration = self._check_start()
-        self.motions.find_free(self.bulk.stiffness, self._constrained)
+        self._bulk_matrix = self.unknowns.widened(self.bulk.stiffness, rows=True)
+        self.motions.find_free(self._bulk_matrix, self._constrained)
         self.motions.check_held(self.contacts)
 
-        self._contact_vector = fem.Function(u.function_space)
+        self._contact_vector = self.unknowns.vector()
         self._length = self.motions.size
-        self._diagonal = np.zeros(self._n_owned)
+        self._diagonal = np.zeros(self.unknowns.n_local)
         self._factorisations = 0
         self._norms = {"residual": 0.0, "force": 0.0, "floor": 0.0}
-        self._committed_force = self._start_residual = 0.0
-        self._committed_u = u.x.array.copy()
+        self.committed_force = self._start_residual = 0.0
+        self._committed = self._state()
+        for contact in self.contacts:
+            contact.evaluate()
+        self._committed_energy = EnergyState.unloaded(self._committed, self.contacts)
+        self._energy = self._committed_energy
         self._rate: Array | None = None
         self._configure(method, dict(petsc_options or {}), prefix)
 
     # ---- construction ----------------------------------------------------------------------------
 
-    def _constrained_dofs(self) -> npt.NDArray[np.bool_]:
-        mask = np.zeros(self._n_owned, dtype=np.bool_)
+    def _motion_names(self) -> list[str]:
+        return [
+            f"translation along {'xyz'[i]} of the support of {contact.name}"
+            for contact in self.contacts
+            for i in contact.free_motion
+        ]
+
+    def _constrained_unknowns(self) -> npt.NDArray[np.bool_]:
+        mask = np.zeros(self.unknowns.n_local, dtype=np.bool_)
         for bc in self._bcs:
             dofs, _ = bc.dof_indices()
             if self._comm.allreduce(int(dofs.size and dofs.max() >= self.u.x.array.size)):
@@ -220,7 +242,7 @@ class ContactProblem:
         if len(set(names)) != len(names):
             raise ValueError(f"contacts are named {names}; give every Contact a name of its own")
         constrained = fem.Function(self.u.function_space)
-        constrained.x.array[: self._n_owned] = self._constrained
+        constrained.x.array[: self._n_owned] = self._constrained[: self._n_owned]
         constrained.x.scatter_forward()
         for contact in self.contacts:
             if contact.u is not self.u:
@@ -263,8 +285,7 @@ class ContactProblem:
 
         default(given, prefix)
         default(_COMMON | _METHODS[method], prefix)
-        self._solution = self.u.x.petsc_vec.duplicate()
-        self._function = self.u.x.petsc_vec.duplicate()
+        self._solution, self._function = self.unknowns.vector(), self.unknowns.vector()
         for consistent in (False, True):
             ksp = PETSc.KSP().create(self._comm)
             ksp.setOptionsPrefix(prefix + ("tangent_" if consistent else ""))
@@ -293,15 +314,15 @@ class ContactProblem:
     def _make_matrices(self) -> None:
         """Allocate the matrices of H₀ and of the consistent tangent. Collective.
 
-        Their pattern is that of the bulk and, with deformable supports, of the pairs.
+        Their pattern is that of the bulk and, with deformable or moving supports, of the pairs.
         """
         self._pairings = [c.pairings for c in self.contacts]
         self._matrices: dict[bool, PETSc.Mat] = {}
         different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
         for consistent, ksp in self._solvers.items():
-            matrix = self.bulk.stiffness.copy()
+            matrix = self._bulk_matrix.copy()
             for contact in self.contacts:
-                if not contact.rigid:
+                if contact.couples:
                     part = contact.stiffness_matrix(1.0, 1.0)
                     matrix.axpy(1.0, part, different)
                     part.destroy()
@@ -332,24 +353,41 @@ class ContactProblem:
 
     # ---- SNES callbacks --------------------------------------------------------------------------
 
-    def _set_u(self, x: PETSc.Vec) -> None:
-        self.u.x.array[: self._n_owned] = x.array_r * self._length
+    def _state(self) -> Array:
+        """Displacement and free motions of supports at this rank's unknowns; a copy."""
+        motions = np.array([float(c.value) for c in self._motions])
+        return self.unknowns.joined(self.u.x.array[: self._n_owned], motions)
+
+    def _set_state(self, state: Array) -> None:
+        """Make a state the present one. Collective."""
+        self.u.x.array[: self._n_owned] = state[: self._n_owned]
         self.u.x.scatter_forward()
+        for constant, value in zip(self._motions, self.unknowns.motions(state), strict=True):
+            constant.value = value
+
+    def _set_u(self, x: PETSc.Vec) -> None:
+        self._set_state(x.array_r * self._length)
 
     def _contact_force(self) -> Array:
-        """Contact part of the residual at the present u, owned dofs. Collective."""
-        vector = self._contact_vector.x
-        vector.array[:] = 0.0
+        """Contact part of the residual at the present state, this rank's unknowns. Collective."""
+        self._contact_vector.set(0.0)
         for contact in self.contacts:
-            contact.add_force(vector.petsc_vec)
-        return vector.array[: self._n_owned]
+            contact.add_force(self._contact_vector)
+        return self._contact_vector.array_r.copy()
+
+    def _bulk_force(self, residual: Array) -> Array:
+        """The rest of the residual: the bulk's, and the forces on free supports."""
+        return self.unknowns.joined(residual, -self._support_forces())
+
+    def _support_forces(self) -> Array:
+        return np.array([f for c in self.contacts for f in _numbers(c.applied_force)])
 
     def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         self._set_u(x)
         # A trial of the line search may overflow; the convergence test sees it.
         with np.errstate(all="ignore"):
             contact = self._contact_force()
-            total = self.bulk.residual() + contact
+            total = self._bulk_force(self.bulk.residual()) + contact
             self._measure_norms(total, contact)
             total[self._constrained] = 0.0
             f.array[:] = total / (self.bulk.scale * self._length)
@@ -358,7 +396,7 @@ class ContactProblem:
         """Norms in force: the free residual, the forces it is compared with, and round-off."""
         reaction = total[self._constrained]
         free = total[~self._constrained]
-        u = self.u.x.array[: self._n_owned]
+        stiff: Array = self._diagonal * self._state()
         squares = global_sum(
             self._comm,
             [
@@ -366,14 +404,14 @@ class ContactProblem:
                 reaction @ reaction,
                 contact @ contact,
                 self._load @ self._load,
-                np.sum((self._diagonal * u) ** 2),
+                stiff @ stiff,
             ],
         )
-        residual, *forces, stiff = np.sqrt(squares)
+        residual, *forces, product = np.sqrt(squares)
         # With the committed forces: a body that is unloaded ends with none of its own.
-        force = float(max(*forces, self._committed_force))
+        force = float(max(*forces, self.committed_force))
         # Rounding of the product K u, which no iteration can undercut.
-        floor = float(10 * np.finfo(float).eps * stiff)
+        floor = float(10 * np.finfo(float).eps * product)
         self._norms = {
             "residual": float(residual),
             "force": force,
@@ -395,7 +433,7 @@ class ContactProblem:
         if self._quasi_newton:
             return  # H₀ is made between the rounds, and kept for all iterations of one
         self._set_u(x)
-        self.bulk.update()
+        self._update_bulk()
         for contact in self.contacts:
             contact.evaluate()
         # Until enough points are closed to hold the body its tangent is singular: take H₀ of the
@@ -413,11 +451,11 @@ class ContactProblem:
             contacts: Contact's part, used up.
         """
         subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
-        if all(c.rigid for c in self.contacts):
-            self.bulk.stiffness.copy(matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        if not any(c.couples for c in self.contacts):
+            self._bulk_matrix.copy(matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         else:
             matrix.zeroEntries()
-            matrix.axpy(1.0, self.bulk.stiffness, subset)
+            matrix.axpy(1.0, self._bulk_matrix, subset)
         for part in contacts:
             matrix.axpy(1.0, part, subset)
             part.destroy()
@@ -462,7 +500,7 @@ class ContactProblem:
         the unsymmetric coupling of slip to pressure, and without it the residual wanders.
         """
         self._set_u(self._solution)
-        self.bulk.update()
+        self._update_bulk()
         if not np.isfinite(self.bulk.scale):
             return False
         for contact in self.contacts:
@@ -479,12 +517,23 @@ class ContactProblem:
         self.snes.reset()
         self._attach(consistent=self._consistent if consistent is None else consistent)
 
+    def _update_bulk(self) -> bool:
+        """Assemble the bulk's tangent if it may have changed; True if it did. Collective."""
+        changed = self.bulk.update()
+        if changed and self.unknowns.n_motions:
+            self._bulk_matrix.destroy()
+            self._bulk_matrix = self.unknowns.widened(self.bulk.stiffness, rows=True)
+        return changed
+
     # ---- solving ---------------------------------------------------------------------------------
 
-    def solve(self) -> Step:
+    def solve(self, *, ahead: float = 1.0) -> Step:
         """Solve the next increment with the loads and conditions as they are now. Collective.
 
         The history does not change: `commit` does that.
+
+        Args:
+            ahead: Size of this increment in units of the last one, for the guess to start from.
 
         Returns:
             What was done, the verdict included.
@@ -496,28 +545,28 @@ class ContactProblem:
                 can balance.
         """
         start = time.perf_counter()
-        saved = self.u.x.array.copy()
+        saved = self._state()
         try:
-            step = self._solve(start)
+            step = self._solve(start, ahead)
         except BaseException:
-            self.u.x.array[:] = saved
+            self._set_state(saved)
             for contact in self.contacts:
                 contact.forget()
             raise
         return step
 
-    def _solve(self, start: float) -> Step:
+    def _solve(self, start: float, ahead: float) -> Step:
         self._check_before()
         for bc in self._bcs:
             bc.set(self.u.x.array)
         self.u.x.scatter_forward()
         self._factorisations = 0
-        stiffness_changed = self.bulk.update()
+        stiffness_changed = self._update_bulk()
         if self._pairings != [c.pairings for c in self.contacts]:
             self._make_matrices()
         self._approach()
         iterations = 0
-        for guess in self._starts():
+        for guess in self._starts(ahead):
             self._solution.array[:] = guess / self._length
             if self._quasi_newton:
                 made, reason = self._solve_quasi_newton(stiffness_changed)
@@ -538,6 +587,7 @@ class ContactProblem:
             factorisations=self._factorisations,
             verdict=verdict,
             contacts={c.name: c.resultants() for c in self.contacts},
+            energy=self._energy.since(self._committed_energy, self.contacts, self._comm),
             wall_seconds=time.perf_counter() - start,
         )
 
@@ -545,7 +595,7 @@ class ContactProblem:
         self.bulk.check_finite()
         for contact in self.contacts:
             contact.check_input()
-        self._load = -self.bulk.update_load()
+        self._load = -self._bulk_force(self.bulk.update_load())
         size = global_max(self._comm, np.abs(self._load))
         if not np.isfinite(size):
             raise ValueError("the external load is not finite (NaN or inf) at some dof")
@@ -559,20 +609,19 @@ class ContactProblem:
         if self.bulk.linear:
             self.motions.check_balance(self._load, self.contacts)
 
-    def _starts(self) -> list[Array]:
+    def _starts(self, ahead: float) -> list[Array]:
         """Displacements to start from, the one nearest to equilibrium first. Collective.
 
         The present state, and that state moved on by as much as the last increment moved it: in
         proportional loading that is the solution.
         """
-        present = self.u.x.array[: self._n_owned].copy()
+        present = self._state()
         starts = [present]
         if self._rate is not None:
-            moved = self.u.x.array
-            moved += self._rate
+            self._set_state(present + ahead * self._rate)
             for bc in self._bcs:
-                bc.set(moved)
-            starts.append(moved[: self._n_owned].copy())
+                bc.set(self.u.x.array)
+            starts.append(self._state())
         residuals = []
         self._start_residual = 0.0
         for guess in starts:
@@ -591,8 +640,7 @@ class ContactProblem:
             return
         way = self.motions.approach(self._load, self.contacts)
         if way is not None:
-            self.u.x.array[: self._n_owned] += way
-            self.u.x.scatter_forward()
+            self._set_state(self._state() + way)
 
     def _solve_quasi_newton(self, stiffness_changed: bool) -> tuple[int, int]:
         """L-BFGS in rounds, H₀ made anew between them from the status reached. Collective.
@@ -635,12 +683,13 @@ class ContactProblem:
     def _judge(self) -> Verdict:
         """Recompute everything from u by assembly, past SNES and its residual. Collective."""
         contact = self._contact_force()
-        bulk = self.bulk.assemble_residual()
+        bulk = self._bulk_force(self.bulk.assemble_residual())
         total = bulk + contact
         self._measure_norms(total, contact)
         gdim = len(self.u)
         reaction = np.where(self._constrained, total, 0.0)
-        by_component = np.stack([v.reshape(-1, gdim).sum(axis=0) for v in (bulk, reaction)])
+        on_dofs = (v[: self._n_owned].reshape(-1, gdim) for v in (bulk, reaction))
+        by_component = np.stack([v.sum(axis=0) for v in on_dofs])
         bulk_sum, reaction_sum = global_sum(self._comm, by_component)
         # ∑F(u) - ∫ (r_n n + τ) = reactions, the middle one by quadrature, not by assembly.
         imbalance = bulk_sum - reaction_sum
@@ -648,6 +697,9 @@ class ContactProblem:
             c.evaluate()
             if c.rigid:  # between two bodies of the mesh contact forces are internal
                 imbalance = imbalance - c.resultants().force
+        self._energy = EnergyState.at(
+            self._state(), bulk + self._load, self._load + reaction, self.contacts
+        )
         absolute = float(global_sum(self._comm, np.abs(bulk).sum() + np.abs(contact).sum()))
         n_dofs = float(global_sum(self._comm, self._n_owned))
         return Verdict(
@@ -663,19 +715,48 @@ class ContactProblem:
         """Make the solved state the start of the next increment, history included. Collective."""
         for contact in self.contacts:
             contact.commit()
-        self._rate = self.u.x.array - self._committed_u
-        self._committed_u[:] = self.u.x.array
-        self._committed_force = self._norms["force"]
+        state = self._state()
+        self._rate = state - self._committed
+        self._committed = state
+        self._committed_energy = self._energy
+        self.committed_force = self._norms["force"]
         self.increment += 1
 
     def restore(self) -> None:
         """Drop a solved increment that was not committed: u is that of the last commit again.
 
-        The history needs no restoring: it changes at `commit` alone.
+        The history needs no restoring: it changes at `commit` alone. Collective.
         """
-        self.u.x.array[:] = self._committed_u
+        self._set_state(self._committed)
         for contact in self.contacts:
             contact.forget()
+
+    def committed_state(self) -> tuple[Array, Array]:
+        """This rank's unknowns at the last commit, and by how much that increment moved them."""
+        rate = np.zeros_like(self._committed) if self._rate is None else self._rate
+        return self._committed.copy(), rate.copy()
+
+    def set_committed(self, state: Array, rate: Array, increment: int, force: float) -> None:
+        """Take up a history where another run left it; the contacts' are set apart. Collective."""
+        self._committed, self._rate = state.copy(), rate.copy()
+        self.committed_force, self.increment = force, increment
+        self.restore()
+        self.restart_solver()
+
+    def take_up_loads(self) -> None:
+        """Take the loads as they are now for those of the committed state. Collective."""
+        self._load = -self._bulk_force(self.bulk.update_load())
+        self._judge()
+        self._committed_energy = self._energy
+
+    def restart_solver(self) -> None:
+        """Drop what the solver has kept from earlier increments. Collective."""
+        self._make_matrices()
+
+
+def _numbers(forces: Mapping[int, Any]) -> list[float]:
+    """Values of numbers and scalar constants."""
+    return [float(f.value if isinstance(f, fem.Constant) else f) for f in forces.values()]
 
 
 def _facets_held(contact: Contact, constrained: Array) -> int:

@@ -18,6 +18,7 @@ from petsc4py import PETSc
 
 from fenics_contact.contact import Contact, Status
 from fenics_contact.parallel import gather_rows, global_min, global_sum
+from fenics_contact.unknowns import Unknowns
 
 __all__ = ["RigidMotions"]
 
@@ -45,8 +46,16 @@ class RigidMotions:
         free: Coefficients of the free motions, shape (n_free, n_motions).
     """
 
-    def __init__(self, space: fem.FunctionSpace) -> None:
-        """Make the motions at the owned dofs. Collective."""
+    def __init__(
+        self, space: fem.FunctionSpace, unknowns: Unknowns, supports: Sequence[str] = ()
+    ) -> None:
+        """Make the motions at this rank's unknowns. Collective.
+
+        Args:
+            space: Of the displacement.
+            unknowns: Its dofs and the free motions of supports, each a rigid motion of its own.
+            supports: Names of the latter.
+        """
         self._comm = space.mesh.comm
         gdim = space.mesh.geometry.dim
         n_owned = space.dofmap.index_map.size_local
@@ -59,14 +68,17 @@ class RigidMotions:
         self._comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
         self.size = float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
         self.names: list[str] = []
-        modes = []
+        modes: list[Array] = []
         for b in range(n_bodies):
             of = f" of body {b + 1}, near {np.round((low[b] + high[b]) / 2, 6).tolist()}"
             kinds = _motions(x - (low[b] + high[b]) / 2, float(np.linalg.norm(high[b] - low[b])))
             for name, mode in kinds.items():
                 self.names.append(name + (of if n_bodies > 1 else ""))
                 modes.append(np.where(body[:, None] == b, mode, 0.0).ravel())
-        self._modes = np.array(modes)
+        self.names += supports
+        none, still = np.zeros(len(supports)), np.zeros(unknowns.n_dofs)
+        of_supports = [unknowns.joined(still, row) for row in np.eye(len(supports))]
+        self._modes = np.array([unknowns.joined(mode, none) for mode in modes] + of_supports)
         self.free = np.zeros((0, len(modes)))
 
     def find_free(self, stiffness: PETSc.Mat, constrained: npt.NDArray[np.bool_]) -> None:
@@ -74,7 +86,7 @@ class RigidMotions:
 
         Args:
             stiffness: Bulk tangent without conditions.
-            constrained: Mask over this rank's owned dofs.
+            constrained: Mask over this rank's unknowns.
         """
         diagonal = stiffness.getDiagonal()
         top = diagonal.norm(PETSc.NormType.NORM_INFINITY)
@@ -158,11 +170,11 @@ class RigidMotions:
         """Rigid motion to first touch, where the load sets free bodies moving. Collective.
 
         Args:
-            load: External forces at this rank's owned dofs (force).
+            load: External forces at this rank's unknowns (force).
             contacts: Evaluated contacts, all of them open.
 
         Returns:
-            Displacement to add at the owned dofs, or None: nothing moves, or it meets nothing.
+            What to add to the unknowns, or None: nothing moves, or it meets nothing.
         """
         if not len(self.free):
             return None
@@ -191,7 +203,7 @@ class RigidMotions:
         along it.
 
         Args:
-            load: External forces at this rank's owned dofs (force).
+            load: External forces at this rank's unknowns (force).
             contacts: Evaluated contacts.
 
         Raises:

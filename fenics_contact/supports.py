@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import ufl
 
-__all__ = ["Ball", "Cylinder", "HalfSpace", "Obstacle", "Placement", "Support"]
+__all__ = ["Ball", "Cylinder", "HalfSpace", "Motion", "Obstacle", "Placement", "Support"]
 
 ToUFL = Callable[[Any], ufl.core.expr.Expr]
 
@@ -32,11 +32,52 @@ class Placement:
     direction: ufl.core.expr.Expr
 
 
+@dataclass(frozen=True)
+class Motion:
+    """A rigid translation of a support of which some components follow from the force on it.
+
+    Per component of space one of the two is given, the other is None. ``Motion(force=(None, -5),
+    displacement=(pull, None))`` is pressed down by 5 and pulled along as ``pull`` says.
+
+    Args to the constructor:
+        force: External force on the support (force; in 2D force per thickness), numbers or scalar
+            ``fem.Constant``; of a symmetric model the modelled part's share.
+        displacement: Prescribed components (length), likewise; none: zero where no force is given.
+    """
+
+    force: Sequence[Any]
+    displacement: Sequence[Any] | None = None
+
+    def components(self, gdim: int) -> tuple[dict[int, Any], dict[int, Any]]:
+        """Forces and prescribed displacements by component.
+
+        Raises:
+            ValueError: A component has both or is missing.
+        """
+        given = self.displacement if self.displacement is not None else (None,) * gdim
+        if len(self.force) != gdim or len(given) != gdim:
+            raise ValueError(
+                f"Motion has {len(self.force)} forces and {len(given)} displacements; it must have "
+                f"{gdim} of each on this mesh, None where the other one is given"
+            )
+        both = [i for i in range(gdim) if self.force[i] is not None and given[i] is not None]
+        if both:
+            raise ValueError(
+                f"Motion gives force and displacement of component {both[0]}; give one of them, "
+                "and None for the other"
+            )
+        forces = {i: f for i, f in enumerate(self.force) if f is not None}
+        return forces, {
+            i: 0.0 if given[i] is None else given[i] for i in range(gdim) if i not in forces
+        }
+
+
 class Support:
     """A rigid support: subclasses say where it is.
 
     Args to all of them: ``displacement``, the prescribed rigid translation (gdim numbers, a
-    ``fem.Constant`` to be changed between increments, or a UFL vector); none means fixed.
+    ``fem.Constant`` to be changed between increments, or a UFL vector), or a `Motion` where the
+    force on the support is given; none means fixed.
     """
 
     displacement: Any = None

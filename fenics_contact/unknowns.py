@@ -1,0 +1,74 @@
+"""The unknowns of a problem: the dofs of the displacement, then the free motions of supports.
+
+The motions stand at the end of the last rank's rows, so that the global numbers of the dofs are
+those of DOLFINx with them and without them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
+
+__all__ = ["Unknowns"]
+
+Array = npt.NDArray[np.float64]
+
+
+class Unknowns:
+    """How the unknowns lie on the ranks.
+
+    Attributes:
+        n_dofs: Dofs of the displacement that this rank owns.
+        n_motions: Free motions of supports, in all.
+        n_local: Unknowns of this rank: its dofs, and the motions on the last one.
+        first_motion: Global number of the first motion.
+    """
+
+    def __init__(self, space: fem.FunctionSpace, n_motions: int = 0) -> None:
+        """Count. Collective."""
+        dofmap = space.dofmap
+        self.comm = space.mesh.comm
+        self.n_dofs = dofmap.index_map.size_local * dofmap.index_map_bs
+        self.n_motions = n_motions
+        self.has_motions_here = n_motions > 0 and self.comm.rank == self.comm.size - 1
+        self.n_local = self.n_dofs + (n_motions if self.has_motions_here else 0)
+        self.first_motion = dofmap.index_map.size_global * dofmap.index_map_bs
+
+    def vector(self) -> PETSc.Vec:
+        """A new vector over the unknowns. Collective."""
+        return PETSc.Vec().createMPI((self.n_local, None), comm=self.comm)
+
+    def joined(self, dofs: Array, motions: Array) -> Array:
+        """This rank's unknowns, of its dofs and all motions."""
+        return np.concatenate([dofs, motions]) if self.has_motions_here else dofs.copy()
+
+    def motions(self, values: Array) -> Array:
+        """The motions out of the ranks' unknowns, on every rank. Collective."""
+        if self.n_motions == 0:
+            return np.zeros(0)
+        mine = values[self.n_dofs :] if self.has_motions_here else None
+        return np.asarray(self.comm.bcast(mine, root=self.comm.size - 1), dtype=np.float64)
+
+    def widened(self, matrix: PETSc.Mat, *, rows: bool = False) -> PETSc.Mat:
+        """A matrix over the dofs as one over the unknowns, zero at the motions. Collective.
+
+        Args:
+            matrix: Its columns, and with ``rows`` its rows too, are dofs. Returned itself where
+                there are no motions.
+            rows: Whether the rows are widened too.
+        """
+        if self.n_motions == 0:
+            return matrix
+        pointers, columns, values = matrix.getValuesCSR()
+        n_rows = matrix.getLocalSize()[0]
+        if rows:
+            added = self.n_local - self.n_dofs
+            pointers = np.append(pointers, np.full(added, pointers[-1], dtype=pointers.dtype))
+            n_rows += added
+        return PETSc.Mat().createAIJ(
+            ((n_rows, None), (self.n_local, None)),
+            csr=(pointers, columns, values),
+            comm=self.comm,
+        )

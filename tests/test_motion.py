@@ -1,0 +1,141 @@
+"""Supports that move as the force on them says: their translation is unknown, the force given."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import LEFT, TOP, block, close, gathered, owned, raised_everywhere
+
+import fenics_contact as fc
+
+COMM = MPI.COMM_WORLD
+
+
+def ball(d: int, motion) -> fc.Ball:
+    """A cushion that just touches the middle of the block's bottom."""
+    center = np.full(d, 0.5)
+    center[-1] = -2.0
+    return fc.Ball(center, 2.0, displacement=motion)
+
+
+def pressed(cell, law, motion, method="lbfgs"):
+    scene = block(cell, 1, n=4)
+    d = scene.dim
+    bcs = [scene.hold(TOP, i) for i in range(d)]
+    problem, contact = scene.problem(law, bcs, contact={"support": ball(d, motion)}, method=method)
+    return scene, problem, contact
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_given_force_and_given_displacement_are_two_ways_to_one_state(cell, method):
+    """Press by a force, drag by a displacement; then prescribe the motion that was found.
+
+    The contact's force is the given one to the solver's tolerance (1e-9), the states agree to 1e-7.
+    """
+    d = 2 if cell == "triangle" else 3
+    law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
+    force, drag = 5.0, 0.01
+    across = [None] * (d - 1) + [force]
+    motion = fc.Motion(force=across, displacement=[drag] + [0.0] * (d - 2) + [None])
+    scene, problem, contact = pressed(cell, law, motion, method)
+    problem.solve()
+    problem.commit()
+    assert close(contact.resultants().force[-1], force, 1e-8)
+    assert contact.resultants().slip > 0
+    up = float(contact.free_motion[d - 1].value)
+    assert up > 0
+
+    given = np.zeros(d)
+    given[0], given[-1] = drag, up
+    other, problem, again = pressed(cell, law, given, method)
+    problem.solve()
+    assert close(again.resultants().force, contact.resultants().force, 1e-7)
+    assert close(gathered(COMM, owned(other.u)), gathered(COMM, owned(scene.u)), 1e-7)
+
+
+def test_newton_converges_quadratically_with_a_turning_normal():
+    """The normals of a ball turn as it moves: the tangent knows it, or Newton takes long."""
+    motion = fc.Motion(force=(0.5, 5.0))
+    _, problem, contact = pressed(
+        "quadrilateral", fc.Coulomb(1.0, k_n=2e4, k_t=1e4), motion, "newton"
+    )
+    problem.solve()
+    problem.commit()
+    contact.applied_force[0] = 0.6
+    step = problem.solve()
+    assert step.iterations <= 5
+    assert close(contact.resultants().force, [0.6, 5.0], 1e-8)
+
+
+def test_two_forces_and_their_history():
+    """Force up, then sideways below and above what friction bears: the latter has no balance."""
+    scene = block("quadrilateral", 1, n=4)
+    pull = fem.Constant(scene.mesh, 0.0)
+    motion = fc.Motion(force=(pull, 5.0))
+    bcs = [scene.hold(TOP, i) for i in range(2)]
+    problem, contact = scene.problem(
+        fc.Coulomb(0.3, k_n=2e4, k_t=1e4), bcs, contact={"support": ball(2, motion)}
+    )
+    problem.solve()
+    problem.commit()
+    pull.value = 1.0
+    problem.solve()
+    problem.commit()
+    assert close(contact.resultants().force, [1.0, 5.0], 1e-8)
+    before = problem._state()
+    pull.value = 3.0
+    raised_everywhere(problem.solve, (ValueError, fc.NotConverged))
+    assert np.array_equal(problem._state(), before)
+
+
+def test_a_block_between_the_floor_and_a_weight():
+    """A free body on a floor, pressed by a free support: p = P everywhere, whatever E is."""
+    scene = block("triangle", 1, n=3, nu=0.0)
+    floor = scene.contact(fc.Frictionless(k_n=1e4), name="floor")
+    lid = fc.ContactSurface(scene.mesh, scene.tags, TOP)
+    weight = fc.HalfSpace((0, 1), (0, -1), displacement=fc.Motion(force=(None, -7.0)))
+    top = fc.Contact(scene.u, lid, weight, fc.Frictionless(k_n=1e4), name="weight")
+    problem = fc.ContactProblem(scene.F, scene.u, bcs=[scene.hold(LEFT, 0)], contacts=[floor, top])
+    problem.solve()
+    pressure = gathered(COMM, floor.pressure)
+    assert close(pressure, np.full(len(pressure), 7.0), 1e-8)
+    # Both springs and the block in series: 7 (1/k_n + 1/E + 1/k_n).
+    assert close(top.free_motion[1].value, -7.0 * (2 / 1e4 + 1 / 1000), 1e-8)
+
+
+def test_a_support_on_its_way_meets_the_body():
+    """A support far away is led to first touch by its force."""
+    scene = block("quadrilateral", 1, n=4, nu=0.0)
+    away = fc.HalfSpace((0, -30.0), (0, 1), displacement=fc.Motion(force=(None, 4.0)))
+    bcs = [scene.hold(TOP, i) for i in range(2)]
+    problem, contact = scene.problem(fc.Frictionless(k_n=1e4), bcs, contact={"support": away})
+    problem.solve()
+    assert close(contact.resultants().force[1], 4.0, 1e-8)
+    assert close(contact.free_motion[1].value, 30.0 + 4.0 * (1 / 1e4 + 1 / 1000), 1e-8)
+
+
+@pytest.mark.parametrize(
+    ("motion", "word"),
+    [
+        (fc.Motion(force=(1.0,)), "2 of each"),
+        (fc.Motion(force=(1.0, 1.0), displacement=(0.0, None)), "one of them"),
+        (fc.Motion(force=(1.0, 0.0, 0.0)), "2 of each"),
+    ],
+)
+def test_wrong_motions(motion, word):
+    """A component with both, or a wrong number of them, is refused."""
+    scene = block("triangle", 1)
+    raised_everywhere(
+        lambda: scene.contact(fc.Frictionless(), displacement=motion), ValueError, word
+    )
+
+
+def test_the_form_alone_refuses_an_unknown_motion():
+    """The boundary form by itself has no place for the support's unknowns."""
+    scene = block("triangle", 1)
+    contact = scene.contact(fc.Frictionless(k_n=1.0), displacement=fc.Motion(force=(None, 1.0)))
+    raised_everywhere(
+        lambda: contact.form(ufl.TestFunction(scene.u.function_space)), ValueError, "ContactProblem"
+    )

@@ -1,0 +1,327 @@
+"""Load histories: loads as functions, cutting, energies, and going on after the end of a run."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from mpi4py import MPI
+from running import environment
+from scenes import TOP, block, close, gathered, owned, raised_everywhere
+
+import fenics_contact as fc
+
+COMM = MPI.COMM_WORLD
+
+
+class Rub:
+    """A block with a moving top, pressed on a cushion and rubbed along it."""
+
+    def __init__(self, cell="quadrilateral", law=None, **kwargs):
+        """Make it, unloaded."""
+        scene = block(cell, 1, n=4)
+        d = scene.dim
+        self.scene = scene
+        self.push = [fem.Constant(scene.mesh, 0.0) for _ in range(d)]
+        bcs = [scene.hold(TOP, i, c) for i, c in enumerate(self.push)]
+        center = np.full(d, 0.5)
+        center[-1] = -2.0
+        law = law or fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
+        support = fc.Ball(center, 2.0)
+        self.problem, self.contact = scene.problem(law, bcs, contact={"support": support}, **kwargs)
+
+    def load(self, t: float) -> None:
+        """Down until 1, along until 2, and back until 4."""
+        self.push[-1].value = -0.03 * min(t, 1.0)
+        self.push[0].value = np.interp(t, [1, 2, 4], [0, 0.1, -0.1])
+
+    def forces(self) -> np.ndarray:
+        """Contact force on the block."""
+        return self.contact.resultants().force
+
+
+def same_states(a: Rub, b: Rub, rtol: float) -> bool:
+    """Displacements and histories; 0: bit for bit."""
+    pairs = [
+        (owned(a.scene.u), owned(b.scene.u)),
+        (a.contact.history.rows(), b.contact.history.rows()),
+    ]
+    if rtol == 0.0:
+        return all(COMM.allgather(all(np.array_equal(x, y) for x, y in pairs)))
+    return all(close(gathered(COMM, x), gathered(COMM, y), rtol) for x, y in pairs)
+
+
+# ---- loads ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_loads_as_a_function(cell):
+    """A cycle of two loads by one function: the friction force returns to its opposite."""
+    made = Rub(cell)
+    shear = {}
+    for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=8):
+        shear[step.load] = made.forces()[0]
+    assert list(shear) == pytest.approx(np.arange(1, 9) / 2)
+    assert shear[2.0] < 0 < shear[4.0]
+    end = made.contact.resultants()
+    assert end.slip > 0 and end.stick == 0
+    assert close(end.tangential_force, 0.3 * end.normal_force, 1e-12)
+
+
+def test_ends_of_increments_as_given():
+    """Increments of unequal size end where they were told to."""
+    made = Rub()
+    steps = fc.increments(made.problem, made.load, 0.0, 2.0, steps=[0.5, 1.0, 1.1, 2.0])
+    assert [s.load for s in steps] == [0.5, 1.0, 1.1, 2.0]
+    assert made.push[0].value == 0.1
+
+
+@pytest.mark.parametrize(
+    ("load", "steps", "word"),
+    [
+        ("load", 1, "function"),
+        (None, 0, "at least 1"),
+        (None, [0.5, 0.25, 1.0], "rising or"),
+        (None, [0.5], "end"),
+        (None, [], "end"),
+    ],
+)
+def test_wrong_histories(load, steps, word):
+    """A load that is none, increments that lead nowhere or to and fro."""
+    made = Rub()
+    call = lambda: list(  # noqa: E731
+        fc.increments(made.problem, load or made.load, 0.0, 1.0, steps=steps)
+    )
+    raised_everywhere(call, ValueError, word)
+
+
+# ---- cutting -------------------------------------------------------------------------------------
+
+
+def limited(made: Rub, largest: float) -> list[float]:
+    """Let increments fail whose load grows by more than ``largest``; returns those tried."""
+    solve, tried, at = made.problem.solve, [], [0.0]
+    now = [0.0]
+    load, commit = made.load, made.problem.commit
+
+    def note(t):
+        now[0] = t
+        load(t)
+
+    def choosy(**kwargs):
+        tried.append(now[0])
+        if now[0] - at[0] > largest:
+            made.problem.snes.setTolerances(max_it=0)
+            made.problem._max_it, kept = 0, made.problem._max_it
+            try:
+                return solve(**kwargs)
+            finally:
+                made.problem._max_it = kept
+        return solve(**kwargs)
+
+    def keep():
+        commit()
+        at[0] = now[0]
+
+    made.load, made.problem.solve, made.problem.commit = note, choosy, keep
+    return tried
+
+
+def test_failed_increments_are_cut_and_grow_again():
+    """Halved until they pass, doubled after two successes, all asked for is met."""
+    made, plain = Rub(), Rub()
+    tried = limited(made, 0.3)
+    done = [s.load for s in fc.increments(made.problem, made.load, 0.0, 2.0, steps=2)]
+    assert done[-1] == 2.0 and 1.0 in done
+    assert np.all(np.diff([0.0, *done]) <= 0.3)
+    assert len(tried) > len(done)  # it failed, and tried to grow
+    asked = list(fc.increments(plain.problem, plain.load, 0.0, 2.0, steps=done))
+    assert made.problem.increment == len(asked) == len(done)
+    assert same_states(made, plain, 1e-7)
+
+
+def test_cutting_has_a_limit():
+    """What never converges is given up, and leaves everything as committed."""
+    made = Rub()
+    limited(made, 0.0)
+    with pytest.raises(fc.NotConverged):
+        list(fc.increments(made.problem, made.load, 0.0, 1.0, max_cuts=3))
+    assert made.problem.increment == 0
+    assert made.push[1].value == 0.0
+    assert np.all(owned(made.scene.u) == 0.0)
+
+
+# ---- energy --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", [fc.Frictionless(k_n=2e4), fc.Coulomb(0.3, k_n=2e4, k_t=1e4)])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_energy_is_balanced(cell, law):
+    """Equilibrium at both ends makes the balance exact, up to the solver's tolerance of 1e-9."""
+    made = Rub(cell, law)
+    for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=8):
+        e = step.energy
+        size = abs(e.work) + abs(e.elastic)
+        assert abs(e.imbalance) <= 1e-6 * size
+        assert e.dissipation >= -1e-14 * size
+        assert close(e.elastic + e.springs + e.dissipation + e.remainder, e.work, 1e-12, scale=size)
+        if not law.has_friction:
+            assert e.dissipation == 0.0
+
+
+def test_what_energy_leaves_out_vanishes_with_the_increments():
+    """The remainder, taken absolutely, more than halves with the increments: second order."""
+    shares = []
+    for n in (8, 16, 32):
+        made = Rub()
+        steps = list(fc.increments(made.problem, made.load, 0.0, 4.0, steps=n))
+        dissipated = sum(s.energy.dissipation for s in steps)
+        assert dissipated > 0
+        shares.append(sum(abs(s.energy.remainder) for s in steps) / dissipated)
+    assert shares[2] < 0.5 * shares[1] < 0.25 * shares[0]
+    assert shares[2] < 0.01
+
+
+def test_energy_of_a_driven_support():
+    """A weight's work goes into the block and the springs: P²/2 (1/k_n + 1/E), all of it."""
+    scene = block("quadrilateral", 1, n=2, nu=0.0)
+    force = fem.Constant(scene.mesh, 0.0)
+    floor = scene.floor(displacement=fc.Motion(force=(None, force)))
+    bcs = [scene.hold(TOP, i) for i in range(2)]
+    problem, _ = scene.problem(fc.Frictionless(k_n=1e4), bcs, contact={"support": floor})
+    (step,) = fc.increments(problem, force, 0.0, 6.0)
+    assert close(step.energy.work, 18.0 * (1 / 1e4 + 1 / 1000), 1e-7)
+    assert close(step.energy.springs, 18.0 / 1e4, 1e-7)
+    assert close(step.energy.elastic, 18.0 / 1000, 1e-7)
+
+
+# ---- checkpoints ---------------------------------------------------------------------------------
+
+
+def shared_folder(tmp_path: Path) -> Path:
+    """Rank 0's folder, on all ranks."""
+    return Path(COMM.bcast(str(tmp_path)))
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+@pytest.mark.parametrize("every", [1, 3])
+def test_going_on_gives_the_same_digits(cell, method, every, tmp_path):
+    """A history broken off after 5 of 8 increments and taken up by a new problem, bit for bit.
+
+    On several ranks MUMPS adds in the order in which messages come: no two runs agree in the last
+    bit, and 1e-12 stands for the same digits.
+    """
+    same = 0.0 if COMM.size == 1 else 1e-12
+    folder = shared_folder(tmp_path)
+    whole, broken, after = (Rub(cell, method=method) for _ in range(3))
+    options = {"steps": 8, "checkpoint_every": every}
+    history = fc.increments(
+        whole.problem, whole.load, 0.0, 4.0, checkpoint=folder / "whole.npz", **options
+    )
+    energies = {s.load: s.energy for s in history}
+    path = folder / "broken.npz"
+    for step in fc.increments(broken.problem, broken.load, 0.0, 4.0, checkpoint=path, **options):
+        if step.increment == 5:
+            break
+    rest = list(fc.increments(after.problem, after.load, 0.0, 4.0, checkpoint=path, **options))
+    assert rest[0].increment == (6 if every == 1 else 4)
+    assert same_states(after, whole, same)
+    for step in rest:
+        size = abs(energies[step.load].work) + abs(energies[step.load].elastic)
+        assert close(step.energy.work, energies[step.load].work, 1e-12, scale=size)
+    # A third start finds nothing left to do.
+    again = Rub(cell, method=method)
+    assert not list(fc.increments(again.problem, again.load, 0.0, 4.0, checkpoint=path, **options))
+    assert same_states(again, whole, same)
+
+
+def test_a_file_of_another_problem_is_refused(tmp_path):
+    """Other meshes and contacts are told from the file, and nothing is changed."""
+    path = shared_folder(tmp_path) / "state.npz"
+    made = Rub()
+    list(fc.increments(made.problem, made.load, 0.0, 1.0, checkpoint=path))
+    other = Rub("triangle", fc.Coulomb(0.3, k_n=2e4, k_t=1e4))
+    raised_everywhere(
+        lambda: list(fc.increments(other.problem, other.load, checkpoint=path)), ValueError, "mesh"
+    )
+    assert other.problem.increment == 0
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    """A full disk: every rank gets the error, the last file and the state are as they were."""
+    path = shared_folder(tmp_path) / "state.npz"
+    made = Rub()
+    history = fc.increments(made.problem, made.load, 0.0, 2.0, steps=4, checkpoint=path)
+    next(history)
+    before = path.read_bytes()
+    COMM.barrier()
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    raised_everywhere(lambda: next(history), (OSError, RuntimeError), "No space left")
+    assert path.read_bytes() == before
+    assert COMM.allgather(os.listdir(path.parent)) == [["state.npz"]] * COMM.size
+    assert made.problem.increment == 2
+
+
+SCRIPT = """
+import json, sys
+sys.path.insert(0, {tests!r})
+from test_stepping import Rub
+import fenics_contact as fc
+made = Rub()
+for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=40, checkpoint={path!r}):
+    print(step.increment, flush=True)
+pressure = made.contact.gather()["pressure"].tolist()
+if made.scene.mesh.comm.rank == 0:
+    print(json.dumps(pressure), flush=True)
+"""
+
+
+def run_script(path: Path, ranks: int, *, kill_after: int | None = None) -> list[str]:
+    """Run the history in a process of its own, killed after so many increments."""
+    script = SCRIPT.format(tests=str(Path(__file__).parent), path=str(path))
+    launch = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks > 1 else []
+    process = subprocess.Popen(
+        [*launch, sys.executable, "-c", script],
+        env=environment(),
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    lines = []
+    for line in process.stdout:
+        lines.append(line.strip())
+        if kill_after is not None and line.startswith(f"{kill_after}"):
+            process.send_signal(signal.SIGKILL)
+            time.sleep(0.1)
+            break
+    process.stdout.close()
+    process.wait()
+    return lines
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="starts its own processes")
+@pytest.mark.parametrize("ranks", [(1, 1), (1, 2)])
+def test_killed_and_started_again(ranks, tmp_path):
+    """Kill -9 in the middle: the second run ends with the digits of one that was let alone.
+
+    On another number of ranks with those of the solver's tolerance (1e-9, pressures to 1e-6).
+    """
+    first, second = ranks
+    alone = run_script(tmp_path / "alone.npz", first)
+    killed = run_script(tmp_path / "killed.npz", first, kill_after=17)
+    after = run_script(tmp_path / "killed.npz", second)
+    assert killed[-1] == "17"
+    assert int(after[0]) >= 17
+    if first == second:
+        assert after[-1] == alone[-1]
+    assert close(json.loads(after[-1]), json.loads(alone[-1]), 1e-6)
