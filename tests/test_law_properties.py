@@ -86,6 +86,7 @@ class Point:
         response = law.response(kinematics, parameters)
         expressions = {"r_n": response.normal_traction}
         expressions |= {"opening": response.opening, "penetration": response.penetration}
+        expressions["stored"] = law.stored(kinematics, response, parameters)
         self.modes = 0
         if law.has_tangential:
             stiffness = law.tangential_stiffness(kinematics, parameters)
@@ -96,6 +97,7 @@ class Point:
             functions = law.yield_functions(kinematics, traction, response.limit, parameters)
             expressions |= {"limit": response.limit, "slip": ufl.as_vector(response.slip)}
             expressions["functions"] = ufl.as_vector(functions)
+            expressions["dissipated"] = law.dissipated(kinematics, response, parameters)
             self.modes = len(functions)
             for j, g in enumerate(functions):
                 expressions[f"gradient {j}"] = ufl.diff(g, traction)
@@ -356,6 +358,26 @@ def test_traction_is_the_closest_point(name, d, data):
     assert tau @ slipped >= -rounding
     others = r["limit"] * corners(name, a)
     assert np.max(others @ slipped) <= tau @ slipped + 10 * rounding
+
+
+@pytest.mark.parametrize(("name", "d"), ALL)
+@properties
+@given(data=st.data())
+def test_energies(name, d, data):
+    """½ k_n δ² and ½ τ·K_t⁻¹ τ are stored, never negative; the slip's work is dissipated (44)."""
+    a = data.draw(arguments(name, d, closed=True))
+    r = point(name, d)(a)
+    law = SPACE[name]
+    expected = a["k_n"] / 2 * r["penetration"] ** 2 if law.has_normal_stiffness else 0.0
+    if law.has_tangential:
+        expected += r["tau"] @ np.linalg.solve(stiffness(a), r["tau"]) / 2
+    # Across the direction the metric has the square of the stretch.
+    exact = 10 * EXACT * loss(a) ** 2
+    assert abs(r["stored"] - expected) <= exact * expected and r["stored"] >= 0
+    if law.has_friction:
+        slipped = np.linalg.solve(stiffness(a), trial(a) - r["tau"])
+        scale = size(a) * np.linalg.norm(np.linalg.solve(stiffness(a), np.eye(d)), 2)
+        assert abs(r["dissipated"] - r["tau"] @ slipped) <= exact * scale * np.linalg.norm(r["tau"])
 
 
 @pytest.mark.parametrize("sides", [3, 4, 5, 8])
