@@ -2,7 +2,7 @@
 
 from fenics_contact._version import __version__
 from fenics_contact.contact import Contact, Resultants, Status
-from fenics_contact.laws import Coulomb, Frictionless, Scaled, Tresca
+from fenics_contact.laws import Coulomb, Foundation, Frictionless, Scaled, Springs, Tresca
 from fenics_contact.pairing import DeformableBody
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.stepping import increments
@@ -18,6 +18,7 @@ __all__ = [
     "Coulomb",
     "Cylinder",
     "DeformableBody",
+    "Foundation",
     "Frictionless",
     "HalfSpace",
     "Motion",
@@ -25,6 +26,7 @@ __all__ = [
     "Obstacle",
     "Resultants",
     "Scaled",
+    "Springs",
     "Status",
     "Step",
     "Tresca",

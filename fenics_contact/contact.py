@@ -16,16 +16,19 @@ from petsc4py import PETSc
 
 from fenics_contact import accuracy
 from fenics_contact.history import History
-from fenics_contact.laws import Kinematics, Law, Scaled
+from fenics_contact.laws import Kinematics, Law, Scaled, Springs
 from fenics_contact.pairing import DeformableBody, Opposite
 from fenics_contact.parallel import gather_rows, global_max, global_min, global_sum
-from fenics_contact.supports import Motion, Placement, Support
-from fenics_contact.surface import ContactSurface, PointEvaluator
+from fenics_contact.supports import Motion, Placement, Support, nonzero_vector
+from fenics_contact.surface import ContactSurface, PointEvaluator, VertexAreas
 from fenics_contact.unknowns import Unknowns
 
 __all__ = ["Contact", "Resultants", "Status"]
 
 Array = npt.NDArray[np.float64]
+
+# A direction with no more than this share across the normal counts as parallel to it.
+_PARALLEL = 1e-6
 
 
 class Status(IntEnum):
@@ -42,9 +45,9 @@ class Resultants:
 
     Attributes:
         force: Contact force on the body, ∫ (r_n n + τ), shape (gdim,) (2D: per thickness).
-        normal_force: ∫ -r_n ≥ 0.
+        normal_force: ∫ -r_n, tension counted negative.
         tangential_force: ∫ |τ|.
-        area: Measure of the closed part.
+        area: Measure of the closed part; all of Γc where the law bears tension.
         open, stick, slip: Numbers of quadrature points.
         max_pressure: Largest -r_n at a point (stress).
         max_penetration: Largest δ₋ (length).
@@ -125,9 +128,14 @@ class Contact:
         degree = _displacement_degree(u, mesh, name)
         self.quadrature = surface.quadrature(degree)
 
+        try:
+            law.check_dimension(gdim)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
         self.weight = self._scalar("weight", 1.0 if weight is None else weight)
         self._scale: fem.Function | None = None  # E/h, if a stiffness is Scaled
         self._scale_known = False
+        self._tributary: VertexAreas | None = None  # if a stiffness is that of Springs
         parameters = {n: self._parameter(n, v) for n, v in law.parameters().items()}
         if modulus is not None:
             self.set_modulus(modulus)
@@ -192,13 +200,18 @@ class Contact:
             "normal_traction": response.normal_traction,
             "jump": self._relative(self._jump),
             "shift": self._prescribed_shift(),
-            "stored": law.stored(response, parameters),
+            "stored": law.stored(kinematics, response, parameters),
         } | {f"parameter {n}": v for n, v in parameters.items()}
+        if law.has_tangential:
+            stiffness = law.tangential_stiffness(kinematics, parameters)
+            expressions |= {
+                "traction": response.traction,
+                "grip": law.grip(parameters),
+            } | {f"tangential_stiffness {i}": stiffness[i, :] for i in range(gdim)}
         if law.has_friction:
             expressions |= {
                 "increment": kinematics.tangential_increment,
                 "old_traction": kinematics.traction,
-                "traction": response.traction,
                 "limit": response.limit,
                 "dissipated": law.dissipated(kinematics, response, parameters),
                 "slip_increment": ufl.as_vector(response.slip),
@@ -208,6 +221,7 @@ class Contact:
             self.quadrature, {"traction": self.weight * self._total_traction(self._jump)}
         )
         self._evaluate_tangent: PointEvaluator | None = None
+        self._evaluate_yield: PointEvaluator | None = None
         self._points: dict[str, Array] | None = None
         self.n_unpaired = 0
         self.pairings = 0
@@ -228,15 +242,19 @@ class Contact:
     def _kinematics(self, jump: Any) -> Kinematics:
         """What the law sees of a displacement of the body at the points (UFL)."""
         normal = self._normal
-        increment = traction = None
+        total = increment = traction = None
+
+        def tangential(vector: Any) -> Any:
+            return vector - ufl.dot(vector, normal) * normal
+
+        if self.law.has_tangential:
+            total = tangential(self._relative(jump))
         if self.law.has_friction:
             # The old traction and displacement are taken along the present normal: the support
             # may have moved on since the last commit.
-            moved = self._relative(jump) - self.history.ufl("jump")
-            increment = moved - ufl.dot(moved, normal) * normal
-            traction = self.history.ufl("traction")
-            traction = traction - ufl.dot(traction, normal) * normal
-        return Kinematics(self._gap, ufl.dot(jump, normal), normal, increment, traction)
+            increment = tangential(self._relative(jump) - self.history.ufl("jump"))
+            traction = tangential(self.history.ufl("traction"))
+        return Kinematics(self._gap, ufl.dot(jump, normal), normal, total, increment, traction)
 
     def _total_traction(self, jump: Any) -> Any:
         """r_n n + τ on the body (UFL)."""
@@ -277,7 +295,7 @@ class Contact:
         """Energy whose derivative by ``u`` is `form` (eq. 19, 43).
 
         Raises:
-            ValueError: The law has none (Coulomb).
+            ValueError: The law has none (Coulomb; a foundation with k_t and without tension).
         """
         density = self.law.potential(self._kinematics(self.u), self._law_parameters)
         return self.weight * density * self.quadrature.ds
@@ -384,11 +402,11 @@ class Contact:
         n = self.quadrature.n_points
         along = np.einsum("qi,qj->qij", values["normal"], values["normal"])
         blocks = np.zeros((n, d, d))
-        if self.law.unilateral:
+        if self.law.has_normal_stiffness:
             blocks += (np.asarray(normal) * values["parameter k_n"])[:, None, None] * along
-        if self.law.has_friction:
-            across = np.eye(d) - along
-            blocks += (np.asarray(tangential) * values["parameter k_t"])[:, None, None] * across
+        if self.law.has_tangential:
+            share = np.broadcast_to(np.asarray(tangential), (n,))
+            blocks += share[:, None, None] * self.tangential_stiffness
         return self._matrix(values["weight"][:, None, None] * blocks)
 
     def at_points(self, displacement: Array) -> Array:
@@ -455,16 +473,24 @@ class Contact:
         self._scale_known = True
 
     def _parameter(self, name: str, value: Any) -> ufl.core.expr.Expr:
+        if name == "direction":
+            return self._to_ufl(
+                name, nonzero_vector(f"{self.name}: direction of friction", value, self._gdim)
+            )
+        if isinstance(value, Springs):
+            if self._tributary is None:
+                self._tributary = VertexAreas(self.quadrature, self.weight, self.name)
+            return self._to_ufl(name, value.k) / self._tributary.area
         if isinstance(value, Scaled):
             if self._scale is None:
                 self._scale = fem.Function(fem.functionspace(self.surface.submesh, ("Lagrange", 1)))
                 self._scale.x.array[:] = 1.0
             return self._to_ufl(name, value.factor) * self._scale
-        positive = name.startswith("k_")
+        positive = name in self.law.positive
         if np.ndim(value) == 0 and isinstance(value, int | float | np.number):
             bad = not np.isfinite(value) or value < 0 or (positive and value == 0)
             if bad:
-                raise ValueError(_range_error(self.name, name, float(value)))
+                raise ValueError(_range_error(self.name, name, float(value), positive))
         return self._scalar(name, value)
 
     def _scalar(self, name: str, value: Any) -> ufl.core.expr.Expr:
@@ -551,6 +577,28 @@ class Contact:
         self._update_jump()
         self._points = self._evaluate_points()
 
+    def evaluate_yield(self) -> tuple[Array, Array]:
+        """The law's yield functions at the present ``u``, and their gradients. Collective.
+
+        Returns:
+            g_j(τ, limit) (stress), (n_points, n_modes), and ∂g_j/∂τ, (n_points, n_modes, gdim).
+        """
+        if self._evaluate_yield is None:
+            kinematics = self._kinematics(self._jump)
+            response = self.law.response(kinematics, self._law_parameters)
+            traction = ufl.variable(response.traction)
+            functions = self.law.yield_functions(
+                kinematics, traction, response.limit, self._law_parameters
+            )
+            rows = {f"gradient {j}": ufl.diff(g, traction) for j, g in enumerate(functions)}
+            self._evaluate_yield = PointEvaluator(
+                self.quadrature, {"functions": ufl.as_vector(functions)} | rows
+            )
+        self._update_jump()
+        found = self._evaluate_yield()
+        gradients = [found[name] for name in found if name != "functions"]
+        return found["functions"], np.stack(gradients, axis=1)
+
     def forget(self) -> None:
         """Drop what was evaluated: the next look at a result evaluates the present ``u``."""
         self._points = None
@@ -562,6 +610,8 @@ class Contact:
             ValueError: On all ranks.
         """
         comm = self.surface.mesh.comm
+        if self._tributary is not None:
+            self._tributary.update()
         self.evaluate()
         points = self._values
         shortest = global_min(comm, points["direction_length"], empty=1.0)
@@ -580,10 +630,26 @@ class Contact:
                         f"{self.name}: {name} is not finite at a point of Γc (values from {low:g} "
                         f"to {high:g}); check the expression or function it was given by"
                     )
-                if key.startswith("parameter ") and (low < 0 or (low == 0 and name[:2] == "k_")):
-                    raise ValueError(_range_error(self.name, name, low))
+                if not key.startswith("parameter ") or name == "direction":
+                    continue
+                positive = name in self.law.positive
+                if low < 0 or (low == 0 and positive):
+                    raise ValueError(_range_error(self.name, name, low, positive))
         if global_min(comm, points["weight"]) < 0:
             raise ValueError(f"{self.name}: weight is negative at a point of Γc")
+        if "parameter direction" in points:
+            given, normal = points["parameter direction"], points["normal"]
+            length = np.linalg.norm(given, axis=1)
+            across = given - np.sum(given * normal, axis=1)[:, None] * normal
+            share = np.linalg.norm(across, axis=1) / np.where(length > 0, length, 1.0)
+            least = global_min(comm, share, empty=1.0)
+            if not least > _PARALLEL:
+                raise ValueError(
+                    f"{self.name}: direction of friction is zero or parallel to the normal at a "
+                    f"point of Γc (share across the normal: {least:.1g}); it must have a part in "
+                    "the tangent plane everywhere: give another direction, or a UFL vector that "
+                    "follows the surface"
+                )
 
     def commit(self) -> None:
         """Make the state at the present ``u`` the history of the next increment. Collective."""
@@ -632,15 +698,24 @@ class Contact:
 
     @property
     def pressure(self) -> Array:
-        """-r_n ≥ 0, shape (n_points,), in stress."""
+        """-r_n, shape (n_points,), in stress; negative only where the law bears tension."""
         return -self._values["normal_traction"]
 
     @property
     def tangential_traction(self) -> Array:
-        """τ on the body, shape (n_points, gdim), in stress; zeros without friction."""
-        if self.law.has_friction:
+        """τ on the body, shape (n_points, gdim), in stress; zeros if the law gives none."""
+        if self.law.has_tangential:
             return self._values["traction"]
         return np.zeros_like(self.points)
+
+    @property
+    def tangential_stiffness(self) -> Array:
+        """K_t of the law, shape (n_points, gdim, gdim), in stress/length; zeros without any."""
+        d = self._gdim
+        if self.law.has_tangential:
+            rows = [self._values[f"tangential_stiffness {i}"] for i in range(d)]
+            return np.stack(rows, axis=1)
+        return np.zeros((self.quadrature.n_points, d, d))
 
     @property
     def traction(self) -> Array:
@@ -650,8 +725,8 @@ class Contact:
 
     @property
     def tangential_displacement(self) -> Array:
-        """u_t (eq. 21), shape (n_points, gdim), in length; zeros without friction."""
-        if not self.law.has_friction:
+        """u_t (eq. 21), shape (n_points, gdim), in length; zeros if the law has no use for it."""
+        if not self.law.has_tangential:
             return np.zeros_like(self.points)
         jump, normal = self._values["jump"], self._values["normal"]
         return jump - np.sum(jump * normal, axis=1)[:, None] * normal
@@ -674,13 +749,13 @@ class Contact:
     def status(self) -> npt.NDArray[np.int8]:
         """`Status` in the last evaluated increment, shape (n_points,).
 
-        Without friction a closed point counts as slip: nothing holds it.
+        Without tangential tractions a closed point counts as slip: nothing holds it. Where the law
+        bears tension no point is open.
         """
-        closed = self._values["normal_traction"] < 0
+        closed = (self._values["normal_traction"] < 0) | self.law.has_tension
         status = np.where(closed, Status.SLIP, Status.OPEN).astype(np.int8)
-        if self.law.has_friction:
-            held = closed & np.all(self._values["slip_increment"] == 0, axis=1)
-            status[held] = Status.STICK
+        if self.law.has_tangential:
+            status[closed & np.all(self.slip_increment == 0, axis=1)] = Status.STICK
         return status
 
     @property
@@ -743,8 +818,9 @@ class Contact:
         return vectors | {n: rows[:, 3 * d + i] for i, n in enumerate(names)}
 
 
-def _range_error(contact: str, name: str, value: float) -> str:
-    wanted = "greater than zero (stress/length)" if name[:2] == "k_" else "zero or greater"
+def _range_error(contact: str, name: str, value: float, positive: bool) -> str:
+    wanted = "greater than zero" if positive else "zero or greater"
+    wanted += " (stress/length)" if name.startswith("k_") else ""
     return f"{contact}: {name} is {value:g} at a point of Γc; it must be finite and {wanted}"
 
 

@@ -2,18 +2,32 @@
 
 A law maps the kinematics of a point of Γc (`Kinematics`) to the reactions there (`Response`). One
 definition serves two and three dimensions and every support. Signs are the paper's: the traction on
-the body is r_n n + τ, with n from the body to the support and r_n ≤ 0.
+the body is r_n n + τ, with n from the body to the support and r_n ≤ 0 (but for `Foundation`, which
+may pull).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeAlias
+from numbers import Integral, Real
+from typing import Any, TypeAlias
 
 import ufl
 
-__all__ = ["Coulomb", "Frictionless", "Kinematics", "Law", "Response", "Scaled", "Tresca"]
+__all__ = [
+    "Coulomb",
+    "Foundation",
+    "FrictionLaw",
+    "Frictionless",
+    "Kinematics",
+    "Law",
+    "Response",
+    "Scaled",
+    "Springs",
+    "Tresca",
+]
 
 Expr: TypeAlias = ufl.core.expr.Expr
 
@@ -35,6 +49,29 @@ class Scaled:
 
 
 @dataclass(frozen=True)
+class Springs:
+    """A stiffness as one spring for each node pair of Γc, the contact springs of section 4.
+
+    At a vertex of Γc the stiffness per area is k over the area that the vertex stands for, the
+    contact's weight included: the reactions of the vertex add up to k times its displacement,
+    whatever the facets around it. Wants a surface with ``quadrature_scheme="vertex"``.
+
+    Args to the constructor:
+        k: Stiffness of one spring (force/length; per thickness in 2D without weight).
+    """
+
+    k: float
+
+    def __post_init__(self) -> None:
+        """Refuse a stiffness that is no positive number."""
+        if not (isinstance(self.k, Real) and 0.0 < self.k < float("inf")):
+            raise ValueError(
+                f"k of the Springs is {self.k!r}; it must be a number greater than zero "
+                "(force/length of one node pair)"
+            )
+
+
+@dataclass(frozen=True)
 class Kinematics:
     """What a law sees at a point (UFL).
 
@@ -42,6 +79,8 @@ class Kinematics:
         gap: Initial gap s (length), the motion of the support included.
         normal_displacement: u_n of eq. (2).
         normal: Unit normal n from body to support, shape (gdim,).
+        tangential_displacement: u_t of eq. (21), relative to the support, shape (gdim,); None if
+            the law gives no tangential traction.
         tangential_increment: Δu_t since the last commit, shape (gdim,); None without friction.
         traction: Tangential traction τ at the last commit, shape (gdim,); None without friction.
     """
@@ -49,6 +88,7 @@ class Kinematics:
     gap: Expr
     normal_displacement: Expr
     normal: Expr
+    tangential_displacement: Expr | None = None
     tangential_increment: Expr | None = None
     traction: Expr | None = None
 
@@ -58,11 +98,11 @@ class Response:
     """The reactions at a point (UFL).
 
     Attributes:
-        normal_traction: r_n ≤ 0 (stress).
+        normal_traction: r_n (stress).
         opening: δ₊ ≥ 0 (length), eq. (6).
         penetration: δ₋ ≥ 0 (length), eq. (6).
-        traction: τ (stress), shape (gdim,); None without friction.
-        limit: Largest |τ| that friction bears (stress); None without friction.
+        traction: τ (stress), shape (gdim,); None if the law gives none.
+        limit: μ p, the size of the yield surface (stress); None without friction.
         slip: Δβ ≥ 0 of each slip mode (length), eq. (44).
     """
 
@@ -75,59 +115,129 @@ class Response:
 
 
 class Law:
-    """A contact law.
+    """A contact law. What a subclass does not say is as for unilateral contact without friction."""
 
-    Attributes:
-        has_friction: Whether tangential state is needed at all.
-        has_potential: Whether the reactions are the gradient of a potential (symmetric tangent).
-        unilateral: Whether r_n answers the gap; False where the normal traction is prescribed.
-    """
+    @property
+    def has_tangential(self) -> bool:
+        """Whether there are tangential tractions."""
+        return self.has_friction
 
-    has_friction: ClassVar[bool]
-    has_potential: ClassVar[bool]
-    unilateral: bool = True
+    @property
+    def has_friction(self) -> bool:
+        """Whether points slip, so that tangential state is needed."""
+        return False
+
+    @property
+    def has_potential(self) -> bool:
+        """Whether the reactions are the gradient of a potential (symmetric tangent)."""
+        return True
+
+    @property
+    def has_normal_stiffness(self) -> bool:
+        """Whether r_n answers the gap by k_n; False where the normal traction is prescribed."""
+        return True
+
+    @property
+    def has_tension(self) -> bool:
+        """Whether r_n pulls where the gap is open: such points are never open."""
+        return False
+
+    @property
+    def positive(self) -> frozenset[str]:
+        """Names of the parameters that must be greater than zero; the others may be zero."""
+        return frozenset({"k_n", "k_t"})
 
     def parameters(self) -> dict[str, Any]:
         """The law's parameters by name, as the user gave them."""
         return dict(vars(self))
+
+    def check_dimension(self, gdim: int) -> None:
+        """Refuse what makes no sense in ``gdim`` dimensions.
+
+        Raises:
+            ValueError: It says what was given, and what is expected.
+        """
 
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """The reactions; ``parameters`` are those of `parameters`, as UFL."""
         raise NotImplementedError
 
     def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
-        """Potential per area whose derivative by the displacement is minus the traction."""
+        """Potential per area whose derivative by the displacement is minus the traction.
+
+        Raises:
+            ValueError: There is none.
+        """
         raise ValueError(
             f"{type(self).__name__} has no potential: its slip is not associated (eq. 46)"
         )
 
-    def stored(self, response: Response, parameters: Mapping[str, Expr]) -> Expr:
-        """Energy per area in the springs, r_n²/2k_n + |τ|²/2k_t."""
+    def n_modes(self, gdim: int) -> int:
+        """Number of slip modes."""
+        return 0
+
+    def grip(self, parameters: Mapping[str, Expr]) -> Expr:
+        """Bound of |τ|/p over all directions; not zero wherever motion along Γc is resisted."""
+        return ufl.as_ufl(0.0)
+
+    def tangential_stiffness(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+        """K_t of a sticking point (stress/length), shape (gdim, gdim), with K_t n = 0."""
+        n = kinematics.normal
+        return parameters["k_t"] * (ufl.Identity(len(n)) - ufl.outer(n, n))
+
+    def elastic_displacement(
+        self, kinematics: Kinematics, traction: Expr, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """K_t⁻¹ τ (length), shape (gdim,): minus the displacement v_e of eq. (24) without slip."""
+        return traction / parameters["k_t"]
+
+    def yield_functions(
+        self, kinematics: Kinematics, traction: Expr, limit: Expr, parameters: Mapping[str, Expr]
+    ) -> tuple[Expr, ...]:
+        """g_j(τ, limit) ≤ 0 of each slip mode (stress), eq. (29), apart from the return map.
+
+        Slip is associated with them: K_t⁻¹ Δτ = -(Δu_t + Σ Δβ_j ∂g_j/∂τ), eq. (44).
+        """
+        return ()
+
+    def stored(
+        self, kinematics: Kinematics, response: Response, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """Energy per area in the springs, r_n²/2k_n + τ·K_t⁻¹τ/2."""
         stored = ufl.as_ufl(0.0)
-        if self.unilateral:
+        if self.has_normal_stiffness:
             stored += response.normal_traction**2 / (2 * parameters["k_n"])
         if response.traction is not None:
-            stored += ufl.dot(response.traction, response.traction) / (2 * parameters["k_t"])
+            stretched = self.elastic_displacement(kinematics, response.traction, parameters)
+            stored += ufl.dot(response.traction, stretched) / 2
         return stored
 
     def dissipated(
         self, kinematics: Kinematics, response: Response, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """Work per area of friction on the slip of the increment, -τ·(Δu_t + Δτ/k_t) ≥ 0."""
+        """Work per area of friction on the slip of the increment, -τ·(Δu_t + K_t⁻¹ Δτ) ≥ 0."""
         assert response.traction is not None
         assert kinematics.traction is not None and kinematics.tangential_increment is not None
-        stretched = (response.traction - kinematics.traction) / parameters["k_t"]
+        change = response.traction - kinematics.traction
+        stretched = self.elastic_displacement(kinematics, change, parameters)
         return -ufl.dot(response.traction, kinematics.tangential_increment + stretched)
-
-    @staticmethod
-    def n_modes(gdim: int) -> int:
-        """Slip modes: ± in the plane (eq. 29), the one cone in space."""
-        return 2 if gdim == 2 else 1
 
 
 def positive_part(value: Expr) -> Expr:
     """⟨value⟩₊, with the derivative 0 at the kink."""
     return ufl.conditional(ufl.gt(value, 0), value, 0)
+
+
+def norm(vector: Expr) -> Expr:
+    """|vector|, with the derivative 0 at zero."""
+    squared = ufl.dot(vector, vector)
+    return ufl.conditional(ufl.gt(squared, 0), ufl.sqrt(squared), 0)
+
+
+def clip(value: Expr, limit: Expr) -> Expr:
+    """The number between -limit and limit that is nearest to ``value``."""
+    below = ufl.conditional(ufl.lt(value, -limit), -limit, value)
+    return ufl.conditional(ufl.gt(value, limit), limit, below)
 
 
 def signorini(kinematics: Kinematics, k_n: Expr) -> tuple[Expr, Expr, Expr]:
@@ -142,38 +252,66 @@ def signorini_potential(kinematics: Kinematics, k_n: Expr) -> Expr:
     return k_n / 2 * positive_part(kinematics.normal_displacement - kinematics.gap) ** 2
 
 
-def _trial_traction(kinematics: Kinematics, k_t: Expr) -> Expr:
-    """τ* = τ - k_t Δu_t: what adherence alone would give, eq. (44)."""
-    return kinematics.traction - k_t * kinematics.tangential_increment
+# ---- return maps: the closest point of the yield surface, and the excess of each mode ------------
 
 
-def _tangent_2d(normal: Expr) -> Expr:
-    return ufl.as_vector([-normal[1], normal[0]])
+def return_to_segment(trial: Expr, limit: Expr, tangent: Expr) -> tuple[Expr, tuple[Expr, ...]]:
+    """In the plane: the two modes g = (τ - limit, -τ - limit), eq. (29).
 
+    Needs no norm and is piecewise linear.
 
-def return_map(kinematics: Kinematics, limit: Expr, k_t: Expr) -> tuple[Expr, tuple[Expr, ...]]:
-    """Traction and slip of the increment, eq. (41-45), given the largest |τ|.
-
-    In the plane the two modes g = (τ - limit, -τ - limit), eq. (29), which needs no norm and is
-    piecewise linear; in space the cone |τ| - limit.
+    Args:
+        trial: τ*, what adherence alone would give, shape (2,).
+        limit: μ p ≥ 0.
+        tangent: Unit vector, shape (2,).
 
     Returns:
-        τ at the end of the increment, shape (gdim,), and Δβ of each mode.
+        τ, shape (2,), and k_t Δβ of each mode (stress).
     """
-    trial = _trial_traction(kinematics, k_t)
-    if trial.ufl_shape == (2,):
-        tangent = _tangent_2d(kinematics.normal)
-        along = ufl.dot(trial, tangent)
-        modes = (along - limit, -along - limit)
-        clipped = ufl.conditional(
-            ufl.gt(modes[0], 0), limit, ufl.conditional(ufl.gt(modes[1], 0), -limit, along)
-        )
-        return clipped * tangent, tuple(positive_part(g) / k_t for g in modes)
+    along = ufl.dot(trial, tangent)
+    excess = (positive_part(along - limit), positive_part(-along - limit))
+    return clip(along, limit) * tangent, excess
+
+
+def return_to_cone(trial: Expr, limit: Expr) -> tuple[Expr, tuple[Expr, ...]]:
+    """In space: the one mode g = |τ| - limit; see `return_to_segment`."""
     # The norm is only used, and only differentiated, where it exceeds the limit: never at zero.
     size = ufl.sqrt(ufl.dot(trial, trial))
     slips = ufl.gt(size, limit)
     traction = ufl.conditional(slips, limit / size, 1) * trial
-    return traction, (ufl.conditional(slips, (size - limit) / k_t, 0),)
+    return traction, (ufl.conditional(slips, size - limit, 0),)
+
+
+def return_to_polygon(
+    trial: Expr, limit: Expr, sides: list[tuple[Expr, Expr]]
+) -> tuple[Expr, tuple[Expr, ...]]:
+    """In space: g_j = τ·a_j - limit, the sides of a regular polygon (paper's fig. 3).
+
+    With x = τ*·a_j, y = τ*·b_j and half a side H = limit tan(π/n), mode j is exceeded by
+    ⟨x - limit - cot(2π/n) ⟨|y| - H⟩₊⟩₊: beyond the end of the side it shares the excess with its
+    neighbour, which is the same formula for the other one. No sector has to be told.
+
+    Args:
+        trial: τ*, shape (3,).
+        limit: Radius of the inscribed circle.
+        sides: Outward unit normal a_j of every side, and the unit vector b_j along it.
+
+    Returns:
+        See `return_to_segment`.
+    """
+    half, share = math.tan(math.pi / len(sides)), 1 / math.tan(2 * math.pi / len(sides))
+    traction, excess = trial, []
+    for a, b in sides:
+        x, y = ufl.dot(trial, a), ufl.dot(trial, b)
+        over = positive_part(x - limit - share * positive_part(abs(y) - half * limit))
+        # The closest point of this side: at a vertex both neighbours give the same.
+        on_side = limit * a + clip(y, half * limit) * b
+        traction = ufl.conditional(ufl.gt(over, 0), on_side, traction)
+        excess.append(over)
+    return traction, tuple(excess)
+
+
+# ---- laws ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -181,12 +319,11 @@ class Frictionless(Law):
     """Unilateral contact without friction, eq. (6-20).
 
     Args to the constructor:
-        k_n: Normal stiffness (stress/length): a number, constant or UFL expression, or `Scaled`.
+        k_n: Normal stiffness (stress/length): a number, constant or UFL expression, `Scaled`, or
+            `Springs`.
     """
 
     k_n: Any = Scaled(10.0)
-    has_friction: ClassVar[bool] = False
-    has_potential: ClassVar[bool] = True
 
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """See `Law.response`."""
@@ -198,33 +335,303 @@ class Frictionless(Law):
 
 
 @dataclass(frozen=True)
-class Coulomb(Law):
+class Foundation(Law):
+    """An elastic foundation: r_n = -k_n (u_n - s) and τ = -k_t u_t, both from the start.
+
+    The stiffness is physical here, that of a layer between body and support (paper, 2.1).
+
+    Args to the constructor:
+        k_n: Normal stiffness (stress/length); see `Frictionless`.
+        k_t: Tangential stiffness (stress/length), likewise; zero by default.
+        tension: True: the foundation is bonded to the body, and pulls as it pushes. False: it acts
+            where the gap is closed and nowhere else; with k_t there is no potential then, since τ
+            jumps where the gap closes.
+    """
+
+    k_n: Any
+    k_t: Any = 0.0
+    tension: bool = True
+
+    @property
+    def has_tangential(self) -> bool:
+        """See `Law.has_tangential`."""
+        return not (isinstance(self.k_t, Real) and self.k_t == 0)
+
+    @property
+    def has_potential(self) -> bool:
+        """See `Law.has_potential`."""
+        return self.tension or not self.has_tangential
+
+    @property
+    def has_tension(self) -> bool:
+        """See `Law.has_tension`."""
+        return self.tension
+
+    @property
+    def positive(self) -> frozenset[str]:
+        """See `Law.positive`: k_t may be zero."""
+        return frozenset({"k_n"})
+
+    def parameters(self) -> dict[str, Any]:
+        """See `Law.parameters`."""
+        return {"k_n": self.k_n} | ({"k_t": self.k_t} if self.has_tangential else {})
+
+    def grip(self, parameters: Mapping[str, Expr]) -> Expr:
+        """See `Law.grip`: there is no limit, so that this tells only where k_t is."""
+        return parameters["k_t"]
+
+    def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
+        """See `Law.response`."""
+        r_n, opening, penetration = signorini(kinematics, parameters["k_n"])
+        if self.tension:
+            r_n = parameters["k_n"] * (kinematics.gap - kinematics.normal_displacement)
+        if not self.has_tangential:
+            return Response(r_n, opening, penetration)
+        k_t = parameters["k_t"]
+        if not self.tension:
+            k_t = ufl.conditional(ufl.gt(penetration, 0), k_t, 0)
+        traction = -k_t * kinematics.tangential_displacement
+        return Response(r_n, opening, penetration, traction)
+
+    def stored(
+        self, kinematics: Kinematics, response: Response, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """See `Law.stored`; by displacements, since k_t may be zero."""
+        closing = kinematics.normal_displacement - kinematics.gap
+        stored = -response.normal_traction * closing / 2
+        if response.traction is not None:
+            stored -= ufl.dot(response.traction, kinematics.tangential_displacement) / 2
+        return stored
+
+    def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+        """½ k_n (u_n - s)² + ½ k_t |u_t|², or eq. (19) without tension."""
+        if not self.has_potential:
+            raise ValueError(
+                "Foundation has no potential with k_t and without tension: τ jumps where the gap "
+                "closes; set k_t=0 or tension=True where one is needed"
+            )
+        if not self.tension:
+            return signorini_potential(kinematics, parameters["k_n"])
+        density = parameters["k_n"] / 2 * (kinematics.normal_displacement - kinematics.gap) ** 2
+        if self.has_tangential:
+            u_t = kinematics.tangential_displacement
+            density += parameters["k_t"] / 2 * ufl.dot(u_t, u_t)
+        return density
+
+
+class FrictionLaw(Law):
+    """What laws with friction share: the yield surface in the tangent plane, and slip.
+
+    In the plane it is ±limit. In space it is the cone |τ| ≤ limit; with ``modes`` the regular
+    polygon around that circle; with ``transverse_friction`` the cone (or polygon) is stretched
+    across the direction by r = μ₂/μ₁. In σ = B⁻¹τ, B = diag(1, r), it is the unstretched one, and
+    with K_t = k_t B² the closest point in the metric of K_t is the closest point in σ.
+    """
+
+    friction: Any
+    k_t: Any
+    modes: int | None
+    transverse_friction: Any
+    direction: Any
+
+    def __post_init__(self) -> None:
+        """Refuse a polygon of fewer than three sides, and a direction that is missing or unused.
+
+        Raises:
+            ValueError: It says what was given, and what is expected.
+        """
+        if self.modes is not None and not (isinstance(self.modes, Integral) and self.modes >= 3):
+            raise ValueError(
+                f"modes is {self.modes!r}; it must be a whole number, 3 or more: the sides of the "
+                "polygon; leave it out for the cone"
+            )
+        if self.transverse_friction is not None and self.direction is None:
+            raise ValueError(
+                f"transverse_friction is {self.transverse_friction!r}, but direction is missing; "
+                "give the direction that friction acts along, direction=(x, y, z)"
+            )
+        if self.direction is not None and self.modes is None and self.transverse_friction is None:
+            raise ValueError(
+                f"direction is {self.direction!r}, but the cone has none; give modes or "
+                "transverse_friction with it, or leave it out"
+            )
+
+    @property
+    def has_friction(self) -> bool:
+        """See `Law.has_friction`."""
+        return True
+
+    @property
+    def positive(self) -> frozenset[str]:
+        """See `Law.positive`: the axes of an ellipse must not vanish."""
+        axes = (
+            {"friction", "transverse_friction"} if self.transverse_friction is not None else set()
+        )
+        return super().positive | axes
+
+    def _friction_parameters(self) -> dict[str, Any]:
+        optional = {"transverse_friction": self.transverse_friction, "direction": self.direction}
+        given = {name: value for name, value in optional.items() if value is not None}
+        return {"friction": self.friction, "k_t": self.k_t} | given
+
+    def check_dimension(self, gdim: int) -> None:
+        """See `Law.check_dimension`."""
+        for name in ("modes", "transverse_friction"):
+            value = getattr(self, name)
+            if gdim == 2 and value is not None:
+                raise ValueError(
+                    f"{name} is {value!r} on a mesh in two dimensions; friction along a line has "
+                    "the two modes ± and no other: leave it out"
+                )
+
+    def n_modes(self, gdim: int) -> int:
+        """Slip modes: ± in the plane (eq. 29), in space the one cone or the polygon's sides."""
+        return 2 if gdim == 2 else self.modes or 1
+
+    def grip(self, parameters: Mapping[str, Expr]) -> Expr:
+        """See `Law.grip`: the vertices of the polygon, the larger of the two frictions."""
+        bound = parameters["friction"]
+        if self.transverse_friction is not None:
+            bound = ufl.max_value(bound, parameters["transverse_friction"])
+        return bound if self.modes is None else bound / math.cos(math.pi / self.modes)
+
+    def _frame(self, normal: Expr, parameters: Mapping[str, Expr]) -> tuple[Expr, Expr]:
+        """Orthonormal vectors of the tangent plane, the first along the direction.
+
+        Without a direction it is that of x, or of y where the normal is nearly along x.
+        """
+        if self.direction is None:
+            x = ufl.conditional(ufl.lt(abs(normal[0]), 0.9), 1.0, 0.0)
+            direction = ufl.as_vector([x, 1 - x, 0.0])
+        else:
+            direction = parameters["direction"]
+        first = direction - ufl.dot(direction, normal) * normal
+        first = first / ufl.sqrt(ufl.dot(first, first))
+        return first, ufl.cross(normal, first)
+
+    def _sides(self, normal: Expr, parameters: Mapping[str, Expr]) -> list[tuple[Expr, Expr]]:
+        """Of each side of the polygon the outward normal, and the vector along it.
+
+        The first side is across the direction.
+        """
+        assert self.modes is not None
+        first, second = self._frame(normal, parameters)
+        sides = []
+        for j in range(self.modes):
+            c, s = (f(2 * math.pi * j / self.modes) for f in (math.cos, math.sin))
+            sides.append((c * first + s * second, -s * first + c * second))
+        return sides
+
+    def _stretched(
+        self, vector: Expr, power: int, normal: Expr, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """B to a power, times a tangential vector."""
+        if self.transverse_friction is None:
+            return vector
+        first, second = self._frame(normal, parameters)
+        ratio = parameters["transverse_friction"] / parameters["friction"]
+        return ufl.dot(vector, first) * first + ratio**power * ufl.dot(vector, second) * second
+
+    def tangential_stiffness(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+        """See `Law.tangential_stiffness`: k_t B²."""
+        if self.transverse_friction is None:
+            return super().tangential_stiffness(kinematics, parameters)
+        first, second = self._frame(kinematics.normal, parameters)
+        ratio = parameters["transverse_friction"] / parameters["friction"]
+        return parameters["k_t"] * (ufl.outer(first, first) + ratio**2 * ufl.outer(second, second))
+
+    def elastic_displacement(
+        self, kinematics: Kinematics, traction: Expr, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """See `Law.elastic_displacement`: B⁻² τ/k_t."""
+        return self._stretched(traction, -2, kinematics.normal, parameters) / parameters["k_t"]
+
+    def yield_functions(
+        self, kinematics: Kinematics, traction: Expr, limit: Expr, parameters: Mapping[str, Expr]
+    ) -> tuple[Expr, ...]:
+        """See `Law.yield_functions`: eq. (29) in the plane, |σ| - limit or σ·a_j - limit."""
+        n = kinematics.normal
+        if len(n) == 2:
+            along = ufl.dot(traction, _perpendicular(n))
+            return along - limit, -along - limit
+        sigma = self._stretched(traction, -1, n, parameters)
+        if self.modes is None:
+            return (norm(sigma) - limit,)
+        return tuple(ufl.dot(sigma, a) - limit for a, _ in self._sides(n, parameters))
+
+    def _return(
+        self, kinematics: Kinematics, limit: Expr, parameters: Mapping[str, Expr]
+    ) -> tuple[Expr, Expr, tuple[Expr, ...]]:
+        """Return map of the increment in σ, eq. (41-45): σ*, σ and Δβ of each mode."""
+        n, k_t = kinematics.normal, parameters["k_t"]
+        trial = self._stretched(kinematics.traction, -1, n, parameters)
+        trial = trial - k_t * self._stretched(kinematics.tangential_increment, 1, n, parameters)
+        if len(n) == 2:
+            sigma, excess = return_to_segment(trial, limit, _perpendicular(n))
+        elif self.modes is None:
+            sigma, excess = return_to_cone(trial, limit)
+        else:
+            sigma, excess = return_to_polygon(trial, limit, self._sides(n, parameters))
+        return trial, sigma, tuple(e / k_t for e in excess)
+
+    def slide(
+        self, kinematics: Kinematics, limit: Expr, parameters: Mapping[str, Expr]
+    ) -> tuple[Expr, tuple[Expr, ...]]:
+        """τ at the end of the increment, shape (gdim,), and Δβ of each mode, eq. (41-45)."""
+        _, sigma, slip = self._return(kinematics, limit, parameters)
+        return self._stretched(sigma, 1, kinematics.normal, parameters), slip
+
+
+def _perpendicular(normal: Expr) -> Expr:
+    return ufl.as_vector([-normal[1], normal[0]])
+
+
+@dataclass(frozen=True)
+class Coulomb(FrictionLaw):
     """Unilateral contact with Coulomb friction, eq. (21-50).
 
     Args to the constructor:
         friction: Friction coefficient μ ≥ 0: a number, constant or UFL expression over Γc.
         k_n: Normal stiffness (stress/length); see `Frictionless`.
         k_t: Tangential stiffness (stress/length), likewise.
+        modes: Sides of a polygonal cone around the circular one, 3 or more, in space only; by
+            default the circular one.
+        transverse_friction: Friction coefficient μ₂ > 0 across ``direction``, in space only;
+            ``friction`` is then the one along it, and > 0 too: (τ₁/μ₁)² + (τ₂/μ₂)² ≤ p², with
+            associated slip. The tangential stiffness is k_t along and k_t (μ₂/μ₁)² across: a
+            metric of the regularisation, for which the return map has a closed form.
+        direction: Of anisotropic friction, or that which the polygon's first side is across: three
+            numbers or UFL, projected on the tangent plane.
     """
 
     friction: Any
     k_n: Any = Scaled(10.0)
     k_t: Any = Scaled(10.0)
-    has_friction: ClassVar[bool] = True
-    has_potential: ClassVar[bool] = False
+    modes: int | None = None
+    transverse_friction: Any = None
+    direction: Any = None
+
+    @property
+    def has_potential(self) -> bool:
+        """See `Law.has_potential`."""
+        return False
+
+    def parameters(self) -> dict[str, Any]:
+        """See `Law.parameters`."""
+        return self._friction_parameters() | {"k_n": self.k_n}
 
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """See `Law.response`. Where the gap is open τ = 0, and moving is not slipping."""
         r_n, opening, penetration = signorini(kinematics, parameters["k_n"])
         limit = -parameters["friction"] * r_n
-        traction, slip = return_map(kinematics, limit, parameters["k_t"])
+        traction, slip = self.slide(kinematics, limit, parameters)
         closed = ufl.gt(penetration, 0)
         slip = tuple(ufl.conditional(closed, mode, 0) for mode in slip)
         return Response(r_n, opening, penetration, traction, limit, slip)
 
 
 @dataclass(frozen=True)
-class Tresca(Law):
+class Tresca(FrictionLaw):
     """Friction whose limit μ p does not depend on the contact pressure (Duvaut-Lions, section 3).
 
     Args to the constructor:
@@ -235,6 +642,7 @@ class Tresca(Law):
         unilateral: True: the normal reaction is that of unilateral contact, and only the limit
             of friction is prescribed. False: the normal traction on the body *is* -p, gap or not
             (eq. 43); k_n is not used.
+        modes, transverse_friction, direction: See `Coulomb`.
     """
 
     friction: Any
@@ -242,18 +650,24 @@ class Tresca(Law):
     k_n: Any = Scaled(10.0)
     k_t: Any = Scaled(10.0)
     unilateral: bool = True
-    has_friction: ClassVar[bool] = True
-    has_potential: ClassVar[bool] = True
+    modes: int | None = None
+    transverse_friction: Any = None
+    direction: Any = None
+
+    @property
+    def has_normal_stiffness(self) -> bool:
+        """See `Law.has_normal_stiffness`."""
+        return self.unilateral
 
     def parameters(self) -> dict[str, Any]:
         """See `Law.parameters`."""
-        names = ("friction", "pressure", "k_t") + (("k_n",) if self.unilateral else ())
-        return {name: getattr(self, name) for name in names}
+        normal = {"k_n": self.k_n} if self.unilateral else {}
+        return self._friction_parameters() | {"pressure": self.pressure} | normal
 
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """See `Law.response`."""
         limit = parameters["friction"] * parameters["pressure"]
-        traction, slip = return_map(kinematics, limit, parameters["k_t"])
+        traction, slip = self.slide(kinematics, limit, parameters)
         k_n = parameters["k_n"] if self.unilateral else ufl.as_ufl(0)
         r_n, opening, penetration = signorini(kinematics, k_n)
         if not self.unilateral:
@@ -261,15 +675,13 @@ class Tresca(Law):
         return Response(r_n, opening, penetration, traction, limit, slip)
 
     def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
-        """Eq. (19) and (43): in Δu_t it is ½|τ*|²/k_t up to the limit, linear beyond."""
-        k_t = parameters["k_t"]
+        """Eq. (19) and (43): in Δu_t it is ½|σ*|²/k_t up to the limit, linear beyond.
+
+        That is (|σ*|² - |σ* - σ|²)/(2 k_t), whose gradient by σ* is the closest point σ over k_t.
+        """
         limit = parameters["friction"] * parameters["pressure"]
-        trial = _trial_traction(kinematics, k_t)
-        squared = ufl.dot(trial, trial)
-        slips = ufl.gt(squared, limit**2)
-        tangential = (
-            ufl.conditional(slips, limit * ufl.sqrt(squared) - limit**2 / 2, squared / 2) / k_t
-        )
+        trial, sigma, _ = self._return(kinematics, limit, parameters)
+        tangential = ufl.dot(sigma, trial - sigma / 2) / parameters["k_t"]
         if not self.unilateral:
             return tangential + parameters["pressure"] * kinematics.normal_displacement
         return tangential + signorini_potential(kinematics, parameters["k_n"])

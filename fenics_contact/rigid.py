@@ -156,10 +156,10 @@ class RigidMotions:
             if closed_only:
                 weights = weights * (contact.status != Status.OPEN)
             area += contact.quadrature.weights.sum()
-            if contact.law.unilateral:
+            if contact.law.has_normal_stiffness:
                 gram += (along * weights) @ along.T
-            if contact.law.has_friction:
-                grip = weights * (values["parameter friction"] > 0)
+            if contact.law.has_tangential:
+                grip = weights * (values["grip"] > 0)
                 across = modes - along[:, :, None] * values["normal"][None]
                 gram += np.einsum("mqd,q,nqd->mn", across, grip, across)
         mean = global_sum(self._comm, gram) / max(float(global_sum(self._comm, area)), 1e-300)
@@ -216,16 +216,18 @@ class RigidMotions:
         # What the load could do at most, were all of it along the motion: the scale of "zero".
         size = float(global_sum(self._comm, np.abs(free) @ np.abs(load)).max())
         for contact in contacts:
-            if not contact.law.unilateral:  # a prescribed normal traction is a load
+            if not contact.law.has_normal_stiffness:  # a prescribed normal traction is a load
                 force = -contact.values["parameter pressure"][:, None] * contact.values["normal"]
                 work = np.einsum("mqd,qd,q->m", self._at_points(contact), force, contact.measure)
                 resultant += global_sum(self._comm, work)
         if np.abs(resultant).max() <= _BALANCED * size:
             return
         rays = np.concatenate([self._rays(contact) for contact in contacts], axis=0)
-        # Unit columns: a ray's length has no meaning, and badly scaled ones spoil the solution.
+        # Unit columns: a ray's length has no meaning, and badly scaled ones spoil the solution. One
+        # of rounding only, such as that of tangential forces on a motion across them, is none.
         length = np.linalg.norm(rays, axis=1)
-        rays = rays[length > 0] / length[length > 0, None]
+        felt = length > _FELT
+        rays = rays[felt] / length[felt, None]
         rest = np.abs(resultant).max()
         if len(rays):
             rest = scipy.optimize.nnls(rays.T, -resultant / rest)[1] * rest
@@ -244,20 +246,23 @@ class RigidMotions:
         normal = values["normal"]
         d = normal.shape[1]
         directions = []
-        if contact.law.has_friction:
+        law = contact.law
+        if law.has_tangential:
             if d == 2:
                 around = [np.column_stack([-normal[:, 1], normal[:, 0]])]
                 around.append(-around[0])
             else:
                 around = _around(normal)
-            friction = values["parameter friction"][:, None]
-            if contact.law.unilateral and not contact.law.has_potential:
+            friction = values["grip"][:, None]
+            if law.has_friction and not law.has_potential:
                 enlarge = 1.0 if d == 2 else 1 / np.cos(np.pi / _CONE_SIDES)
                 directions = [-normal + enlarge * friction * t for t in around]
-            else:  # Tresca: the tangential force does not need the normal one
+            else:  # Tresca, foundation: the tangential force does not need the normal one
                 directions = [np.where(friction > 0, t, 0.0) for t in around]
-        if contact.law.unilateral:
+        if law.has_normal_stiffness:
             directions.append(-normal)
+        if law.has_tension:
+            directions.append(normal)
         modes = self._at_points(contact)
         rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
         return gather_rows(self._comm, np.concatenate(rays).reshape(-1, len(self.free)))

@@ -110,7 +110,7 @@ def _vector(name: str, value: Any, gdim: int) -> Any:
     return array
 
 
-def _nonzero(name: str, value: Any, gdim: int) -> Any:
+def nonzero_vector(name: str, value: Any, gdim: int) -> Any:
     """Check a direction given by numbers: not of length zero. Its length does not matter."""
     value = _vector(name, value, gdim)
     if isinstance(value, np.ndarray):
@@ -144,7 +144,7 @@ class HalfSpace(Support):
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
         """Gap (x - point - shift)·normal; see `Support.place`."""
         gdim = x.ufl_shape[0]
-        normal = to_ufl(_nonzero("normal of the HalfSpace", self.normal, gdim))
+        normal = to_ufl(nonzero_vector("normal of the HalfSpace", self.normal, gdim))
         normal = normal / ufl.sqrt(ufl.dot(normal, normal))
         arm = x - to_ufl(_vector("point of the HalfSpace", self.point, gdim))
         if shift is not None:
@@ -190,7 +190,7 @@ class Cylinder(Support):
         if gdim == 3:
             if self.axis is None:
                 raise ValueError("axis of the Cylinder is missing; in 3D give its direction")
-            axis = to_ufl(_nonzero("axis of the Cylinder", self.axis, gdim))
+            axis = to_ufl(nonzero_vector("axis of the Cylinder", self.axis, gdim))
             axis = axis / ufl.sqrt(ufl.dot(axis, axis))
             arm = arm - ufl.dot(arm, axis) * axis
             if shift is not None:
@@ -227,7 +227,7 @@ class Obstacle(Support):
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
         """The given gap, plus the support's own motion along the normal; see `Support.place`."""
         gdim = x.ufl_shape[0]
-        direction = to_ufl(_nonzero("normal of the Obstacle", self.normal, gdim))
+        direction = to_ufl(nonzero_vector("normal of the Obstacle", self.normal, gdim))
         gap = to_ufl(self.gap)
         if gap.ufl_shape != ():
             raise ValueError(f"gap of the Obstacle has shape {gap.ufl_shape}; it must be a scalar")

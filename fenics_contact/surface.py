@@ -13,9 +13,9 @@ from dolfinx import fem, la
 from petsc4py import PETSc
 
 from fenics_contact import compat
-from fenics_contact.parallel import gather_rows
+from fenics_contact.parallel import gather_rows, global_min
 
-__all__ = ["ContactSurface", "PointEvaluator", "SurfaceQuadrature"]
+__all__ = ["ContactSurface", "PointEvaluator", "SurfaceQuadrature", "VertexAreas"]
 
 _SCHEMES = ("default", "vertex")
 
@@ -211,6 +211,59 @@ class SurfaceQuadrature:
         matrix.diagonalScale(inverse, None)
         inverse.destroy()
         return matrix
+
+
+class VertexAreas:
+    """The area that each vertex of Γc stands for in the rule "vertex".
+
+    Attributes:
+        area: Continuous function of degree 1 on the submesh of Γc, ∫ w v ds with v the function of
+            the vertex (length^(gdim-1) times the unit of the weight).
+    """
+
+    def __init__(
+        self, quadrature: SurfaceQuadrature, weight: ufl.core.expr.Expr, name: str
+    ) -> None:
+        """Measure the areas. Collective.
+
+        Args:
+            quadrature: The rule.
+            weight: Factor w of the surface measure.
+            name: Of the contact, in messages.
+
+        Raises:
+            ValueError: The rule is another one, or an area is not positive.
+        """
+        surface = quadrature.surface
+        if surface.quadrature_scheme != "vertex":
+            raise ValueError(
+                f"{name}: Springs stand at the vertices of Γc, and quadrature_scheme is "
+                f"{surface.quadrature_scheme!r}; make the ContactSurface with "
+                'quadrature_scheme="vertex", or give the stiffness per area'
+            )
+        self._name = name
+        self._comm = surface.mesh.comm
+        space = fem.functionspace(surface.submesh, ("Lagrange", 1))
+        self.area = fem.Function(space, name="area")
+        self._form = compat.compile_form(
+            weight * ufl.TestFunction(space) * quadrature.ds, surface.entity_maps
+        )
+        self.update()
+
+    def update(self) -> None:
+        """Measure again, with the weight as it is now. Collective.
+
+        Raises:
+            ValueError: The area of a vertex is not positive.
+        """
+        _assemble(self._form, self.area.x)
+        smallest = global_min(self._comm, self.area.x.array, empty=1.0)
+        if not smallest > 0.0:
+            raise ValueError(
+                f"{self._name}: the area of a vertex of Γc is {smallest:g}, weight included; "
+                "Springs need one that is positive: check the weight (2πr is zero on the axis), "
+                "or give the stiffness per area"
+            )
 
 
 class PointEvaluator:

@@ -62,13 +62,16 @@ def check_laws(contact: Contact) -> dict[str, float]:
         contact: An evaluated contact.
 
     Returns:
-        Largest violations, relative to the largest value concerned: "complementarity"
-        (eq. 6-11: r_n ≤ 0, δ± ≥ 0, δ₊δ₋ = 0, r_n δ₊ = 0, s - u_n = δ₊ - δ₋, r_n = -k_n δ₋) and,
-        with friction, "cone" (|τ| ≤ limit), "slip" (eq. 44: Δτ = -k_t (Δu_t + g_τ·Δβ), Δβ ≥ 0)
-        and "dissipation" (Δβ·g = 0, slip against τ). NaN where something is not finite.
+        Largest violations, relative to the largest value concerned. "complementarity"
+        (eq. 6-11: r_n ≤ 0, δ± ≥ 0, δ₊δ₋ = 0, r_n δ₊ = 0, s - u_n = δ₊ - δ₋, r_n = -k_n δ₋), or
+        where the law bears tension "stiffness" (r_n = -k_n (u_n - s)). With friction, by the law's
+        yield functions g_j: "cone" (g_j ≤ 0), "slip" (eq. 44: Δβ ≥ 0, the change of the traction
+        is that of adherence and associated slip, Δτ = -K_t (Δu_t + Σ Δβ_j ∂g_j/∂τ)) and
+        "dissipation" (Δβ_j g_j = 0, slip against τ). With tangential tractions but no friction
+        "stiffness" holds τ = -K_t u_t too, or τ = 0 where open. NaN where something is not finite.
     """
     comm = contact.surface.mesh.comm
-    v = contact.values
+    law, v = contact.law, contact.values
 
     def worst(*violations: np.ndarray) -> float:
         return max(global_max(comm, np.abs(x)) for x in violations)
@@ -79,43 +82,56 @@ def check_laws(contact: Contact) -> dict[str, float]:
 
     opening, penetration, r_n = v["opening"], v["penetration"], v["normal_traction"]
     length = (opening, penetration, v["gap"], v["normal_displacement"])
-    kinematic = relative(
-        worst(
-            np.minimum(opening, 0),
-            np.minimum(penetration, 0),
-            np.minimum(opening, penetration),
-            v["gap"] - v["normal_displacement"] - opening + penetration,
-        ),
-        *length,
-    )
-    found = {"complementarity": kinematic}
-    if contact.law.unilateral:
+    violations = [
+        relative(
+            worst(
+                np.minimum(opening, 0),
+                np.minimum(penetration, 0),
+                np.minimum(opening, penetration),
+                v["gap"] - v["normal_displacement"] - opening + penetration,
+            ),
+            *length,
+        )
+    ]
+    if law.has_tension:
         k_n = v["parameter k_n"]
-        reaction = relative(worst(np.maximum(r_n, 0), r_n + k_n * penetration), r_n)
-        found["complementarity"] = max(kinematic, reaction)
-    if not contact.law.has_friction:
+        elastic = k_n * (v["normal_displacement"] - v["gap"])
+        parts = (k_n * v["normal_displacement"], k_n * v["gap"])  # whose round-off is in r_n
+        violations.append(relative(worst(r_n + elastic), r_n, *parts))
+    elif law.has_normal_stiffness:
+        elastic = v["parameter k_n"] * penetration
+        violations.append(relative(worst(np.maximum(r_n, 0), r_n + elastic), r_n))
+    found = {"stiffness" if law.has_tension else "complementarity": max(violations)}
+    if not law.has_tangential:
         return found
 
-    tau, old, limit, k_t = v["traction"], v["old_traction"], v["limit"], v["parameter k_t"]
-    beta, normal = v["slip_increment"], v["normal"]
-    size = np.linalg.norm(tau, axis=1)
+    tau, stiffness = v["traction"], contact.tangential_stiffness
+    if not law.has_friction:
+        elastic = np.einsum("qij,qj->qi", stiffness, contact.tangential_displacement)
+        if not law.has_tension:
+            elastic[penetration <= 0] = 0.0
+        # Round-off in u_t is that of the displacement it is a part of.
+        whole = np.abs(stiffness).max(axis=(1, 2))[:, None] * v["jump"]
+        violation = relative(worst(tau + elastic), tau, whole)
+        found["stiffness"] = max(found.get("stiffness", 0.0), violation)
+        return found
+
+    limit, beta, normal = v["limit"], v["slip_increment"], v["normal"]
+    functions, gradients = contact.evaluate_yield()
+    # K_t has no inverse along the normal, and nothing acts there: any stiffness will do.
+    along = np.einsum("q,qi,qj->qij", v["parameter k_t"], normal, normal)
+    change = tau - v["old_traction"]
+    change = np.linalg.solve(stiffness + along, change[:, :, None])[:, :, 0]
     # An open point keeps no traction and counts no slip, whatever it moves.
     bears = limit > 0
-    missing = v["increment"] + (tau - old) / k_t[:, None]  # = -g_τ·Δβ (44)
-    if beta.shape[1] == 2:
-        tangent = np.column_stack([-normal[:, 1], normal[:, 0]])
-        slipped = -(beta[:, 0] - beta[:, 1])[:, None] * tangent
-    else:
-        slipped = -beta * tau / np.where(size > 0, size, 1)[:, None]
+    missing = v["increment"] + change  # = -Σ Δβ_j ∂g_j/∂τ (44)
+    slipped = -np.einsum("qm,qmd->qd", beta, gradients)
     # Round-off in the increments is that of the displacements they are differences of.
-    travel = (v["jump"], v["increment"], (tau - old) / k_t[:, None])
-    found["cone"] = relative(worst(np.maximum(size - limit, 0)), limit)
+    travel = (v["jump"], v["increment"], change)
+    found["cone"] = relative(worst(np.maximum(functions, 0)), limit)
     found["slip"] = relative(worst(np.minimum(beta, 0), (missing - slipped)[bears]), *travel)
     found["dissipation"] = relative(
-        worst(
-            beta.sum(axis=1) * (limit - size) * bears,
-            np.maximum(np.sum(tau * missing, axis=1) * bears, 0),
-        ),
+        worst((beta * functions)[bears], np.maximum(np.sum(tau * missing, axis=1) * bears, 0)),
         np.array([worst(limit) * worst(*travel)]),
     )
     return found

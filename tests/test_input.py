@@ -129,6 +129,136 @@ def test_parameter_out_of_range_at_one_point(value):
     raised_everywhere(lambda: scene.problem(coulomb(mu), scene.rollers()), ValueError, "friction")
 
 
+def in_space() -> Block:
+    """A block of tetrahedra, pressed down."""
+    return block("tetrahedron", up=-1.0)
+
+
+@pytest.mark.parametrize("value", [2, 0, -4, 3.5, "5", True])
+def test_polygon_of_too_few_sides(value):
+    """A polygon has a whole number of sides, three or more: refused by the law itself."""
+    for law in (fc.Coulomb, lambda mu, **kwargs: fc.Tresca(mu, 1.0, **kwargs)):
+        raised_everywhere(
+            lambda law=law: law(0.3, modes=value), ValueError, "modes", repr(value), "3 or more"
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("modes", {"modes": 4}),
+        ("transverse_friction", {"transverse_friction": 0.1, "direction": (1.0, 0.0)}),
+    ],
+)
+def test_directions_of_friction_in_the_plane(name, options):
+    """Polygon and ellipse are of the tangent plane: none in two dimensions."""
+    scene = pressed()
+    law = fc.Coulomb(0.3, k_n=1e4, k_t=1e3, **options)
+    raised_everywhere(lambda: scene.contact(law), ValueError, "contact", name, "two dimensions")
+
+
+def test_direction_of_friction_missing_or_unused():
+    """An ellipse without direction; a direction that the cone has no use for."""
+    raised_everywhere(
+        lambda: fc.Coulomb(0.3, transverse_friction=0.1), ValueError, "direction", "missing"
+    )
+    raised_everywhere(lambda: fc.Coulomb(0.3, direction=(1, 0, 0)), ValueError, "direction", "cone")
+
+
+def elliptic(friction=0.3, transverse_friction=0.1, direction=(1.0, 0.0, 0.0)) -> fc.Coulomb:
+    return fc.Coulomb(
+        friction, 1e4, 1e3, transverse_friction=transverse_friction, direction=direction
+    )
+
+
+def test_elliptic_friction_is_solved():
+    """What the tests below spoil in one respect is sound otherwise: it carries its load, 1."""
+    step = build_and_solve(in_space(), elliptic())()
+    # Equilibrium to the solver's tolerance, 1e-9 of the forces.
+    assert step.contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
+
+
+@pytest.mark.parametrize("value", [0.0, -0.1, np.nan, np.inf])
+@pytest.mark.parametrize("name", ["friction", "transverse_friction"])
+def test_axis_of_the_ellipse_out_of_range(name, value):
+    """Both frictions of an ellipse are greater than zero: as a number, a constant, by UFL."""
+    scene = in_space()
+    raised_everywhere(
+        lambda: scene.contact(elliptic(**{name: value})), ValueError, name, "greater than zero"
+    )
+    constant = fem.Constant(scene.mesh, float(value))
+    law = elliptic(**{name: constant})
+    raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
+    x = ufl.SpatialCoordinate(scene.mesh)
+    law = elliptic(**{name: ufl.conditional(ufl.gt(x[0], 0.5), 0.2, constant)})
+    raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ((0.0, 0.0, 0.0), ["length zero"]),
+        ((1.0, 0.0), ["3 finite numbers"]),
+        ((1.0, np.nan, 0.0), ["3 finite numbers"]),
+        (1.0, ["3 finite numbers"]),
+    ],
+)
+def test_direction_of_friction_by_number(value, words):
+    """A direction that is none: refused by `Contact`."""
+    scene = in_space()
+    law = elliptic(direction=value)
+    raised_everywhere(lambda: scene.contact(law), ValueError, "contact", "direction", *words)
+
+
+def test_direction_of_friction_parallel_to_the_normal():
+    """A direction with no part in the tangent plane, everywhere or at some points; later changed.
+
+    The normal of the floor is along z. In parallel only some ranks have such points.
+    """
+    scene = in_space()
+    words = ("contact", "direction", "parallel")
+    for law in (
+        elliptic(direction=(0, 0, 2.0)),
+        fc.Tresca(0.3, 1.0, k_n=1e4, k_t=1e3, modes=4, direction=(0, 0, -1)),
+    ):
+        raised_everywhere(lambda law=law: scene.problem(law, scene.rollers()), ValueError, *words)
+    x = ufl.SpatialCoordinate(scene.mesh)
+    somewhere = ufl.as_vector([ufl.conditional(ufl.gt(x[0], 0.5), 1.0, 0.0), 0.0, 1.0])
+    raised_everywhere(
+        lambda: scene.problem(elliptic(direction=somewhere), scene.rollers()), ValueError, *words
+    )
+    problem, contact = scene.problem(elliptic(), scene.rollers())
+    problem.solve()
+    for value in ((0, 0, 1.0), (0, 0, 0)):
+        contact.parameters["direction"].value = value
+        raised_everywhere(problem.solve, ValueError, *words)
+    contact.parameters["direction"].value = (np.nan, 0, 0)
+    raised_everywhere(problem.solve, ValueError, "direction", "finite")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("k_n", 0.0), ("k_n", -1.0), ("k_n", np.inf), ("k_t", -1.0), ("k_t", np.nan)],
+)
+def test_foundation_out_of_range(name, value):
+    """Stiffness of a foundation: k_n > 0, k_t ≥ 0; a number is refused at once, else at a solve."""
+    scene = pressed()
+    numbers = {"k_n": 1e3, "k_t": 1e2}
+    law = fc.Foundation(**numbers | {name: value})
+    raised_everywhere(lambda: scene.contact(law), ValueError, "contact", name)
+    law = fc.Foundation(**numbers | {name: fem.Constant(scene.mesh, float(value))})
+    raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
+
+
+def test_foundation_without_tangential_stiffness_at_some_points():
+    """k_t = 0 by a constant is sound: it means what the number zero means."""
+    scene = pressed()
+    law = fc.Foundation(1e3, fem.Constant(scene.mesh, 0.0))
+    step = build_and_solve(scene, law)()
+    assert step.contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
+    assert step.contacts["contact"].tangential_force == 0.0
+
+
 @pytest.mark.parametrize("pressure", [-1.0, np.nan])
 def test_tresca_pressure_out_of_range(pressure):
     """The prescribed pressure of Tresca's law is a pressure."""

@@ -1,0 +1,350 @@
+"""Contact springs of node pairs, elastic foundations, and anisotropic friction of whole bodies."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+from scenes import (
+    BOTTOM,
+    CELLS,
+    LEFT,
+    TOP,
+    block,
+    block_mesh,
+    close,
+    dimension,
+    displacement_space,
+    gathered,
+    raised_everywhere,
+)
+from test_two_bodies import LOWER, UPPER, two_blocks
+
+import fenics_contact as fc
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+COMM = MPI.COMM_WORLD
+
+VERTEX = {"quadrature_scheme": "vertex"}
+K_N, K_T = 7.0, 3.0
+
+
+def turned(d: int) -> np.ndarray:
+    """A rotation that leaves no axis where it was."""
+    angle = 0.7
+    c, s = np.cos(angle), np.sin(angle)
+    plane = np.array([[c, -s], [s, c]])
+    if d == 2:
+        return plane
+    one, other = np.eye(3), np.eye(3)
+    one[np.ix_([0, 2], [0, 2])] = plane
+    other[np.ix_([1, 2], [1, 2])] = plane
+    return one @ other
+
+
+def dense(matrix: PETSc.Mat, d: int) -> np.ndarray:
+    """All of a matrix on every rank, (n_nodes, n_nodes, d, d); the matrix is destroyed."""
+    start, _ = matrix.getOwnershipRange()
+    indptr, columns, values = matrix.getValuesCSR()
+    rows = start + np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
+    n = matrix.getSize()[0]
+    matrix.destroy()
+    full = np.zeros((n, n))
+    for i, j, a in zip(*(gathered(COMM, x) for x in (rows, columns, values)), strict=True):
+        full[i, j] += a
+    return full.reshape(n // d, d, n // d, d).transpose(0, 2, 1, 3)
+
+
+def nodes(space: fem.FunctionSpace) -> np.ndarray:
+    """Coordinates of all nodes in the global order, on every rank."""
+    n = space.dofmap.index_map.size_local
+    return gathered(COMM, space.tabulate_dof_coordinates()[:n, : space.mesh.geometry.dim])
+
+
+@pytest.mark.parametrize("weight", ["none", "varying"])
+@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize("cell", CELLS)
+def test_springs_of_an_inclined_surface(cell, n, weight):
+    """Every vertex of Γc has K_n = k n⊗n and K_t = k_t (1 - n⊗n), and nothing else has any.
+
+    Section 4; on one inclined facet (n = 1) and on facets of all sizes around a vertex, with the
+    contact's weight or without. Round-off 1e-13.
+    """
+    d = dimension(cell)
+    mesh, tags = block_mesh(cell, n=n, shuffled=True)
+    q = turned(d)
+    space = displacement_space(mesh, 1)
+    on_surface = np.abs(nodes(space)[:, -1]) < 1e-12
+    mesh.geometry.x[:, :d] = mesh.geometry.x[:, :d] @ q.T
+    normal = -q[:, -1]
+    along = np.outer(normal, normal)
+    u = fem.Function(space)
+    x = ufl.SpatialCoordinate(mesh)
+    contact = fc.Contact(
+        u,
+        fc.ContactSurface(mesh, tags, BOTTOM, **VERTEX),
+        fc.Obstacle(0.1, normal),
+        fc.Coulomb(0.3, k_n=fc.Springs(K_N), k_t=fc.Springs(K_T)),
+        weight=None if weight == "none" else 3.0 + x[0] * x[1],
+    )
+    for shares, block_of_node in (((1, 0), K_N * along), ((0, 1), K_T * (np.eye(d) - along))):
+        matrix = dense(contact.stiffness_matrix(*shares), d)
+        expected = np.zeros_like(matrix)
+        for node in np.flatnonzero(on_surface):
+            expected[node, node] = block_of_node
+        assert close(matrix, expected, 1e-13)
+    assert np.count_nonzero(on_surface) == (n + 1) ** (d - 1)
+    # The forces too: a penetration of 0.2 everywhere is a force of 0.2 k at every node.
+    u.x.array[:] = np.tile(0.3 * normal, u.x.array.size // d)
+    force = fem.Function(space)
+    contact.add_force(force.x.petsc_vec)
+    n_owned = space.dofmap.index_map.size_local
+    force = gathered(COMM, force.x.array.reshape(-1, d)[:n_owned])
+    assert close(force, np.outer(on_surface, 0.2 * K_N * normal), 1e-12)
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_springs_between_two_bodies(cell):
+    """Nodes face to face: [[nn, -nn], [-nn, nn]] times k, and the same with t⊗t.
+
+    Section 4, with the pair inclined. Tolerance 1e-9 of k: that of the coordinates by which points
+    are paired.
+    """
+    d = dimension(cell)
+    mesh, tags = two_blocks(cell, (2, 2))
+    q = turned(d)
+    space = displacement_space(mesh, 1)
+    middle = np.flatnonzero(np.abs(nodes(space)[:, -1] - 0.5) < 1e-12)
+    mesh.geometry.x[:, :d] = mesh.geometry.x[:, :d] @ q.T
+    x = nodes(space)
+    contact = fc.Contact(
+        fem.Function(space),
+        fc.ContactSurface(mesh, tags, LOWER, **VERTEX),
+        fc.DeformableBody(tags, UPPER),
+        fc.Coulomb(0.3, k_n=fc.Springs(K_N), k_t=fc.Springs(K_T)),
+    )
+    assert contact.n_unpaired == 0
+    along = np.outer(q[:, -1], q[:, -1])
+    for shares, block_of_pair in (((1, 0), K_N * along), ((0, 1), K_T * (np.eye(d) - along))):
+        matrix = dense(contact.stiffness_matrix(*shares), d)
+        expected = np.zeros_like(matrix)
+        for i in middle:
+            (j,) = (j for j in middle if j != i and np.allclose(x[i], x[j], atol=1e-12))
+            expected[i, i] = block_of_pair
+            expected[i, j] = -block_of_pair
+        assert close(matrix, expected, 1e-9)
+    assert len(middle) == 2 * 3 ** (d - 1)
+
+
+def test_springs_follow_their_parameters():
+    """Weight and k may change: at the node stays k n⊗n, with the k of now, once it is checked."""
+    mesh, tags = block_mesh("quadrilateral")
+    u = fem.Function(displacement_space(mesh, 1))
+    surface = fc.ContactSurface(mesh, tags, BOTTOM, **VERTEX)
+    law = fc.Frictionless(fc.Springs(K_N))
+    contact = fc.Contact(u, surface, fc.HalfSpace((0, 0), (0, 1)), law, weight=2.0)
+    contact.parameters["k_n"].value = 5.0
+    contact.parameters["weight"].value = 11.0
+    contact.check_input()
+    matrix = dense(contact.stiffness_matrix(1, 0), 2)
+    assert np.count_nonzero(np.abs(matrix) > 1e-13) == 3
+    assert matrix.max() == pytest.approx(5.0, rel=1e-13)
+    contact.parameters["weight"].value = 0.0
+    raised_everywhere(contact.check_input, ValueError, "contact", "area of a vertex", "weight")
+
+
+def test_springs_want_vertices():
+    """Springs on a surface whose points are no vertices; springs of no stiffness."""
+    scene = block()
+    for law in (fc.Frictionless(fc.Springs(1.0)), fc.Coulomb(0.3, k_t=fc.Springs(1.0))):
+        raised_everywhere(
+            lambda law=law: scene.contact(law), ValueError, "contact", "'default'", "vertex"
+        )
+    for value in (0.0, -1.0, np.nan, np.inf, "stiff", None):
+        raised_everywhere(
+            lambda value=value: fc.Springs(value), ValueError, repr(value), "greater than zero"
+        )
+
+
+# ---- foundations ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+@pytest.mark.parametrize("cell", CELLS)
+def test_a_block_on_a_foundation(cell, method):
+    """A block bonded to a foundation, and nothing else, pressed down, pulled along and lifted.
+
+    Reference: balance alone. The mean displacement of the bottom is force/(area k), up and down,
+    and the reactions add up to the load. Tolerance 1e-7: a hundred times the solver's on forces.
+    """
+    scene = block(cell)
+    problem, contact = scene.problem(fc.Foundation(50.0, 20.0), [], method=method)
+    for side, up in ((0.0, -2.0), (0.5, -1.0), (0.5, 1.5), (0.0, 0.0)):
+        scene.load(side=side, up=up)
+        step = problem.solve()
+        problem.commit()
+        found = step.contacts["contact"]
+        assert close(found.force, -scene.vector(side=side, up=up), 1e-7, scale=1.0)
+        assert found.normal_force == pytest.approx(-up, abs=1e-7)
+        jump = gathered(COMM, contact.values["jump"])
+        measure = gathered(COMM, contact.measure)
+        expected = scene.vector(side=side / 20.0, up=up / 50.0)
+        assert close(measure @ jump, expected, 1e-7, scale=0.02)
+        assert found.open == found.slip == 0 and found.area == pytest.approx(1.0, rel=1e-12)
+        assert set(step.verdict.laws["contact"]) == {"stiffness"}
+        assert step.verdict.laws["contact"]["stiffness"] <= 1e-10
+
+
+def test_a_foundation_that_does_not_pull():
+    """Without tension: pressed it carries the load and holds, and it cannot carry one that lifts.
+
+    Tolerance 1e-7: a hundred times the solver's on forces.
+    """
+    scene = block("quadrilateral", up=-2.0)
+    law = fc.Foundation(50.0, 20.0, tension=False)
+    problem, contact = scene.problem(law, [scene.hold(LEFT, 0)])
+    step = problem.solve()
+    assert step.contacts["contact"].normal_force == pytest.approx(2.0, abs=1e-7)
+    assert set(step.verdict.laws["contact"]) == {"complementarity", "stiffness"}
+    assert max(step.verdict.laws["contact"].values()) <= 1e-10
+    assert np.all(gathered(COMM, contact.status) == fc.Status.STICK)
+    scene.load(up=0.5)
+    raised_everywhere(problem.solve, ValueError, "balance")
+
+
+def test_a_foundation_without_tangential_stiffness_has_no_tangential_state():
+    """k_t = 0: no tractions along Γc, no history of them, and nothing holds the body there."""
+    scene = block("quadrilateral", up=0.5)
+    raised_everywhere(
+        lambda: scene.problem(fc.Foundation(50.0), []), ValueError, "translation along x"
+    )
+    problem, contact = scene.problem(fc.Foundation(50.0), [scene.hold(LEFT, 0)])
+    step = problem.solve()
+    assert step.contacts["contact"].normal_force == pytest.approx(-0.5, abs=1e-7)
+    assert np.all(gathered(COMM, contact.status) == fc.Status.SLIP)
+    assert "traction" not in contact.history and "traction" not in contact.values
+    assert not np.any(gathered(COMM, contact.tangential_traction))
+
+
+@pytest.mark.parametrize("what", ["pull", "normal", "tangential"])
+def test_a_foundation_that_lies_is_caught(what):
+    """Reactions that are not those of the stiffness do not pass the verdict."""
+
+    class Changed(fc.Foundation):
+        """A foundation with one reaction 1 % wrong, or none where it should pull."""
+
+        def parameters(self):
+            """Those of the foundation."""
+            return {"k_n": 50.0, "k_t": 20.0}
+
+        def response(self, kinematics, parameters):
+            """The foundation's, changed."""
+            r = super().response(kinematics, parameters)
+            r_n, tau = r.normal_traction, r.traction
+            if what == "pull":
+                r_n = ufl.min_value(r_n, 0.0)
+            return fc.laws.Response(
+                1.01 * r_n if what == "normal" else r_n,
+                r.opening,
+                r.penetration,
+                1.01 * tau if what == "tangential" else tau,
+            )
+
+    scene = block("quadrilateral")
+    contact = scene.contact(Changed(50.0, 20.0))
+    scene.u.interpolate(lambda x: np.vstack([0.02 + 0 * x[0], 0.01 * (x[0] - 0.4)]))
+    contact.evaluate()
+    assert fc.verdict.check_laws(contact)["stiffness"] > 1e-4
+    sound = scene.contact(fc.Foundation(50.0, 20.0))
+    sound.evaluate()
+    assert fc.verdict.check_laws(sound)["stiffness"] <= 1e-14
+
+
+# ---- anisotropic friction ------------------------------------------------------------------------
+
+ALONG = np.array([np.cos(0.5), np.sin(0.5)])
+SLIDING = {
+    # All slip is along e: τ is where the ellipse has the normal -e, at its vertex in a polygon.
+    "ellipse": (
+        {"transverse_friction": 0.1, "direction": (1.0, 0.0, 5.0)},
+        np.array([0.3, 0.1]) ** 2 * ALONG / np.linalg.norm(np.array([0.3, 0.1]) * ALONG),
+    ),
+    "square": ({"modes": 4, "direction": (1.0, 0.0, 5.0)}, np.array([0.3, 0.3])),
+    "octagon": (
+        {"modes": 8},
+        0.3 / np.cos(np.pi / 8) * np.array([np.cos(np.pi / 8), np.sin(np.pi / 8)]),
+    ),
+}
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+@pytest.mark.parametrize("kind", SLIDING)
+@pytest.mark.parametrize("cell", ["tetrahedron", "hexahedron"])
+def test_sliding_aslant(cell, kind, method):
+    """A block pressed on a floor and pushed aslant: friction is not against the motion.
+
+    Reference: once all of it slides (or is lifted at the rear), τ = -p times the point of the law's
+    surface (of limit one) where slip is along the motion, so that it is with the forces. Tolerance
+    1e-6: the elastic share of an increment is 1 % of it, and what is left of its direction falls so
+    at each of five.
+    """
+    options, expected = SLIDING[kind]
+    scene = block(cell)
+    push = [fem.Constant(scene.mesh, 0.0) for _ in range(3)]
+    bcs = [scene.hold(TOP, i, c) for i, c in enumerate(push)]
+    law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4, **options)
+    problem, _ = scene.problem(law, bcs, method=method)
+    for number in range(5):
+        push[0].value, push[1].value = 0.1 * (number + 1) * ALONG
+        push[2].value = -0.01
+        step = problem.solve()
+        problem.commit()
+    found = step.contacts["contact"]
+    assert found.slip > 0 and found.stick == 0
+    assert close(found.force[:2] / found.normal_force, -expected, 1e-6)
+    assert {"cone", "slip", "dissipation"} <= set(step.verdict.laws["contact"])
+
+
+@pytest.mark.parametrize(
+    ("what", "claim"),
+    [("nothing", ""), ("metric", "slip"), ("friction", "cone"), ("modes", "dissipation")],
+)
+def test_an_anisotropic_law_that_lies_is_caught(what, claim):
+    """Traction and slip of the ellipse, or of a polygon, against another surface or metric."""
+    options = {"modes": 5} if what == "modes" else {"transverse_friction": 0.1}
+
+    class Changed(fc.Coulomb):
+        """A law whose return map is not that of what it claims."""
+
+        def parameters(self):
+            """Those of Coulomb's law."""
+            return fc.Coulomb(
+                self.friction, self.k_n, self.k_t, direction=self.direction, **options
+            ).parameters()
+
+        def tangential_stiffness(self, kinematics, parameters):
+            """In one case as without the stretch."""
+            if what == "metric":
+                return fc.laws.Law.tangential_stiffness(self, kinematics, parameters)
+            return super().tangential_stiffness(kinematics, parameters)
+
+        def yield_functions(self, kinematics, traction, limit, parameters):
+            """In two cases of less friction across, or of other sides."""
+            if what == "friction":
+                less = 0.9 * parameters["transverse_friction"]
+                parameters = dict(parameters) | {"transverse_friction": less}
+            found = super().yield_functions(kinematics, traction, limit, parameters)
+            return (*found[1:], found[0]) if what == "modes" else found
+
+    scene = block("tetrahedron")
+    law = Changed(0.3, 1e4, 1e3, direction=(1.0, 0.0, 0.0), **options)
+    contact = scene.contact(law)
+    scene.u.interpolate(lambda x: np.vstack([0.1 + 0 * x[0], 0.07 + 0 * x[0], -0.01 + 0 * x[0]]))
+    contact.evaluate()
+    assert np.all(gathered(COMM, contact.status) == fc.Status.SLIP)
+    found = fc.verdict.check_laws(contact)
+    if claim:
+        assert found[claim] > 1e-3
+    else:
+        assert max(found.values()) <= 1e-13
