@@ -63,7 +63,9 @@ def plot_deformation(
     plt = _pyplot()
     from matplotlib.collections import PolyCollection
 
-    figure, axes = plt.subplots(figsize=(6.4, 6.0), layout="constrained")
+    extent = np.ptp(np.concatenate([original, deformed]), axis=(0, 1))
+    height = np.clip(6.0 * extent[1] / extent[0], 1.0, 8.0)
+    figure, axes = plt.subplots(figsize=(6.8, height + 1.4), layout="constrained")
     axes.add_collection(
         PolyCollection(original, facecolors="none", edgecolors=_COLOURS["mesh"], linewidths=0.4)
     )
@@ -82,7 +84,7 @@ def plot_deformation(
     axes.set(xlabel=f"x [{unit}]", ylabel=f"y [{unit}]", title=title, aspect="equal")
     axes.autoscale_view()
     axes.margins(0.03)
-    axes.legend(loc="best")
+    figure.legend(loc="outside lower center", ncols=3)
     figure.savefig(path, dpi=150)
     plt.close(figure)
 

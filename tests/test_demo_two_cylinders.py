@@ -43,14 +43,14 @@ def test_increments_do_not_matter_here(tmp_path: Path) -> None:
 
     To 0.1 % in the largest shear, which stands at the end of the stick zone; the forces to 1e-7.
     """
-    once = run_demo("two_cylinders", tmp_path / "1", "--cells", "14", "--increments", "1")
-    often = run_demo("two_cylinders", tmp_path / "4", "--cells", "14", "--increments", "4")
+    once = run_demo("two_cylinders", tmp_path / "1", "--cells", "20", "--increments", "1")
+    often = run_demo("two_cylinders", tmp_path / "4", "--cells", "20", "--increments", "4")
     assert values(once) == pytest.approx(values(often), rel=1e-3)
 
 
 def test_two_ranks_agree(tmp_path: Path) -> None:
     """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
-    options = ("--cells", "14", "--increments", "1")
+    options = ("--cells", "20", "--increments", "1")
     serial = run_demo("two_cylinders", tmp_path / "1", *options)
     parallel = run_demo("two_cylinders", tmp_path / "2", *options, ranks=2)
     assert values(parallel) == pytest.approx(values(serial), rel=1e-6)
