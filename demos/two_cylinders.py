@@ -28,6 +28,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -104,40 +105,65 @@ def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
         gmsh.finalize()
 
 
-def solve(arguments: argparse.Namespace) -> tuple[fc.Contact, LinearElastic, dict[str, Any]]:
-    """Press, shear, and measure. Collective."""
-    start = time.perf_counter()
-    mesh, tags = make_mesh(arguments.cells)
-    V = fem.functionspace(mesh, ("Lagrange", arguments.degree, (2,)))
+@dataclass
+class Pressed:
+    """The cylinders, pressed on each other and ready to be sheared.
+
+    Attributes:
+        problem, contact, body: The parts of the problem.
+        shear: The shear traction on the upper flat face (MPa).
+        deflection: Form of the displacement that this shear does its work on (mm).
+        step: What pressing took.
+    """
+
+    problem: fc.ContactProblem
+    contact: fc.Contact
+    body: LinearElastic
+    shear: fem.Constant
+    deflection: fem.Form
+    step: fc.Step
+
+
+def press(cells: int, degree: int, stiffness: float) -> Pressed:
+    """Build the cylinders and press them, free of shear. Collective."""
+    mesh, tags = make_mesh(cells)
+    V = fem.functionspace(mesh, ("Lagrange", degree, (2,)))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
     body = LinearElastic(u, E, NU, "plane strain")
     pressure = fem.Constant(mesh, PETSc.ScalarType(0.0))
     shear = fem.Constant(mesh, PETSc.ScalarType(0.0))
-    x = ufl.SpatialCoordinate(mesh)
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
     # The linear part makes no force, and the moment about the origin that shear at y = R lacks.
-    traction = ufl.as_vector([shear, -pressure + 3 * shear * x[0] / R])
-    F = body.residual(v) - ufl.dot(traction, v) * ds(TOP)
+    along = ufl.as_vector([1, 3 * ufl.SpatialCoordinate(mesh)[0] / R])
+    F = body.residual(v) + (pressure * v[1] - shear * ufl.dot(along, v)) * ds(TOP)
     clamped = fem.locate_dofs_topological(V, 1, tags.find(BASE))
     bcs = [fem.dirichletbc(np.zeros(2, dtype=PETSc.ScalarType), clamped, V)]
 
-    stiffness = fc.Scaled(arguments.stiffness)
-    law = fc.Coulomb(FRICTION, k_n=stiffness, k_t=stiffness)
-    contact = fc.Contact(
-        u, fc.ContactSurface(mesh, tags, UPPER), fc.DeformableBody(tags, LOWER), law
-    )
+    law = fc.Coulomb(FRICTION, k_n=fc.Scaled(stiffness), k_t=fc.Scaled(stiffness))
+    surface = fc.ContactSurface(mesh, tags, UPPER)
+    contact = fc.Contact(u, surface, fc.DeformableBody(tags, LOWER), law)
     # Pressed on without friction, on rollers along the axis; from then on friction holds it.
     friction = contact.parameters["friction"]
     friction.value = 0.0
     axis = fem.locate_dofs_topological(V.sub(0), 1, tags.find(AXIS))
     rollers = fem.dirichletbc(PETSc.ScalarType(0.0), axis, V.sub(0))
     pressing = fc.ContactProblem(F, u, bcs=[*bcs, rollers], contacts=[contact])
-    made = list(fc.increments(pressing, pressure, 0.0, PRESSURE))
+    (step,) = fc.increments(pressing, pressure, 0.0, PRESSURE)
     friction.value = FRICTION
     problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
-    history = fc.increments(problem, shear, 0.0, SHEAR, steps=arguments.increments)
-    quiet = None if mesh.comm.rank == 0 else True
-    made += tqdm(history, "shear", arguments.increments, disable=quiet, unit="increment")
+    deflection = fem.form(ufl.dot(along, u) / (2 * R) * ds(TOP))
+    return Pressed(problem, contact, body, shear, deflection, step)
+
+
+def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
+    """Press, shear, and measure. Collective."""
+    start = time.perf_counter()
+    scene = press(arguments.cells, arguments.degree, arguments.stiffness)
+    contact = scene.contact
+    history = fc.increments(scene.problem, scene.shear, 0.0, SHEAR, steps=arguments.increments)
+    quiet = None if MPI.COMM_WORLD.rank == 0 else True
+    bar = tqdm(history, "shear", arguments.increments, disable=quiet, unit="increment")
+    made = [scene.step, *bar]
 
     points, resultants = contact.gather(), contact.resultants()
     stuck = points["measure"] @ (points["status"] == fc.Status.STICK)
@@ -152,17 +178,13 @@ def solve(arguments: argparse.Namespace) -> tuple[fc.Contact, LinearElastic, dic
     exact = (P, Q, A, C, PEAK, float(cattaneo(np.array(C))))
     allowed = (EQUILIBRIUM, EQUILIBRIUM, *(TOLERANCE,) * 4)
     references = dict(zip(values, zip(exact, allowed, strict=True), strict=True))
-    return (
-        contact,
-        body,
-        {
-            "references": output.compare(values, references),
-            "dofs": V.dofmap.index_map.size_global * 2,
-            "increments": arguments.increments,
-            "iterations": [step.iterations for step in made],
-            "wall_seconds": time.perf_counter() - start,
-        },
-    )
+    return scene, {
+        "references": output.compare(values, references),
+        "dofs": contact.u.function_space.dofmap.index_map.size_global * 2,
+        "increments": arguments.increments,
+        "iterations": [step.iterations for step in made],
+        "wall_seconds": time.perf_counter() - start,
+    }
 
 
 def draw(folder: Path, points: dict[str, np.ndarray]) -> None:
@@ -201,9 +223,10 @@ def main() -> int:
     parser.add_argument("--stiffness", type=float, default=10, help="contact stiffness over E/h")
     parser.add_argument("--output", type=Path, default=Path("output/two_cylinders"), help="folder")
     arguments, _ = parser.parse_known_args()
-    contact, body, result = solve(arguments)
+    scene, result = solve(arguments)
+    contact = scene.contact
     comm, folder = MPI.COMM_WORLD, arguments.output
-    output.write_body(folder, contact.u, body.stress)
+    output.write_body(folder, contact.u, scene.body.stress)
     output.write_surface(folder, contact)
     output.write_json(folder / "result.json", result, comm)
     plotting.plot_deformation(folder / "mesh.png", contact.u, title="Two half-cylinders")
