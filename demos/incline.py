@@ -94,7 +94,7 @@ def tilt(arguments: argparse.Namespace) -> tuple[Block, dict[str, Any]]:
     list(fc.increments(problem, block.weight, 0.0, DENSITY))
     rows, holds, refused, message = [], 0.0, np.inf, ""
     steps = [0.25, 0.5, 0.75, 0.9, 0.95, 0.99]
-    while refused - holds > 2e-5:
+    while refused - holds > STATICS:
         # First up the steps and past the limit, then into the middle of what is left.
         share = steps.pop(0) if steps else 1.013 if refused > 2 else (holds + refused) / 2
         present = float(block.tilt.value)

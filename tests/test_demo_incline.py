@@ -40,7 +40,7 @@ def test_friction_angle_and_wedge(tmp_path: Path) -> None:
 
 def test_two_ranks_agree(tmp_path: Path) -> None:
     """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
-    options = ("--cells", "18", "--increments", "4")
+    options = ("--cells", "18", "--increments", "2")
     serial = run_demo("incline", tmp_path / "1", *options)
     parallel = run_demo("incline", tmp_path / "2", *options, ranks=2)
     assert values(parallel) == pytest.approx(values(serial), rel=1e-6, abs=1e-7)
