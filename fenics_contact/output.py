@@ -1,13 +1,15 @@
-"""Results in files: ParaView collections of the body and of Γc, and JSON."""
+"""Results in files and figures: ParaView collections, JSON, values at points, references met."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import basix
+import dolfinx
 import numpy as np
 import numpy.typing as npt
 import ufl
@@ -16,8 +18,18 @@ from mpi4py import MPI
 
 from fenics_contact import compat
 from fenics_contact.contact import Contact
+from fenics_contact.parallel import gather_rows, global_max, global_min
 
-__all__ = ["surface_fields", "write_body", "write_json", "write_surface"]
+__all__ = [
+    "at_node",
+    "compare",
+    "sample",
+    "surface_fields",
+    "table",
+    "write_body",
+    "write_json",
+    "write_surface",
+]
 
 Array = npt.NDArray[np.float64]
 
@@ -100,6 +112,86 @@ def write_body(
     function = fem.Function(space, name="stress")
     function.interpolate(fem.Expression(stress, points))
     _write(Path(folder) / "stress.pvd", [function], time)
+
+
+def at_node(u: fem.Function, point: Sequence[float]) -> Array:
+    """Displacement of the node at ``point`` (before any displacement), shape (gdim,). Collective.
+
+    Raises:
+        ValueError: No node is nearer than 1e-6 of the mesh's size. On all ranks.
+    """
+    space = u.function_space
+    gdim, n_owned = space.mesh.geometry.dim, space.dofmap.index_map.size_local
+    distance = np.linalg.norm(
+        space.tabulate_dof_coordinates()[:n_owned, :gdim] - np.asarray(point), axis=1
+    )
+    values = u.x.array.reshape(-1, len(u))[:n_owned]
+    nearest = np.argsort(distance)[:1]
+    rows = gather_rows(space.mesh.comm, np.column_stack([distance[nearest], values[nearest]]))
+    row = rows[np.argmin(rows[:, 0])]
+    comm, x = space.mesh.comm, space.mesh.geometry.x
+    if row[0] > 1e-6 * (global_max(comm, x) - global_min(comm, x)):
+        raise ValueError(f"no node at {list(point)}; the nearest is {row[0]:g} away")
+    return row[1:]
+
+
+def sample(expression: Any, mesh: dolfinx.mesh.Mesh, degree: int = 1) -> tuple[Array, Array]:
+    """Values of a UFL expression inside every cell, for curves and tables. Collective.
+
+    Args:
+        expression: A scalar, vector or tensor on ``mesh``.
+        mesh: The mesh.
+        degree: Of the quadrature rule whose points are taken.
+
+    Returns:
+        On all ranks, points (n, gdim) and values (n, …), ordered by coordinates.
+    """
+    expression = ufl.as_ufl(expression)
+    points, _ = basix.make_quadrature(mesh.basix_cell(), degree)
+    cells = np.arange(mesh.topology.index_map(mesh.topology.dim).size_local, dtype=np.int32)
+    gdim, shape = mesh.geometry.dim, expression.ufl_shape
+    columns = [
+        np.asarray(fem.Expression(e, points).eval(mesh, cells)).reshape(
+            len(cells) * len(points), -1
+        )
+        for e in (ufl.SpatialCoordinate(mesh), expression)
+    ]
+    rows = gather_rows(mesh.comm, np.column_stack(columns))
+    rows = rows[np.lexsort(rows[:, :gdim].T[::-1])]
+    return rows[:, :gdim], rows[:, gdim:].reshape(-1, *shape)
+
+
+def compare(
+    values: Mapping[str, float], references: Mapping[str, tuple[float, float]]
+) -> dict[str, dict[str, Any]]:
+    """Put results beside their references: value, reference, error, tolerance, passed, by name.
+
+    Args:
+        values: Results by name.
+        references: By name, the reference and the tolerance relative to it (absolute where the
+            reference is zero).
+    """
+    entries = {}
+    for name, (reference, tolerance) in references.items():
+        error = abs(float(values[name]) - reference) / (abs(reference) or 1.0)
+        entries[name] = {
+            "value": float(values[name]),
+            "reference": float(reference),
+            "error": error,
+            "tolerance": tolerance,
+            "passed": bool(error <= tolerance),
+        }
+    return entries
+
+
+def table(entries: Mapping[str, Mapping[str, Any]]) -> str:
+    """What `compare` returns, one line an entry."""
+    lines = [f"{'':32}{'result':>14}{'reference':>14}{'error':>10}{'allowed':>10}"]
+    for name, e in entries.items():
+        line = f"{name:32}{e['value']:14.6g}{e['reference']:14.6g}"
+        line += f"{e['error']:10.1e}{e['tolerance']:10.1e}"
+        lines.append(line + ("" if e["passed"] else "  MISSED"))
+    return "\n".join(lines)
 
 
 def write_json(path: str | os.PathLike[str], data: Mapping[str, Any], comm: MPI.Comm) -> None:

@@ -1,9 +1,10 @@
-"""Pictures of plane problems, drawn on the first rank. Needs matplotlib."""
+"""Pictures, drawn on the first rank. Needs matplotlib."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from dolfinx.mesh import CellType
 
 from fenics_contact.contact import Status
 
-__all__ = ["plot_deformation", "plot_tractions"]
+__all__ = ["figure", "plot_deformation", "plot_tractions"]
 
 Array = npt.NDArray[np.float64]
 
@@ -62,7 +63,9 @@ def plot_deformation(
     plt = _pyplot()
     from matplotlib.collections import PolyCollection
 
-    figure, axes = plt.subplots(figsize=(6.4, 6.0), layout="constrained")
+    extent = np.ptp(np.concatenate([original, deformed]), axis=(0, 1))
+    height = np.clip(6.0 * extent[1] / extent[0], 1.0, 8.0)
+    figure, axes = plt.subplots(figsize=(6.8, height + 1.4), layout="constrained")
     axes.add_collection(
         PolyCollection(original, facecolors="none", edgecolors=_COLOURS["mesh"], linewidths=0.4)
     )
@@ -81,7 +84,7 @@ def plot_deformation(
     axes.set(xlabel=f"x [{unit}]", ylabel=f"y [{unit}]", title=title, aspect="equal")
     axes.autoscale_view()
     axes.margins(0.03)
-    axes.legend(loc="best")
+    figure.legend(loc="outside lower center", ncols=3)
     figure.savefig(path, dpi=150)
     plt.close(figure)
 
@@ -151,6 +154,31 @@ def plot_tractions(
     axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
     figure.savefig(path, dpi=150)
     plt.close(figure)
+
+
+@contextmanager
+def figure(
+    path: str | os.PathLike[str], columns: int = 1, size: tuple[float, float] = (6.4, 4.8)
+) -> Iterator[Any]:
+    """Axes of a picture of one's own, written at the end of the block. On the calling rank only.
+
+    Args:
+        path: PNG or PDF to write.
+        columns: Number of axes beside each other.
+        size: Width and height of each, in inches.
+
+    Yields:
+        The axes, or an array of them if there are several.
+    """
+    plt = _pyplot()
+    drawn, axes = plt.subplots(
+        1, columns, figsize=(columns * size[0], size[1]), layout="constrained"
+    )
+    try:
+        yield axes
+        drawn.savefig(path, dpi=150)
+    finally:
+        plt.close(drawn)
 
 
 def _pyplot() -> Any:

@@ -1,0 +1,58 @@
+"""The male-female fitting, run as its user runs it, against what holds for every geometry."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mpi4py import MPI
+from running import run_demo
+
+pytestmark = [
+    pytest.mark.demo,
+    pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own"),
+]
+
+
+def values(result: dict[str, Any]) -> dict[str, float]:
+    return {name: entry["value"] for name, entry in result["references"].items()}
+
+
+def test_statics_and_homogeneity(tmp_path: Path) -> None:
+    """Forces of a wedge under its pull, to 1e-7; a state of degree one in the load, to 1e-8.
+
+    P = 0.02656 · 6.4 · 43 daN; the flank climbs 40 mm on 22.
+    """
+    result = run_demo("fitting", tmp_path)
+    found = values(result)
+    half = 0.02656 * 6.4 * 43 / 2
+    length = math.hypot(22, 40)
+    sine, cosine = 22 / length, 40 / length
+    assert found["lift of a flank [daN]"] == pytest.approx(half, rel=1e-7)
+    assert found["half of the top's reaction [daN]"] == pytest.approx(half, rel=1e-7)
+    assert found["N without friction [daN]"] == pytest.approx(half / sine, rel=1e-7)
+    normal, tangential = result["normal_force"], result["tangential_force"]
+    assert half / (sine + 0.2 * cosine) * (1 - 1e-7) <= normal <= half / (sine - 0.2 * cosine)
+    # All of the closed flank slips one way here, so that |T| is the resultant, too.
+    assert result["lateral_thrust"] == pytest.approx(normal * cosine - tangential * sine, rel=1e-7)
+    assert found["twice the load, difference"] <= 1e-8
+    assert found["5 increments, difference"] <= 1e-8
+    for name in ("flank", "mesh"):
+        assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_another_geometry(tmp_path: Path) -> None:
+    """Steeper flanks, more friction: the demo's own checks hold (exit code 0)."""
+    result = run_demo("fitting", tmp_path, "--f", "60", "--friction", "0.3", "--h", "2")
+    assert result["flank_angle_degrees"] == pytest.approx(math.degrees(math.atan2(22, 60)))
+
+
+def test_two_ranks_agree(tmp_path: Path) -> None:
+    """The same on two ranks, to 1e-6: the solver stops at 1e-12 of the forces."""
+    serial = run_demo("fitting", tmp_path / "1", "--h", "2")
+    parallel = run_demo("fitting", tmp_path / "2", "--h", "2", ranks=2)
+    for name in ("normal_force", "tangential_force", "lateral_thrust", "closed_length"):
+        assert parallel[name] == pytest.approx(serial[name], rel=1e-6), name
+    assert parallel["largest_pressure"] == pytest.approx(serial["largest_pressure"], rel=1e-6)

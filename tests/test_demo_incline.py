@@ -1,0 +1,49 @@
+"""The block on an incline, run as its user runs it, against statics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mpi4py import MPI
+from running import run_demo
+
+pytestmark = [
+    pytest.mark.demo,
+    pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own"),
+]
+
+
+def values(result: dict[str, Any]) -> dict[str, float]:
+    return {name: entry["value"] for name, entry in result["references"].items()}
+
+
+def test_friction_angle_and_wedge(tmp_path: Path) -> None:
+    """Refused where tan α = μ, to the 1e-4 it is searched; F/G of NAFEMS CGS-4 to all its digits.
+
+    Statics decides both, whatever the mesh. On the way up part of the base slips, more and more.
+    """
+    result = run_demo("incline", tmp_path)
+    assert result["tilted"]["limit"] == pytest.approx(0.3, rel=1e-4)
+    for row in result["tilted"]["rows"]:
+        assert row["T/N"] == pytest.approx(row["slope"], rel=1e-6)
+    slips = [row["slip"] for row in result["tilted"]["rows"]]
+    assert slips == sorted(slips) and 0 < slips[0] < 0.1 < 0.9 < slips[-1]
+    assert "no contact force can balance" in result["tilted"]["message"]
+    wedge = [run["rows"][-1]["F/G"] for run in result["pushed"]]
+    assert wedge == pytest.approx([0.1, 0.202020, 0.306122, 0.412371], abs=5e-7)
+    assert result["pushed"][-1]["rows"][1]["F/G"] < 0.3  # it sticks before it slides
+    for name in ("forces", "mesh"):
+        assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_two_ranks_agree(tmp_path: Path) -> None:
+    """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
+    options = ("--cells", "18", "--increments", "2")
+    serial = run_demo("incline", tmp_path / "1", *options)
+    parallel = run_demo("incline", tmp_path / "2", *options, ranks=2)
+    assert values(parallel) == pytest.approx(values(serial), rel=1e-6, abs=1e-7)
+    for one, two in zip(serial["pushed"], parallel["pushed"], strict=True):
+        for a, b in zip(one["rows"], two["rows"], strict=True):
+            assert b["F/G"] == pytest.approx(a["F/G"], rel=1e-6)

@@ -1,0 +1,49 @@
+"""Balls in contact, run as their user runs them, against Hertz."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mpi4py import MPI
+from running import run_demo
+
+pytestmark = [
+    pytest.mark.demo,
+    pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own"),
+]
+
+
+def values(run: dict[str, Any]) -> dict[str, float]:
+    return {name: entry["value"] for name, entry in run["references"].items()}
+
+
+def test_hertz(tmp_path: Path) -> None:
+    """Force, radius and peak within 2 % of Hertz, a/R = 0.02; his formulas with numbers put in.
+
+    d = 4e-4: a = 0.02, F = 160, p₀ = 190986. Half a per cent stems from a/R, the rest from eight
+    cells per radius.
+    """
+    result = run_demo("sphere", tmp_path)
+    block, ball = result["runs"]
+    assert values(block)["force [N]"] == pytest.approx(160.0, rel=0.02)
+    assert values(block)["radius [mm]"] == pytest.approx(0.02, rel=0.02)
+    assert values(block)["peak pressure [MPa]"] == pytest.approx(190986, rel=0.02)
+    radius = (0.75 * ball["force"] / 1.5e7) ** (1 / 3)
+    assert ball["force"] == pytest.approx(160.0, rel=0.02)
+    assert values(ball)["radius [mm]"] == pytest.approx(radius, rel=0.02)
+    assert (tmp_path / "pressure.png").read_bytes()[:4] == b"\x89PNG"
+    for case in ("block", "ball"):
+        for name in ("displacement", "stress", "contact"):
+            assert (tmp_path / case / f"{name}.pvd").exists()
+
+
+def test_two_ranks_agree(tmp_path: Path) -> None:
+    """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
+    options = ("--cases", "ball", "--cells", "6")
+    serial = run_demo("sphere", tmp_path / "1", *options)
+    parallel = run_demo("sphere", tmp_path / "2", *options, ranks=2)
+    for one, two in zip(serial["runs"], parallel["runs"], strict=True):
+        assert values(two) == pytest.approx(values(one), rel=1e-6)
+        assert two["force"] == pytest.approx(one["force"], rel=1e-6)

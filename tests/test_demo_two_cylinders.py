@@ -1,0 +1,56 @@
+"""Two cylinders pressed and sheared, run as their user runs them, against Cattaneo and Mindlin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mpi4py import MPI
+from running import run_demo
+
+pytestmark = [
+    pytest.mark.demo,
+    pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own"),
+]
+
+
+def values(result: dict[str, Any]) -> dict[str, float]:
+    return {name: entry["value"] for name, entry in result["references"].items()}
+
+
+def test_cattaneo_mindlin(tmp_path: Path) -> None:
+    """a, c and p₀ within 2 % of the theory of half-planes, with its published numbers.
+
+    a/R = 0.085 costs 1 % of a and half a per cent of p₀, whatever the mesh; the points are 1.1 % of
+    a apart. The forces are those of the loads, to the solver's tolerance.
+    """
+    result = run_demo("two_cylinders", tmp_path)
+    found = values(result)
+    assert found["force along y [N/mm]"] == pytest.approx(16 * 0.625, rel=1e-7)
+    assert found["force along x [N/mm]"] == pytest.approx(16 * 0.05851, rel=1e-7)
+    assert found["half-width of contact [mm]"] == pytest.approx(0.68078, rel=0.02)
+    assert found["half-width of stick zone [mm]"] == pytest.approx(0.72933 * 0.68078, rel=0.02)
+    assert found["largest pressure [MPa]"] == pytest.approx(9.3514, rel=0.02)
+    for name in ("shear", "traction", "mesh"):
+        assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+    for name in ("displacement", "stress", "contact"):
+        assert (tmp_path / f"{name}.pvd").exists()
+
+
+def test_increments_do_not_matter_here(tmp_path: Path) -> None:
+    """Under monotonic shear slip only spreads, one way: one increment ends where four do.
+
+    To 0.1 % in the largest shear, which stands at the end of the stick zone; the forces to 1e-7.
+    """
+    once = run_demo("two_cylinders", tmp_path / "1", "--cells", "20", "--increments", "1")
+    often = run_demo("two_cylinders", tmp_path / "4", "--cells", "20", "--increments", "4")
+    assert values(once) == pytest.approx(values(often), rel=1e-3)
+
+
+def test_two_ranks_agree(tmp_path: Path) -> None:
+    """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
+    options = ("--cells", "20", "--increments", "1")
+    serial = run_demo("two_cylinders", tmp_path / "1", *options)
+    parallel = run_demo("two_cylinders", tmp_path / "2", *options, ranks=2)
+    assert values(parallel) == pytest.approx(values(serial), rel=1e-6)

@@ -1,0 +1,197 @@
+"""Elastic bodies of every kind, in contact, against states of uniform stress and Lamé's ring."""
+
+from __future__ import annotations
+
+import dolfinx
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import CellType
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.elasticity import LinearElastic
+from fenics_contact.parallel import global_max
+
+E, NU, PRESSURE, K_N = 1000.0, 0.3, 10.0, 1e5
+BOTTOM, TOP = 1, 2
+
+pytestmark = pytest.mark.mpi
+
+
+def ends(mesh, axis: int, high: float, low: float = 0.0):
+    """Tags BOTTOM and TOP where the coordinate is lowest and highest. Collective."""
+    fdim = mesh.topology.dim - 1
+    found = [
+        dolfinx.mesh.locate_entities_boundary(mesh, fdim, lambda x, at=at: np.isclose(x[axis], at))
+        for at in (low, high)
+    ]
+    facets = np.concatenate(found)
+    order = np.argsort(facets)
+    values = np.repeat(np.int32([BOTTOM, TOP]), [len(f) for f in found])
+    return dolfinx.mesh.meshtags(mesh, fdim, facets[order], values[order])
+
+
+def column(kind: str, degree: int = 2, **options):
+    """A column 2 x 3 (x 2) on a frictionless rigid plane, pressed on its top.
+
+    Held along x (and y) at x = 0: the axis, if it is axisymmetric.
+    """
+    d = 3 if kind == "3D" else 2
+    size = [2.0, 3.0] if d == 2 else [2.0, 2.0, 3.0]
+    if d == 2:
+        mesh = dolfinx.mesh.create_rectangle(
+            MPI.COMM_WORLD, [np.zeros(2), np.array(size)], (3, 4), CellType.triangle
+        )
+    else:
+        mesh = dolfinx.mesh.create_box(
+            MPI.COMM_WORLD, [np.zeros(3), np.array(size)], (2, 2, 2), CellType.tetrahedron
+        )
+    tags = ends(mesh, d - 1, 3.0)
+    V = fem.functionspace(mesh, ("Lagrange", degree, (d,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    body = LinearElastic(u, E, NU, kind, **options)
+    ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
+    F = body.residual(v) + body.weight * PRESSURE * v[d - 1] * ds(TOP)
+    bcs = []
+    for i in range(d - 1):
+        side = dolfinx.mesh.locate_entities_boundary(
+            mesh, d - 1, lambda x, i=i: np.isclose(x[i], 0)
+        )
+        dofs = fem.locate_dofs_topological(V.sub(i), d - 1, side)
+        bcs.append(fem.dirichletbc(dolfinx.default_scalar_type(0.0), dofs, V.sub(i)))
+    floor = fc.HalfSpace(point=[0.0] * d, normal=[0.0] * (d - 1) + [1.0])
+    contact = fc.Contact(
+        u, fc.ContactSurface(mesh, tags, BOTTOM), floor, fc.Frictionless(K_N), weight=body.weight
+    )
+    fc.ContactProblem(F, u, bcs=bcs, contacts=[contact]).solve()
+    return body, contact
+
+
+def deviation(u: fem.Function, exact) -> float:
+    """Largest difference from a displacement given by a function of x. Collective."""
+    other = fem.Function(u.function_space)
+    other.interpolate(exact)
+    return global_max(u.function_space.mesh.comm, np.abs(u.x.array - other.x.array))
+
+
+# Kind, options, base area in contact (2 wide, thickness or 2πr or 2 deep), strain along and across.
+UNIFORM = [
+    ("plane strain", {}, 2.0, (1 - NU**2) / E, NU * (1 + NU) / E),
+    ("plane strain", {"thickness": 5.0}, 10.0, (1 - NU**2) / E, NU * (1 + NU) / E),
+    ("plane stress", {"thickness": 6.4}, 12.8, 1 / E, NU / E),
+    ("axisymmetric", {}, 4 * np.pi, 1 / E, NU / E),
+    ("3D", {}, 4.0, 1 / E, NU / E),
+]
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize(("kind", "options", "area", "along", "across"), UNIFORM)
+def test_column(kind, options, area, along, across, degree) -> None:
+    """Uniform stress: force p·area, sunk by p/k_n, shortened by Hooke's law; to 1e-8.
+
+    The solution is linear, so that both degrees have it; the solver stops at 1e-9 of the forces.
+    """
+    body, contact = column(kind, degree, **options)
+    d = len(body.u)
+    resultants = contact.resultants()
+    assert resultants.normal_force == pytest.approx(PRESSURE * area, rel=1e-8)
+    assert resultants.area == pytest.approx(area, rel=1e-12)
+    assert contact.pressure == pytest.approx(np.full(len(contact.pressure), PRESSURE), rel=1e-7)
+
+    def exact(x):
+        sides = [PRESSURE * across * x[i] for i in range(d - 1)]
+        return np.vstack([*sides, -PRESSURE * along * x[d - 1] - PRESSURE / K_N])
+
+    assert deviation(body.u, exact) <= 1e-8 * PRESSURE * 3 / E
+
+
+@pytest.mark.parametrize(("kind", "third"), [("plane strain", -NU * PRESSURE), ("plane stress", 0)])
+def test_stress_out_of_the_plane(kind: str, third: float) -> None:
+    """σ_zz = -νp where the strain is zero, 0 where the stress is; to the solver's 1e-8."""
+    body, _ = column(kind)
+    mesh = body.u.function_space.mesh
+    wrong = ufl.sqrt((body.stress[2, 2] - third) ** 2 + (body.stress[1, 1] + PRESSURE) ** 2)
+    total = mesh.comm.allreduce(fem.assemble_scalar(fem.form(wrong * ufl.dx)))
+    assert total <= 1e-7 * PRESSURE
+
+
+def test_axisymmetric_ring_on_a_mandrel() -> None:
+    """A ring 10/20, free along z, on a rigid mandrel 0.01 too thick: Lamé's pressure to 1e-4.
+
+    p/k_n enlarges the compliance of the bore and is part of the reference; quadratic cells of 0.25.
+    """
+    mesh = dolfinx.mesh.create_rectangle(
+        MPI.COMM_WORLD, [(10.0, 0.0), (20.0, 2.0)], (40, 4), CellType.quadrilateral
+    )
+    tags = ends(mesh, 0, 20.0, low=10.0)
+    V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    modulus = fem.Constant(mesh, E)
+    body = LinearElastic(u, modulus, NU, "axisymmetric")
+    base = dolfinx.mesh.locate_entities_boundary(mesh, 1, lambda x: np.isclose(x[1], 0))
+    dofs = fem.locate_dofs_topological(V.sub(1), 1, base)
+    bc = fem.dirichletbc(dolfinx.default_scalar_type(0.0), dofs, V.sub(1))
+    contact = fc.Contact(
+        u,
+        fc.ContactSurface(mesh, tags, BOTTOM),
+        fc.HalfSpace(point=(10.0, 0.0), normal=(1.0, 0.0)),
+        fc.Frictionless(K_N),
+        gap=-0.01,
+        weight=body.weight,
+    )
+    fc.ContactProblem(body.residual(v), u, bcs=[bc], contacts=[contact]).solve()
+    compliance = 10 / E * ((20**2 + 10**2) / (20**2 - 10**2) + NU) + 1 / K_N
+    points = contact.gather()
+    exact = np.full(len(points["pressure"]), 0.01 / compliance)
+    assert points["pressure"] == pytest.approx(exact, rel=1e-4)
+    force = 0.01 / compliance * 2 * np.pi * 10 * 2
+    assert contact.resultants().normal_force == pytest.approx(force, rel=1e-4)
+
+
+def test_moduli_as_functions() -> None:
+    """Two layers in a row shorten by the sum of their compliances; scaled stiffness finds E/h."""
+    mesh = dolfinx.mesh.create_rectangle(MPI.COMM_WORLD, [(0.0, 0.0), (1.0, 2.0)], (2, 4))
+    V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    modulus = fem.Function(fem.functionspace(mesh, ("DG", 0)))
+    modulus.interpolate(lambda x: np.where(x[1] < 1, E, 3 * E))
+    body = LinearElastic(u, modulus, 0.0, "plane stress", thickness=fem.Constant(mesh, 2.0))
+    tags = ends(mesh, 1, 2.0)
+    ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
+    F = body.residual(v) + body.weight * PRESSURE * v[1] * ds(TOP)
+    corner = fem.locate_dofs_geometrical(
+        (V.sub(0), V.sub(0).collapse()[0]), lambda x: np.isclose(x[0], 0)
+    )[0]
+    bc = fem.dirichletbc(dolfinx.default_scalar_type(0.0), corner, V.sub(0))
+    contact = fc.Contact(
+        u,
+        fc.ContactSurface(mesh, tags, BOTTOM),
+        fc.HalfSpace((0, 0), (0, 1)),
+        fc.Frictionless(),
+        weight=body.weight,
+    )
+    fc.ContactProblem(F, u, bcs=[bc], contacts=[contact]).solve()
+    assert contact.resultants().normal_force == pytest.approx(2 * PRESSURE, rel=1e-8)
+    lowest = -PRESSURE * (1 / E + 1 / (3 * E)) - PRESSURE / (10 * E / 0.5)
+    assert -global_max(mesh.comm, -u.x.array) == pytest.approx(lowest, rel=1e-7)
+
+
+def test_what_has_no_sense_is_refused() -> None:
+    """Wrong kinds, dimensions and numbers: each is named."""
+    mesh = dolfinx.mesh.create_unit_square(MPI.COMM_WORLD, 2, 2)
+    u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (2,))))
+    with pytest.raises(ValueError, match="kind is 'plane'"):
+        LinearElastic(u, E, NU, "plane")
+    with pytest.raises(ValueError, match="on a mesh in 2D"):
+        LinearElastic(u, E, NU, "3D")
+    with pytest.raises(ValueError, match="has none"):
+        LinearElastic(u, E, NU, "axisymmetric", thickness=2.0)
+    with pytest.raises(ValueError, match=r"nu is 0\.5"):
+        LinearElastic(u, E, 0.5, "plane strain")
+    with pytest.raises(ValueError, match="E is -1"):
+        LinearElastic(u, -1.0, NU, "plane strain")
+    with pytest.raises(ValueError, match="thickness is 0"):
+        LinearElastic(u, E, NU, "plane stress", thickness=0)
+    LinearElastic(u, E, 0.5, "plane stress")  # incompressible sheets are ordinary
