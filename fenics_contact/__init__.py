@@ -1,5 +1,6 @@
 """Frictional contact for FEniCSx: contact as a boundary form, an answer that is checked."""
 
+from fenics_contact import elasticity
 from fenics_contact._version import __version__
 from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.laws import Coulomb, Foundation, Frictionless, Scaled, Springs, Tresca
@@ -32,5 +33,6 @@ __all__ = [
     "Tresca",
     "Verdict",
     "__version__",
+    "elasticity",
     "increments",
 ]

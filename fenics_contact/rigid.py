@@ -230,7 +230,7 @@ class RigidMotions:
         rays = rays[felt] / length[felt, None]
         rest = np.abs(resultant).max()
         if len(rays):
-            rest = scipy.optimize.nnls(rays.T, -resultant / rest)[1] * rest
+            rest *= _unbalanced(rays.T, -resultant / rest)
         if rest > _BALANCED * max(size, np.abs(resultant).max()):
             worst = int(np.argmax(np.abs(resultant)))
             raise ValueError(
@@ -266,6 +266,23 @@ class RigidMotions:
         modes = self._at_points(contact)
         rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
         return gather_rows(self._comm, np.concatenate(rays).reshape(-1, len(self.free)))
+
+
+def _unbalanced(rays: Array, resultant: Array) -> float:
+    """The least Σ|resultant - rays·x| over x ≥ 0; rays (n_free, n_rays) of unit length.
+
+    As a linear programme: least squares without negatives (nnls) may end far from its optimum.
+    """
+    m, n = rays.shape
+    tolerance = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+    found = scipy.optimize.linprog(
+        np.concatenate([np.zeros(n), np.ones(2 * m)]),
+        A_eq=np.hstack([rays, np.eye(m), -np.eye(m)]),
+        b_eq=resultant,
+        options=tolerance,
+    )
+    # What the programme cannot tell is left to the solution itself to show.
+    return float(found.fun) if found.status == 0 else 0.0
 
 
 def _motions(arm: Array, size: float) -> dict[str, Array]:

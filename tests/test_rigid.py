@@ -1,0 +1,43 @@
+"""Balance of a load by contact forces: a cone of rays, told apart from what lies outside."""
+
+import numpy as np
+import pytest
+from scenes import block, raised_everywhere
+
+import fenics_contact as fc
+from fenics_contact.rigid import _unbalanced
+
+
+@pytest.mark.parametrize("m", [1, 2, 3, 6])
+def test_inside_and_outside_of_a_cone(m):
+    """Rays in a half-space: sums of them are balanced, what points out of it never is.
+
+    The distance from outside is at least the resultant's part along the half-space's normal w, for
+    Σ|w·rest| ≤ max|w| Σ|rest|.
+    """
+    rng = np.random.default_rng(m)
+    for _ in range(100):
+        w = rng.normal(size=m)
+        w /= np.linalg.norm(w)
+        rays = rng.normal(size=(m, 40 * m))
+        rays *= np.where(w @ rays > 0, -1.0, 1.0)
+        rays /= np.linalg.norm(rays, axis=0)
+        inside = rays @ rng.exponential(size=rays.shape[1]) ** 8
+        inside /= np.abs(inside).max()
+        assert _unbalanced(rays, inside) < 1e-9
+        outside = inside + (abs(w @ inside) + 10.0 ** rng.uniform(-6, 0)) * w
+        assert _unbalanced(rays, outside) >= 0.99 * (w @ outside) / np.abs(w).max()
+
+
+@pytest.mark.parametrize("n", [3, 5, 12])
+@pytest.mark.parametrize("above", [0.9, 1.01])
+def test_a_block_beside_its_friction_angle(n, above):
+    """Pushed along by less than μ times its weight a block can be held, by more it cannot."""
+    scene = block("quadrilateral", up=-1.0, side=0.3 * above, n=n)
+    # A low block, so that it does not tip: the push acts at half its height.
+    scene.mesh.geometry.x[:, 1] *= 0.1
+    problem, _ = scene.problem(fc.Coulomb(0.3, k_n=1e5, k_t=1e5), [])
+    if above < 1:
+        problem.solve()
+    else:
+        raised_everywhere(problem.solve, ValueError, "balance")
