@@ -1,0 +1,252 @@
+"""Ironing: a rigid cylinder pressed into an elastic block by a force, and dragged along it.
+
+Plane strain; lengths in mm, stresses in MPa, forces per mm of thickness. The cylinder (R = 3) bears
+the force P = 18 and is moved by 4 along a block (E = 1000, ν = 0.3, μ = 0.3) that is held at its
+bottom, so far away that it stands for a half-plane. On its way, sixteen half-widths of the contact,
+the cylinder passes more than a hundred facets. Its height is not prescribed: it follows from P.
+
+    python demos/ironing.py
+    python demos/ironing.py --cells 4 --increments 20
+    mpirun -n 2 python demos/ironing.py
+
+Reference: a rigid cylinder that slides on an elastic half-plane (K. L. Johnson, Contact Mechanics,
+section 7.2). With tan(πγ) = μ (1-2ν)/(2(1-ν)) and E* = E/(1-ν²)
+
+    P = π a² E* (1 - 4γ²)/(4R),    p(x) = E*/(2R) cos(πγ) (a + x)^{1/2-γ} (a - x)^{1/2+γ},
+
+x along the way: a little skewed against Hertz's, for friction moves the surface along the normal,
+too. Checked are half-width and peak (2 %), that the peak keeps still while the cylinder slides
+(1 %), T = μN and the vertical force P (1e-6), and that the work of the drag goes into friction
+(5 %: displacements are small in theory, normals those of the undeformed surface, and what that
+leaves out are strains of one per cent, beside a friction coefficient of 0.3). The exit code is 1 if
+one of them is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import dolfinx
+import gmsh
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from tqdm import tqdm
+
+import fenics_contact as fc
+from fenics_contact import compat, output, plotting
+from fenics_contact.elasticity import LinearElastic
+
+E, NU, MU, R, P = 1000.0, 0.3, 0.3, 3.0, 18.0
+WAY, SIZE = 4.0, 60.0  # of the cylinder; of the block
+BOTTOM, TOP = 1, 2
+E_STAR = E / (1 - NU**2)
+GAMMA = np.arctan(MU * (1 - 2 * NU) / (2 * (1 - NU))) / np.pi
+HALF_WIDTH = np.sqrt(4 * P * R / (np.pi * E_STAR * (1 - 4 * GAMMA**2)))
+
+
+def sliding_pressure(x: np.ndarray) -> np.ndarray:
+    """Johnson's pressure at x from the middle of the contact, x along the way (stress)."""
+    a = HALF_WIDTH
+    before, behind = np.clip(a + x, 0, None), np.clip(a - x, 0, None)
+    skewed = before ** (0.5 - GAMMA) * behind ** (0.5 + GAMMA)
+    return E_STAR / (2 * R) * np.cos(np.pi * GAMMA) * skewed
+
+
+def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
+    """The block, ``cells`` per half-width along the way, coarser with the distance. Collective."""
+    gmsh.initialize()
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
+        gmsh.model.add("block")
+        if MPI.COMM_WORLD.rank == 0:
+            occ, half, reach = gmsh.model.occ, SIZE / 2, WAY / 2 + 3 * HALF_WIDTH
+            corners = [
+                (-half, -half),
+                (half, -half),
+                (half, 0),
+                (reach, 0),
+                (-reach, 0),
+                (-half, 0),
+            ]
+            points = [occ.addPoint(x, y, 0) for x, y in corners]
+            lines = [
+                occ.addLine(p, q) for p, q in zip(points, points[1:] + points[:1], strict=True)
+            ]
+            block = occ.addPlaneSurface([occ.addCurveLoop(lines)])
+            occ.synchronize()
+            gmsh.model.addPhysicalGroup(2, [block], 1)
+            gmsh.model.addPhysicalGroup(1, [lines[0]], BOTTOM)
+            gmsh.model.addPhysicalGroup(1, [lines[3]], TOP)
+
+            def size(dim: int, tag: int, x: float, y: float, z: float, lc: float) -> float:
+                along = max(0.0, abs(x) - reach)
+                return HALF_WIDTH / cells + 0.25 * float(np.hypot(along, y))
+
+            gmsh.model.mesh.setSizeCallback(size)
+            gmsh.model.mesh.generate(2)
+        return compat.model_to_mesh(gmsh.model, MPI.COMM_WORLD, 0, 2)
+    finally:
+        gmsh.finalize()
+
+
+def solve(
+    arguments: argparse.Namespace,
+) -> tuple[fc.Contact, LinearElastic, list[dict[str, float]], dict[str, Any]]:
+    """Press, drag, and note every increment of the drag. Collective."""
+    start = time.perf_counter()
+    mesh, tags = make_mesh(arguments.cells)
+    V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
+    u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
+    body = LinearElastic(u, E, NU, "plane strain")
+    held = fem.locate_dofs_topological(V, 1, tags.find(BOTTOM))
+    bcs = [fem.dirichletbc(np.zeros(2), held, V)]
+
+    # The cylinder's motion along x is prescribed, the one along y follows from the force.
+    along, press = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
+    motion = fc.Motion(displacement=(along, None), force=(None, press))
+    cylinder = fc.Cylinder(point=(-WAY / 2, R), radius=R, displacement=motion)
+    surface = fc.ContactSurface(mesh, tags, TOP)
+    stiffness = fc.Scaled(arguments.stiffness)
+    contact = fc.Contact(u, surface, cylinder, fc.Coulomb(MU, stiffness, stiffness))
+    problem = fc.ContactProblem(
+        body.residual(v), u, bcs=bcs, contacts=[contact], method=arguments.solver
+    )
+
+    def load(t: float) -> None:
+        """Press until t = 1, drag until t = 2."""
+        press.value = -P * min(t, 1.0)
+        along.value = WAY * max(t - 1.0, 0.0)
+
+    ends = [0.5, 1.0, *(1 + np.arange(1, arguments.increments + 1) / arguments.increments)]
+    history: Any = fc.increments(problem, load, 0.0, 2.0, steps=ends)
+    quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
+    path, iterations, last = [], [], 0.0
+    for step in tqdm(history, "ironing", len(ends), disable=quiet, unit="increment"):
+        iterations.append(step.iterations)
+        if step.load <= 1.0:
+            continue
+        r = step.contacts["contact"]
+        path.append(
+            {
+                "along": float(along.value),
+                "depth": -float(contact.free_motion[1].value),
+                "normal": r.normal_force,
+                "tangential": r.tangential_force,
+                "vertical": -r.force[1],
+                "drag": r.force[0],
+                "peak": r.max_pressure,
+                "half_width": 0.5 * r.area,
+                "stick": r.stick,
+                "dissipation": step.energy.dissipation,
+                "way": float(along.value) - last,
+            }
+        )
+        last = float(along.value)
+    info = {
+        "dofs": V.dofmap.index_map.size_global * 2,
+        "facets_passed": float(WAY / HALF_WIDTH * arguments.cells),
+        "iterations": iterations,
+        "wall_seconds": time.perf_counter() - start,
+    }
+    return contact, body, path, info
+
+
+def compare(path: list[dict[str, float]]) -> dict[str, Any]:
+    """The steady half of the way beside its references."""
+    steady = path[len(path) // 2 :]
+    column = {name: np.array([row[name] for row in steady]) for name in steady[0]}
+    peak = float(sliding_pressure(np.linspace(-HALF_WIDTH, HALF_WIDTH, 2001)).max())
+    values = {
+        "half-width [mm]": float(column["half_width"].mean()),
+        "peak pressure [MPa]": float(column["peak"].mean()),
+        "spread of the peak [MPa]": float(np.ptp(column["peak"])) / 2,
+        "tangential over normal": float((column["tangential"] / column["normal"]).mean()),
+        "vertical force [N/mm]": float(column["vertical"].mean()),
+        "friction's work over the drag's": float(
+            column["dissipation"].sum() / (column["drag"] * column["way"]).sum()
+        ),
+    }
+    references = {
+        "half-width [mm]": (float(HALF_WIDTH), 0.02),
+        "peak pressure [MPa]": (peak, 0.02),
+        "spread of the peak [MPa]": (0.0, 0.01 * peak),
+        "tangential over normal": (MU, 1e-6),
+        "vertical force [N/mm]": (P, 1e-6),
+        "friction's work over the drag's": (1.0, 0.05),
+    }
+    return output.compare(values, references)
+
+
+def draw(folder: Path, path: list[dict[str, float]], points: dict[str, np.ndarray]) -> None:
+    """Tractions at the end, and the forces along the way. On this rank."""
+    with plotting.figure(folder / "ironing.png", 2) as (left, right):
+        x = points["x"][:, 0]
+        closed = points["pressure"] > 0
+        middle = 0.5 * (x[closed].min() + x[closed].max())
+        near = np.abs(x - middle) < 1.4 * HALF_WIDTH
+        offset = (x[near] - middle) / HALF_WIDTH
+        at = np.linspace(-1, 1, 401)
+        exact = sliding_pressure(at * HALF_WIDTH)
+        left.plot(offset, points["pressure"][near], ".", color="#1f5fa8", label="pressure p")
+        left.plot(
+            offset,
+            np.abs(points["tangential_traction"][near, 0]),
+            ".",
+            color="#c4482f",
+            label="friction |τ|",
+        )
+        left.plot(at, exact, "k--", label="half-plane: p")
+        left.plot(at, MU * exact, "k:", label="half-plane: μp")
+        left.set(xlabel="distance from the middle / a (way to the right)", ylabel="traction [MPa]")
+        left.set(
+            title=f"Rigid cylinder sliding, μ = {MU:g}, P = {P:g} N/mm",
+            ylim=(0, 1.35 * exact.max()),
+        )
+        left.legend(loc="upper left")
+        way = [row["along"] for row in path]
+        for name, color, label in (
+            ("vertical", "#1f5fa8", "vertical force"),
+            ("drag", "#c4482f", "drag"),
+        ):
+            right.plot(way, [row[name] for row in path], ".-", color=color, label=label)
+        right.axhline(P, color="k", ls="--", lw=1, label="P")
+        right.axhline(MU * P, color="k", ls=":", lw=1, label="μP")
+        right.set(xlabel="way of the cylinder [mm]", ylabel="force [N/mm]", ylim=(0, 1.25 * P))
+        right.set(title=f"{len(path)} increments")
+        right.legend(loc="center right")
+        for ax in (left, right):
+            ax.grid(alpha=0.25)
+
+
+def main() -> int:
+    """Iron, and write all results; 0 if every reference is met."""
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.add_argument("--cells", type=int, default=8, help="cells per half-width of the contact")
+    parser.add_argument("--increments", type=int, default=60, help="increments of the drag")
+    parser.add_argument("--stiffness", type=float, default=40, help="k_n and k_t over E/h")
+    parser.add_argument("--solver", default="newton", choices=("lbfgs", "newton", "alternating"))
+    parser.add_argument("--output", type=Path, default=Path("output/ironing"), help="folder")
+    arguments, _ = parser.parse_known_args()
+    contact, body, path, info = solve(arguments)
+    comm, result = MPI.COMM_WORLD, {"references": compare(path)} | info | {"path": path}
+    output.write_body(arguments.output, contact.u, body.stress)
+    output.write_surface(arguments.output, contact)
+    points = contact.gather()
+    if comm.rank == 0:
+        print(output.table(result["references"]))
+        draw(arguments.output, path, points)
+    output.write_json(arguments.output / "result.json", result, comm)
+    return 0 if all(entry["passed"] for entry in result["references"].values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,48 @@
+"""The ironing demo, run as its user runs it, against the sliding cylinder on a half-plane."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from running import run_demo
+
+pytestmark = [
+    pytest.mark.demo,
+    pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own"),
+]
+OPTIONS = ("--cells", "6", "--increments", "12")
+
+
+def values(run: dict[str, Any]) -> dict[str, float]:
+    return {name: entry["value"] for name, entry in run["references"].items()}
+
+
+def test_sliding(tmp_path: Path) -> None:
+    """Half-width and peak of Johnson's solution, numbers put in: 2 %, six cells per half-width.
+
+    γ = 0.0272: a = 0.2505, p₀ = 45.78; without friction they would be 0.2501 and 45.82. The
+    vertical force is the one given, though the height of the cylinder is not.
+    """
+    result = run_demo("ironing", tmp_path, *OPTIONS)
+    found = values(result)
+    assert found["half-width [mm]"] == pytest.approx(0.2505, rel=0.02)
+    assert found["peak pressure [MPa]"] == pytest.approx(45.78, rel=0.02)
+    assert found["vertical force [N/mm]"] == pytest.approx(18.0, rel=1e-6)
+    assert len(result["path"]) == 12
+    peaks = np.array([row["peak"] for row in result["path"][4:]])
+    assert np.ptp(peaks) < 0.03 * peaks.mean()
+    assert all(row["stick"] == 0 for row in result["path"][2:])
+    assert (tmp_path / "ironing.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_two_ranks_agree(tmp_path: Path) -> None:
+    """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
+    options = ("--cells", "5", "--increments", "4")
+    serial = run_demo("ironing", tmp_path / "1", *options)
+    parallel = run_demo("ironing", tmp_path / "2", *options, ranks=2)
+    for name, value in values(serial).items():
+        assert values(parallel)[name] == pytest.approx(value, rel=1e-6, abs=1e-6)
