@@ -61,7 +61,9 @@ def boxes(
         number = first + np.arange(np.prod(counts)).reshape(counts)
         found = []
         for corner in range(2**d):  # the first coordinate runs fastest
-            cut = tuple(slice(corner >> i & 1, n - 1 + (corner >> i & 1)) for i, n in enumerate(counts))
+            cut = tuple(
+                slice(corner >> i & 1, n - 1 + (corner >> i & 1)) for i, n in enumerate(counts)
+            )
             found.append(number[cut].ravel())
         cells.append(np.column_stack(found))
         first += len(corners[-1])

@@ -48,14 +48,22 @@ def flat_punch() -> Outcome:
     exact = force / (np.pi * np.sqrt(a**2 - along[inside] ** 2))
     source = "p = P/(π√(a² - x²))"
     rows = [
-        Row(f"p({at:g} a) a/P", float(np.interp(at, along, p)), 1 / np.pi / np.sqrt(1 - at**2), source, 0.005)
+        Row(
+            f"p({at:g} a) a/P",
+            float(np.interp(at, along, p)),
+            1 / np.pi / np.sqrt(1 - at**2),
+            source,
+            0.005,
+        )
         for at in (0.0, 0.5, 0.8)
     ]
     worst = float(np.abs(p[inside] / exact - 1).max())
     rows.append(Row("largest error of p, |x| ≤ 0.9 a", worst, 0.0, source, 0.005))
     share = 2 * float(points["measure"][inside] @ p[inside]) / force
     source = "(2/π) arcsin 0.9"
-    rows.append(Row("share of the load in |x| ≤ 0.9 a", share, 2 / np.pi * np.arcsin(0.9), source, 0.005))
+    rows.append(
+        Row("share of the load in |x| ≤ 0.9 a", share, 2 / np.pi * np.arcsin(0.9), source, 0.005)
+    )
     return Outcome(tuple(rows), f"{len(x) - 1} × {len(y) - 1} quadrilaterals, degree 2", body.dofs)
 
 
@@ -84,7 +92,11 @@ def wavy() -> Outcome:
     contact = fc.Contact(body.u, surface, fc.Obstacle(gap, (0, -1)), fc.Frictionless())
     problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
     rows = []
-    for share, width, peak in ((0.25, 1 / 6, 4.0), (0.5, 0.25, 8**0.5), (0.75, 1 / 3, 16 / 48**0.5)):
+    for share, width, peak in (
+        (0.25, 1 / 6, 4.0),
+        (0.5, 0.25, 8**0.5),
+        (0.75, 1 / 3, 16 / 48**0.5),
+    ):
         mean = share * full
         load.value = mean
         problem.solve()
@@ -92,7 +104,9 @@ def wavy() -> Outcome:
         points = contact.gather()
         x, p = points["x"][:, 0], points["pressure"]
         source = f"Westergaard, p̄ = {share:g} p*"
-        rows.append(Row(f"a/λ at {share:g} p*", contact.resultants().area / wave, width, source, 0.01))
+        rows.append(
+            Row(f"a/λ at {share:g} p*", contact.resultants().area / wave, width, source, 0.01)
+        )
         rows.append(Row(f"p(0)/p̄ at {share:g} p*", float(p[0] / mean), peak, source, 0.01))
         s, sx = np.sin(np.pi * width), np.sin(np.pi * x / wave)
         exact = 2 * mean * np.cos(np.pi * x / wave) / s**2 * np.sqrt(np.maximum(s**2 - sx**2, 0))

@@ -91,7 +91,9 @@ def spheres() -> Outcome:
         s = np.linalg.norm(points["x"][middle, :2], axis=1) / a
         exact = friction * p0 * (np.sqrt(1 - s**2) - c * np.sqrt(1 - (s / c) ** 2))
         ratio = float(traction.mean() / exact.mean())
-        rows.append(Row(f"shear traction at the centre over Mindlin's, {at}", ratio, 1.0, source, 0.02))
+        rows.append(
+            Row(f"shear traction at the centre over Mindlin's, {at}", ratio, 1.0, source, 0.02)
+        )
         made = value - slope * share
         part = unit * (1 - (1 - share) ** (2 / 3) - 2 / 3 * share)
         rows.append(Row(f"displacement made by slip, {at}", made, part, source, 0.02))
