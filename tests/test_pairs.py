@@ -191,8 +191,7 @@ def test_floor_and_wall(cell):
     body = stack(cell, (4,), (1.0,), nu=nu, tags={WALL: at(0, 0), 9: at(0, 1)})
     up = body.d - 1
     if body.d == 3:  # plane strain
-        body.hold(WALL, 1)
-        body.hold(9, 1)
+        body.hold(SIDES, 1)
     body.F += q * body.v[up] * body.ds(ROOF) + side * body.v[0] * body.ds(9)
     wall = fc.Contact(
         body.u,
@@ -202,13 +201,6 @@ def test_floor_and_wall(cell):
         name="wall",
     )
     base = floor(body, fc.Frictionless(k))
-    if body.d == 3:
-        everywhere = fem.locate_dofs_geometrical(
-            (body.u.function_space.sub(1), body.u.function_space.sub(1).collapse()[0]),
-            lambda x: x[0] > -1,
-        )
-        zero = fem.Function(body.u.function_space.sub(1).collapse()[0])
-        body.bcs = [fem.dirichletbc(zero, everywhere, body.u.function_space.sub(1))]
     fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[base, wall]).solve()
     assert uniform(base.pressure, q)
     assert uniform(wall.pressure, side)
@@ -258,6 +250,109 @@ def test_both_ways_round():
     for contact in (one, other):
         assert uniform(contact.pressure, q / 2)
         assert uniform(contact.gap, -q / 1e7)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_a_stack_under_a_weight(cell):
+    """Floor, two bodies, and a free rigid lid with a force on it: all three contacts carry it."""
+    body = stack(cell, (3, 4), (0.5, 0.5))
+    up, k_n, weight = body.d - 1, 1e7, 5e3
+    body.hold(SIDES, *range(up))
+    down = np.eye(body.d)[-1]
+    motion = fc.Motion(force=[None] * up + [-weight])
+    lid = fc.Contact(
+        body.u,
+        fc.ContactSurface(body.mesh, body.tags, ROOF),
+        fc.HalfSpace(down, -down, displacement=motion),
+        fc.Frictionless(k_n),
+        name="lid",
+    )
+    contacts = [floor(body, fc.Frictionless(k_n)), joint(body, 1, fc.Frictionless(k_n)), lid]
+    fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=contacts).solve()
+    for contact in contacts:
+        assert uniform(contact.pressure, weight, 1e-8)
+    assert close(lid.free_motion[up].value, -weight * (1 / E + 3 / k_n), 1e-8)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
+def test_a_bonded_stack(cell, degree):
+    """Elastic layers in two joints bear tension and shear: both are uniform, springs in series.
+
+    Pure shear of a stack whose heights do not change and whose sides carry the shear that belongs
+    to it: u_x = t (z/G + the layers below over k_t).
+    """
+    q, t, k_n, k_t = 5e3, 2e3, 1e7, 4e6
+    counts = (2, 3, 4) if cell == "hexahedron" else (3, 5, 4)
+    body = stack(cell, counts, (0.5, 0.25, 0.75), degree=degree, tags={8: at(0, 0), 9: at(0, 1)})
+    up = body.d - 1
+    body.hold(FLOOR, *range(body.d))
+    body.F -= (q * body.v[up] + t * body.v[0]) * body.ds(ROOF)
+    body.F -= t * body.v[up] * body.ds(9) - t * body.v[up] * body.ds(8)
+    law = fc.Foundation(k_n, k_t)
+    contacts = [joint(body, 1, law), joint(body, 2, law, swap=True)]
+    fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=contacts).solve()
+    for contact, upward in zip(contacts, (False, True), strict=True):
+        # Γc of joint 1 is the bottom of the upper block, that of joint 2 the top of the lower one.
+        assert uniform(contact.pressure, -q)
+        side = gathered(COMM, contact.tangential_traction)
+        exact = np.zeros_like(side)
+        exact[:, 0] = t if upward else -t
+        assert close(side, exact, 1e-9)
+    space = body.u.function_space
+    top = fem.locate_dofs_topological(space, up, body.tags.find(ROOF))
+    top = top[top < space.dofmap.index_map.size_local]
+    moved = gathered(COMM, body.u.x.array.reshape(-1, body.d)[top])
+    shear = E / 2
+    assert close(moved[:, 0], np.full(len(moved), t * (1.5 / shear + 2 / k_t)), 1e-8)
+    assert close(moved[:, up], np.full(len(moved), q * (1.5 / E + 2 / k_n)), 1e-8)
+
+
+@pytest.mark.parametrize("swap", [False, True])
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_axisymmetric_discs(cell, degree, swap):
+    """Two discs of unequal meshes, weight 2πr down to the axis: uniform pressure, N = q π."""
+    q, k_n = 5e3, 1e7
+    body = stack(cell, (3, 5), (0.5, 0.5), degree=degree)
+    r, u, v = body.x[0], body.u, body.v
+    strain, virtual = ufl.sym(ufl.grad(u)), ufl.sym(ufl.grad(v))
+    F = 2 * np.pi * E * (r * ufl.inner(strain, virtual) + u[0] * v[0] / r) * ufl.dx
+    F += 2 * np.pi * r * q * v[1] * body.ds(ROOF)
+    body.hold(FLOOR, 1)
+    body.hold(SIDES, 0)
+    contact = joint(body, 1, fc.Frictionless(k_n), swap=swap, weight=2 * np.pi * r)
+    fc.ContactProblem(F, u, bcs=body.bcs, contacts=[contact]).solve()
+    assert uniform(contact.pressure, q)
+    assert uniform(contact.gap, -q / k_n)
+    assert close(contact.resultants().normal_force, q * np.pi, 1e-9)
+    total, _, size = balance(contact)
+    assert np.abs(total).max() <= 1e-12 * size
+
+
+def test_one_joint_slides_far_and_another_holds():
+    """Pairs found anew in one joint alone, while that joint slides over three facets: T = μN."""
+    q = 5e3
+    body = stack("quadrilateral", (8, 16, 5), (0.3, 0.2, 0.2), widths=[1.0, 1.0, 0.4], nu=0.3)
+    drag = body.constant(0.0)
+    body.hold(FLOOR, 0, 1)
+    body.hold(ROOF, 0, value=drag)
+    body.F += q * body.v[1] * body.ds(ROOF)
+    glued = joint(body, 1, fc.Coulomb(0.5, k_n=1e7, k_t=1e7))
+    surface = fc.ContactSurface(body.mesh, body.tags, 20 + UPPER)
+    support = fc.DeformableBody(body.tags, 20 + LOWER, update="increment")
+    slides = fc.Contact(body.u, surface, support, fc.Coulomb(0.2, k_n=1e7, k_t=1e7), name="slides")
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[glued, slides])
+    n = 0.4 * q
+    for step in fc.increments(problem, drag, 0.0, 0.2, steps=10):
+        r = step.contacts["slides"]
+        assert close(r.normal_force, n, 1e-8)
+        assert r.stick == 0
+        assert close(r.force, [-0.2 * n, n], 1e-8)
+        assert close(step.contacts["joint 1"].force, [-0.2 * n, n], 1e-7)
+        assert step.contacts["joint 1"].stick > 0
+    assert slides.pairings > 1 and glued.pairings == 1
+    assert slides.n_unpaired == 0
 
 
 # ---- self-contact --------------------------------------------------------------------------------
