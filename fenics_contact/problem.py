@@ -16,6 +16,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact import accuracy, compat
+from fenics_contact.alternating import Alternation
 from fenics_contact.bulk import Bulk
 from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.energy import Energy, EnergyState
@@ -72,6 +73,7 @@ _METHODS: dict[str, dict[str, Any]] = {
         "qn_mat_lmvm_eps": 0.0,  # else pairs are dropped by a test that depends on the units
     },
     "newton": {"snes_type": "newtonls", "snes_max_it": 100},
+    "alternating": {},
 }
 
 
@@ -83,6 +85,7 @@ class Step:
         increment: Number of the increment, from 1.
         reason: SNES reason of the last solve (positive: converged).
         iterations: SNES iterations in all.
+        method: The method that found the solution; see `ContactProblem`.
         factorisations: Matrices factored.
         verdict: The independent check.
         contacts: Resultants of every contact, by name.
@@ -94,6 +97,7 @@ class Step:
     increment: int
     reason: int
     iterations: int
+    method: str
     factorisations: int
     verdict: Verdict
     contacts: dict[str, Resultants]
@@ -145,6 +149,7 @@ class ContactProblem:
         method: str = "lbfgs",
         alpha: float = 1.0,
         phi: float = 1.0,
+        fallback: bool = True,
         petsc_options: Mapping[str, Any] | None = None,
         prefix: str = "contact_",
     ) -> None:
@@ -155,11 +160,14 @@ class ContactProblem:
             u: Displacement; its values are the starting state.
             bcs: Dirichlet conditions on ``u`` or its components.
             contacts: Contacts of ``u``.
-            method: "lbfgs" (quasi-Newton, H₀ = (K + αK_n + φK_t)⁻¹) or "newton" (consistent
-                tangent).
+            method: "lbfgs" (quasi-Newton, H₀ = (K + αK_n + φK_t)⁻¹), "newton" (consistent
+                tangent), or "alternating" (minimum problems in turn, each by Newton's method with
+                a line search on the energy).
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
                 paper has 0; 1 needs a third of the iterations once a point sticks.
+            fallback: Whether to alternate where the method fails with no less than its usual
+                limit on iterations.
             petsc_options: Options without prefix; they win over the method's, the command line
                 over both.
             prefix: Prefix of the options.
@@ -216,6 +224,7 @@ class ContactProblem:
         self._committed_energy = EnergyState.unloaded(self._committed, self.contacts)
         self._energy = self._committed_energy
         self._rate: Array | None = None
+        self.prefix, self._method, self._fallback = prefix, method, fallback
         self._configure(method, dict(petsc_options or {}), prefix)
 
     # ---- construction ----------------------------------------------------------------------------
@@ -303,13 +312,14 @@ class ContactProblem:
         self._quasi_newton = snes.getType() == PETSc.SNES.Type.QN
         self._attach(consistent=not self._quasi_newton)
         snes.setUp()
+        self._alternation = Alternation(self, default)
         for key in inserted:
             database.delValue(key)
         self._rtol = snes.getTolerances()[0]
         self._max_it = snes.getTolerances()[3]
 
     def _symmetric(self, consistent: bool) -> bool:
-        return self.bulk.symmetric and (not consistent or self._has_potential)
+        return self.bulk.symmetric and (not consistent or self.has_potential)
 
     def _make_matrices(self) -> None:
         """New matrices for new couplings, or to forget all that was factored. Collective."""
@@ -353,7 +363,8 @@ class ContactProblem:
         self.snes.setConvergenceTest(lambda _, it, norms: this._test_convergence(norms))
 
     @property
-    def _has_potential(self) -> bool:
+    def has_potential(self) -> bool:
+        """Whether every contact law has one."""
         return all(c.law.has_potential for c in self.contacts)
 
     # ---- SNES callbacks --------------------------------------------------------------------------
@@ -396,6 +407,16 @@ class ContactProblem:
             self._measure_norms(total, contact)
             total[self._constrained] = 0.0
             f.array[:] = total / (self.bulk.scale * self._length)
+
+    def _energy_at(self, x: PETSc.Vec) -> float:
+        """Potential of a linear bulk and contacts, dimensionless as SNES sees it. Collective."""
+        self._set_u(x)
+        with np.errstate(all="ignore"):
+            # F(u) = K u + F(0), so that the energy is (F(u) + F(0))·u/2.
+            force = self._bulk_force(self.bulk.residual()) - self._load
+            energy = 0.5 * force @ self._state() + sum(c.energy() for c in self.contacts)
+        total = float(global_sum(self._comm, energy))
+        return total / (self.bulk.scale * self._length**2)
 
     def _measure_norms(self, total: Array, contact: Array) -> None:
         """Norms in force: the free residual, the forces it is compared with, and round-off."""
@@ -498,6 +519,10 @@ class ContactProblem:
         self._clear_pairs(consistent=False)
         self._assemble_matrix(self._matrices[False], self._stiffnesses(everywhere=True))
 
+    def drop_h0(self) -> None:
+        """Say that the matrix of H₀ was used for something else."""
+        self._has_h0 = False
+
     def _refresh_h0(self) -> bool:
         """Make H₀ anew from the status that the last round reached; False if none. Collective.
 
@@ -510,7 +535,7 @@ class ContactProblem:
             return False
         for contact in self.contacts:
             contact.evaluate()
-        consistent = not self._has_potential and self.motions.held(self.contacts, closed_only=True)
+        consistent = not self.has_potential and self.motions.held(self.contacts, closed_only=True)
         parts = self._tangents() if consistent else self._stiffnesses(everywhere=False)
         self._clear_pairs(consistent=consistent)
         self._assemble_matrix(self._matrices[consistent], parts)
@@ -570,8 +595,9 @@ class ContactProblem:
         if self._pairings != [c.pairings for c in self.contacts]:
             self._make_matrices()
         self._approach()
-        iterations = 0
-        for guess in self._starts(ahead):
+        iterations, reason, starts = 0, 0, self._starts(ahead)
+        method = self._method
+        for guess in starts if method != "alternating" else []:
             self._solution.array[:] = guess / self._length
             if self._quasi_newton:
                 made, reason = self._solve_quasi_newton(stiffness_changed)
@@ -581,6 +607,13 @@ class ContactProblem:
             iterations += made
             if reason > 0:
                 break
+        if method == "alternating" or (reason <= 0 and self._may_alternate()):
+            self._solution.array[:] = starts[0] / self._length
+            made, reason = self._alternation.solve(self._solution)
+            iterations += made
+            if method != "alternating" and self._comm.rank == 0:
+                logger.info("increment %d: %s failed, alternated", self.increment + 1, method)
+            method = "alternating"
         self._set_u(self._solution)
         verdict = self._judge()
         if reason <= 0 or verdict.failures:
@@ -589,12 +622,18 @@ class ContactProblem:
             increment=self.increment + 1,
             reason=int(reason),
             iterations=iterations,
+            method=method,
             factorisations=self._factorisations,
             verdict=verdict,
             contacts={c.name: c.resultants() for c in self.contacts},
             energy=self._energy.since(self._committed_energy, self.contacts, self._comm),
             wall_seconds=time.perf_counter() - start,
         )
+
+    def _may_alternate(self) -> bool:
+        """Whether to alternate after a failure: not if iterations are rationed by the caller."""
+        limit = self._max_it if self._quasi_newton else self.snes.getTolerances()[3]
+        return self._fallback and limit >= (_COMMON | _METHODS[self._method])["snes_max_it"]
 
     def _check_before(self) -> None:
         self.bulk.check_finite()
