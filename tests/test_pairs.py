@@ -1,0 +1,624 @@
+"""Several contacts, self-contact, interference, unequal and curved meshes, unpaired points.
+
+References are closed answers or invariants. What is uniform is met to 1e-9 and what is solved for
+to 1e-8, as the solver's tolerance on the forces is 1e-9; sums of forces to 1e-12, round-off.
+"""
+
+import sys
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import compute_midpoints
+from mpi4py import MPI
+from running import ROOT
+from scenes import close, gathered
+
+sys.path.insert(0, str(ROOT / "verification"))
+
+from bodies import Bodies, boxes
+
+import fenics_contact as fc
+
+COMM = MPI.COMM_WORLD
+FLOOR, ROOF, LOWER, UPPER, WALL, SIDES = 1, 2, 3, 4, 5, 6
+E = 1e6
+
+pytestmark = pytest.mark.mpi
+
+
+# ---- scenes --------------------------------------------------------------------------------------
+
+
+def at(i, value):
+    """Facets whose midpoint lies at the coordinate ``i``."""
+    return lambda x, cell: np.abs(x[:, i] - value) < 1e-9
+
+
+def between(i, value, *, above):
+    """The same, of the cells on one side."""
+    side = 1 if above else -1
+    return lambda x, cell: at(i, value)(x, cell) & (side * (cell[:, i] - value) > 0)
+
+
+def either(*choices):
+    return lambda x, cell: np.any([choice(x, cell) for choice in choices], axis=0)
+
+
+def stack(cell, counts, heights, *, widths=None, apart=0.0, degree=1, nu=0.0, tags=None):
+    """Blocks one on the other, ``counts`` cells along x in each, ``apart`` from each other.
+
+    Tags: FLOOR, ROOF, SIDES (all upright faces), and both faces of joint j, counted from 1 at the
+    top of the lowest block: 10 j + LOWER and 10 j + UPPER.
+    """
+    d = 3 if cell == "hexahedron" else 2
+    widths = widths or [1.0] * len(counts)
+    axes, low, marks = [], 0.0, {}
+    for j, (n, height, width) in enumerate(zip(counts, heights, widths, strict=True)):
+        across = np.linspace((1 - width) / 2, (1 + width) / 2, n + 1)
+        up = np.linspace(low, low + height, max(1, round(n * height / width)) + 1)
+        axes.append([across] * (d - 1) + [up])
+        if j:
+            marks[10 * j + UPPER] = between(d - 1, low, above=True)
+        low += height
+        if j + 1 < len(counts):
+            marks[10 * (j + 1) + LOWER] = between(d - 1, low, above=False)
+            low += apart
+    ends = [at(i, v) for i in range(d - 1) for v in (0.0, 1.0)]
+    marks = {FLOOR: at(d - 1, 0), ROOF: at(d - 1, low), SIDES: either(*ends)} | marks | (tags or {})
+    return Bodies(boxes(axes, marks, simplex=cell == "triangle"), E, nu, degree=degree)
+
+
+def joint(body, j, law, *, swap=False, **options):
+    """Contact of the blocks over and under joint ``j``."""
+    here, there = (LOWER, UPPER) if swap else (UPPER, LOWER)
+    surface = fc.ContactSurface(body.mesh, body.tags, 10 * j + here)
+    support = fc.DeformableBody(body.tags, 10 * j + there)
+    return fc.Contact(body.u, surface, support, law, name=f"joint {j}", **options)
+
+
+def floor(body, law, tag=FLOOR, **options):
+    up = np.eye(body.d)[-1]
+    surface = fc.ContactSurface(body.mesh, body.tags, tag)
+    return fc.Contact(body.u, surface, fc.HalfSpace(0 * up, up), law, name="floor", **options)
+
+
+def nodal(contact):
+    """Contact's forces at the nodes of this rank and where these are, (n, d) each."""
+    space = contact.u.function_space
+    force = fem.Function(space)
+    contact.add_force(force.x.petsc_vec)
+    d, n = len(contact.u), space.dofmap.index_map.size_local
+    return -force.x.array.reshape(-1, d)[:n], space.tabulate_dof_coordinates()[:n, :d]
+
+
+def balance(contact):
+    """Sum of the forces, of their moments about the origin, and of their sizes."""
+    f, x = nodal(contact)
+    i = contact.surface.mesh.geometry.dim - 1
+    moment = x[:, 0] * f[:, i] - x[:, i] * f[:, 0]
+    return (
+        COMM.allreduce(f.sum(axis=0)),
+        COMM.allreduce(moment.sum()),
+        COMM.allreduce(np.abs(f).sum()),
+    )
+
+
+def uniform(values, expected, rtol=1e-9):
+    values = gathered(COMM, values)
+    return close(values, np.full(values.shape, expected), rtol)
+
+
+def rough(u, size, where=None):
+    """An uneven displacement, of a part of the bodies if ``where`` says so."""
+    d = len(u)
+
+    def value(x):
+        field = [size * np.sin(3 * x[0] + 5 * x[d - 1] + i) for i in range(d)]
+        return np.vstack(field) * (1.0 if where is None else where(x))
+
+    u.interpolate(value)
+
+
+# ---- several pairs -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
+def test_three_blocks_on_a_floor(cell, degree):
+    """One pressure through three joints of unequal meshes and stiffness: springs in series."""
+    q, stiffness, heights = 5e3, (1e7, 3e6, 2e7), (0.5, 0.25, 0.75)
+    body = stack(cell, (3, 5, 4), heights, degree=degree)
+    body.hold(SIDES, *range(body.d - 1))
+    up = body.d - 1
+    body.F += q * body.v[up] * body.ds(ROOF)
+    contacts = [floor(body, fc.Frictionless(stiffness[0]))]
+    contacts += [joint(body, j, fc.Frictionless(stiffness[j]), swap=j == 2) for j in (1, 2)]
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=contacts)
+    step = problem.solve()
+    assert list(step.contacts) == ["floor", "joint 1", "joint 2"]
+    for contact, k in zip(contacts, stiffness, strict=True):
+        assert contact.n_unpaired == 0
+        assert uniform(contact.pressure, q)
+        assert uniform(contact.gap, -q / k)
+    top = fem.locate_dofs_topological(body.u.function_space.sub(up), up, body.tags.find(ROOF))
+    sunk = q * (sum(heights) / E + sum(1 / k for k in stiffness))
+    top = top[top < body.u.function_space.dofmap.index_map.size_local * body.d]
+    assert uniform(body.u.x.array[top], -sunk)
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+def test_a_sheared_stack_that_friction_alone_holds(method):
+    """No Dirichlet condition at all: every joint carries the same force, though none evenly."""
+    q, t = 5e3, 0.1 * 5e3
+    body = stack("quadrilateral", (6, 9, 4), (0.3, 0.2, 0.3), nu=0.3)
+    body.F += (q * body.v[1] - t * body.v[0]) * body.ds(ROOF)
+    law = fc.Coulomb(0.4, k_n=1e7, k_t=1e7)
+    contacts = [floor(body, law), joint(body, 1, law), joint(body, 2, law)]
+    problem = fc.ContactProblem(body.F, body.u, contacts=contacts, method=method)
+    problem.solve()
+    for contact in contacts:
+        assert close(contact.resultants().force, [-t, q], 1e-8)
+        # Moment about the middle of the joint: the shear's lever is the height over it.
+        points = contact.gather()
+        lever = points["measure"] * (points["x"][:, 0] - 0.5)
+        moment = lever @ points["pressure"]
+        height = 0.8 - points["x"][0, 1]
+        assert close(moment, t * height, 1e-7)
+        assert np.ptp(points["pressure"]) > 0.1 * q
+
+
+def test_one_joint_fails_and_the_others_hold():
+    """Of joints with μ = 0.5, 0.1, 0.5 the middle one slips all over: it bears μN and no more."""
+    body = stack("triangle", (6, 9, 4), (0.3, 0.2, 0.3), nu=0.3)
+    q, push = 5e3, body.constant(0.0)
+    body.F += q * body.v[1] * body.ds(ROOF)
+    body.hold(ROOF, 0, value=push)
+    laws = [fc.Coulomb(mu, k_n=1e7, k_t=1e7) for mu in (0.5, 0.1, 0.5)]
+    contacts = [floor(body, laws[0])] + [joint(body, j, laws[j]) for j in (1, 2)]
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=contacts)
+    list(fc.increments(problem, push, 0.0, 0.02, steps=4))
+    first, middle, last = (contact.resultants() for contact in contacts)
+    assert middle.stick == 0 and first.stick > 0 and last.stick > 0
+    for r in (first, middle, last):
+        assert close(r.force, [-0.1 * q, q], 1e-7)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_floor_and_wall(cell):
+    """A block in a corner under two pressures: Γc's share an edge, both are met exactly."""
+    nu, q, side, k = 0.3, 3e3, 2e3, 1e7
+    body = stack(cell, (4,), (1.0,), nu=nu, tags={WALL: at(0, 0), 9: at(0, 1)})
+    up = body.d - 1
+    if body.d == 3:  # plane strain
+        body.hold(SIDES, 1)
+    body.F += q * body.v[up] * body.ds(ROOF) + side * body.v[0] * body.ds(9)
+    wall = fc.Contact(
+        body.u,
+        fc.ContactSurface(body.mesh, body.tags, WALL),
+        fc.HalfSpace(np.zeros(body.d), np.eye(body.d)[0]),
+        fc.Frictionless(k),
+        name="wall",
+    )
+    base = floor(body, fc.Frictionless(k))
+    fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[base, wall]).solve()
+    assert uniform(base.pressure, q)
+    assert uniform(wall.pressure, side)
+    modulus, ratio = E / (1 - nu**2), nu / (1 - nu)
+
+    def exact(x):
+        across = (-side + ratio * q) / modulus * x[0] - side / k
+        along = (-q + ratio * side) / modulus * x[up] - q / k
+        return np.vstack([across, *([0 * x[0]] * (body.d - 2)), along])
+
+    reference = fem.Function(body.u.function_space)
+    reference.interpolate(exact)
+    n = body.u.function_space.dofmap.index_map.size_local * body.d
+    assert close(gathered(COMM, body.u.x.array[:n]), gathered(COMM, reference.x.array[:n]), 1e-8)
+
+
+def test_one_surface_on_a_body_and_on_a_rigid_support():
+    """The same Γc against two supports: springs in parallel, one of them with a block in series."""
+    q, k_1, k_2 = 5e3, 1e7, 4e5
+    body = stack("quadrilateral", (3, 5), (0.5, 0.5))
+    body.hold(FLOOR, 1)
+    body.hold(SIDES, 0)
+    body.F += q * body.v[1] * body.ds(ROOF)
+    pair = joint(body, 1, fc.Frictionless(k_1))
+    rest = fc.Contact(
+        body.u, pair.surface, fc.HalfSpace((0, 0.5), (0, 1)), fc.Frictionless(k_2), name="rest"
+    )
+    fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[pair, rest]).solve()
+    series = 1 / (1 / k_1 + 0.5 / E)
+    assert uniform(pair.pressure, q * series / (series + k_2))
+    assert uniform(rest.pressure, q * k_2 / (series + k_2))
+
+
+def test_both_ways_round():
+    """Each surface against the other, half the stiffness each: the pressure is shared evenly."""
+    q = 5e3
+    body = stack("triangle", (3, 5), (0.5, 0.5))
+    body.hold(FLOOR, 1)
+    body.hold(SIDES, 0)
+    body.F += q * body.v[1] * body.ds(ROOF)
+    one, other = (
+        joint(body, 1, fc.Frictionless(5e6)),
+        joint(body, 1, fc.Frictionless(5e6), swap=True),
+    )
+    other.name = "back"
+    fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[one, other]).solve()
+    for contact in (one, other):
+        assert uniform(contact.pressure, q / 2)
+        assert uniform(contact.gap, -q / 1e7)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_a_stack_under_a_weight(cell):
+    """Floor, two bodies, and a free rigid lid with a force on it: all three contacts carry it."""
+    body = stack(cell, (3, 4), (0.5, 0.5))
+    up, k_n, weight = body.d - 1, 1e7, 5e3
+    body.hold(SIDES, *range(up))
+    down = np.eye(body.d)[-1]
+    motion = fc.Motion(force=[None] * up + [-weight])
+    lid = fc.Contact(
+        body.u,
+        fc.ContactSurface(body.mesh, body.tags, ROOF),
+        fc.HalfSpace(down, -down, displacement=motion),
+        fc.Frictionless(k_n),
+        name="lid",
+    )
+    contacts = [floor(body, fc.Frictionless(k_n)), joint(body, 1, fc.Frictionless(k_n)), lid]
+    fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=contacts).solve()
+    for contact in contacts:
+        assert uniform(contact.pressure, weight, 1e-8)
+    assert close(lid.free_motion[up].value, -weight * (1 / E + 3 / k_n), 1e-8)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
+def test_a_bonded_stack(cell, degree):
+    """Elastic layers in two joints bear tension and shear: both are uniform, springs in series.
+
+    Pure shear of a stack whose heights do not change and whose sides carry the shear that belongs
+    to it: u_x = t (z/G + the layers below over k_t).
+    """
+    q, t, k_n, k_t = 5e3, 2e3, 1e7, 4e6
+    counts = (2, 3, 4) if cell == "hexahedron" else (3, 5, 4)
+    body = stack(cell, counts, (0.5, 0.25, 0.75), degree=degree, tags={8: at(0, 0), 9: at(0, 1)})
+    up = body.d - 1
+    body.hold(FLOOR, *range(body.d))
+    body.F -= (q * body.v[up] + t * body.v[0]) * body.ds(ROOF)
+    body.F -= t * body.v[up] * body.ds(9) - t * body.v[up] * body.ds(8)
+    law = fc.Foundation(k_n, k_t)
+    contacts = [joint(body, 1, law), joint(body, 2, law, swap=True)]
+    fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=contacts).solve()
+    for contact, upward in zip(contacts, (False, True), strict=True):
+        # Γc of joint 1 is the bottom of the upper block, that of joint 2 the top of the lower one.
+        assert uniform(contact.pressure, -q)
+        side = gathered(COMM, contact.tangential_traction)
+        exact = np.zeros_like(side)
+        exact[:, 0] = t if upward else -t
+        assert close(side, exact, 1e-9)
+    space = body.u.function_space
+    top = fem.locate_dofs_topological(space, up, body.tags.find(ROOF))
+    top = top[top < space.dofmap.index_map.size_local]
+    moved = gathered(COMM, body.u.x.array.reshape(-1, body.d)[top])
+    shear = E / 2
+    assert close(moved[:, 0], np.full(len(moved), t * (1.5 / shear + 2 / k_t)), 1e-8)
+    assert close(moved[:, up], np.full(len(moved), q * (1.5 / E + 2 / k_n)), 1e-8)
+
+
+@pytest.mark.parametrize("swap", [False, True])
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_axisymmetric_discs(cell, degree, swap):
+    """Two discs of unequal meshes, weight 2πr down to the axis: uniform pressure, N = q π."""
+    q, k_n = 5e3, 1e7
+    body = stack(cell, (3, 5), (0.5, 0.5), degree=degree)
+    r, u, v = body.x[0], body.u, body.v
+    strain, virtual = ufl.sym(ufl.grad(u)), ufl.sym(ufl.grad(v))
+    F = 2 * np.pi * E * (r * ufl.inner(strain, virtual) + u[0] * v[0] / r) * ufl.dx
+    F += 2 * np.pi * r * q * v[1] * body.ds(ROOF)
+    body.hold(FLOOR, 1)
+    body.hold(SIDES, 0)
+    contact = joint(body, 1, fc.Frictionless(k_n), swap=swap, weight=2 * np.pi * r)
+    fc.ContactProblem(F, u, bcs=body.bcs, contacts=[contact]).solve()
+    assert uniform(contact.pressure, q)
+    assert uniform(contact.gap, -q / k_n)
+    assert close(contact.resultants().normal_force, q * np.pi, 1e-9)
+    total, _, size = balance(contact)
+    assert np.abs(total).max() <= 1e-12 * size
+
+
+def test_one_joint_slides_far_and_another_holds():
+    """Pairs found anew in one joint alone, while that joint slides over three facets: T = μN."""
+    q = 5e3
+    body = stack("quadrilateral", (8, 16, 5), (0.3, 0.2, 0.2), widths=[1.0, 1.0, 0.4], nu=0.3)
+    drag = body.constant(0.0)
+    body.hold(FLOOR, 0, 1)
+    body.hold(ROOF, 0, value=drag)
+    body.F += q * body.v[1] * body.ds(ROOF)
+    glued = joint(body, 1, fc.Coulomb(0.5, k_n=1e7, k_t=1e7))
+    surface = fc.ContactSurface(body.mesh, body.tags, 20 + UPPER)
+    support = fc.DeformableBody(body.tags, 20 + LOWER, update="increment")
+    slides = fc.Contact(body.u, surface, support, fc.Coulomb(0.2, k_n=1e7, k_t=1e7), name="slides")
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[glued, slides])
+    n = 0.4 * q
+    for step in fc.increments(problem, drag, 0.0, 0.2, steps=10):
+        r = step.contacts["slides"]
+        assert close(r.normal_force, n, 1e-8)
+        assert r.stick == 0
+        assert close(r.force, [-0.2 * n, n], 1e-8)
+        assert close(step.contacts["joint 1"].force, [-0.2 * n, n], 1e-7)
+        assert step.contacts["joint 1"].stick > 0
+    assert slides.pairings > 1 and glued.pairings == 1
+    assert slides.n_unpaired == 0
+
+
+# ---- self-contact --------------------------------------------------------------------------------
+
+
+def slit_ring(*, half, degree):
+    """A ring from 1 to 1.5, slit along x > 0 by 0.02; or its upper half. Clamped opposite the slit.
+
+    FLOOR is the upper lip, ROOF the lower one (or the clamped cut of the half), SIDES the outside.
+    """
+    n = 24
+    end = np.pi if half else 2 * np.pi
+    axes = [[np.linspace(0, end, n // (2 if half else 1) + 1), np.linspace(1, 1.5, 4)]]
+
+    def bend(x):
+        offset = 0.01 * (1 - x[:, 0] / np.pi)
+        return np.column_stack([x[:, 1] * np.cos(x[:, 0]), x[:, 1] * np.sin(x[:, 0]) + offset])
+
+    sides = {FLOOR: at(0, 0), ROOF: at(0, end), SIDES: at(1, 1.5)}
+    body = Bodies(boxes(axes, sides, bend=bend, degree=2), E, 0.3, degree=degree)
+    space = body.u.function_space
+    cut = fem.locate_dofs_geometrical(space, lambda x: (x[0] < 0) & (np.abs(x[1]) < 1e-9))
+    body.bcs = [fem.dirichletbc(np.zeros(2), cut, space)]
+    return body
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_a_slit_ring_closes(degree):
+    """Lips of one body against each other: as its half on a rigid plane of twice the stiffness.
+
+    Both sink by half the jump. By symmetry the lips do not shear, so that friction, which the ring
+    has and the half has not, bears nothing.
+    """
+    k_n, made, first = 1e7, [], []
+    for half in (False, True):
+        body = slit_ring(half=half, degree=degree)
+        squeeze = body.constant(0.0)
+        body.F += squeeze * ufl.dot(ufl.FacetNormal(body.mesh), body.v) * body.ds(SIDES)
+        surface = fc.ContactSurface(body.mesh, body.tags, FLOOR)
+        if half:
+            contact = fc.Contact(
+                body.u, surface, fc.HalfSpace((0, 0), (0, 1)), fc.Frictionless(2 * k_n)
+            )
+        else:
+            law = fc.Coulomb(0.3, k_n=k_n, k_t=k_n)
+            contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, ROOF), law)
+            assert contact.n_unpaired == 0
+        problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+        few, *_ = list(fc.increments(problem, squeeze, 0.0, 1e3, steps=[200.0, 1e3]))
+        assert few.contacts["contact"].open > 0, "first, only a part of the lips shall touch"
+        made.append(contact)
+        first.append(few.contacts["contact"].force)
+    ring, half = made
+    assert close(*first, 1e-7) and first[0][1] > 100.0
+    assert close(ring.gather()["pressure"], half.gather()["pressure"], 1e-6)
+    assert close(ring.resultants().force, half.resultants().force, 1e-7)
+    assert ring.resultants().tangential_force <= 1e-6 * ring.resultants().normal_force
+    total, _, size = balance(ring)
+    assert np.abs(total).max() <= 1e-12 * size
+
+
+# ---- interference --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_interference(cell):
+    """A gap of -0.01 between blocks that are held: p = (0.01 - w)/(H/E + 1/k_n), and w opens it."""
+    k_n, oversize = 1e7, 0.01
+    body = stack(cell, (3, 5), (0.5, 0.5))
+    up = body.d - 1
+    away = body.constant(0.0)
+    body.hold(FLOOR, up)
+    body.hold(ROOF, up, value=away)
+    body.hold(SIDES, *range(up))
+    contact = joint(body, 1, fc.Frictionless(k_n), gap=-oversize)
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    assert problem.initial_penetration == 0.0
+    for opening in (0.0, 0.004, 0.0099):
+        away.value = opening
+        problem.solve()
+        problem.commit()
+        assert uniform(contact.pressure, (oversize - opening) / (1 / E + 1 / k_n), 1e-8)
+    away.value = 0.015
+    problem.solve()
+    assert contact.resultants().normal_force == 0.0
+    assert uniform(contact.gap, 0.005, 1e-8)
+
+
+def test_interference_that_varies_along_the_joint():
+    """A gap by UFL, linear along the joint, between rigid blocks: the pressure is k_n times it."""
+    body = stack("quadrilateral", (3, 5), (0.5, 0.5))
+    contact = joint(body, 1, fc.Frictionless(1e7), gap=-0.01 * body.x[0])
+    contact.evaluate()
+    points = contact.gather()
+    assert close(points["pressure"], 1e5 * points["x"][:, 0], 1e-12)
+
+
+# ---- meshes that have nothing in common ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("swap", [False, True])
+@pytest.mark.parametrize(
+    ("cell", "degree", "counts"),
+    [
+        (cell, degree, counts)
+        for cell in ("triangle", "quadrilateral")
+        for degree in (1, 2)
+        for counts in ((1, 20), (20, 1), (19, 20))
+    ]
+    + [("hexahedron", 1, counts) for counts in ((1, 9), (9, 1), (8, 9))],
+)
+def test_patch_of_very_different_cells(counts, cell, degree, swap):
+    """One cell opposite twenty, either of them Γc; and cells that nearly match: still uniform."""
+    nu, k_n = 0.3, 1e7
+    body = stack(cell, counts, (0.05, 0.05), degree=degree, nu=nu)
+    body.hold(FLOOR, body.d - 1)
+    body.hold(ROOF, body.d - 1, value=-0.001)
+    body.hold(SIDES, *range(body.d - 1))
+    contact = joint(body, 1, fc.Coulomb(0.3, k_n=k_n, k_t=k_n), swap=swap)
+    fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact]).solve()
+    confined = E * (1 - nu) / ((1 + nu) * (1 - 2 * nu))
+    p = 0.001 / (0.1 / confined + 1 / k_n)
+    assert contact.n_unpaired == 0
+    assert uniform(contact.pressure, p, 1e-8)
+    assert uniform(contact.gap, -p / k_n, 1e-8)
+
+
+# ---- action and reaction -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("swap", [False, True])
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
+def test_moment_of_a_gap(cell, swap):
+    """Equal forces on faces 0.02 apart: they cancel, and their moment is the shear times 0.02."""
+    gap = 0.02
+    body = stack(cell, (3, 5), (0.5, 0.5), apart=gap)
+    contact = joint(body, 1, fc.Coulomb(0.3, k_n=1e6, k_t=1e6), swap=swap)
+    up = body.d - 1
+    # The upper block moved down by more than the gap, and along.
+    shape = np.zeros(body.d)
+    shape[0], shape[-1] = 0.03, -0.06
+
+    def moved(x):
+        return np.outer(shape, x[up] > 0.51) + 0.005 * np.sin(
+            np.vstack([4 * x[i] + 3 * x[0] for i in range(body.d)])
+        )
+
+    body.u.interpolate(moved)
+    contact.evaluate()
+    r = contact.resultants()
+    assert r.slip > 0 and r.normal_force > 0
+    total, moment, size = balance(contact)
+    assert np.abs(total).max() <= 1e-12 * size
+    assert abs(r.force[0]) > 0.05 * size / 2
+    # On the body the shear, on the other one its opposite, a gap away.
+    sign = 1 if swap else -1
+    assert close(moment, sign * gap * r.force[0], 1e-10, scale=size * gap)
+
+
+def rings(inner, outer, law, **options):
+    """Sectors of two rings, 10/20 and 20/40, of curved cells that do not match; Γc is the inner."""
+    angle = 1.5
+    axes = [
+        [np.linspace(0, angle, inner + 1), np.linspace(10, 20, 4)],
+        [np.linspace(0, angle, outer + 1), np.linspace(20, 40, 4)],
+    ]
+
+    def bend(x):
+        return np.column_stack([x[:, 1] * np.cos(x[:, 0]), x[:, 1] * np.sin(x[:, 0])])
+
+    sides = {LOWER: between(1, 20, above=False), UPPER: between(1, 20, above=True)}
+    body = Bodies(boxes(axes, sides, bend=bend, degree=2), E, 0.3, degree=2)
+    surface = fc.ContactSurface(body.mesh, body.tags, LOWER)
+    contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, UPPER), law, **options)
+    return body, contact, angle
+
+
+def inside(body, field):
+    """Give the inner ring's cells the displacement ``field``; nodes are not shared."""
+    index_map = body.mesh.topology.index_map(2)
+    cells = np.arange(index_map.size_local + index_map.num_ghosts, dtype=np.int32)
+    middle = compute_midpoints(body.mesh, 2, cells).reshape(-1, 3)
+    cells = cells[np.linalg.norm(middle[:, :2], axis=1) < 20]
+    body.u.interpolate(field, cells0=cells)
+    body.u.x.scatter_forward()
+
+
+@pytest.mark.parametrize("counts", [(7, 11), (14, 23)])
+def test_turning_a_ring_in_a_ring(counts):
+    """The inner ring turned, an interference of 0.01: N = k_n δ R θ, torque = μ N R, all slips.
+
+    With a prescribed gap, length and normals of the arcs are all that the cells can miss: their
+    error is of the order (h/R)⁴, and that of 7 cells below 1e-5.
+    """
+    k_n, oversize, friction = 1e5, 0.01, 0.2
+    law = fc.Coulomb(friction, k_n=k_n, k_t=1e6)
+    body, contact, angle = rings(*counts, law, gap=-oversize)
+    assert contact.n_unpaired == 0
+    inside(body, lambda x: 0.01 * np.vstack([-x[1], x[0]]))
+    contact.evaluate()
+    r, points = contact.resultants(), contact.gather()
+    assert r.stick == r.open == 0
+    assert close(r.normal_force, k_n * oversize * 20 * angle, 1e-5)
+    x, t = points["x"], points["tangential_traction"]
+    torque = points["measure"] @ (x[:, 0] * t[:, 1] - x[:, 1] * t[:, 0])
+    assert close(torque, -friction * r.normal_force * 20, 1e-5)
+
+
+def test_moments_of_curved_surfaces_cancel_as_the_meshes_are_refined():
+    """Forces cancel to round-off, moments up to the distance of the two meshes' arcs."""
+    errors = []
+    for counts in ((4, 7), (8, 14), (16, 28)):
+        body, contact, _ = rings(*counts, fc.Coulomb(0.2, k_n=1e5, k_t=1e6), gap=-0.01)
+        inside(body, lambda x: 0.005 * np.sin(np.vstack([x[0] / 5, x[1] / 7])))
+        contact.evaluate()
+        total, moment, size = balance(contact)
+        assert np.abs(total).max() <= 1e-12 * size
+        errors.append(abs(moment) / (20 * size))
+    assert errors[0] <= 1e-6
+    assert errors[2] <= errors[0] / 16, "second order or better"
+
+
+# ---- points without an opposite ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
+def test_overhang(cell):
+    """A slab on a narrower pillar: the points that look past it are counted, open, and free.
+
+    What the pillar bears is the load, and its middle is the load's.
+    """
+    q = 1e3
+    body = stack(cell, (5, 8), (0.5, 0.25), widths=[0.6, 1.0], nu=0.3)
+    up = body.d - 1
+    body.hold(FLOOR, *range(body.d))
+    body.F += q * body.v[up] * body.ds(ROOF)
+    contact = joint(body, 1, fc.Coulomb(0.5, k_n=1e7, k_t=1e7))
+    points = contact.gather()
+    outside = np.any(np.abs(points["x"][:, :up] - 0.5) > 0.3, axis=1)
+    assert 0 < contact.n_unpaired == np.count_nonzero(outside)
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    problem.solve()
+    points = contact.gather()
+    assert np.all(points["status"][outside] == fc.Status.OPEN)
+    assert np.all(points["pressure"][outside] == 0.0)
+    assert close(contact.resultants().force, q * np.eye(body.d)[-1], 1e-8)
+    total, moment, size = balance(contact)
+    assert np.abs(total).max() <= 1e-12 * size
+    assert abs(moment) <= 1e-12 * size
+    middle = points["measure"] * points["pressure"] @ points["x"][:, 0]
+    assert close(middle, 0.5 * q, 1e-8)
+
+
+def test_no_opposite_at_all():
+    """A body beside the other one: all of Γc is unpaired, and nothing acts."""
+    axes = [
+        [np.linspace(0, 1, 4), np.linspace(0, 1, 4)],
+        [np.linspace(2, 3, 4), np.linspace(1, 2, 4)],
+    ]
+    sides = {LOWER: between(1, 1, above=False), UPPER: between(1, 1, above=True)}
+    body = Bodies(boxes(axes, sides), E, 0.3)
+    surface = fc.ContactSurface(body.mesh, body.tags, UPPER)
+    contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, LOWER), fc.Frictionless(1e6))
+    rough(body.u, 0.1)
+    contact.evaluate()
+    assert contact.n_unpaired == len(contact.gather()["x"]) > 0
+    assert contact.resultants().normal_force == 0.0
+    assert balance(contact)[2] == 0.0

@@ -1,0 +1,240 @@
+"""The demos as cases: each is run in a process of its own, and its result.json is read."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cases import Case, Outcome, Row
+
+__all__ = ["DEMOS"]
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def run(name: str, *options: str) -> dict[str, Any]:
+    """Run ``demos/NAME.py``; what it wrote.
+
+    Raises:
+        RuntimeError: It wrote nothing.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, str(ROOT / "demos" / f"{name}.py"), *options]
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        done = subprocess.run(
+            [*command, "--output", folder], capture_output=True, text=True, env=environment
+        )
+        written = Path(folder) / "result.json"
+        if not written.exists():
+            raise RuntimeError(
+                f"demos/{name}.py ended with {done.returncode}: {done.stderr[-500:]}"
+            )
+        return json.loads(written.read_text())
+
+
+def runs(result: dict[str, Any]) -> list[dict[str, Any]]:
+    """A demo's runs; it may have but one."""
+    return result.get("runs", [result])
+
+
+def demo(
+    title: str, reason: str, name: str, *options: str, source: Mapping[str, str], label: str = ""
+) -> Case:
+    """A demo that puts value, reference and relative tolerance under "references".
+
+    Args:
+        title: Of the case.
+        reason: For the tolerance.
+        name: Of the demo.
+        options: Of its command line.
+        source: Of its references: of those whose name has the word, the first that fits.
+        label: Key of what tells its runs apart.
+    """
+
+    def compute() -> Outcome:
+        made = runs(run(name, *options))
+        rows = [
+            Row(
+                f"{quantity}, {one[label]}" if label else quantity,
+                entry["value"],
+                entry["reference"],
+                next(text for word, text in source.items() if word in quantity),
+                entry["tolerance"],
+            )
+            for one in made
+            for quantity, entry in one["references"].items()
+        ]
+        dofs = max(one.get("dofs", 0) for one in made)
+        return Outcome(tuple(rows), " ".join([f"demos/{name}.py", *options]), dofs)
+
+    return Case(title, reason, compute, slow=True)
+
+
+EXACT = "exact complementarity, converged"
+FINE = ("--h", "0.05", "--degree", "2")
+
+
+def _entries(one: dict[str, Any]) -> Iterator[Row]:
+    """Rows of the half-cylinder: pairs by component, tolerances there are absolute."""
+    for name, entry in one["references"].items():
+        pairs = zip(np.atleast_1d(one[name]), np.atleast_1d(entry["value"]), strict=True)
+        for i, (obtained, reference) in enumerate(pairs):
+            if reference == 0 and np.ndim(entry["value"]) == 0:
+                continue  # friction of the frictionless run
+            quantity = name.replace("_", " ") + (f" {'xy'[i]}" if np.ndim(entry["value"]) else "")
+            size = abs(reference) or 1.0
+            yield Row(
+                f"{quantity}, μ = {one['friction']:g}",
+                float(obtained),
+                float(reference),
+                entry["source"],
+                entry["tolerance"] / size,
+            )
+
+
+def half_cylinder() -> Outcome:
+    """The half-cylinder of the source paper, fine."""
+    made = runs(run("hertz", *FINE))
+    rows = [row for one in made for row in _entries(one)]
+    dofs = max(one["dofs"] for one in made)
+    return Outcome(tuple(rows), "demos/hertz.py " + " ".join(FINE), dofs)
+
+
+def half_cylinder_at_once() -> Outcome:
+    """The same in one increment: another load history, another state."""
+    options = (*FINE, "--friction", "0.2", "--increments", "1")
+    (one,) = runs(run("hertz", *options))
+    # Stick ends at 0.23 a: given to 0.01 a, and points are h/3 apart.
+    stick = 0.23 * one["half_width"]
+    place = (0.005 * one["half_width"] + 0.05 / 3) / stick
+    rows = (
+        Row("tangential resultant per half", one["tangential_resultant"], 38.99, EXACT, 0.01),
+        Row("max tangential traction", one["max_tangential_traction"], 29.3, EXACT, 0.02),
+        Row("stick half width", one["stick_half_width"], stick, EXACT, place),
+    )
+    return Outcome(rows, "demos/hertz.py " + " ".join(options), one["dofs"])
+
+
+def thin_half_cylinder() -> Outcome:
+    """a/R = 0.048, where the half-cylinder is nearly a half-plane."""
+    options = ("--h", "0.01", "--degree", "2", "--load", "1", "--friction", "0")
+    (one,) = runs(run("hertz", *options))
+    a = np.sqrt(8 * 8**2 / (np.pi * 1000 / (1 - 0.3**2)))
+    rows = (
+        Row("half-width", one["half_width"], float(a), "Hertz", 0.01),
+        Row("peak pressure", one["peak_pressure"], 2 * 16 / (np.pi * float(a)), "Hertz", 0.01),
+    )
+    return Outcome(rows, "demos/hertz.py " + " ".join(options), one["dofs"])
+
+
+def greco() -> Outcome:
+    """Displacements along the base, forces and zones."""
+    (one,) = runs(run("greco_block"))
+    converged = dict(
+        zip((0.0, 1.25, 5.0, 7.5, 11.25), (28.603, 27.226, 22.868, 19.807, 15.414), strict=True)
+    )
+    published = dict(zip(converged, (28.6, 27.2, 22.8, 19.8, 15.0), strict=True))
+    obtained = dict(zip(one["places_mm"], one["displacements_um"], strict=True))
+    rows = [
+        Row(f"u_x at x = {x:g} mm [µm]", obtained[x], value, EXACT, 0.003)
+        for x, value in converged.items()
+    ]
+    rows += [
+        Row(
+            f"u_x at x = {x:g} mm [µm]",
+            obtained[x],
+            value,
+            "mean of codes, Code_Aster SSNV128",
+            0.05,
+        )
+        for x, value in published.items()
+    ]
+    zones = one["zones_mm"]
+    slip = (zones["slip"][1] + zones["stick"][0]) / 2
+    lift = (zones["open"][1] + zones["slip"][0]) / 2
+    rows += [
+        Row("normal force [N/mm]", one["normal_force"], 2000.0, "equilibrium", 1e-8),
+        Row("friction force [N/mm]", one["tangential_force"], 1405.36, EXACT, 0.003),
+        Row("end of the open zone [mm]", lift, 3.35, EXACT, 0.2 / 3.35),
+        Row("end of the slip zone [mm]", slip, 29.8, EXACT, 0.6 / 29.8),
+    ]
+    return Outcome(tuple(rows), "demos/greco_block.py", one["dofs"])
+
+
+DEMOS = [
+    Case(
+        "Half-cylinder on a plane, a/R = 0.26",
+        "0.4 %, with friction 1 % (2 % for the largest shear), and what h leaves: see the demo",
+        half_cylinder,
+        slow=True,
+    ),
+    Case(
+        "Half-cylinder on a plane, friction in one increment",
+        "1 % as for 80 increments, 2 % for the largest shear; the zone to the spacing of points",
+        half_cylinder_at_once,
+        slow=True,
+    ),
+    Case(
+        "Half-cylinder on a plane, a/R = 0.048",
+        "1 %: what a/R leaves between the body and a half-plane, and h = a/38",
+        thin_half_cylinder,
+        slow=True,
+    ),
+    Case(
+        "Block with friction (GRECO)",
+        "0.3 % against the converged values, 5 % against the published ones as stated for them; "
+        "zones to the spacing of the points",
+        greco,
+        slow=True,
+    ),
+    demo(
+        "Sphere on a block, ball on a plane",
+        "2 %: cells of an eighth of the contact's radius, bodies of finite size",
+        "sphere",
+        source={"": "Hertz"},
+        label="case",
+    ),
+    demo(
+        "Two cylinders pressed, then sheared",
+        "2 %: a/R = 0.085, and the points of the cells; forces are equilibrium",
+        "two_cylinders",
+        source={
+            "force": "equilibrium",
+            "stick": "Cattaneo, Mindlin",
+            "shear": "Cattaneo, Mindlin",
+            "": "Hertz",
+        },
+    ),
+    demo(
+        "Fretting cycle of two cylinders",
+        "1 % for energies, 3 % for the shear that is left: a difference of two curves",
+        "fretting",
+        source={"gap": "closed loop", "": "Mindlin, Deresiewicz"},
+    ),
+    demo(
+        "Shrink fit",
+        "0.5 %: the penalty's share of the interference and the cells; evenness to 1 %",
+        "shrink_fit",
+        source={"uneven": "axial symmetry", "": "Lamé"},
+        label="kind",
+    ),
+    demo(
+        "Male–female fitting",
+        "1e-7: equilibrium to the solver's tolerance; 1e-8 for homogeneity",
+        "fitting",
+        source={"difference": "homogeneity", "": "statics"},
+    ),
+    demo(
+        "Block on a rigid incline; wedge",
+        "1e-4, to which the limit is searched; 1e-6 for the wedge: statics",
+        "incline",
+        source={"F/G": "NAFEMS CGS-4: (tan α + μ)/(1 - μ tan α)", "": "statics: tan α = μ"},
+    ),
+]

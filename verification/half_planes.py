@@ -1,0 +1,224 @@
+"""Cases with closed solutions for half-planes: flat punch, wavy surface, cylinder on block."""
+
+from __future__ import annotations
+
+import dolfinx
+import gmsh
+import numpy as np
+import ufl
+from bodies import COMM, Bodies, boxes, graded
+from cases import Outcome, Row, case
+from dolfinx import fem
+from statics import near
+
+import fenics_contact as fc
+from fenics_contact import compat
+
+GROUND, LOAD, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
+
+
+@case(
+    "Rigid flat punch on a half-plane",
+    "0.5 %: the half-plane ends at 50 a, and next to the corner the singular pressure is smeared "
+    "over two of the cells, 1/160 of a",
+)
+def flat_punch() -> Outcome:
+    """Half of it, driven by a force: the pressure inside |x| ≤ 0.9 a, and the load inside x."""
+    a, force, far = 1.0, 1.0, 50.0
+    # Fine towards the corner, from both sides.
+    fine = graded(0.05, 8, 1.0, 1.15)
+    x = np.concatenate([(a - fine)[::-1], a + graded(0.05, 8, far - a, 1.15)[1:]])
+    y = -graded(0.05, 8, far, 1.15)[::-1]
+    sides = {
+        GROUND: near(1, -far),
+        AXIS: near(0, 0),
+        SURFACE: lambda x, cell: near(1, 0)(x, cell) & (x[:, 0] < a),
+    }
+    body = Bodies(boxes([[x, y]], sides), 1000.0, 0.3, degree=2)
+    body.hold(GROUND, 0, 1)
+    body.hold(AXIS, 0)
+    punch = fc.HalfSpace((0, 0), (0, -1), displacement=fc.Motion(force=(None, -force / 2)))
+    surface = fc.ContactSurface(body.mesh, body.tags, SURFACE)
+    contact = fc.Contact(body.u, surface, punch, fc.Frictionless(fc.Scaled(100)))
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    problem.solve()
+    points = contact.gather()
+    along, p = points["x"][:, 0], points["pressure"]
+    inside = along <= 0.9 * a
+    exact = force / (np.pi * np.sqrt(a**2 - along[inside] ** 2))
+    source = "p = P/(π√(a² - x²))"
+    rows = [
+        Row(
+            f"p({at:g} a) a/P",
+            float(np.interp(at, along, p)),
+            1 / np.pi / np.sqrt(1 - at**2),
+            source,
+            0.005,
+        )
+        for at in (0.0, 0.5, 0.8)
+    ]
+    worst = float(np.abs(p[inside] / exact - 1).max())
+    rows.append(Row("largest error of p, |x| ≤ 0.9 a", worst, 0.0, source, 0.005))
+    share = 2 * float(points["measure"][inside] @ p[inside]) / force
+    source = "(2/π) arcsin 0.9"
+    rows.append(
+        Row("share of the load in |x| ≤ 0.9 a", share, 2 / np.pi * np.arcsin(0.9), source, 0.005)
+    )
+    return Outcome(tuple(rows), f"{len(x) - 1} × {len(y) - 1} quadrilaterals, degree 2", body.dofs)
+
+
+@case(
+    "Wavy surface, Westergaard",
+    "1 %: 256 cells over half a wave leave half a cell, 0.6 %, in a/λ = 1/6; a smooth pressure is "
+    "far better, but the stiffness of 10 E/h lowers the wave by some 0.1 %",
+)
+def wavy() -> Outcome:
+    """An elastic half-plane pressed on a rigid wave by p*/4, p*/2, 3p*/4; period by symmetry."""
+    wave, height, n = 1.0, 1.5, 256
+    modulus, nu, amplitude = 1000.0, 0.3, 1e-3
+    full = np.pi * modulus / (1 - nu**2) * amplitude / wave
+    y = graded(8 * wave / 2 / n, 8, height, 1.2)
+    sides = {
+        SURFACE: near(1, 0),
+        LOAD: near(1, height),
+        AXIS: lambda x, cell: near(0, 0)(x, cell) | near(0, wave / 2)(x, cell),
+    }
+    body = Bodies(boxes([[np.linspace(0, wave / 2, n + 1), y]], sides), modulus, nu)
+    body.hold(AXIS, 0)
+    load = body.constant(0.0)
+    body.F += load * body.v[1] * body.ds(LOAD)
+    gap = amplitude * (1 - ufl.cos(2 * np.pi / wave * body.x[0]))
+    surface = fc.ContactSurface(body.mesh, body.tags, SURFACE)
+    contact = fc.Contact(body.u, surface, fc.Obstacle(gap, (0, -1)), fc.Frictionless())
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    rows = []
+    for share, width, peak in (
+        (0.25, 1 / 6, 4.0),
+        (0.5, 0.25, 8**0.5),
+        (0.75, 1 / 3, 16 / 48**0.5),
+    ):
+        mean = share * full
+        load.value = mean
+        problem.solve()
+        problem.commit()
+        points = contact.gather()
+        x, p = points["x"][:, 0], points["pressure"]
+        source = f"Westergaard, p̄ = {share:g} p*"
+        rows.append(
+            Row(f"a/λ at {share:g} p*", contact.resultants().area / wave, width, source, 0.01)
+        )
+        rows.append(Row(f"p(0)/p̄ at {share:g} p*", float(p[0] / mean), peak, source, 0.01))
+        s, sx = np.sin(np.pi * width), np.sin(np.pi * x / wave)
+        exact = 2 * mean * np.cos(np.pi * x / wave) / s**2 * np.sqrt(np.maximum(s**2 - sx**2, 0))
+        rms = np.sqrt(points["measure"] @ (p - exact) ** 2 / (points["measure"] @ exact**2))
+        rows.append(Row(f"error of p(x), rms, at {share:g} p*", float(rms), 0.0, source, 0.01))
+    return Outcome(tuple(rows), f"{n} × {len(y) - 1} quadrilaterals", body.dofs)
+
+
+def cylinder_on_block(h: float):
+    """Half of a cylinder of radius 50 on half of a block of 200 × 200, in mm. Collective.
+
+    Cells of size ``h`` at the contact on the block, 0.8 ``h`` on the cylinder.
+    """
+    radius, side = 50.0, 200.0
+    gmsh.initialize()
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
+        gmsh.model.add("cylinder on block")
+        if COMM.rank == 0:
+            occ = gmsh.model.occ
+            foot, centre = occ.addPoint(0, 0, 0), occ.addPoint(0, radius, 0)
+            wide, steep = 0.4, np.pi - 0.2  # where contact may be; where the load is
+
+            def on(angle: float) -> int:
+                return occ.addPoint(radius * np.sin(angle), radius * (1 - np.cos(angle)), 0)
+
+            near_end, shoulder, cap = on(wide), on(steep), occ.addPoint(0, 2 * radius, 0)
+            arc = occ.addCircleArc(foot, centre, near_end)
+            flank = occ.addCircleArc(near_end, centre, shoulder)
+            top = occ.addCircleArc(shoulder, centre, cap)
+            axis = occ.addLine(cap, foot)
+            occ.addPlaneSurface([occ.addCurveLoop([arc, flank, top, axis])], 1)
+            corner = [(0, 0), (20, 0), (side / 2, 0), (side / 2, -side), (0, -side)]
+            points = [occ.addPoint(x, y, 0) for x, y in corner]
+            lines = [
+                occ.addLine(p, q) for p, q in zip(points, points[1:] + points[:1], strict=True)
+            ]
+            occ.addPlaneSurface([occ.addCurveLoop(lines)], 2)
+            occ.synchronize()
+            gmsh.model.addPhysicalGroup(2, [1], 1)
+            gmsh.model.addPhysicalGroup(2, [2], 2)
+            groups = {
+                GROUND: [lines[3]],
+                LOAD: [top],
+                AXIS: [axis, lines[4]],
+                SURFACE: [arc],
+                OPPOSITE: [lines[0]],
+            }
+            for tag, group in groups.items():
+                gmsh.model.addPhysicalGroup(1, group, tag)
+
+            def size(dim: int, tag: int, x: float, y: float, z: float, lc: float) -> float:
+                away = max(0.0, np.hypot(x, y) - 9.0)
+                return (0.8 if y > 0 else 1.0) * h + 0.15 * away
+
+            gmsh.model.mesh.setSizeCallback(size)
+            gmsh.model.mesh.generate(2)
+            gmsh.model.mesh.setOrder(2)
+        return compat.model_to_mesh(gmsh.model, COMM, 0, 2)
+    finally:
+        gmsh.finalize()
+
+
+@case(
+    "Cylinder on block, two bodies, NAFEMS R0094-1",
+    "1.5 %, that is (a/R)²: Hertz takes the cylinder for a parabola and the normals for parallel",
+)
+def cylinder() -> Outcome:
+    """35 kN/mm on a steel cylinder, on a block of 70 GPa, small displacements, no friction."""
+    made = cylinder_on_block(0.25)
+    body = Bodies(made, _moduli(made[0], 210e3, 70e3), 0.3, degree=2)
+    body.hold(GROUND, 0, 1)
+    body.hold(AXIS, 0)
+    total = 35e3
+    # As traction on a cap, so that it is the load that is given that arrives.
+    width = _integral(body, LOAD)
+    load = body.constant(0.0)
+    body.F += load / width * body.v[1] * body.ds(LOAD)
+    contact = fc.Contact(
+        body.u,
+        fc.ContactSurface(body.mesh, body.tags, SURFACE),
+        fc.DeformableBody(body.tags, OPPOSITE),
+        fc.Frictionless(),
+    )
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    list(fc.increments(problem, load, 0.0, total / 2, steps=2))
+    r, points = contact.resultants(), contact.gather()
+    rows = (
+        Row("contact force per half [N/mm]", r.force[1], total / 2, "the load", 1e-6),
+        Row("half-width a [mm]", _half_width(points), 6.2146, "Hertz", 0.015),
+        Row("peak pressure p₀ [MPa]", r.max_pressure, 3585.4, "Hertz", 0.015),
+    )
+    n = body.mesh.topology.index_map(2).size_global
+    return Outcome(rows, f"2 bodies, {n} curved triangles, h = a/25, degree 2", body.dofs)
+
+
+def _moduli(mesh: dolfinx.mesh.Mesh, upper: float, lower: float) -> fem.Function:
+    """Young's modulus above and below y = 0, one value a cell."""
+    E = fem.Function(fem.functionspace(mesh, ("DG", 0)))
+    middle = E.function_space.tabulate_dof_coordinates()[:, 1]
+    E.x.array[:] = np.where(middle > 0, upper, lower)
+    return E
+
+
+def _integral(body: Bodies, tag: int) -> float:
+    one = body.constant(1.0)
+    return float(COMM.allreduce(fem.assemble_scalar(fem.form(one * body.ds(tag)))))
+
+
+def _half_width(points) -> float:
+    """Where the gap opens, linear between the last closed and the first open point."""
+    x, gap = points["x"][:, 0], points["gap"]
+    i = int(np.flatnonzero(gap < 0)[-1])
+    return float(x[i] + (x[i + 1] - x[i]) * gap[i] / (gap[i] - gap[i + 1]))

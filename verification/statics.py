@@ -1,0 +1,334 @@
+"""Cases whose references are statics or a few springs: nothing is left to the mesh."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import ufl
+from bodies import COMM, Bodies, boxes
+from cases import Outcome, Row, case
+from dolfinx import fem
+
+import fenics_contact as fc
+
+BASE, TOP, LEFT, RIGHT, SEAT = 1, 2, 3, 4, 5
+
+
+def near(i: int, value: float):
+    """Facets whose midpoint has the coordinate ``i`` near ``value``."""
+    return lambda x, cell: np.abs(x[:, i] - value) < 1e-9
+
+
+def block(n: tuple[int, int], size: tuple[float, float] = (1.0, 1.0), **kwargs):
+    """A rectangle with its sides tagged."""
+    axes = [[np.linspace(0, length, k + 1) for k, length in zip(n, size, strict=True)]]
+    sides = {BASE: near(1, 0), TOP: near(1, size[1]), LEFT: near(0, 0), RIGHT: near(0, size[0])}
+    return boxes(axes, sides, **kwargs)
+
+
+@case(
+    "Contact spring, Code_Aster SSND116A",
+    "1e-6 as the benchmark states; the solver's tolerance on the forces is 1e-9",
+)
+def contact_spring() -> Outcome:
+    """k_n = 1, k_t = 0.5, μ = 0.5, gap 0.5, unit springs: N up to 1, then T up to 2 and back.
+
+    The springs, the loads and the contact act on the same points: the body moves as one.
+    """
+    body = Bodies(block((1, 1)), 1000.0, 0.3)
+    force = body.constant([0.0, 0.0])
+    body.F += ufl.dot(body.u - force, body.v) * body.ds(BASE)
+    surface = fc.ContactSurface(body.mesh, body.tags, BASE)
+    law = fc.Coulomb(0.5, k_n=1.0, k_t=0.5)
+    contact = fc.Contact(body.u, surface, fc.HalfSpace((0, 0), (0, 1)), law, gap=0.5)
+    problem = fc.ContactProblem(body.F, body.u, contacts=[contact])
+    history = [
+        # N, T, component, reference
+        (0.5, 0.0, 1, -0.5),
+        (1.0, 0.0, 1, -0.75),
+        (1.0, 0.2, 0, 0.133333333),
+        (1.0, 2.0, 0, 1.875),
+        (1.0, 1.8, 0, 1.741666667),
+        (1.0, 0.0, 0, 0.125),
+    ]
+    rows = []
+    for normal, tangential, i, reference in history:
+        force.value[:] = tangential, -normal
+        problem.solve()
+        problem.commit()
+        mean = [
+            COMM.allreduce(fem.assemble_scalar(fem.form(body.u[j] * body.ds(BASE))))
+            for j in range(2)
+        ]
+        quantity = f"{'u_t' if i == 0 else 'u_n'} at N = {normal:g}, T = {tangential:g}"
+        rows.append(Row(quantity, mean[i], reference, "Code_Aster SSND116A", 1e-6))
+    return Outcome(tuple(rows), "1 quadrilateral", body.dofs)
+
+
+SLOPE = 0.1
+WEIGHT = 3058.0  # N per thickness
+
+
+@case(
+    "Wedge pushed up a wedge, NAFEMS CGS-4",
+    "statics of two rigid bodies holds for elastic ones too: 1e-6, far above the solver's 1e-9",
+)
+def wedge() -> Outcome:
+    """Two elastic wedges of meshes that do not match, the upper one on the lower and on a pusher.
+
+    The upper one's weight is G; a rigid plate without friction is moved by the displacement at
+    which all that is closed slips. The plate's force F follows from G and μ alone.
+    """
+    rows, dofs = [], 0
+    for friction in (0.0, 0.1, 0.2, 0.3):
+        long, short = np.linspace(0, 1200, 31), np.linspace(200, 800, 23)
+        low, high = np.linspace(0, 1, 5), np.linspace(1, 2, 6)
+
+        def bend(x: np.ndarray) -> np.ndarray:
+            # Up to 1: from the floor to the slope; from there to a level top.
+            ramp = 200 + SLOPE * x[:, 0]
+            y = np.where(x[:, 1] <= 1, x[:, 1] * ramp, ramp + (x[:, 1] - 1) * (500 - ramp))
+            return np.column_stack([x[:, 0], y])
+
+        sides = {
+            BASE: near(1, 0),
+            SEAT: lambda x, cell: near(1, 1)(x, cell) & (cell[:, 1] < 1),
+            TOP: lambda x, cell: near(1, 1)(x, cell) & (cell[:, 1] > 1),
+            LEFT: lambda x, cell: near(0, 200)(x, cell) & (cell[:, 1] > 1),
+        }
+        body = Bodies(boxes([[long, low], [short, high]], sides, bend=bend), 206e3, 0.3)
+        body.hold(BASE, 0, 1)
+        marked = fem.Function(fem.functionspace(body.mesh, ("DG", 0)))
+        middle = marked.function_space.tabulate_dof_coordinates()
+        marked.x.array[:] = middle[:, 1] > 200 + SLOPE * middle[:, 0]
+        area = COMM.allreduce(fem.assemble_scalar(fem.form(marked * ufl.dx)))
+        body.F += WEIGHT / area * marked * body.v[1] * ufl.dx
+        move = body.constant([0.0, 0.0])
+        law = fc.Coulomb(friction) if friction else fc.Frictionless()
+        slope = fc.Contact(
+            body.u,
+            fc.ContactSurface(body.mesh, body.tags, TOP),
+            fc.DeformableBody(body.tags, SEAT),
+            law,
+            name="slope",
+        )
+        plate = fc.Contact(
+            body.u,
+            fc.ContactSurface(body.mesh, body.tags, LEFT),
+            fc.HalfSpace((200, 0), (1, 0), displacement=move),
+            fc.Frictionless(),
+            name="plate",
+        )
+        problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[slope, plate])
+        for along in (0.0, 0.05, 0.1, 0.2):
+            move.value[0] = along
+            problem.solve()
+            problem.commit()
+        ratio = plate.resultants().normal_force / WEIGHT
+        reference = (SLOPE + friction) / (1 - friction * SLOPE)
+        source = "(tan α + μ)/(1 - μ tan α)"
+        rows.append(Row(f"F/G, μ = {friction:g}", ratio, reference, source, 1e-6))
+        dofs = body.dofs
+    return Outcome(tuple(rows), "2 bodies, 30 × 4 and 22 × 5 quadrilaterals", dofs)
+
+
+@case(
+    "Belt on a drum (capstan)",
+    "1 %, twice t/R = 0.005: the formula is that of a belt without thickness",
+)
+def capstan() -> Outcome:
+    """A belt halfway round a fixed drum, one end under T₁, the other one drawn until all slips."""
+    rows, dofs = [], 0
+    radius, thickness, angle, tension, n = 100.0, 0.5, np.pi, 1.0, 240
+    for friction in (0.1, 0.3):
+        axes = [[np.linspace(0, angle, n + 1), np.array([0.0, thickness / 2, thickness])]]
+        sides = {BASE: near(1, 0), LEFT: near(0, 0), RIGHT: near(0, angle)}
+
+        def bend(x: np.ndarray) -> np.ndarray:
+            r = radius + x[:, 1]
+            return np.column_stack([r * np.cos(x[:, 0]), r * np.sin(x[:, 0])])
+
+        body = Bodies(boxes(axes, sides, bend=bend, degree=2), 1e4, 0.0, degree=2)
+        pull, draw = body.constant(0.0), body.constant(0.0)
+        body.hold(LEFT, 1, value=draw)  # at the angle 0 the belt runs along y
+        body.F += pull * body.v[1] * body.ds(RIGHT)
+        surface = fc.ContactSurface(body.mesh, body.tags, BASE)
+        law = fc.Coulomb(friction, k_n=20.0, k_t=20.0)
+        contact = fc.Contact(body.u, surface, fc.Cylinder((0, 0), radius), law)
+        problem = fc.ContactProblem(
+            body.F, body.u, bcs=body.bcs, contacts=[contact], method="newton"
+        )
+        list(fc.increments(problem, pull, 0.0, tension / thickness, steps=2))
+        list(fc.increments(problem, draw, 0.0, -2.0, steps=8))
+        r = contact.resultants()
+        drawn = (r.force[1] - tension) / tension
+        source = "exp(μθ), θ = π"
+        rows.append(Row(f"T₂/T₁, μ = {friction:g}", drawn, np.exp(friction * angle), source, 0.01))
+        rows.append(
+            Row(f"sticking points, μ = {friction:g}", r.stick, 0.0, "all of the belt slips", 0.5)
+        )
+        dofs = body.dofs
+    return Outcome(tuple(rows), f"{n} × 2 curved quadrilaterals, degree 2", dofs)
+
+
+@case(
+    "Block on an elastic incline",
+    "1e-4: to that the limit is searched; T/N is statics, to 1e-6",
+)
+def incline() -> Outcome:
+    """The steepest slope on which a block stays, on a support that is elastic itself.
+
+    Gravity is turned, not the mesh. Parts of the base slip long before.
+    """
+    friction, weight = 0.3, 8.0
+    axes = [
+        [np.linspace(0, 3, 31), np.linspace(-1, 0, 7)],
+        [np.linspace(1, 2, 13), np.linspace(0, 0.4, 6)],
+    ]
+    sides = {
+        BASE: near(1, -1),
+        SEAT: lambda x, cell: near(1, 0)(x, cell) & (cell[:, 1] < 0),
+        TOP: lambda x, cell: near(1, 0)(x, cell) & (cell[:, 1] > 0),
+    }
+    body = Bodies(boxes(axes, sides), 1000.0, 0.3)
+    body.hold(BASE, 0, 1)
+    tilt = body.constant(0.0)
+    marked = fem.Function(fem.functionspace(body.mesh, ("DG", 0)))
+    marked.x.array[:] = marked.function_space.tabulate_dof_coordinates()[:, 1] > 0
+    pull = ufl.sin(tilt) * body.v[0] - ufl.cos(tilt) * body.v[1]
+    body.F -= weight / 0.4 * marked * pull * ufl.dx
+    surface = fc.ContactSurface(body.mesh, body.tags, TOP)
+    support = fc.DeformableBody(body.tags, SEAT)
+    contact = fc.Contact(body.u, surface, support, fc.Coulomb(friction))
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    holds, slides, worst = 0.0, 2.0, 0.0
+    trials = [0.0, 0.5, 0.9]
+    while slides - holds > 1e-4:
+        share = trials.pop(0) if trials else (holds + slides) / 2
+        tilt.value = np.arctan(share * friction)
+        try:
+            problem.solve()
+        except (fc.NotConverged, ValueError):
+            slides = share
+            continue
+        problem.commit()
+        holds = share
+        along, across = contact.resultants().force
+        worst = max(worst, abs(-along / across - share * friction) / friction)
+    rows = (
+        Row("tan α at which it slides, over μ", (holds + slides) / 2, 1.0, "tan α = μ", 1e-4),
+        Row("T/N - tan α, largest, over μ", worst, 0.0, "statics", 1e-6),
+    )
+    return Outcome(rows, "2 bodies, 30 × 6 and 12 × 5 quadrilaterals", body.dofs)
+
+
+@case(
+    "Homogeneity of degree one",
+    "1e-8: the solver is set to 1e-12, and displacements are some hundred times as sensitive",
+)
+def homogeneity() -> Outcome:
+    """Block on a plane without gap, pressed and sheared in proportion, sticking, slipping, open.
+
+    Twice the load gives twice the displacements, and four increments give those of one.
+    """
+    rows = []
+    source = "homogeneous of degree one"
+    made = block((20, 20), (40.0, 40.0))  # one mesh: partitions differ from one to the next
+    for method in ("lbfgs", "newton"):
+        one, _ = _sheared(made, method, 1.0, 1)
+        twice, _ = _sheared(made, method, 2.0, 1)
+        split, counts = _sheared(made, method, 1.0, 4)
+        doubled = _norm(twice - 2 * one) / _norm(2 * one)
+        rows += [
+            Row(f"|u(2F) - 2u(F)| / |2u(F)|, {method}", doubled, 0.0, source, 1e-8),
+            Row(
+                f"|u(4 increments) - u| / |u|, {method}",
+                _norm(split - one) / _norm(one),
+                0.0,
+                source,
+                1e-8,
+            ),
+        ]
+        every = min(counts.open, counts.stick, counts.slip) > 0
+        rows.append(Row(f"open, sticking and slipping parts, {method}", every, 1.0, "present", 0.0))
+    return Outcome(tuple(rows), "20 × 20 quadrilaterals", 2 * 21**2)
+
+
+def _sheared(made: Any, method: str, load: float, steps: int) -> tuple[np.ndarray, fc.Resultants]:
+    """The block of Raous under so much of its load: displacements of this rank, and counts."""
+    body = Bodies(made, 130e3, 0.2)
+    body.hold(RIGHT, 0)
+    grow = body.constant(0.0)
+    body.F += 50 * grow * body.v[1] * body.ds(TOP) - 150 * grow * body.v[0] * body.ds(LEFT)
+    surface = fc.ContactSurface(body.mesh, body.tags, BASE)
+    contact = fc.Contact(body.u, surface, fc.HalfSpace((0, 0), (0, 1)), fc.Coulomb(1.0))
+    problem = fc.ContactProblem(
+        body.F,
+        body.u,
+        bcs=body.bcs,
+        contacts=[contact],
+        petsc_options={"snes_rtol": 1e-12},
+        method=method,
+    )
+    list(fc.increments(problem, grow, 0.0, load, steps=steps))
+    n = body.u.function_space.dofmap.index_map.size_local * 2
+    return body.u.x.array[:n].copy(), contact.resultants()
+
+
+def _norm(x: np.ndarray) -> float:
+    """Over all ranks."""
+    return float(np.sqrt(COMM.allreduce(x @ x)))
+
+
+@case(
+    "Patch test, meshes that do not match",
+    "1e-9, the solver's tolerance: penalty and projection are exact here; 2e-6 against exact "
+    "contact, from which a stiffness of 1e12 leaves 1e-6",
+)
+def patch() -> Outcome:
+    """Two confined blocks, the top moved by 0.01: pressure and jump are uniform."""
+    rows, k_n = [], 1e7
+    for nu in (0.0, 0.3):
+        axes = [
+            [np.linspace(0, 1, 4), np.linspace(0, 0.5, 3)],
+            [np.linspace(0, 1, 6), np.linspace(0.5, 1, 3)],
+        ]
+        sides = {
+            BASE: near(1, 0),
+            TOP: near(1, 1),
+            LEFT: lambda x, cell: near(0, 0)(x, cell) | near(0, 1)(x, cell),
+            SEAT: lambda x, cell: near(1, 0.5)(x, cell) & (cell[:, 1] < 0.5),
+            RIGHT: lambda x, cell: near(1, 0.5)(x, cell) & (cell[:, 1] > 0.5),
+        }
+        body = Bodies(boxes(axes, sides), 1e6, nu, degree=2)
+        body.hold(BASE, 1)
+        body.hold(LEFT, 0)
+        body.hold(TOP, 1, value=-0.01)
+        surface = fc.ContactSurface(body.mesh, body.tags, SEAT)
+        law = fc.Coulomb(0.3, k_n=k_n, k_t=1e6)
+        contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, RIGHT), law)
+        fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact]).solve()
+        p = 0.01 / ((1 + nu) * (1 - 2 * nu) / (1 - nu) / 1e6 + 1 / k_n)
+        points = contact.gather()
+        for name, values, exact in (
+            ("pressure", points["pressure"], p),
+            ("jump", -points["gap"], p / k_n),
+        ):
+            farthest = values[np.argmax(np.abs(values - exact))]
+            source = "uniform: 0.01/(1/M + 1/k_n)" if name == "pressure" else "p/k_n"
+            rows.append(Row(f"{name}, farthest point, ν = {nu:g}", farthest, exact, source, 1e-9))
+    # The exact contact of the blocks with ν = 0, but for a jump of 1e-6 of the displacement.
+    body = Bodies(boxes(axes, sides), 1e6, 0.0, degree=2)
+    body.hold(BASE, 1)
+    body.hold(LEFT, 0)
+    body.hold(TOP, 1, value=-0.01)
+    surface = fc.ContactSurface(body.mesh, body.tags, SEAT)
+    stiff = fc.Frictionless(1e12)
+    contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, RIGHT), stiff)
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact], method="newton")
+    problem.solve()
+    rows.append(
+        Row("pressure, k_n = 1e12", contact.resultants().normal_force, 1e4, "E·0.01/H", 2e-6)
+    )
+    return Outcome(tuple(rows), "2 bodies, 3 × 2 and 5 × 2 quadrilaterals, degree 2", body.dofs)
