@@ -1,0 +1,174 @@
+"""The three methods on three scenes with friction: iterations, factorisations and time.
+
+    python benchmarks/methods.py --output output/methods
+
+Scenes: the half-cylinder of the demo (μ = 0.2, ten increments), the cylinder dragged over a block
+(μ = 0.3, ten increments), and in space a ball pressed into a block and dragged (μ = 0.3, five
+increments), each at moderate and at high contact stiffness. Without the fallback: a method that
+fails is seen to fail, at the increment that is given. Writes a table in Markdown and a CSV; times
+are of the solves alone, medians of ``--repeats`` runs, without what is compiled once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import dolfinx
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
+import hertz
+import ironing
+
+METHODS = ("lbfgs", "newton", "alternating")
+STIFFNESSES = (10.0, 1000.0)
+Loading = tuple[fc.ContactProblem, Callable[[float], None], int]
+
+
+def half_cylinder(method: str, stiffness: float) -> Loading:
+    """The paper's first example, quadratic triangles."""
+    mesh, tags = hertz.make_mesh(0.1, 1.3 * hertz.hertz(hertz.PAPER_LOAD)[0])
+    V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    pressure = fem.Constant(mesh, 0.0)
+    ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
+    body = fc.elasticity.LinearElastic(u, hertz.E, hertz.NU, "plane strain")
+    F = body.residual(v) + pressure * v[1] * ds(hertz.TOP)
+    axis = fem.locate_dofs_topological(V.sub(0), 1, tags.find(hertz.AXIS))
+    bcs = [fem.dirichletbc(0.0, axis, V.sub(0))]
+    k = fc.Scaled(stiffness)
+    floor = fc.HalfSpace((0, 0), (0, 1))
+    surface = fc.ContactSurface(mesh, tags, hertz.CONTACT)
+    contact = fc.Contact(u, surface, floor, fc.Coulomb(0.2, k, k))
+    problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method=method, fallback=False)
+
+    def load(t: float) -> None:
+        pressure.value = hertz.PAPER_LOAD * t
+
+    return problem, load, 10
+
+
+def dragged_cylinder(method: str, stiffness: float) -> Loading:
+    """The ironing demo's scene; the cylinder is moved down by what its force made of it there."""
+    mesh, tags = ironing.make_mesh(6)
+    V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    body = fc.elasticity.LinearElastic(u, ironing.E, ironing.NU, "plane strain")
+    held = fem.locate_dofs_topological(V, 1, tags.find(ironing.BOTTOM))
+    bcs = [fem.dirichletbc(np.zeros(2), held, V)]
+    move = fem.Constant(mesh, np.zeros(2))
+    cylinder = fc.Cylinder((-1.0, ironing.R), ironing.R, displacement=move)
+    k = fc.Scaled(stiffness)
+    surface = fc.ContactSurface(mesh, tags, ironing.TOP)
+    contact = fc.Contact(u, surface, cylinder, fc.Coulomb(ironing.MU, k, k))
+    problem = fc.ContactProblem(
+        body.residual(v), u, bcs=bcs, contacts=[contact], method=method, fallback=False
+    )
+
+    def load(t: float) -> None:
+        move.value[:] = 2.0 * max(t - 0.2, 0.0), -0.057 * min(5 * t, 1.0)
+
+    return problem, load, 10
+
+
+def dragged_ball(method: str, stiffness: float) -> Loading:
+    """A ball on a block of hexahedra, linear displacements."""
+    mesh = dolfinx.mesh.create_box(
+        MPI.COMM_WORLD, [[-1, -1, -1], [1, 1, 0]], (16, 16, 8), dolfinx.mesh.CellType.hexahedron
+    )
+    parts = [
+        dolfinx.mesh.locate_entities_boundary(mesh, 2, lambda x, z=z: np.isclose(x[2], z))
+        for z in (-1.0, 0.0)
+    ]
+    facets = np.concatenate(parts)
+    values = np.repeat(np.array([1, 2], dtype=np.int32), [len(p) for p in parts])
+    order = np.argsort(facets)
+    tags = dolfinx.mesh.meshtags(mesh, 2, facets[order], values[order])
+    V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    body = fc.elasticity.LinearElastic(u, 1000.0, 0.3, "3D")
+    held = fem.locate_dofs_topological(V, 2, tags.find(1))
+    bcs = [fem.dirichletbc(np.zeros(3), held, V)]
+    move = fem.Constant(mesh, np.zeros(3))
+    k = fc.Scaled(stiffness)
+    ball = fc.Ball((0, 0, 2.0), 2.0, displacement=move)
+    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, 2), ball, fc.Coulomb(0.3, k, k))
+    problem = fc.ContactProblem(
+        body.residual(v), u, bcs=bcs, contacts=[contact], method=method, fallback=False
+    )
+
+    def load(t: float) -> None:
+        move.value[:] = 0.2 * max(t - 0.2, 0.0), 0.0, -0.05 * min(5 * t, 1.0)
+
+    return problem, load, 5
+
+
+SCENES = {
+    "half-cylinder": half_cylinder,
+    "dragged cylinder": dragged_cylinder,
+    "dragged ball": dragged_ball,
+}
+
+
+def measure(repeats: int) -> Iterator[dict[str, object]]:
+    """Run all scenes; one row for each method and stiffness."""
+    for scene, make in SCENES.items():
+        for stiffness in STIFFNESSES:
+            for method in METHODS:
+                times, outcome, iterations, factorisations = [], "converged", 0, 0
+                for _ in range(repeats):
+                    problem, load, steps = make(method, stiffness)
+                    iterations = factorisations = 0
+                    start = time.perf_counter()
+                    try:
+                        for step in fc.increments(problem, load, steps=steps, max_cuts=0):
+                            iterations += step.iterations
+                            factorisations += step.factorisations
+                    except fc.NotConverged as error:
+                        iterations += error.iterations
+                        outcome = f"failed at increment {error.increment}"
+                    times.append(time.perf_counter() - start)
+                yield {
+                    "scene": scene,
+                    "k_n h/E": stiffness,
+                    "method": method,
+                    "outcome": outcome,
+                    "iterations": iterations,
+                    "factorisations": factorisations,
+                    "seconds": round(statistics.median(times), 3),
+                }
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--output", type=Path, default=Path("output/methods"))
+    arguments = parser.parse_args()
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for row in measure(arguments.repeats):
+        rows.append(row)
+        print(*row.values(), sep="  ", flush=True)
+    with open(arguments.output / "methods.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
+    lines += ["| " + " | ".join(str(value) for value in row.values()) + " |" for row in rows]
+    (arguments.output / "methods.md").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()
