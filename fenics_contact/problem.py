@@ -17,11 +17,13 @@ from petsc4py import PETSc
 
 from fenics_contact import accuracy, compat
 from fenics_contact.bulk import Bulk
+from fenics_contact.condense import CondensedSpace, touched, worthwhile
 from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.energy import Energy, EnergyState
 from fenics_contact.parallel import global_max, global_min, global_sum
 from fenics_contact.rigid import RigidMotions
-from fenics_contact.unknowns import Unknowns
+from fenics_contact.spaces import WholeSpace
+from fenics_contact.unknowns import Selection, Unknowns
 from fenics_contact.verdict import NotConverged, Verdict, check_laws
 
 __all__ = ["ContactProblem", "Step"]
@@ -61,7 +63,8 @@ _COMMON = {
     # `cp` takes |F·y| below this for convergence of the whole; the residual itself is tested here.
     "snes_linesearch_atol": 1e-300,
 }
-_LINEAR = {"ksp_type": "preonly", "pc_factor_mat_solver_type": "mumps"}
+# Options that only make sense for the sparse matrices over all unknowns.
+_NAMES_A_SOLVER = ("ksp_type", "pc_type", "pc_factor_mat_solver_type")
 _METHODS: dict[str, dict[str, Any]] = {
     "lbfgs": {
         "snes_type": "qn",
@@ -145,6 +148,7 @@ class ContactProblem:
         method: str = "lbfgs",
         alpha: float = 1.0,
         phi: float = 1.0,
+        condensation: bool | None = None,
         petsc_options: Mapping[str, Any] | None = None,
         prefix: str = "contact_",
     ) -> None:
@@ -160,6 +164,9 @@ class ContactProblem:
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
                 paper has 0; 1 needs a third of the iterations once a point sticks.
+            condensation: Whether to iterate on the unknowns that contact touches alone, all others
+                eliminated: for a linear bulk on one rank. By default where it can be done and is
+                worth it (`condense.worthwhile`), unless an option names a linear solver.
             petsc_options: Options without prefix; they win over the method's, the command line
                 over both.
             prefix: Prefix of the options.
@@ -180,15 +187,12 @@ class ContactProblem:
         self._comm = u.function_space.mesh.comm
         self._bcs = list(bcs)
         self._alpha, self._phi = alpha, phi
-        self._motions = [c for contact in self.contacts for c in contact.free_motion.values()]
-        self.unknowns = Unknowns(u.function_space, len(self._motions))
+        n_motions = sum(len(contact.free_motion) for contact in self.contacts)
+        self.unknowns = Unknowns(u.function_space, n_motions)
         self._n_owned = self.unknowns.n_dofs
         self._constrained = self._constrained_unknowns()
         self._check_contacts()
-        first = 0
-        for contact in self.contacts:
-            contact.set_unknowns(self.unknowns, first)
-            first += len(contact.free_motion)
+        self._whole = WholeSpace(u, self.unknowns, self.bulk, self.contacts, self._constrained)
 
         self.bulk.check_finite()
         self.bulk.update()
@@ -204,18 +208,17 @@ class ContactProblem:
         self.motions.find_free(self._bulk_matrix, self._constrained)
         self.motions.check_held(self.contacts)
 
-        self._contact_vector = self.unknowns.vector()
         self._length = self.motions.size
-        self._diagonal = np.zeros(self.unknowns.n_local)
         self._factorisations = 0
         self._norms = {"residual": 0.0, "force": 0.0, "floor": 0.0}
         self.committed_force = self._start_residual = 0.0
-        self._committed = self._state()
+        self._committed = self._whole.state()
         for contact in self.contacts:
             contact.evaluate()
         self._committed_energy = EnergyState.unloaded(self._committed, self.contacts)
         self._energy = self._committed_energy
         self._rate: Array | None = None
+        self._condensation, self._prefix = condensation, prefix
         self._configure(method, dict(petsc_options or {}), prefix)
 
     # ---- construction ----------------------------------------------------------------------------
@@ -285,12 +288,16 @@ class ContactProblem:
 
         default(given, prefix)
         default(_COMMON | _METHODS[method], prefix)
-        self._solution, self._function = self.unknowns.vector(), self.unknowns.vector()
+        solvers = [prefix + part + name for part in ("", "tangent_") for name in _NAMES_A_SOLVER]
+        self._condensed = self._choose_condensation([s for s in solvers if database.hasName(s)])
+        self._set_space()
         for consistent in (False, True):
             ksp = PETSc.KSP().create(self._comm)
             ksp.setOptionsPrefix(prefix + ("tangent_" if consistent else ""))
-            factorisation = {"pc_type": "cholesky" if self._symmetric(consistent) else "lu"}
-            default(_LINEAR | factorisation, ksp.getOptionsPrefix())
+            options = self._space.linear_solver(
+                symmetric=self._symmetric(consistent), consistent=consistent
+            )
+            default(options, ksp.getOptionsPrefix())
             ksp.setFromOptions()
             self._solvers[consistent] = ksp
         self._allocate_matrices()
@@ -311,28 +318,69 @@ class ContactProblem:
     def _symmetric(self, consistent: bool) -> bool:
         return self.bulk.symmetric and (not consistent or self._has_potential)
 
+    def _choose_condensation(self, solvers: Sequence[str]) -> bool:
+        """Whether to iterate on the unknowns that contact touches alone. Collective.
+
+        Args:
+            solvers: Options given that name a linear solver, which the dense one cannot be.
+        """
+        obstacle = None
+        if not self.contacts:
+            obstacle = "there is no contact"
+        elif not self.bulk.linear:
+            obstacle = "the bulk is not linear in u"
+        elif self._comm.size > 1:
+            obstacle = f"it takes one rank, and there are {self._comm.size}"
+        if self._condensation and obstacle:
+            raise ValueError(
+                f"condensation is True, but {obstacle}; leave it out, or give condensation=False"
+            )
+        if self._condensation is False:
+            obstacle = "the caller wants none"
+        elif self._condensation is None and not obstacle:
+            n, n_touched = self.unknowns.n_local, touched(self.contacts, self.unknowns).size
+            if solvers:
+                obstacle = f"the options name a linear solver ({', '.join(solvers)})"
+            elif not worthwhile(n, n_touched, len(self.u)):
+                obstacle = f"contact touches {n_touched} of {n} unknowns, too many to gain by it"
+        if self._comm.rank == 0:
+            logger.info("no condensation: %s", obstacle) if obstacle else None
+        return obstacle is None
+
+    def _set_space(self) -> None:
+        """Take the space to iterate in, new if the pairs have changed. Collective."""
+        self._pairings = [c.pairings for c in self.contacts]
+        if not self._condensed:
+            self._space = self._whole
+        else:
+            kept = touched(self.contacts, self.unknowns)
+            self._space = CondensedSpace(
+                self._whole, Selection(self.unknowns, kept), prefix=self._prefix + "interior_"
+            )
+            logger.info("condensed: %d of %d unknowns", kept.size, self.unknowns.n_local)
+        self._solution, self._function = self._space.vector(), self._space.vector()
+
+    def _update_space(self, stiffness_changed: bool) -> None:
+        """Follow changes of the pairs and of the bulk's tangent. Collective."""
+        if self._pairings != [c.pairings for c in self.contacts]:
+            self._set_space()
+            self.snes.reset()
+            self._make_matrices()
+        if stiffness_changed or not self._space.ready:
+            self._factorisations += self._space.update(self._bulk_matrix)
+
     def _make_matrices(self) -> None:
         """New matrices for new couplings, or to forget all that was factored. Collective."""
         self._allocate_matrices()
         self._attach(consistent=not self._quasi_newton)
 
     def _allocate_matrices(self) -> None:
-        """Allocate the matrices of H₀ and of the consistent tangent. Collective.
-
-        Their pattern is that of the bulk and, with deformable or moving supports, of the pairs.
-        """
-        self._pairings = [c.pairings for c in self.contacts]
+        """Allocate the matrices of H₀ and of the consistent tangent. Collective."""
         self._matrices: dict[bool, PETSc.Mat] = {}
-        different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
         for consistent, ksp in self._solvers.items():
-            matrix = self._bulk_matrix.copy()
-            for contact in self.contacts:
-                if contact.couples:
-                    part = contact.stiffness_matrix(1.0, 1.0)
-                    matrix.axpy(1.0, part, different)
-                    part.destroy()
-            matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
-            matrix.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric(consistent))
+            matrix = self._space.matrix(
+                self._bulk_matrix, symmetric=self._symmetric(consistent), consistent=consistent
+            )
             ksp.reset()
             ksp.setOperators(matrix)
             self._matrices[consistent] = matrix
@@ -358,58 +406,32 @@ class ContactProblem:
 
     # ---- SNES callbacks --------------------------------------------------------------------------
 
-    def _state(self) -> Array:
-        """Displacement and free motions of supports at this rank's unknowns; a copy."""
-        motions = np.array([float(c.value) for c in self._motions])
-        return self.unknowns.joined(self.u.x.array[: self._n_owned], motions)
-
-    def _set_state(self, state: Array) -> None:
-        """Make a state the present one. Collective."""
-        self.u.x.array[: self._n_owned] = state[: self._n_owned]
-        self.u.x.scatter_forward()
-        for constant, value in zip(self._motions, self.unknowns.motions(state), strict=True):
-            constant.value = value
-
     def _set_u(self, x: PETSc.Vec) -> None:
-        self._set_state(x.array_r * self._length)
-
-    def _contact_force(self) -> Array:
-        """Contact part of the residual at the present state, this rank's unknowns. Collective."""
-        self._contact_vector.set(0.0)
-        for contact in self.contacts:
-            contact.add_force(self._contact_vector)
-        return self._contact_vector.array_r.copy()
-
-    def _bulk_force(self, residual: Array) -> Array:
-        """The rest of the residual: the bulk's, and the forces on free supports."""
-        return self.unknowns.joined(residual, -self._support_forces())
-
-    def _support_forces(self) -> Array:
-        return np.array([f for c in self.contacts for f in _numbers(c.applied_force)])
+        self._space.set_state(x.array_r * self._length)
 
     def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         self._set_u(x)
         # A trial of the line search may overflow; the convergence test sees it.
         with np.errstate(all="ignore"):
-            contact = self._contact_force()
-            total = self._bulk_force(self.bulk.residual()) + contact
-            self._measure_norms(total, contact)
-            total[self._constrained] = 0.0
+            contact = self._space.contact_force()
+            total = self._space.bulk_force() + contact
+            self._measure_norms(self._space, total, contact)
+            total[self._space.constrained] = 0.0
             f.array[:] = total / (self.bulk.scale * self._length)
 
-    def _measure_norms(self, total: Array, contact: Array) -> None:
+    def _measure_norms(self, space: WholeSpace, total: Array, contact: Array) -> None:
         """Norms in force: the free residual, the forces it is compared with, and round-off."""
-        reaction = total[self._constrained]
-        free = total[~self._constrained]
-        stiff: Array = self._diagonal * self._state()
+        reaction = total[space.constrained]
+        free = total[~space.constrained]
+        stiff: Array = space.diagonal * space.state()
         squares = global_sum(
             self._comm,
             [
                 free @ free,
                 reaction @ reaction,
                 contact @ contact,
-                self._load @ self._load,
-                stiff @ stiff,
+                space.load @ space.load + space.outside[0],
+                stiff @ stiff + space.outside[1],
             ],
         )
         residual, *forces, product = np.sqrt(squares)
@@ -455,24 +477,7 @@ class ContactProblem:
             matrix: What to fill.
             contacts: Contact's part, used up.
         """
-        subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
-        if not any(c.couples for c in self.contacts):
-            self._bulk_matrix.copy(matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        else:
-            matrix.zeroEntries()
-            matrix.axpy(1.0, self._bulk_matrix, subset)
-        for part in contacts:
-            matrix.axpy(1.0, part, subset)
-            part.destroy()
-        start, _ = matrix.getOwnershipRange()
-        rows = (start + np.flatnonzero(self._constrained)).astype(PETSc.IntType)
-        scale = self.bulk.scale
-        matrix.zeroRowsColumns(rows, diag=scale)
-        diagonal = matrix.getDiagonal()
-        self._diagonal = diagonal.array.copy()
-        diagonal.destroy()
-        matrix.scale(1.0 / scale)
-        self._factorisations += 1
+        self._factorisations += self._space.fill(matrix, self._bulk_matrix, contacts)
 
     def _tangents(self) -> Iterator[PETSc.Mat]:
         return (contact.tangent_matrix() for contact in self.contacts)
@@ -550,11 +555,11 @@ class ContactProblem:
                 can balance.
         """
         start = time.perf_counter()
-        saved = self._state()
+        saved = self._whole.state()
         try:
             step = self._solve(start, ahead)
         except BaseException:
-            self._set_state(saved)
+            self._whole.set_state(saved)
             for contact in self.contacts:
                 contact.forget()
             raise
@@ -567,21 +572,11 @@ class ContactProblem:
         self.u.x.scatter_forward()
         self._factorisations = 0
         stiffness_changed = self._update_bulk()
-        if self._pairings != [c.pairings for c in self.contacts]:
-            self._make_matrices()
+        self._update_space(stiffness_changed)
         self._approach()
-        iterations = 0
-        for guess in self._starts(ahead):
-            self._solution.array[:] = guess / self._length
-            if self._quasi_newton:
-                made, reason = self._solve_quasi_newton(stiffness_changed)
-            else:
-                self.snes.solve(None, self._solution)
-                made, reason = self.snes.getIterationNumber(), self.snes.getConvergedReason()
-            iterations += made
-            if reason > 0:
-                break
-        self._set_u(self._solution)
+        self._space.begin(self._load)
+        iterations, reason = self._iterate(ahead, stiffness_changed)
+        self._space.complete()
         verdict = self._judge()
         if reason <= 0 or verdict.failures:
             raise NotConverged(self.increment + 1, int(reason), iterations, verdict)
@@ -596,11 +591,31 @@ class ContactProblem:
             wall_seconds=time.perf_counter() - start,
         )
 
+    def _iterate(self, ahead: float, stiffness_changed: bool) -> tuple[int, int]:
+        """Iterate from one start after another; iterations and reason. Collective."""
+        iterations = 0
+        self._space.enter()
+        try:
+            for guess in self._starts(ahead):
+                self._solution.array[:] = self._space.part(guess) / self._length
+                if self._quasi_newton:
+                    made, reason = self._solve_quasi_newton(stiffness_changed)
+                else:
+                    self.snes.solve(None, self._solution)
+                    made, reason = self.snes.getIterationNumber(), self.snes.getConvergedReason()
+                iterations += made
+                if reason > 0:
+                    break
+            self._set_u(self._solution)
+        finally:
+            self._whole.enter()
+        return iterations, int(reason)
+
     def _check_before(self) -> None:
         self.bulk.check_finite()
         for contact in self.contacts:
             contact.check_input()
-        self._load = -self._bulk_force(self.bulk.update_load())
+        self._load = -self._whole.with_supports(self.bulk.update_load())
         size = global_max(self._comm, np.abs(self._load))
         if not np.isfinite(size):
             raise ValueError("the external load is not finite (NaN or inf) at some dof")
@@ -620,17 +635,17 @@ class ContactProblem:
         The present state, and that state moved on by as much as the last increment moved it: in
         proportional loading that is the solution.
         """
-        present = self._state()
+        present = self._whole.state()
         starts = [present]
         if self._rate is not None:
-            self._set_state(present + ahead * self._rate)
+            self._whole.set_state(present + ahead * self._rate)
             for bc in self._bcs:
                 bc.set(self.u.x.array)
-            starts.append(self._state())
+            starts.append(self._whole.state())
         residuals = []
         self._start_residual = 0.0
         for guess in starts:
-            self._solution.array[:] = guess / self._length
+            self._solution.array[:] = self._space.part(guess) / self._length
             self._compute_residual(self._solution, self._function)
             residuals.append(self._norms["residual"])
         self._start_residual = residuals[0]
@@ -645,7 +660,7 @@ class ContactProblem:
             return
         way = self.motions.approach(self._load, self.contacts)
         if way is not None:
-            self._set_state(self._state() + way)
+            self._whole.set_state(self._whole.state() + way)
 
     def _solve_quasi_newton(self, stiffness_changed: bool) -> tuple[int, int]:
         """L-BFGS in rounds, H₀ made anew between them from the status reached. Collective.
@@ -687,10 +702,10 @@ class ContactProblem:
 
     def _judge(self) -> Verdict:
         """Recompute everything from u by assembly, past SNES and its residual. Collective."""
-        contact = self._contact_force()
-        bulk = self._bulk_force(self.bulk.assemble_residual())
+        contact = self._whole.contact_force()
+        bulk = self._whole.with_supports(self.bulk.assemble_residual())
         total = bulk + contact
-        self._measure_norms(total, contact)
+        self._measure_norms(self._whole, total, contact)
         gdim = len(self.u)
         reaction = np.where(self._constrained, total, 0.0)
         on_dofs = (v[: self._n_owned].reshape(-1, gdim) for v in (bulk, reaction))
@@ -703,7 +718,7 @@ class ContactProblem:
             if c.rigid:  # between two bodies of the mesh contact forces are internal
                 imbalance = imbalance - c.resultants().force
         self._energy = EnergyState.at(
-            self._state(), bulk + self._load, self._load + reaction, self.contacts
+            self._whole.state(), bulk + self._load, self._load + reaction, self.contacts
         )
         absolute = float(global_sum(self._comm, np.abs(bulk).sum() + np.abs(contact).sum()))
         n_dofs = float(global_sum(self._comm, self._n_owned))
@@ -720,7 +735,7 @@ class ContactProblem:
         """Make the solved state the start of the next increment, history included. Collective."""
         for contact in self.contacts:
             contact.commit()
-        state = self._state()
+        state = self._whole.state()
         self._rate = state - self._committed
         self._committed = state
         self._committed_energy = self._energy.between([c.committed_jump for c in self.contacts])
@@ -732,7 +747,7 @@ class ContactProblem:
 
         The history needs no restoring: it changes at `commit` alone. Collective.
         """
-        self._set_state(self._committed)
+        self._whole.set_state(self._committed)
         for contact in self.contacts:
             contact.forget()
 
@@ -750,18 +765,13 @@ class ContactProblem:
 
     def take_up_loads(self) -> None:
         """Take the loads as they are now for those of the committed state. Collective."""
-        self._load = -self._bulk_force(self.bulk.update_load())
+        self._load = -self._whole.with_supports(self.bulk.update_load())
         self._judge()
         self._committed_energy = self._energy
 
     def restart_solver(self) -> None:
         """Drop what the solver has kept from earlier increments. Collective."""
         self._make_matrices()
-
-
-def _numbers(forces: Mapping[int, Any]) -> list[float]:
-    """Values of numbers and scalar constants."""
-    return [float(f.value if isinstance(f, fem.Constant) else f) for f in forces.values()]
 
 
 def _facets_held(contact: Contact, constrained: Array) -> int:
