@@ -196,6 +196,10 @@ class Condensation:
                 del self._directions[:-_DIRECTIONS]
         return result
 
+    def forget(self) -> None:
+        """Drop the solutions for earlier loads."""
+        self._directions = []
+
     def recover(self, kept: Array) -> Array:
         """All unknowns under the load of `set_load`, (n,), from those kept, (n_kept,)."""
         state = np.zeros_like(self.particular)
@@ -288,6 +292,15 @@ class CondensedSpace(WholeSpace):
     def bulk_force(self) -> Array:
         """S x - g: the residual of the bulk and of free supports."""
         return self.condensation.schur @ self.state() - self.condensation.load
+
+    def bulk_energy(self) -> float:
+        """Potential of S and g, up to a constant."""
+        return float(0.5 * (self.bulk_force() - self.condensation.load) @ self.state())
+
+    def forget(self) -> None:
+        """Drop the solutions for earlier loads."""
+        if self._condensation is not None:
+            self._condensation.forget()
 
     def matrix(self, stiffness: PETSc.Mat, *, symmetric: bool, consistent: bool) -> PETSc.Mat:
         """A new dense matrix."""

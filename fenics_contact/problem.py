@@ -771,6 +771,7 @@ class ContactProblem:
 
     def restart_solver(self) -> None:
         """Drop what the solver has kept from earlier increments. Collective."""
+        self._space.forget()
         self._make_matrices()
 
 

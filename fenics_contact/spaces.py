@@ -100,6 +100,9 @@ class WholeSpace:
     def complete(self) -> None:
         """Find the unknowns outside of the space for those inside. Collective."""
 
+    def forget(self) -> None:
+        """Drop what was kept of earlier increments and could show in the digits of the next."""
+
     def contact_force(self) -> Array:
         """Contact part of the residual at the present state, this rank's unknowns. Collective."""
         self._contact_vector.set(0.0)
@@ -110,6 +113,11 @@ class WholeSpace:
     def bulk_force(self) -> Array:
         """The rest of the residual: the bulk's, and the forces on free supports. Collective."""
         return self.with_supports(self.bulk.residual())
+
+    def bulk_energy(self) -> float:
+        """This rank's part of the potential of a linear bulk and its loads, up to a constant."""
+        # F(u) = K u + F(0), so that it is (F(u) + F(0))·u/2.
+        return float(0.5 * (self.bulk_force() - self.load) @ self.state())
 
     def with_supports(self, residual: Array) -> Array:
         """A residual over the dofs with that of the free supports, which their forces are."""
