@@ -34,9 +34,6 @@ logger = logging.getLogger("fenics_contact")
 # An open point keeps this share of its stiffness in H₀: enough that a body held by contact alone
 # stays held when its whole surface is open, too little to be felt as a wrong tangent.
 _OPEN_SHARE = 1e-3
-# L-BFGS iterations after which H₀ is made anew from the present contact status. One iteration costs
-# 1/15 to 1/35 of a factorisation, and pairs taken across changes of status are worth little.
-_REFRESH_EVERY = 20
 # Rounds in a row that do not lower the residual before the increment is given up: the potential may
 # fall for long before the residual does.
 _MAX_STALLS = 10
@@ -48,6 +45,8 @@ _ASTRAY = 1e3
 _MAX_FLOOR = 1e-5
 # Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
 _TOUCHING = 1e-12
+# PETSc's error for one in a dense factorisation (PETSC_ERR_MAT_LU_ZRPVT).
+_ZERO_PIVOT = 71
 
 _COMMON = {
     "snes_rtol": 1e-9,
@@ -331,6 +330,8 @@ class ContactProblem:
             obstacle = "the bulk is not linear in u"
         elif self._comm.size > 1:
             obstacle = f"it takes one rank, and there are {self._comm.size}"
+        elif solvers:
+            obstacle = f"the options name a linear solver ({', '.join(solvers)})"
         if self._condensation and obstacle:
             raise ValueError(
                 f"condensation is True, but {obstacle}; leave it out, or give condensation=False"
@@ -339,31 +340,39 @@ class ContactProblem:
             obstacle = "the caller wants none"
         elif self._condensation is None and not obstacle:
             n, n_touched = self.unknowns.n_local, touched(self.contacts, self.unknowns).size
-            if solvers:
-                obstacle = f"the options name a linear solver ({', '.join(solvers)})"
-            elif not worthwhile(n, n_touched, len(self.u)):
+            if not worthwhile(n, n_touched, len(self.u)):
                 obstacle = f"contact touches {n_touched} of {n} unknowns, too many to gain by it"
-        if self._comm.rank == 0:
-            logger.info("no condensation: %s", obstacle) if obstacle else None
+        if obstacle and self._comm.rank == 0:
+            logger.info("iterating on all unknowns: %s", obstacle)
         return obstacle is None
 
-    def _set_space(self) -> None:
-        """Take the space to iterate in, new if the pairs have changed. Collective."""
-        self._pairings = [c.pairings for c in self.contacts]
-        if not self._condensed:
-            self._space = self._whole
-        else:
-            kept = touched(self.contacts, self.unknowns)
+    def _set_space(self, kept: npt.NDArray[np.int32] | None = None) -> None:
+        """Take the space to iterate in: all unknowns, or those kept, by default those touched.
+
+        Collective.
+        """
+        self._space = self._whole
+        if self._condensed:
+            kept = touched(self.contacts, self.unknowns) if kept is None else kept
             self._space = CondensedSpace(
                 self._whole, Selection(self.unknowns, kept), prefix=self._prefix + "interior_"
             )
-            logger.info("condensed: %d of %d unknowns", kept.size, self.unknowns.n_local)
+            logger.info("condensed onto %d of %d unknowns", kept.size, self.unknowns.n_local)
+        self._pairings = [c.pairings for c in self.contacts]
         self._solution, self._function = self._space.vector(), self._space.vector()
 
     def _update_space(self, stiffness_changed: bool) -> None:
         """Follow changes of the pairs and of the bulk's tangent. Collective."""
         if self._pairings != [c.pairings for c in self.contacts]:
-            self._set_space()
+            if not self._condensed:
+                self._set_space()
+            else:
+                # A body that slides comes back to places where it was: what is kept grows only.
+                before = self._space.unknowns.kept
+                kept = np.union1d(before, touched(self.contacts, self.unknowns))
+                if kept.size > before.size:
+                    self._set_space(kept.astype(np.int32))
+                self._pairings = [c.pairings for c in self.contacts]
             self.snes.reset()
             self._make_matrices()
         if stiffness_changed or not self._space.ready:
@@ -502,6 +511,7 @@ class ContactProblem:
         """H₀ = (K + αK_n + φK_t)⁻¹, all of Γc closed and sticking (section 5). Collective."""
         self._clear_pairs(consistent=False)
         self._assemble_matrix(self._matrices[False], self._stiffnesses(everywhere=True))
+        self._factor_h0()
 
     def _refresh_h0(self) -> bool:
         """Make H₀ anew from the status that the last round reached; False if none. Collective.
@@ -519,7 +529,20 @@ class ContactProblem:
         parts = self._tangents() if consistent else self._stiffnesses(everywhere=False)
         self._clear_pairs(consistent=consistent)
         self._assemble_matrix(self._matrices[consistent], parts)
+        if not consistent:
+            self._factor_h0()
         return True
+
+    def _factor_h0(self) -> None:
+        """Factor H₀ where it is dense: by Cholesky's method, or, if it is not definite, by LU."""
+        if not self._condensed:
+            return
+        ksp = self._solvers[False]
+        try:
+            ksp.setUp()
+        except PETSc.Error:
+            ksp.getPC().setType(PETSc.PC.Type.LU)
+            ksp.setUp()
 
     def _clear_pairs(self, *, consistent: bool | None = None) -> None:
         """Forget the pairs of L-BFGS and keep the factorisation, which reset() would drop too."""
@@ -593,16 +616,17 @@ class ContactProblem:
 
     def _iterate(self, ahead: float, stiffness_changed: bool) -> tuple[int, int]:
         """Iterate from one start after another; iterations and reason. Collective."""
-        iterations = 0
+        iterations, reason = 0, PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
         self._space.enter()
         try:
             for guess in self._starts(ahead):
                 self._solution.array[:] = self._space.part(guess) / self._length
-                if self._quasi_newton:
-                    made, reason = self._solve_quasi_newton(stiffness_changed)
-                else:
-                    self.snes.solve(None, self._solution)
-                    made, reason = self.snes.getIterationNumber(), self.snes.getConvergedReason()
+                try:
+                    made, reason = self._solve_from_guess(stiffness_changed)
+                except PETSc.Error as error:
+                    if error.ierr != _ZERO_PIVOT:
+                        raise
+                    continue  # a dense matrix that is singular
                 iterations += made
                 if reason > 0:
                     break
@@ -610,6 +634,12 @@ class ContactProblem:
         finally:
             self._whole.enter()
         return iterations, int(reason)
+
+    def _solve_from_guess(self, stiffness_changed: bool) -> tuple[int, int]:
+        if self._quasi_newton:
+            return self._solve_quasi_newton(stiffness_changed)
+        self.snes.solve(None, self._solution)
+        return self.snes.getIterationNumber(), self.snes.getConvergedReason()
 
     def _check_before(self) -> None:
         self.bulk.check_finite()
@@ -677,7 +707,9 @@ class ContactProblem:
         iterations = stalls = 0
         best, kept = np.inf, self._solution.copy()
         while True:
-            snes.setTolerances(max_it=min(_REFRESH_EVERY, self._max_it - iterations))
+            snes.setTolerances(
+                max_it=min(self._space.iterations_per_round, self._max_it - iterations)
+            )
             snes.solve(None, self._solution)
             iterations += snes.getIterationNumber()
             self._compute_residual(self._solution, self._function)

@@ -29,8 +29,13 @@ class WholeSpace:
         load: External forces at them (force).
         diagonal: Diagonal of the matrix assembled last (force/length).
         outside: Squares of load and of diagonal times state at unknowns outside of the space.
+        iterations_per_round: Iterations of L-BFGS after which H₀ is made anew from the status: one
+            costs 1/15 to 1/35 of a factorisation, and pairs taken across changes of status are
+            worth little.
         ready: Whether `fill` can be called; else `update` comes first.
     """
+
+    iterations_per_round = 20
 
     def __init__(
         self,

@@ -25,6 +25,7 @@ class Unknowns:
         n_local: Unknowns of this rank: its dofs, and the motions on the last one.
         first_motion: Global number of the first motion.
         whole: All unknowns, of which these may be a `Selection`.
+        kept: Numbers of these among this rank's share of all, ascending.
     """
 
     def __init__(self, space: fem.FunctionSpace, n_motions: int = 0) -> None:
@@ -37,6 +38,7 @@ class Unknowns:
         self.has_motions_here = n_motions > 0 and self.comm.rank == self.comm.size - 1
         self.n_local = self.n_dofs + (n_motions if self.has_motions_here else 0)
         self.first_motion = dofmap.index_map.size_global * dofmap.index_map_bs
+        self.kept: npt.NDArray[np.int32] = np.arange(self.n_local, dtype=np.int32)
 
     def vector(self) -> PETSc.Vec:
         """A new vector over the unknowns. Collective."""
@@ -79,9 +81,7 @@ class Unknowns:
 class Selection(Unknowns):
     """Some of the dofs and all of the motions, on one rank.
 
-    Attributes:
-        kept: Their numbers among all, ascending.
-        whole: All unknowns.
+    Attributes are those of `Unknowns`.
     """
 
     def __init__(self, whole: Unknowns, kept: npt.NDArray[np.int32]) -> None:
