@@ -285,17 +285,16 @@ class ContactProblem:
                     database.setValue(prefix + name, value)
                     inserted.append(prefix + name)
 
+        solvers = [part + name for part in ("", "tangent_") for name in _NAMES_A_SOLVER]
+        named = [s for s in solvers if s in given or database.hasName(prefix + s)]
+        self._condensed = self._choose_condensation(named)
+        self._set_space()
         default(given, prefix)
         default(_COMMON | _METHODS[method], prefix)
-        solvers = [prefix + part + name for part in ("", "tangent_") for name in _NAMES_A_SOLVER]
-        self._condensed = self._choose_condensation([s for s in solvers if database.hasName(s)])
-        self._set_space()
         for consistent in (False, True):
             ksp = PETSc.KSP().create(self._comm)
             ksp.setOptionsPrefix(prefix + ("tangent_" if consistent else ""))
-            options = self._space.linear_solver(
-                symmetric=self._symmetric(consistent), consistent=consistent
-            )
+            options = self._space.linear_solver(symmetric=self._symmetric(consistent))
             default(options, ksp.getOptionsPrefix())
             ksp.setFromOptions()
             self._solvers[consistent] = ksp
@@ -387,9 +386,8 @@ class ContactProblem:
         """Allocate the matrices of H₀ and of the consistent tangent. Collective."""
         self._matrices: dict[bool, PETSc.Mat] = {}
         for consistent, ksp in self._solvers.items():
-            matrix = self._space.matrix(
-                self._bulk_matrix, symmetric=self._symmetric(consistent), consistent=consistent
-            )
+            symmetric = self._symmetric(consistent)
+            matrix = self._space.matrix(self._bulk_matrix, symmetric=symmetric)
             ksp.reset()
             ksp.setOperators(matrix)
             self._matrices[consistent] = matrix
@@ -511,7 +509,6 @@ class ContactProblem:
         """H₀ = (K + αK_n + φK_t)⁻¹, all of Γc closed and sticking (section 5). Collective."""
         self._clear_pairs(consistent=False)
         self._assemble_matrix(self._matrices[False], self._stiffnesses(everywhere=True))
-        self._factor_h0()
 
     def _refresh_h0(self) -> bool:
         """Make H₀ anew from the status that the last round reached; False if none. Collective.
@@ -529,20 +526,7 @@ class ContactProblem:
         parts = self._tangents() if consistent else self._stiffnesses(everywhere=False)
         self._clear_pairs(consistent=consistent)
         self._assemble_matrix(self._matrices[consistent], parts)
-        if not consistent:
-            self._factor_h0()
         return True
-
-    def _factor_h0(self) -> None:
-        """Factor H₀ where it is dense: by Cholesky's method, or, if it is not definite, by LU."""
-        if not self._condensed:
-            return
-        ksp = self._solvers[False]
-        try:
-            ksp.setUp()
-        except PETSc.Error:
-            ksp.getPC().setType(PETSc.PC.Type.LU)
-            ksp.setUp()
 
     def _clear_pairs(self, *, consistent: bool | None = None) -> None:
         """Forget the pairs of L-BFGS and keep the factorisation, which reset() would drop too."""

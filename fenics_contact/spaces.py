@@ -67,8 +67,8 @@ class WholeSpace:
         """A new vector over the unknowns. Collective."""
         return self.unknowns.vector()
 
-    def linear_solver(self, *, symmetric: bool, consistent: bool) -> dict[str, Any]:
-        """Options of the solver for `matrix`, whose arguments these are."""
+    def linear_solver(self, *, symmetric: bool) -> dict[str, Any]:
+        """Options of the solver for `matrix`."""
         return {
             "ksp_type": "preonly",
             "pc_type": "cholesky" if symmetric else "lu",
@@ -129,7 +129,7 @@ class WholeSpace:
         forces = [f for c in self.contacts for f in _numbers(c.applied_force)]
         return self.unknowns.joined(residual, -np.array(forces))
 
-    def matrix(self, stiffness: PETSc.Mat, *, symmetric: bool, consistent: bool) -> PETSc.Mat:
+    def matrix(self, stiffness: PETSc.Mat, *, symmetric: bool) -> PETSc.Mat:
         """A new matrix for `fill`. Collective.
 
         Its pattern is that of the bulk and, with deformable or moving supports, of the pairs.
@@ -137,7 +137,6 @@ class WholeSpace:
         Args:
             stiffness: Bulk tangent over all unknowns.
             symmetric: Whether what will be filled in is symmetric.
-            consistent: Whether it is the consistent tangent, not H₀.
         """
         different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
         matrix = stiffness.copy()
