@@ -321,6 +321,7 @@ class CondensedSpace(WholeSpace):
         array[:, held] = 0.0
         array[held, held] = self.bulk.scale
         self.diagonal = np.diag(array).copy()
+        self._whole.diagonal[self.unknowns.kept] = self.diagonal  # for the round-off of contact
         array /= self.bulk.scale
         matrix.assemble()
         return 0

@@ -6,6 +6,7 @@ import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 from typing import Any
 
 import basix
@@ -219,10 +220,8 @@ class Contact:
                 "slip_increment": ufl.as_vector(response.slip),
             }
         self._evaluate_points = PointEvaluator(self.quadrature, expressions)
-        self._evaluate_traction = PointEvaluator(
-            self.quadrature, {"traction": self.weight * self._total_traction(self._jump)}
-        )
-        self._evaluate_tangent: PointEvaluator | None = None
+        self._acting = self._whole = _Reactions(self, law, parameters)
+        self._frozen: _Reactions | None = None
         self._evaluate_yield: PointEvaluator | None = None
         self._points: dict[str, Array] | None = None
         self.n_unpaired = 0
@@ -241,28 +240,23 @@ class Contact:
             return none
         return ufl.replace(self._shift, {c: ufl.as_ufl(0.0) for c in self.free_motion.values()})
 
-    def _kinematics(self, jump: Any) -> Kinematics:
-        """What the law sees of a displacement of the body at the points (UFL)."""
+    def _kinematics(self, jump: Any, law: Law | None = None) -> Kinematics:
+        """What a law, by default the contact's, sees of a displacement of the body (UFL)."""
+        law = law or self.law
         normal = self._normal
         total = increment = traction = None
 
         def tangential(vector: Any) -> Any:
             return vector - ufl.dot(vector, normal) * normal
 
-        if self.law.has_tangential:
+        if law.has_tangential:
             total = tangential(self._relative(jump))
-        if self.law.has_friction:
+        if law.has_friction:
             # The old traction and displacement are taken along the present normal: the support
             # may have moved on since the last commit.
             increment = tangential(self._relative(jump) - self.history.ufl("jump"))
             traction = tangential(self.history.ufl("traction"))
         return Kinematics(self._gap, ufl.dot(jump, normal), normal, total, increment, traction)
-
-    def _total_traction(self, jump: Any) -> Any:
-        """r_n n + τ on the body (UFL)."""
-        response = self.law.response(self._kinematics(jump), self._law_parameters)
-        total = response.normal_traction * self._normal
-        return total if response.traction is None else total + response.traction
 
     # ---- forms -----------------------------------------------------------------------------------
 
@@ -291,7 +285,8 @@ class Contact:
                 "Contact(modulus=...), give k_n and k_t in stress/length, or use ContactProblem, "
                 "which measures E in the bulk form"
             )
-        return -self.weight * ufl.dot(self._total_traction(self.u), v) * self.quadrature.ds
+        traction = self._whole.traction(self.u)
+        return -self.weight * ufl.dot(traction, v) * self.quadrature.ds
 
     def potential(self) -> ufl.Form:
         """Energy whose derivative by ``u`` is `form` (eq. 19, 43).
@@ -364,16 +359,14 @@ class Contact:
         points: the law is evaluated on Γc alone, whatever the element of the bulk.
         """
         self._update_jump()
-        traction = self._evaluate_traction()["traction"]
+        traction = self._acting.evaluate_traction()["traction"]
         self._reaction.array[:] = -(self.quadrature.weights[:, None] * traction).ravel()
         self._felt_map.multTransposeAdd(self._reaction, residual, residual)
 
     def tangent_matrix(self) -> PETSc.Mat:
         """`tangent`, assembled at the present ``u``, a new matrix over the unknowns. Collective."""
-        if self._evaluate_tangent is None:
-            self._evaluate_tangent = self._tangent_evaluator()
         self._update_jump()
-        rows = self._evaluate_tangent()
+        rows = self._acting.evaluate_tangent()
         by_jump = -np.stack([rows[f"jump {i}"] for i in range(self._gdim)], axis=1)
         if not self.free_motion:
             return self._matrix(by_jump)
@@ -388,22 +381,37 @@ class Contact:
             item.destroy()
         return product
 
-    def _tangent_evaluator(self) -> PointEvaluator:
-        """Derivatives of the traction by the jump and the free motion of the support."""
-        d = self._gdim
-        jump = ufl.variable(self._jump)
-        derivative = ufl.diff(self._total_traction(jump), jump)
-        rows = {f"jump {i}": self.weight * derivative[i, :] for i in range(d)}
-        if self.free_motion:
-            traction, none = self._total_traction(self._jump), ufl.as_vector([0.0] * d)
-            by_shift = [
-                ufl.diff(traction, self._free_shift[i]) if i in self._free_shift else none
-                for i in range(d)
-            ]
-            for i in range(d):
-                row = ufl.as_vector([column[i] for column in by_shift])
-                rows[f"shift {i}"] = self.weight * row
-        return PointEvaluator(self.quadrature, rows)
+    def energy(self) -> float:
+        """`potential` at the present ``u``, this rank's points only. Collective.
+
+        Raises:
+            ValueError: The law has none.
+        """
+        self._update_jump()
+        return float(self.quadrature.weights @ self._acting.evaluate_potential()["potential"])
+
+    def freeze(self, pressure: Array) -> None:
+        """Let `Law.at_pressure` act. Collective.
+
+        `add_force`, `tangent_matrix` and `energy` are those of the acting law; results are not.
+
+        Args:
+            pressure: ≥ 0, shape (n_points,) (stress).
+        """
+        if self.law.has_potential:
+            return
+        if self._frozen is None:
+            self._pressure = fem.Function(self.quadrature.space(), name="pressure")
+            law = self.law.at_pressure(self._pressure)
+            parameters = self._law_parameters | {"pressure": self._pressure}
+            self._frozen = _Reactions(self, law, parameters)
+        self._pressure.x.array[: self.quadrature.n_points] = pressure
+        self._pressure.x.scatter_forward()
+        self._acting = self._frozen
+
+    def thaw(self) -> None:
+        """Let the law itself act again."""
+        self._acting = self._whole
 
     def stiffness_matrix(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> PETSc.Mat:
         """Symmetric stiffness a K_n + b K_t of section 5, new, over the unknowns. Collective.
@@ -865,3 +873,53 @@ def _displacement_degree(u: fem.Function, mesh: Any, name: str) -> int:
             "Lagrange element of degree 1 or higher"
         )
     return int(basis.degree)
+
+
+class _Reactions:
+    """What a law makes of the jump at the points: evaluators, compiled when first called."""
+
+    def __init__(self, contact: Contact, law: Law, parameters: Mapping[str, Any]) -> None:
+        self._contact, self._law, self._parameters = weakref.proxy(contact), law, parameters
+
+    def traction(self, jump: Any) -> Any:
+        """r_n n + τ on the body (UFL)."""
+        contact = self._contact
+        response = self._law.response(contact._kinematics(jump, self._law), self._parameters)
+        total = response.normal_traction * contact._normal
+        return total if response.traction is None else total + response.traction
+
+    @cached_property
+    def evaluate_traction(self) -> PointEvaluator:
+        """Weighted "traction", (n_points, gdim)."""
+        traction = self._contact.weight * self.traction(self._contact._jump)
+        return PointEvaluator(self._contact.quadrature, {"traction": traction})
+
+    @cached_property
+    def evaluate_potential(self) -> PointEvaluator:
+        """The weighted "potential" per area, (n_points,)."""
+        contact = self._contact
+        kinematics = contact._kinematics(contact._jump, self._law)
+        density = self._law.potential(kinematics, self._parameters)
+        return PointEvaluator(contact.quadrature, {"potential": contact.weight * density})
+
+    @cached_property
+    def evaluate_tangent(self) -> PointEvaluator:
+        """Weighted derivatives of the traction, row by row, (n_points, gdim).
+
+        By the jump, "jump i", and by the free motion of the support, "shift i".
+        """
+        contact = self._contact
+        d, weight = contact._gdim, contact.weight
+        jump = ufl.variable(contact._jump)
+        derivative = ufl.diff(self.traction(jump), jump)
+        rows = {f"jump {i}": weight * derivative[i, :] for i in range(d)}
+        if contact.free_motion:
+            traction, none = self.traction(contact._jump), ufl.as_vector([0.0] * d)
+            by_shift = [
+                ufl.diff(traction, contact._free_shift[i]) if i in contact._free_shift else none
+                for i in range(d)
+            ]
+            for i in range(d):
+                row = ufl.as_vector([column[i] for column in by_shift])
+                rows[f"shift {i}"] = weight * row
+        return PointEvaluator(contact.quadrature, rows)

@@ -172,6 +172,14 @@ class Law:
             f"{type(self).__name__} has no potential: its slip is not associated (eq. 46)"
         )
 
+    def at_pressure(self, pressure: Expr) -> Law:
+        """A law with a potential that is this one where ``pressure`` is the contact pressure.
+
+        Args:
+            pressure: Taken for given where this law has no potential, ≥ 0 (stress).
+        """
+        return self
+
     def n_modes(self, gdim: int) -> int:
         """Number of slip modes."""
         return 0
@@ -619,6 +627,11 @@ class Coulomb(FrictionLaw):
     def parameters(self) -> dict[str, Any]:
         """See `Law.parameters`."""
         return self._friction_parameters() | {"k_n": self.k_n}
+
+    def at_pressure(self, pressure: Expr) -> Law:
+        """See `Law.at_pressure`: the pressure sets the limit of friction, and nothing else."""
+        shape = (self.modes, self.transverse_friction, self.direction)
+        return Tresca(self.friction, pressure, self.k_n, self.k_t, True, *shape)
 
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """See `Law.response`. Where the gap is open τ = 0, and moving is not slipping."""

@@ -16,6 +16,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact import accuracy, compat
+from fenics_contact.alternating import Alternation
 from fenics_contact.bulk import Bulk
 from fenics_contact.condense import CondensedSpace, touched, worthwhile
 from fenics_contact.contact import Contact, Resultants, Status
@@ -74,6 +75,7 @@ _METHODS: dict[str, dict[str, Any]] = {
         "qn_mat_lmvm_eps": 0.0,  # else pairs are dropped by a test that depends on the units
     },
     "newton": {"snes_type": "newtonls", "snes_max_it": 100},
+    "alternating": {},
 }
 
 
@@ -85,6 +87,7 @@ class Step:
         increment: Number of the increment, from 1.
         reason: SNES reason of the last solve (positive: converged).
         iterations: SNES iterations in all.
+        method: The method that found the solution; see `ContactProblem`.
         factorisations: Matrices factored.
         verdict: The independent check.
         contacts: Resultants of every contact, by name.
@@ -96,6 +99,7 @@ class Step:
     increment: int
     reason: int
     iterations: int
+    method: str
     factorisations: int
     verdict: Verdict
     contacts: dict[str, Resultants]
@@ -147,6 +151,7 @@ class ContactProblem:
         method: str = "lbfgs",
         alpha: float = 1.0,
         phi: float = 1.0,
+        fallback: bool = True,
         condensation: bool | None = None,
         petsc_options: Mapping[str, Any] | None = None,
         prefix: str = "contact_",
@@ -158,11 +163,14 @@ class ContactProblem:
             u: Displacement; its values are the starting state.
             bcs: Dirichlet conditions on ``u`` or its components.
             contacts: Contacts of ``u``.
-            method: "lbfgs" (quasi-Newton, H₀ = (K + αK_n + φK_t)⁻¹) or "newton" (consistent
-                tangent).
+            method: "lbfgs" (quasi-Newton, H₀ = (K + αK_n + φK_t)⁻¹), "newton" (consistent
+                tangent), or "alternating" (minimum problems in turn, each by Newton's method with
+                a line search on the energy).
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
                 paper has 0; 1 needs a third of the iterations once a point sticks.
+            fallback: Whether to alternate where the method fails with no less than its usual
+                limit on iterations.
             condensation: Whether to iterate on the unknowns that contact touches alone, all others
                 eliminated: for a linear bulk on one rank. By default where it can be done and is
                 worth it (`condense.worthwhile`), unless an option names a linear solver.
@@ -217,7 +225,8 @@ class ContactProblem:
         self._committed_energy = EnergyState.unloaded(self._committed, self.contacts)
         self._energy = self._committed_energy
         self._rate: Array | None = None
-        self._condensation, self._prefix = condensation, prefix
+        self._condensation = condensation
+        self.prefix, self._method, self._fallback = prefix, method, fallback
         self._configure(method, dict(petsc_options or {}), prefix)
 
     # ---- construction ----------------------------------------------------------------------------
@@ -308,13 +317,14 @@ class ContactProblem:
         self._quasi_newton = snes.getType() == PETSc.SNES.Type.QN
         self._attach(consistent=not self._quasi_newton)
         snes.setUp()
+        self._alternation = Alternation(self, default)
         for key in inserted:
             database.delValue(key)
         self._rtol = snes.getTolerances()[0]
         self._max_it = snes.getTolerances()[3]
 
     def _symmetric(self, consistent: bool) -> bool:
-        return self.bulk.symmetric and (not consistent or self._has_potential)
+        return self.bulk.symmetric and (not consistent or self.has_potential)
 
     def _choose_condensation(self, solvers: Sequence[str]) -> bool:
         """Whether to iterate on the unknowns that contact touches alone. Collective.
@@ -354,7 +364,7 @@ class ContactProblem:
         if self._condensed:
             kept = touched(self.contacts, self.unknowns) if kept is None else kept
             self._space = CondensedSpace(
-                self._whole, Selection(self.unknowns, kept), prefix=self._prefix + "interior_"
+                self._whole, Selection(self.unknowns, kept), prefix=self.prefix + "interior_"
             )
             logger.info("condensed onto %d of %d unknowns", kept.size, self.unknowns.n_local)
         self._pairings = [c.pairings for c in self.contacts]
@@ -408,7 +418,8 @@ class ContactProblem:
         self.snes.setConvergenceTest(lambda _, it, norms: this._test_convergence(norms))
 
     @property
-    def _has_potential(self) -> bool:
+    def has_potential(self) -> bool:
+        """Whether every contact law has one."""
         return all(c.law.has_potential for c in self.contacts)
 
     # ---- SNES callbacks --------------------------------------------------------------------------
@@ -425,6 +436,14 @@ class ContactProblem:
             self._measure_norms(self._space, total, contact)
             total[self._space.constrained] = 0.0
             f.array[:] = total / (self.bulk.scale * self._length)
+
+    def _energy_at(self, x: PETSc.Vec) -> float:
+        """Potential of a linear bulk and contacts, dimensionless as SNES sees it. Collective."""
+        self._set_u(x)
+        with np.errstate(all="ignore"):
+            energy = self._space.bulk_energy() + sum(c.energy() for c in self.contacts)
+        total = float(global_sum(self._comm, energy))
+        return total / (self.bulk.scale * self._length**2)
 
     def _measure_norms(self, space: WholeSpace, total: Array, contact: Array) -> None:
         """Norms in force: the free residual, the forces it is compared with, and round-off."""
@@ -510,6 +529,10 @@ class ContactProblem:
         self._clear_pairs(consistent=False)
         self._assemble_matrix(self._matrices[False], self._stiffnesses(everywhere=True))
 
+    def drop_h0(self) -> None:
+        """Say that the matrix of H₀ was used for something else."""
+        self._has_h0 = False
+
     def _refresh_h0(self) -> bool:
         """Make H₀ anew from the status that the last round reached; False if none. Collective.
 
@@ -522,7 +545,7 @@ class ContactProblem:
             return False
         for contact in self.contacts:
             contact.evaluate()
-        consistent = not self._has_potential and self.motions.held(self.contacts, closed_only=True)
+        consistent = not self.has_potential and self.motions.held(self.contacts, closed_only=True)
         parts = self._tangents() if consistent else self._stiffnesses(everywhere=False)
         self._clear_pairs(consistent=consistent)
         self._assemble_matrix(self._matrices[consistent], parts)
@@ -582,7 +605,7 @@ class ContactProblem:
         self._update_space(stiffness_changed)
         self._approach()
         self._space.begin(self._load)
-        iterations, reason = self._iterate(ahead, stiffness_changed)
+        iterations, reason, method = self._iterate(ahead, stiffness_changed)
         self._space.complete()
         verdict = self._judge()
         if reason <= 0 or verdict.failures:
@@ -591,6 +614,7 @@ class ContactProblem:
             increment=self.increment + 1,
             reason=int(reason),
             iterations=iterations,
+            method=method,
             factorisations=self._factorisations,
             verdict=verdict,
             contacts={c.name: c.resultants() for c in self.contacts},
@@ -598,15 +622,26 @@ class ContactProblem:
             wall_seconds=time.perf_counter() - start,
         )
 
-    def _iterate(self, ahead: float, stiffness_changed: bool) -> tuple[int, int]:
-        """Iterate from one start after another; iterations and reason. Collective."""
-        iterations, reason = 0, PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
+    def _iterate(self, ahead: float, stiffness_changed: bool) -> tuple[int, int, str]:
+        """Iterate from one start after another, then alternate if that failed. Collective.
+
+        Returns:
+            Iterations, reason, and the method that found the solution.
+        """
+        iterations, reason = 0, int(PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE)
+        method = self._method
         self._space.enter()
         try:
-            for guess in self._starts(ahead):
-                self._solution.array[:] = self._space.part(guess) / self._length
+            starts = [self._space.part(start) / self._length for start in self._starts(ahead)]
+            tries = [(start, method) for start in starts]
+            if method == "alternating":
+                del tries[1:]
+            elif self._may_alternate():
+                tries.append((starts[0], "alternating"))
+            for start, method in tries:
+                self._solution.array[:] = start
                 try:
-                    made, reason = self._solve_from_guess(stiffness_changed)
+                    made, reason = self._solve_by(method, stiffness_changed)
                 except PETSc.Error as error:
                     if error.ierr != _ZERO_PIVOT:
                         raise
@@ -614,16 +649,26 @@ class ContactProblem:
                 iterations += made
                 if reason > 0:
                     break
+            if method != self._method and self._comm.rank == 0:
+                logger.info("increment %d: %s failed, alternated", self.increment + 1, self._method)
             self._set_u(self._solution)
         finally:
             self._whole.enter()
-        return iterations, int(reason)
+        return iterations, int(reason), method
 
-    def _solve_from_guess(self, stiffness_changed: bool) -> tuple[int, int]:
+    def _solve_by(self, method: str, stiffness_changed: bool) -> tuple[int, int]:
+        """Iterations and reason of one method, from ``_solution``. Collective."""
+        if method == "alternating":
+            return self._alternation.solve(self._solution)
         if self._quasi_newton:
             return self._solve_quasi_newton(stiffness_changed)
         self.snes.solve(None, self._solution)
         return self.snes.getIterationNumber(), self.snes.getConvergedReason()
+
+    def _may_alternate(self) -> bool:
+        """Whether to alternate after a failure: not if iterations are rationed by the caller."""
+        limit = self._max_it if self._quasi_newton else self.snes.getTolerances()[3]
+        return self._fallback and limit >= (_COMMON | _METHODS[self._method])["snes_max_it"]
 
     def _check_before(self) -> None:
         self.bulk.check_finite()

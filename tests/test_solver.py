@@ -725,7 +725,7 @@ def test_a_wrong_contact_residual_is_caught(method, factor):
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_a_premature_end_is_caught(method, monkeypatch):
     """SNES that claims convergence at its first look is not believed; the state is as before."""
-    made = rub(method=method)
+    made = rub(method=method, fallback=False)
     walk(made, path=PATH[:1])
     before = snapshot(made)
     made.move(*PATH[2])

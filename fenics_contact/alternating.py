@@ -1,0 +1,182 @@
+"""Minimum problems one after another: contact with friction of given limit, then a new limit.
+
+Coulomb's law has no potential. Given the pressure that sets the limit of friction, unilateral
+contact with friction has one (Signorini with Tresca or Duvaut-Lions, section 3): Newton's method
+with a line search on the energy solves it however stiff it is. The pressure that comes out sets the
+next limit, until the whole law holds. Each cycle gains a constant factor, the less the larger the
+friction is.
+
+The paper's conclusion takes the normal and the tangential reaction apart, one given while the other
+is sought. That needs ten times the steps (half-cylinder, μ = 0.2: 228 against 25), and a body that
+contact alone holds is loose in either.
+"""
+
+from __future__ import annotations
+
+import logging
+import weakref
+from collections.abc import Callable
+from itertools import chain
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+__all__ = ["OPTIONS", "Alternation"]
+
+Array = npt.NDArray[np.float64]
+logger = logging.getLogger("fenics_contact")
+
+OPTIONS = {
+    "snes_type": "newtonls",
+    "snes_rtol": 0.0,
+    "snes_stol": 0.0,
+    "snes_atol": 0.0,
+    "snes_max_it": 200,
+    "snes_linesearch_type": "bt",
+    "snes_linesearch_max_it": 40,
+}
+# Newton steps without line search finish where the energy has no digits left.
+_FINISH = OPTIONS | {"snes_max_it": 5, "snes_linesearch_type": "basic"}
+# Cycles before it is given up, and cycles in a row that may pass without a lower residual.
+_MAX_CYCLES = 200
+_MAX_STALLS = 20
+# Cycles without a lower residual after which only half of the change of the limit is taken, and the
+# least share: two cycles may undo one another.
+_PATIENCE = 2
+_LEAST = 1 / 8
+# Share of the whole law's residual to which a subproblem is solved: more would be lost again.
+_INNER = 1e-2
+# Share of k_t that keeps a slipping body in place in the matrix (not in the equations).
+_STILL = 1e-6
+
+
+class Alternation:
+    """The method, on the unknowns, matrices and measures of a problem.
+
+    Attributes:
+        snes: Newton's method for the subproblems, prefix "alternating_" behind the problem's.
+    """
+
+    def __init__(self, problem: Any, set_defaults: Callable[[dict[str, Any], str], None]) -> None:
+        """Set up SNES; the matrices are those of H₀. Collective.
+
+        Args:
+            problem: The `ContactProblem`.
+            set_defaults: Puts options with a prefix into the database where they are not set.
+        """
+        self._problem = weakref.proxy(problem)
+        self._function: PETSc.Vec | None = None
+        self.snes = self._make_snes(f"{problem.prefix}alternating_", OPTIONS, set_defaults)
+        self._finish = self._make_snes(f"{problem.prefix}finishing_", _FINISH, set_defaults)
+        self._goal = 0.0
+
+    def _make_snes(
+        self,
+        prefix: str,
+        options: dict[str, Any],
+        set_defaults: Callable[[dict[str, Any], str], None],
+    ) -> PETSc.SNES:
+        snes = PETSc.SNES().create(self._problem.u.function_space.mesh.comm)
+        snes.setOptionsPrefix(prefix)
+        set_defaults(options, prefix)
+        snes.setFromOptions()
+        return snes
+
+    def _attach(self) -> None:
+        """Take the vectors, matrices and solver of H₀ of the problem's present space."""
+        problem = self._problem
+        new = self._function is not problem._function
+        self._function = problem._function
+        for snes in (self.snes, self._finish):
+            if new:
+                snes.reset()
+            snes.setKSP(problem._solvers[False])
+            snes.setJacobian(lambda _, x, J, P: self._assemble(x, J), problem._matrices[False])
+            snes.setFunction(lambda _, x, f: self._problem._compute_residual(x, f), self._function)
+            snes.setConvergenceTest(lambda _, it, norms: self._test(norms[2]))
+        if problem.bulk.linear:
+            self.snes.setObjective(lambda _, x: self._problem._energy_at(x))
+
+    def solve(self, solution: PETSc.Vec) -> tuple[int, int]:
+        """Solve the problem from ``solution`` on. Collective.
+
+        Returns:
+            Newton iterations in all, and the reason as SNES has them.
+        """
+        problem, reasons = self._problem, PETSc.SNES.ConvergedReason
+        self._attach()
+        iterations = stalls = 0
+        best = np.inf
+        relaxation = 1.0
+        try:
+            residual = self._residual(solution)
+            pressure: Array = self._pressure()
+            for cycle in range(_MAX_CYCLES):
+                ends = np.cumsum([c.quadrature.n_points for c in problem.contacts])[:-1]
+                for contact, part in zip(problem.contacts, np.split(pressure, ends), strict=True):
+                    contact.freeze(part)
+                share = 0.0 if problem.has_potential else _INNER
+                self._goal = max(problem._tolerance(), share * residual)
+                iterations += self._minimise(solution)
+                residual = self._residual(solution)
+                if residual <= problem._tolerance():
+                    logger.debug("%d cycles, %d Newton iterations", cycle + 1, iterations)
+                    return iterations, int(reasons.CONVERGED_FNORM_RELATIVE)
+                stalls = 0 if residual < best else stalls + 1
+                best = min(best, residual)
+                if not np.isfinite(residual) or stalls > _MAX_STALLS or problem.has_potential:
+                    return iterations, int(reasons.DIVERGED_LINE_SEARCH)
+                if stalls and stalls % _PATIENCE == 0:
+                    relaxation = max(relaxation / 2, _LEAST)
+                pressure = pressure + relaxation * (self._pressure() - pressure)
+            return iterations, int(reasons.DIVERGED_MAX_IT)
+        finally:
+            problem.drop_h0()
+            for contact in problem.contacts:
+                contact.thaw()
+
+    def _pressure(self) -> Array:
+        """Of all contacts at this rank's points."""
+        contacts = self._problem.contacts
+        for contact in contacts:
+            contact.evaluate()
+        return np.concatenate([contact.pressure for contact in contacts])
+
+    def _residual(self, solution: PETSc.Vec) -> float:
+        """That of the whole law."""
+        for contact in self._problem.contacts:
+            contact.thaw()
+        self._problem._compute_residual(solution, self._function)
+        return float(self._problem._norms["residual"])
+
+    def _minimise(self, solution: PETSc.Vec) -> int:
+        """Newton's method with the line search on the energy, then without any."""
+        self.snes.solve(None, solution)
+        made: int = self.snes.getIterationNumber()
+        if self.snes.getConvergedReason() <= 0:
+            # The last digits of the residual are below the rounding of the energy.
+            self._finish.solve(None, solution)
+            made += self._finish.getIterationNumber()
+        return made
+
+    def _test(self, norm: float) -> int:
+        reasons = PETSc.SNES.ConvergedReason
+        if not np.isfinite(norm):
+            return int(reasons.DIVERGED_FNORM_NAN)
+        converged = self._problem._norms["residual"] <= self._goal
+        return int(reasons.CONVERGED_FNORM_RELATIVE if converged else reasons.ITERATING)
+
+    def _assemble(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
+        problem = self._problem
+        problem._set_u(x)
+        problem._update_bulk()
+        for contact in problem.contacts:
+            contact.evaluate()
+        if not problem.motions.held(problem.contacts, closed_only=True):
+            problem._assemble_matrix(matrix, problem._stiffnesses(everywhere=True))
+            return
+        # Where all slips, what nothing but friction holds would be loose.
+        still = (c.stiffness_matrix(0.0, _STILL) for c in problem.contacts)
+        problem._assemble_matrix(matrix, chain(problem._tangents(), still))

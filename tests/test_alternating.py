@@ -1,0 +1,215 @@
+"""Alternation of minimum problems: the direct solution's, and what the direct methods cannot do."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+from scenes import GRID, TOP, block, close, gathered, owned, wave
+
+import fenics_contact as fc
+
+COMM = MPI.COMM_WORLD
+
+
+def cushion(d: int, **kwargs) -> fc.Ball:
+    """A ball that just touches the middle of the block's bottom."""
+    center = np.full(d, 0.5)
+    center[-1] = -2.0
+    return fc.Ball(center, 2.0, **kwargs)
+
+
+def pressed(cell, law, method, *, degree=1, side=0.01, down=0.03, n=4, **options):
+    """A block pressed on a cushion and moved along it, solved."""
+    scene = block(cell, degree, n=n)
+    d = scene.dim
+    move = np.zeros(d)
+    move[0], move[-1] = side, -down
+    bcs = [scene.hold(TOP, i, value) for i, value in enumerate(move)]
+    problem, contact = scene.problem(
+        law, bcs, contact={"support": cushion(d)}, method=method, **options
+    )
+    return scene, problem, contact
+
+
+@pytest.mark.parametrize(("cell", "degree"), GRID)
+def test_the_same_solution(cell, degree):
+    """Both satisfy the whole law to the solver's tolerance of 1e-9: states agree to 1e-6."""
+    law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
+    states = []
+    for method in ("alternating", "newton"):
+        scene, problem, contact = pressed(cell, law, method, degree=degree, n=3, side=0.06)
+        step = problem.solve()
+        assert step.method == method
+        r = step.contacts["contact"]
+        assert r.slip > 0 and not step.verdict.failures
+        states.append((gathered(COMM, owned(scene.u)), r.force))
+        assert contact.history.values("slip").max(initial=0.0) == 0.0  # nothing is committed
+    for a, b in zip(*states, strict=True):
+        assert close(a, b, 1e-6)
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        fc.Frictionless(k_n=2e4),
+        fc.Tresca(0.3, 10.0, k_n=2e4, k_t=1e4),
+        fc.Coulomb(0.3, k_n=2e4, k_t=1e4, modes=6),
+        fc.Coulomb(0.4, k_n=2e4, k_t=1e4, transverse_friction=0.2, direction=(1, 1, 0)),
+        fc.Foundation(1e4, 1e3),
+    ],
+    ids=["frictionless", "tresca", "polygon", "ellipse", "foundation"],
+)
+def test_every_law(law):
+    """Laws with a potential are one minimum problem; anisotropic friction is like isotropic."""
+    forces = []
+    for method in ("alternating", "newton"):
+        _, problem, _ = pressed("hexahedron", law, method)
+        forces.append(problem.solve().contacts["contact"].force)
+    assert close(*forces, 1e-6)
+
+
+def test_history_and_increments():
+    """Over a cycle of loads both methods keep the same history."""
+    ends = []
+    for method in ("alternating", "lbfgs"):
+        scene = block("quadrilateral", 1, n=4)
+        push = [fem.Constant(scene.mesh, 0.0) for _ in range(2)]
+        bcs = [scene.hold(TOP, i, c) for i, c in enumerate(push)]
+        law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
+        problem, contact = scene.problem(law, bcs, contact={"support": cushion(2)}, method=method)
+
+        def load(t, push=push):
+            push[1].value = -0.03 * min(t, 1.0)
+            push[0].value = np.interp(t, [1, 2, 4], [0, 0.05, -0.05])
+
+        list(fc.increments(problem, load, 0.0, 4.0, steps=8))
+        ends.append(gathered(COMM, contact.history.rows()))
+    assert close(*ends, 1e-5)
+
+
+def test_a_body_held_by_friction_alone():
+    """Nothing but friction holds the block: the normal problem alone would leave it loose."""
+    forces = []
+    for method in ("alternating", "newton"):
+        scene = block("triangle", 1, n=4, up=-1.0, side=0.15)
+        problem, _ = scene.problem(fc.Coulomb(0.3, k_n=1e5, k_t=1e5), [], method=method)
+        forces.append(problem.solve().contacts["contact"].force)
+    assert close(*forces, 1e-6)
+
+
+def test_a_driven_support():
+    """A support that is pressed by a force, and then dragged by another."""
+    motions = []
+    for method in ("alternating", "newton"):
+        scene = block("quadrilateral", 1, n=4)
+        drag = fem.Constant(scene.mesh, 0.0)
+        support = cushion(2, displacement=fc.Motion(force=(drag, 5.0)))
+        bcs = [scene.hold(TOP, i) for i in range(2)]
+        law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
+        problem, contact = scene.problem(law, bcs, contact={"support": support}, method=method)
+        for drag.value in (0.0, 0.4):
+            problem.solve()
+            problem.commit()
+        motions.append([float(c.value) for c in contact.free_motion.values()])
+    assert close(*motions, 1e-6)
+
+
+@pytest.mark.parametrize("condensation", [False, None])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_the_residual_is_the_gradient_of_the_energy(cell, condensation):
+    """With the limit of friction frozen: central differences, 1e-6.
+
+    On all unknowns, and on those of contact alone where that is the choice.
+    """
+    law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
+    scene, problem, contact = pressed(cell, law, "newton", side=0.03, condensation=condensation)
+    problem.solve()
+    problem.commit()
+    contact.freeze(contact.pressure)
+    space = problem._space
+    space.enter()
+    x = problem._solution.copy()
+    f, y, z = x.duplicate(), x.duplicate(), x.duplicate()
+    direction = fem.Function(scene.u.function_space)
+    direction.interpolate(wave(scene.dim, 3))
+    y.array[:] = np.where(space.constrained, 0.0, space.part(owned(direction)))
+    x.axpy(0.02, y)  # away from the solution, where slopes are not zero
+    problem._compute_residual(x, f)
+    slope, step = f.dot(y), 1e-5
+    energies = []
+    for sign in (1, -1):
+        x.copy(z)
+        z.axpy(sign * step, y)
+        energies.append(problem._energy_at(z))
+    assert slope != 0.0
+    assert close((energies[0] - energies[1]) / (2 * step), slope, 1e-6)
+    contact.thaw()
+
+
+@pytest.mark.parametrize(("factor", "friction"), [(1e6, 0.0), (1e8, 0.0), (1e4, 0.3)])
+def test_stiff_contact_from_a_cold_start(factor, friction):
+    """k_n h/E up to 1e8, with friction to 1e4, in one increment: penetration is next to none.
+
+    At 1e4 and more the pressures are those of hard contact; compared with 1e3, whose error is of
+    the order of 1e-3, to 1e-2.
+    """
+    peaks = []
+    for scaled in (fc.Scaled(1e3), fc.Scaled(factor)):
+        law = fc.Coulomb(friction, scaled, scaled) if friction else fc.Frictionless(scaled)
+        _, problem, _ = pressed("quadrilateral", law, "alternating", n=8, side=0.0)
+        step = problem.solve()
+        r = step.contacts["contact"]
+        peaks.append(r.normal_force)
+    assert close(peaks[1], peaks[0], 1e-2)
+    assert r.max_penetration < 1e-1 / factor
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+def test_used_by_itself_where_the_method_fails(method):
+    """Stiff friction that the direct methods do not solve from a cold start is solved all the same.
+
+    Without the fallback they say that they failed.
+    """
+    stiff = fc.Scaled(1e4)
+    law = fc.Coulomb(0.3, stiff, stiff)
+    _, problem, _ = pressed("quadrilateral", law, method, n=12, side=0.02, fallback=False)
+    with pytest.raises(fc.NotConverged):
+        problem.solve()
+    _, problem, _ = pressed("quadrilateral", law, method, n=12, side=0.02)
+    step = problem.solve()
+    assert step.method == "alternating"
+    assert not step.verdict.failures
+
+
+def test_rationed_iterations_are_not_exceeded():
+    """Who limits the iterations gets no others instead."""
+    law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
+    _, problem, _ = pressed("triangle", law, "newton", petsc_options={"snes_max_it": 1})
+    with pytest.raises(fc.NotConverged) as caught:
+        problem.solve()
+    assert caught.value.reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT
+
+
+def test_its_options_are_reached():
+    """The subproblems' solver takes options under its own prefix."""
+    law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
+    options = {"alternating_snes_max_it": 7}
+    _, problem, _ = pressed("triangle", law, "alternating", petsc_options=options)
+    assert problem._alternation.snes.getTolerances()[3] == 7
+
+
+def test_a_nonlinear_bulk():
+    """Without an energy at hand the line search looks at the residual; the solution is the same."""
+    ends = []
+    for method in ("alternating", "newton"):
+        scene = block("quadrilateral", 1, n=4)
+        v = ufl.TestFunction(scene.u.function_space)
+        scene.F += 1e4 * ufl.dot(scene.u, scene.u) * ufl.dot(scene.u, v) * ufl.dx
+        bcs = [scene.hold(TOP, 0, 0.005), scene.hold(TOP, 1, -0.03)]
+        law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
+        problem, _ = scene.problem(law, bcs, contact={"support": cushion(2)}, method=method)
+        problem.solve()
+        ends.append(gathered(COMM, owned(scene.u)))
+    assert close(*ends, 1e-6)
