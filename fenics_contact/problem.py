@@ -88,7 +88,7 @@ class Step:
         reason: SNES reason of the last solve (positive: converged).
         iterations: SNES iterations in all.
         method: The method that found the solution; see `ContactProblem`.
-        factorisations: Matrices factored.
+        factorisations: Sparse matrices factored; dense ones of a condensed problem do not count.
         verdict: The independent check.
         contacts: Resultants of every contact, by name.
         energy: Works and energies of the increment.
