@@ -67,10 +67,8 @@ class Alternation:
             set_defaults: Puts options with a prefix into the database where they are not set.
         """
         self._problem = weakref.proxy(problem)
-        self._function = problem.unknowns.vector()
+        self._function: PETSc.Vec | None = None
         self.snes = self._make_snes(f"{problem.prefix}alternating_", OPTIONS, set_defaults)
-        if problem.bulk.linear:
-            self.snes.setObjective(lambda _, x: self._problem._energy_at(x))
         self._finish = self._make_snes(f"{problem.prefix}finishing_", _FINISH, set_defaults)
         self._goal = 0.0
 
@@ -83,10 +81,23 @@ class Alternation:
         snes = PETSc.SNES().create(self._problem.u.function_space.mesh.comm)
         snes.setOptionsPrefix(prefix)
         set_defaults(options, prefix)
-        snes.setFunction(lambda _, x, f: self._problem._compute_residual(x, f), self._function)
-        snes.setConvergenceTest(lambda _, it, norms: self._test(norms[2]))
         snes.setFromOptions()
         return snes
+
+    def _attach(self) -> None:
+        """Take the vectors, matrices and solver of H₀ of the problem's present space."""
+        problem = self._problem
+        new = self._function is not problem._function
+        self._function = problem._function
+        for snes in (self.snes, self._finish):
+            if new:
+                snes.reset()
+            snes.setKSP(problem._solvers[False])
+            snes.setJacobian(lambda _, x, J, P: self._assemble(x, J), problem._matrices[False])
+            snes.setFunction(lambda _, x, f: self._problem._compute_residual(x, f), self._function)
+            snes.setConvergenceTest(lambda _, it, norms: self._test(norms[2]))
+        if problem.bulk.linear:
+            self.snes.setObjective(lambda _, x: self._problem._energy_at(x))
 
     def solve(self, solution: PETSc.Vec) -> tuple[int, int]:
         """Solve the problem from ``solution`` on. Collective.
@@ -95,9 +106,7 @@ class Alternation:
             Newton iterations in all, and the reason as SNES has them.
         """
         problem, reasons = self._problem, PETSc.SNES.ConvergedReason
-        for snes in (self.snes, self._finish):
-            snes.setKSP(problem._solvers[False])
-            snes.setJacobian(lambda _, x, J, P: self._assemble(x, J), problem._matrices[False])
+        self._attach()
         iterations = stalls = 0
         best = np.inf
         relaxation = 1.0

@@ -185,7 +185,8 @@ class Contact:
         self._map = self._own_map
         self._unknowns = Unknowns(u.function_space)
         self._first_motion = 0
-        self._felt_map = self._map
+        self._felt_maps: weakref.WeakKeyDictionary[Unknowns, PETSc.Mat]
+        self._felt_maps = weakref.WeakKeyDictionary({self._unknowns: self._map})
         self._jump = fem.Function(self.quadrature.space(gdim), name="jump")
         self._reaction = self._map.createVecLeft()
         kinematics = self._kinematics(self._jump)
@@ -308,20 +309,32 @@ class Contact:
         By default they are the dofs of ``u`` alone.
 
         Args:
-            unknowns: Those of the problem.
+            unknowns: Those of the problem, or a selection of them that has all that contact
+                touches.
             first_motion: Number of this contact's first free motion among all.
         """
         self._unknowns, self._first_motion = unknowns, first_motion
-        self._make_felt_map()
+        if unknowns not in self._felt_maps:
+            self._felt_maps[unknowns] = self._make_felt_map()
 
-    def _make_felt_map(self) -> None:
+    @property
+    def _felt_map(self) -> PETSc.Mat:
         """The map from the unknowns to the body's displacement relative to the support."""
-        self._felt_map = self._unknowns.widened(self._map)
+        return self._felt_maps[self._unknowns]
+
+    def _make_felt_map(self) -> PETSc.Mat:
+        felt = self._unknowns.widened(self._map)
         if self.free_motion:
-            self._felt_map = self._felt_map.copy()
+            felt = felt.copy()
             motions = self._motion_map()
-            self._felt_map.axpy(-1.0, motions, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+            felt.axpy(-1.0, motions, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
             motions.destroy()
+        return felt
+
+    def felt_unknowns(self) -> npt.NDArray[np.int32]:
+        """Numbers of the unknowns that contact feels or acts on, ascending. One rank only."""
+        _, columns, values = self._felt_map.getValuesCSR()
+        return np.unique(columns[values != 0.0])
 
     def _motion_map(self) -> PETSc.Mat:
         """The map from the unknowns to the free displacement of the support. Collective."""
@@ -423,9 +436,10 @@ class Contact:
 
         Collective.
         """
-        vector = self._felt_map.createVecRight()
+        felt = self._felt_maps[self._unknowns.whole]
+        vector = felt.createVecRight()
         vector.array[:] = displacement
-        self._felt_map.mult(vector, self._reaction)
+        felt.mult(vector, self._reaction)
         vector.destroy()
         return self._reaction.array.reshape(-1, self._gdim).copy()
 
@@ -574,7 +588,8 @@ class Contact:
         opposite.destroy()
         mask.destroy()
         self._map = relative
-        self._make_felt_map()
+        self._felt_maps.clear()
+        self._felt_maps[self._unknowns] = self._make_felt_map()
         self.forget()
         self.n_unpaired = int(global_sum(mesh.comm, np.count_nonzero(~paired)))
         self.pairings += 1

@@ -18,11 +18,13 @@ from petsc4py import PETSc
 from fenics_contact import accuracy, compat
 from fenics_contact.alternating import Alternation
 from fenics_contact.bulk import Bulk
+from fenics_contact.condense import CondensedSpace, touched, worthwhile
 from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.energy import Energy, EnergyState
 from fenics_contact.parallel import global_max, global_min, global_sum
 from fenics_contact.rigid import RigidMotions
-from fenics_contact.unknowns import Unknowns
+from fenics_contact.spaces import WholeSpace
+from fenics_contact.unknowns import Selection, Unknowns
 from fenics_contact.verdict import NotConverged, Verdict, check_laws
 
 __all__ = ["ContactProblem", "Step"]
@@ -33,9 +35,6 @@ logger = logging.getLogger("fenics_contact")
 # An open point keeps this share of its stiffness in H₀: enough that a body held by contact alone
 # stays held when its whole surface is open, too little to be felt as a wrong tangent.
 _OPEN_SHARE = 1e-3
-# L-BFGS iterations after which H₀ is made anew from the present contact status. One iteration costs
-# 1/15 to 1/35 of a factorisation, and pairs taken across changes of status are worth little.
-_REFRESH_EVERY = 20
 # Rounds in a row that do not lower the residual before the increment is given up: the potential may
 # fall for long before the residual does.
 _MAX_STALLS = 10
@@ -47,6 +46,8 @@ _ASTRAY = 1e3
 _MAX_FLOOR = 1e-5
 # Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
 _TOUCHING = 1e-12
+# PETSc's error for one in a dense factorisation (PETSC_ERR_MAT_LU_ZRPVT).
+_ZERO_PIVOT = 71
 
 _COMMON = {
     "snes_rtol": 1e-9,
@@ -62,7 +63,8 @@ _COMMON = {
     # `cp` takes |F·y| below this for convergence of the whole; the residual itself is tested here.
     "snes_linesearch_atol": 1e-300,
 }
-_LINEAR = {"ksp_type": "preonly", "pc_factor_mat_solver_type": "mumps"}
+# Options that only make sense for the sparse matrices over all unknowns.
+_NAMES_A_SOLVER = ("ksp_type", "pc_type", "pc_factor_mat_solver_type")
 _METHODS: dict[str, dict[str, Any]] = {
     "lbfgs": {
         "snes_type": "qn",
@@ -86,7 +88,7 @@ class Step:
         reason: SNES reason of the last solve (positive: converged).
         iterations: SNES iterations in all.
         method: The method that found the solution; see `ContactProblem`.
-        factorisations: Matrices factored.
+        factorisations: Sparse matrices factored; dense ones of a condensed problem do not count.
         verdict: The independent check.
         contacts: Resultants of every contact, by name.
         energy: Works and energies of the increment.
@@ -150,6 +152,7 @@ class ContactProblem:
         alpha: float = 1.0,
         phi: float = 1.0,
         fallback: bool = True,
+        condensation: bool | None = None,
         petsc_options: Mapping[str, Any] | None = None,
         prefix: str = "contact_",
     ) -> None:
@@ -168,6 +171,9 @@ class ContactProblem:
                 paper has 0; 1 needs a third of the iterations once a point sticks.
             fallback: Whether to alternate where the method fails with no less than its usual
                 limit on iterations.
+            condensation: Whether to iterate on the unknowns that contact touches alone, all others
+                eliminated: for a linear bulk on one rank. By default where it can be done and is
+                worth it (`condense.worthwhile`), unless an option names a linear solver.
             petsc_options: Options without prefix; they win over the method's, the command line
                 over both.
             prefix: Prefix of the options.
@@ -188,15 +194,12 @@ class ContactProblem:
         self._comm = u.function_space.mesh.comm
         self._bcs = list(bcs)
         self._alpha, self._phi = alpha, phi
-        self._motions = [c for contact in self.contacts for c in contact.free_motion.values()]
-        self.unknowns = Unknowns(u.function_space, len(self._motions))
+        n_motions = sum(len(contact.free_motion) for contact in self.contacts)
+        self.unknowns = Unknowns(u.function_space, n_motions)
         self._n_owned = self.unknowns.n_dofs
         self._constrained = self._constrained_unknowns()
         self._check_contacts()
-        first = 0
-        for contact in self.contacts:
-            contact.set_unknowns(self.unknowns, first)
-            first += len(contact.free_motion)
+        self._whole = WholeSpace(u, self.unknowns, self.bulk, self.contacts, self._constrained)
 
         self.bulk.check_finite()
         self.bulk.update()
@@ -212,18 +215,17 @@ class ContactProblem:
         self.motions.find_free(self._bulk_matrix, self._constrained)
         self.motions.check_held(self.contacts)
 
-        self._contact_vector = self.unknowns.vector()
         self._length = self.motions.size
-        self._diagonal = np.zeros(self.unknowns.n_local)
         self._factorisations = 0
         self._norms = {"residual": 0.0, "force": 0.0, "floor": 0.0}
         self.committed_force = self._start_residual = 0.0
-        self._committed = self._state()
+        self._committed = self._whole.state()
         for contact in self.contacts:
             contact.evaluate()
         self._committed_energy = EnergyState.unloaded(self._committed, self.contacts)
         self._energy = self._committed_energy
         self._rate: Array | None = None
+        self._condensation = condensation
         self.prefix, self._method, self._fallback = prefix, method, fallback
         self._configure(method, dict(petsc_options or {}), prefix)
 
@@ -292,14 +294,17 @@ class ContactProblem:
                     database.setValue(prefix + name, value)
                     inserted.append(prefix + name)
 
+        solvers = [part + name for part in ("", "tangent_") for name in _NAMES_A_SOLVER]
+        named = [s for s in solvers if s in given or database.hasName(prefix + s)]
+        self._condensed = self._choose_condensation(named)
+        self._set_space()
         default(given, prefix)
         default(_COMMON | _METHODS[method], prefix)
-        self._solution, self._function = self.unknowns.vector(), self.unknowns.vector()
         for consistent in (False, True):
             ksp = PETSc.KSP().create(self._comm)
             ksp.setOptionsPrefix(prefix + ("tangent_" if consistent else ""))
-            factorisation = {"pc_type": "cholesky" if self._symmetric(consistent) else "lu"}
-            default(_LINEAR | factorisation, ksp.getOptionsPrefix())
+            options = self._space.linear_solver(symmetric=self._symmetric(consistent))
+            default(options, ksp.getOptionsPrefix())
             ksp.setFromOptions()
             self._solvers[consistent] = ksp
         self._allocate_matrices()
@@ -321,28 +326,78 @@ class ContactProblem:
     def _symmetric(self, consistent: bool) -> bool:
         return self.bulk.symmetric and (not consistent or self.has_potential)
 
+    def _choose_condensation(self, solvers: Sequence[str]) -> bool:
+        """Whether to iterate on the unknowns that contact touches alone. Collective.
+
+        Args:
+            solvers: Options given that name a linear solver, which the dense one cannot be.
+        """
+        obstacle = None
+        if not self.contacts:
+            obstacle = "there is no contact"
+        elif not self.bulk.linear:
+            obstacle = "the bulk is not linear in u"
+        elif self._comm.size > 1:
+            obstacle = f"it takes one rank, and there are {self._comm.size}"
+        elif solvers:
+            obstacle = f"the options name a linear solver ({', '.join(solvers)})"
+        if self._condensation and obstacle:
+            raise ValueError(
+                f"condensation is True, but {obstacle}; leave it out, or give condensation=False"
+            )
+        if self._condensation is False:
+            obstacle = "the caller wants none"
+        elif self._condensation is None and not obstacle:
+            n, n_touched = self.unknowns.n_local, touched(self.contacts, self.unknowns).size
+            if not worthwhile(n, n_touched, len(self.u)):
+                obstacle = f"contact touches {n_touched} of {n} unknowns, too many to gain by it"
+        if obstacle and self._comm.rank == 0:
+            logger.info("iterating on all unknowns: %s", obstacle)
+        return obstacle is None
+
+    def _set_space(self, kept: npt.NDArray[np.int32] | None = None) -> None:
+        """Take the space to iterate in: all unknowns, or those kept, by default those touched.
+
+        Collective.
+        """
+        self._space = self._whole
+        if self._condensed:
+            kept = touched(self.contacts, self.unknowns) if kept is None else kept
+            self._space = CondensedSpace(
+                self._whole, Selection(self.unknowns, kept), prefix=self.prefix + "interior_"
+            )
+            logger.info("condensed onto %d of %d unknowns", kept.size, self.unknowns.n_local)
+        self._pairings = [c.pairings for c in self.contacts]
+        self._solution, self._function = self._space.vector(), self._space.vector()
+
+    def _update_space(self, stiffness_changed: bool) -> None:
+        """Follow changes of the pairs and of the bulk's tangent. Collective."""
+        if self._pairings != [c.pairings for c in self.contacts]:
+            if not self._condensed:
+                self._set_space()
+            else:
+                # A body that slides comes back to places where it was: what is kept grows only.
+                before = self._space.unknowns.kept
+                kept = np.union1d(before, touched(self.contacts, self.unknowns))
+                if kept.size > before.size:
+                    self._set_space(kept.astype(np.int32))
+                self._pairings = [c.pairings for c in self.contacts]
+            self.snes.reset()
+            self._make_matrices()
+        if stiffness_changed or not self._space.ready:
+            self._factorisations += self._space.update(self._bulk_matrix)
+
     def _make_matrices(self) -> None:
         """New matrices for new couplings, or to forget all that was factored. Collective."""
         self._allocate_matrices()
         self._attach(consistent=not self._quasi_newton)
 
     def _allocate_matrices(self) -> None:
-        """Allocate the matrices of H₀ and of the consistent tangent. Collective.
-
-        Their pattern is that of the bulk and, with deformable or moving supports, of the pairs.
-        """
-        self._pairings = [c.pairings for c in self.contacts]
+        """Allocate the matrices of H₀ and of the consistent tangent. Collective."""
         self._matrices: dict[bool, PETSc.Mat] = {}
-        different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
         for consistent, ksp in self._solvers.items():
-            matrix = self._bulk_matrix.copy()
-            for contact in self.contacts:
-                if contact.couples:
-                    part = contact.stiffness_matrix(1.0, 1.0)
-                    matrix.axpy(1.0, part, different)
-                    part.destroy()
-            matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
-            matrix.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric(consistent))
+            symmetric = self._symmetric(consistent)
+            matrix = self._space.matrix(self._bulk_matrix, symmetric=symmetric)
             ksp.reset()
             ksp.setOperators(matrix)
             self._matrices[consistent] = matrix
@@ -369,68 +424,40 @@ class ContactProblem:
 
     # ---- SNES callbacks --------------------------------------------------------------------------
 
-    def _state(self) -> Array:
-        """Displacement and free motions of supports at this rank's unknowns; a copy."""
-        motions = np.array([float(c.value) for c in self._motions])
-        return self.unknowns.joined(self.u.x.array[: self._n_owned], motions)
-
-    def _set_state(self, state: Array) -> None:
-        """Make a state the present one. Collective."""
-        self.u.x.array[: self._n_owned] = state[: self._n_owned]
-        self.u.x.scatter_forward()
-        for constant, value in zip(self._motions, self.unknowns.motions(state), strict=True):
-            constant.value = value
-
     def _set_u(self, x: PETSc.Vec) -> None:
-        self._set_state(x.array_r * self._length)
-
-    def _contact_force(self) -> Array:
-        """Contact part of the residual at the present state, this rank's unknowns. Collective."""
-        self._contact_vector.set(0.0)
-        for contact in self.contacts:
-            contact.add_force(self._contact_vector)
-        return self._contact_vector.array_r.copy()
-
-    def _bulk_force(self, residual: Array) -> Array:
-        """The rest of the residual: the bulk's, and the forces on free supports."""
-        return self.unknowns.joined(residual, -self._support_forces())
-
-    def _support_forces(self) -> Array:
-        return np.array([f for c in self.contacts for f in _numbers(c.applied_force)])
+        self._space.set_state(x.array_r * self._length)
 
     def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         self._set_u(x)
         # A trial of the line search may overflow; the convergence test sees it.
         with np.errstate(all="ignore"):
-            contact = self._contact_force()
-            total = self._bulk_force(self.bulk.residual()) + contact
-            self._measure_norms(total, contact)
-            total[self._constrained] = 0.0
+            contact = self._space.contact_force()
+            total = self._space.bulk_force() + contact
+            self._measure_norms(self._space, total, contact)
+            total[self._space.constrained] = 0.0
             f.array[:] = total / (self.bulk.scale * self._length)
 
     def _energy_at(self, x: PETSc.Vec) -> float:
         """Potential of a linear bulk and contacts, dimensionless as SNES sees it. Collective."""
         self._set_u(x)
         with np.errstate(all="ignore"):
-            # F(u) = K u + F(0), so that the energy is (F(u) + F(0))·u/2.
-            force = self._bulk_force(self.bulk.residual()) - self._load
-            energy = 0.5 * force @ self._state() + sum(c.energy() for c in self.contacts)
+            energy = self._space.bulk_energy() + sum(c.energy() for c in self.contacts)
         total = float(global_sum(self._comm, energy))
         return total / (self.bulk.scale * self._length**2)
 
-    def _measure_norms(self, total: Array, contact: Array) -> None:
+    def _measure_norms(self, space: WholeSpace, total: Array, contact: Array) -> None:
         """Norms in force: the free residual, the forces it is compared with, and round-off."""
-        reaction = total[self._constrained]
-        free = total[~self._constrained]
-        stiff: Array = self._diagonal * self._state()
+        reaction = total[space.constrained]
+        free = total[~space.constrained]
+        stiff: Array = space.diagonal * space.state()
         squares = global_sum(
             self._comm,
             [
                 free @ free,
                 reaction @ reaction,
                 contact @ contact,
-                self._load @ self._load,
-                stiff @ stiff,
+                space.load @ space.load + space.outside[0],
+                stiff @ stiff + space.outside[1],
             ],
         )
         residual, *forces, product = np.sqrt(squares)
@@ -476,24 +503,7 @@ class ContactProblem:
             matrix: What to fill.
             contacts: Contact's part, used up.
         """
-        subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
-        if not any(c.couples for c in self.contacts):
-            self._bulk_matrix.copy(matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        else:
-            matrix.zeroEntries()
-            matrix.axpy(1.0, self._bulk_matrix, subset)
-        for part in contacts:
-            matrix.axpy(1.0, part, subset)
-            part.destroy()
-        start, _ = matrix.getOwnershipRange()
-        rows = (start + np.flatnonzero(self._constrained)).astype(PETSc.IntType)
-        scale = self.bulk.scale
-        matrix.zeroRowsColumns(rows, diag=scale)
-        diagonal = matrix.getDiagonal()
-        self._diagonal = diagonal.array.copy()
-        diagonal.destroy()
-        matrix.scale(1.0 / scale)
-        self._factorisations += 1
+        self._factorisations += self._space.fill(matrix, self._bulk_matrix, contacts)
 
     def _tangents(self) -> Iterator[PETSc.Mat]:
         return (contact.tangent_matrix() for contact in self.contacts)
@@ -575,11 +585,11 @@ class ContactProblem:
                 can balance.
         """
         start = time.perf_counter()
-        saved = self._state()
+        saved = self._whole.state()
         try:
             step = self._solve(start, ahead)
         except BaseException:
-            self._set_state(saved)
+            self._whole.set_state(saved)
             for contact in self.contacts:
                 contact.forget()
             raise
@@ -592,29 +602,11 @@ class ContactProblem:
         self.u.x.scatter_forward()
         self._factorisations = 0
         stiffness_changed = self._update_bulk()
-        if self._pairings != [c.pairings for c in self.contacts]:
-            self._make_matrices()
+        self._update_space(stiffness_changed)
         self._approach()
-        iterations, reason, starts = 0, 0, self._starts(ahead)
-        method = self._method
-        for guess in starts if method != "alternating" else []:
-            self._solution.array[:] = guess / self._length
-            if self._quasi_newton:
-                made, reason = self._solve_quasi_newton(stiffness_changed)
-            else:
-                self.snes.solve(None, self._solution)
-                made, reason = self.snes.getIterationNumber(), self.snes.getConvergedReason()
-            iterations += made
-            if reason > 0:
-                break
-        if method == "alternating" or (reason <= 0 and self._may_alternate()):
-            self._solution.array[:] = starts[0] / self._length
-            made, reason = self._alternation.solve(self._solution)
-            iterations += made
-            if method != "alternating" and self._comm.rank == 0:
-                logger.info("increment %d: %s failed, alternated", self.increment + 1, method)
-            method = "alternating"
-        self._set_u(self._solution)
+        self._space.begin(self._load)
+        iterations, reason, method = self._iterate(ahead, stiffness_changed)
+        self._space.complete()
         verdict = self._judge()
         if reason <= 0 or verdict.failures:
             raise NotConverged(self.increment + 1, int(reason), iterations, verdict)
@@ -630,6 +622,49 @@ class ContactProblem:
             wall_seconds=time.perf_counter() - start,
         )
 
+    def _iterate(self, ahead: float, stiffness_changed: bool) -> tuple[int, int, str]:
+        """Iterate from one start after another, then alternate if that failed. Collective.
+
+        Returns:
+            Iterations, reason, and the method that found the solution.
+        """
+        iterations, reason = 0, int(PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE)
+        method = self._method
+        self._space.enter()
+        try:
+            starts = [self._space.part(start) / self._length for start in self._starts(ahead)]
+            tries = [(start, method) for start in starts]
+            if method == "alternating":
+                del tries[1:]
+            elif self._may_alternate():
+                tries.append((starts[0], "alternating"))
+            for start, method in tries:
+                self._solution.array[:] = start
+                try:
+                    made, reason = self._solve_by(method, stiffness_changed)
+                except PETSc.Error as error:
+                    if error.ierr != _ZERO_PIVOT:
+                        raise
+                    continue  # a dense matrix that is singular
+                iterations += made
+                if reason > 0:
+                    break
+            if method != self._method and self._comm.rank == 0:
+                logger.info("increment %d: %s failed, alternated", self.increment + 1, self._method)
+            self._set_u(self._solution)
+        finally:
+            self._whole.enter()
+        return iterations, int(reason), method
+
+    def _solve_by(self, method: str, stiffness_changed: bool) -> tuple[int, int]:
+        """Iterations and reason of one method, from ``_solution``. Collective."""
+        if method == "alternating":
+            return self._alternation.solve(self._solution)
+        if self._quasi_newton:
+            return self._solve_quasi_newton(stiffness_changed)
+        self.snes.solve(None, self._solution)
+        return self.snes.getIterationNumber(), self.snes.getConvergedReason()
+
     def _may_alternate(self) -> bool:
         """Whether to alternate after a failure: not if iterations are rationed by the caller."""
         limit = self._max_it if self._quasi_newton else self.snes.getTolerances()[3]
@@ -639,7 +674,7 @@ class ContactProblem:
         self.bulk.check_finite()
         for contact in self.contacts:
             contact.check_input()
-        self._load = -self._bulk_force(self.bulk.update_load())
+        self._load = -self._whole.with_supports(self.bulk.update_load())
         size = global_max(self._comm, np.abs(self._load))
         if not np.isfinite(size):
             raise ValueError("the external load is not finite (NaN or inf) at some dof")
@@ -659,17 +694,17 @@ class ContactProblem:
         The present state, and that state moved on by as much as the last increment moved it: in
         proportional loading that is the solution.
         """
-        present = self._state()
+        present = self._whole.state()
         starts = [present]
         if self._rate is not None:
-            self._set_state(present + ahead * self._rate)
+            self._whole.set_state(present + ahead * self._rate)
             for bc in self._bcs:
                 bc.set(self.u.x.array)
-            starts.append(self._state())
+            starts.append(self._whole.state())
         residuals = []
         self._start_residual = 0.0
         for guess in starts:
-            self._solution.array[:] = guess / self._length
+            self._solution.array[:] = self._space.part(guess) / self._length
             self._compute_residual(self._solution, self._function)
             residuals.append(self._norms["residual"])
         self._start_residual = residuals[0]
@@ -684,7 +719,7 @@ class ContactProblem:
             return
         way = self.motions.approach(self._load, self.contacts)
         if way is not None:
-            self._set_state(self._state() + way)
+            self._whole.set_state(self._whole.state() + way)
 
     def _solve_quasi_newton(self, stiffness_changed: bool) -> tuple[int, int]:
         """L-BFGS in rounds, H₀ made anew between them from the status reached. Collective.
@@ -701,7 +736,9 @@ class ContactProblem:
         iterations = stalls = 0
         best, kept = np.inf, self._solution.copy()
         while True:
-            snes.setTolerances(max_it=min(_REFRESH_EVERY, self._max_it - iterations))
+            snes.setTolerances(
+                max_it=min(self._space.iterations_per_round, self._max_it - iterations)
+            )
             snes.solve(None, self._solution)
             iterations += snes.getIterationNumber()
             self._compute_residual(self._solution, self._function)
@@ -726,10 +763,10 @@ class ContactProblem:
 
     def _judge(self) -> Verdict:
         """Recompute everything from u by assembly, past SNES and its residual. Collective."""
-        contact = self._contact_force()
-        bulk = self._bulk_force(self.bulk.assemble_residual())
+        contact = self._whole.contact_force()
+        bulk = self._whole.with_supports(self.bulk.assemble_residual())
         total = bulk + contact
-        self._measure_norms(total, contact)
+        self._measure_norms(self._whole, total, contact)
         gdim = len(self.u)
         reaction = np.where(self._constrained, total, 0.0)
         on_dofs = (v[: self._n_owned].reshape(-1, gdim) for v in (bulk, reaction))
@@ -742,7 +779,7 @@ class ContactProblem:
             if c.rigid:  # between two bodies of the mesh contact forces are internal
                 imbalance = imbalance - c.resultants().force
         self._energy = EnergyState.at(
-            self._state(), bulk + self._load, self._load + reaction, self.contacts
+            self._whole.state(), bulk + self._load, self._load + reaction, self.contacts
         )
         absolute = float(global_sum(self._comm, np.abs(bulk).sum() + np.abs(contact).sum()))
         n_dofs = float(global_sum(self._comm, self._n_owned))
@@ -759,7 +796,7 @@ class ContactProblem:
         """Make the solved state the start of the next increment, history included. Collective."""
         for contact in self.contacts:
             contact.commit()
-        state = self._state()
+        state = self._whole.state()
         self._rate = state - self._committed
         self._committed = state
         self._committed_energy = self._energy.between([c.committed_jump for c in self.contacts])
@@ -771,7 +808,7 @@ class ContactProblem:
 
         The history needs no restoring: it changes at `commit` alone. Collective.
         """
-        self._set_state(self._committed)
+        self._whole.set_state(self._committed)
         for contact in self.contacts:
             contact.forget()
 
@@ -789,18 +826,14 @@ class ContactProblem:
 
     def take_up_loads(self) -> None:
         """Take the loads as they are now for those of the committed state. Collective."""
-        self._load = -self._bulk_force(self.bulk.update_load())
+        self._load = -self._whole.with_supports(self.bulk.update_load())
         self._judge()
         self._committed_energy = self._energy
 
     def restart_solver(self) -> None:
         """Drop what the solver has kept from earlier increments. Collective."""
+        self._space.forget()
         self._make_matrices()
-
-
-def _numbers(forces: Mapping[int, Any]) -> list[float]:
-    """Values of numbers and scalar constants."""
-    return [float(f.value if isinstance(f, fem.Constant) else f) for f in forces.values()]
 
 
 def _facets_held(contact: Contact, constrained: Array) -> int:

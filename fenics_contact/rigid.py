@@ -6,6 +6,7 @@ support, has no solution: both are found here, before any iteration.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
 
 import numpy as np
@@ -80,6 +81,8 @@ class RigidMotions:
         of_supports = [unknowns.joined(still, row) for row in np.eye(len(supports))]
         self._modes = np.array([unknowns.joined(mode, none) for mode in modes] + of_supports)
         self.free = np.zeros((0, len(modes)))
+        self._jumps: weakref.WeakKeyDictionary[Contact, tuple[int, Array]]
+        self._jumps = weakref.WeakKeyDictionary()
 
     def find_free(self, stiffness: PETSc.Mat, constrained: npt.NDArray[np.bool_]) -> None:
         """Find the motions with no bulk energy that no Dirichlet condition holds. Collective.
@@ -102,15 +105,20 @@ class RigidMotions:
         scale = 1 / np.sqrt(np.diag(mass))
         values, vectors = np.linalg.eigh((energy + energy.T) / 2 * np.outer(scale, scale))
         free = (vectors * scale[:, None])[:, values < _FREE]
+        self._jumps.clear()
         self.free = (free / np.abs(free).max(axis=0)).T if free.size else free.T
         for vector in (diagonal, work, image):
             vector.destroy()
 
     def _at_points(self, contact: Contact) -> Array:
         """Jumps of the free motions at a contact's points: (n_free, n_points, gdim). Collective."""
-        gdim = contact.surface.mesh.geometry.dim
-        jumps = [contact.at_points(c @ self._modes) for c in self.free]
-        return np.array(jumps).reshape(len(self.free), contact.quadrature.n_points, gdim)
+        pairing, jumps = self._jumps.get(contact, (-1, None))
+        if jumps is None or pairing != contact.pairings:
+            gdim = contact.surface.mesh.geometry.dim
+            found = [contact.at_points(c @ self._modes) for c in self.free]
+            jumps = np.array(found).reshape(len(self.free), contact.quadrature.n_points, gdim)
+            self._jumps[contact] = contact.pairings, jumps
+        return jumps
 
     def _describe(self, coefficients: Array) -> str:
         share = np.abs(coefficients) / np.abs(coefficients).max()

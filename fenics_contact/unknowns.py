@@ -24,17 +24,21 @@ class Unknowns:
         n_motions: Free motions of supports, in all.
         n_local: Unknowns of this rank: its dofs, and the motions on the last one.
         first_motion: Global number of the first motion.
+        whole: All unknowns, of which these may be a `Selection`.
+        kept: Numbers of these among this rank's share of all, ascending.
     """
 
     def __init__(self, space: fem.FunctionSpace, n_motions: int = 0) -> None:
         """Count. Collective."""
         dofmap = space.dofmap
         self.comm = space.mesh.comm
+        self.whole: Unknowns = self
         self.n_dofs = dofmap.index_map.size_local * dofmap.index_map_bs
         self.n_motions = n_motions
         self.has_motions_here = n_motions > 0 and self.comm.rank == self.comm.size - 1
         self.n_local = self.n_dofs + (n_motions if self.has_motions_here else 0)
         self.first_motion = dofmap.index_map.size_global * dofmap.index_map_bs
+        self.kept: npt.NDArray[np.int32] = np.arange(self.n_local, dtype=np.int32)
 
     def vector(self) -> PETSc.Vec:
         """A new vector over the unknowns. Collective."""
@@ -70,5 +74,47 @@ class Unknowns:
         return PETSc.Mat().createAIJ(
             ((n_rows, None), (self.n_local, None)),
             csr=(pointers, columns, values),
+            comm=self.comm,
+        )
+
+
+class Selection(Unknowns):
+    """Some of the dofs and all of the motions, on one rank.
+
+    Attributes are those of `Unknowns`.
+    """
+
+    def __init__(self, whole: Unknowns, kept: npt.NDArray[np.int32]) -> None:
+        """Select.
+
+        Args:
+            whole: All unknowns, those of one rank.
+            kept: Numbers of the dofs and motions, ascending.
+        """
+        self.whole, self.kept = whole, kept
+        self.comm = whole.comm
+        self.n_local = kept.size
+        self.n_motions = whole.n_motions
+        self.n_dofs = self.first_motion = self.n_local - self.n_motions
+        self.has_motions_here = whole.has_motions_here
+
+    def widened(self, matrix: PETSc.Mat, *, rows: bool = False) -> PETSc.Mat:
+        """Of a matrix over the dofs the columns selected; zero at the motions; a new matrix.
+
+        Raises:
+            NotImplementedError: With ``rows``.
+        """
+        if rows:
+            raise NotImplementedError("rows of a selection")
+        pointers, columns, values = matrix.getValuesCSR()
+        position = np.full(self.whole.n_local, -1, dtype=PETSc.IntType)
+        position[self.kept] = np.arange(self.n_local)
+        columns = position[columns]
+        found = columns >= 0
+        pointers = np.concatenate([[0], np.cumsum(found)])[pointers].astype(PETSc.IntType)
+        n_rows = matrix.getLocalSize()[0]
+        return PETSc.Mat().createAIJ(
+            ((n_rows, None), (self.n_local, None)),
+            csr=(pointers, columns[found], values[found]),
             comm=self.comm,
         )

@@ -116,19 +116,25 @@ def test_a_driven_support():
     assert close(*motions, 1e-6)
 
 
+@pytest.mark.parametrize("condensation", [False, None])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_the_residual_is_the_gradient_of_the_energy(cell):
-    """With the limit of friction frozen: central differences, 1e-6."""
+def test_the_residual_is_the_gradient_of_the_energy(cell, condensation):
+    """With the limit of friction frozen: central differences, 1e-6.
+
+    On all unknowns, and on those of contact alone where that is the choice.
+    """
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
-    scene, problem, contact = pressed(cell, law, "newton", side=0.03)
+    scene, problem, contact = pressed(cell, law, "newton", side=0.03, condensation=condensation)
     problem.solve()
     problem.commit()
     contact.freeze(contact.pressure)
+    space = problem._space
+    space.enter()
     x = problem._solution.copy()
     f, y, z = x.duplicate(), x.duplicate(), x.duplicate()
     direction = fem.Function(scene.u.function_space)
     direction.interpolate(wave(scene.dim, 3))
-    y.array[:] = np.where(problem._constrained, 0.0, owned(direction))
+    y.array[:] = np.where(space.constrained, 0.0, space.part(owned(direction)))
     x.axpy(0.02, y)  # away from the solution, where slopes are not zero
     problem._compute_residual(x, f)
     slope, step = f.dot(y), 1e-5

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.mpi
 class Slider:
     """A block of width 1 that stands at ``start`` on one of width 4, its top moved."""
 
-    def __init__(self, cell, law, *, start, update="increment", method="lbfgs", n=(14, 4)):
+    def __init__(self, cell, law, *, start, update="increment", n=(14, 4), **options):
         """Make it, unloaded."""
         mesh, tags = two_blocks(cell, n, (4.0, 1.0), start)
         d = mesh.geometry.dim
@@ -36,7 +36,7 @@ class Slider:
         base = fc.DeformableBody(tags, LOWER, update=update)
         self.contact = fc.Contact(self.u, surface, base, law)
         F = elasticity(self.u, v, 0.3)
-        self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=[self.contact], method=method)
+        self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=[self.contact], **options)
 
     def step(self, down, along) -> fc.Step:
         """Move the top, solve and commit."""

@@ -1,0 +1,185 @@
+"""What the iteration runs on: all unknowns of a problem. `condense` has the other space."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
+
+from fenics_contact.bulk import Bulk
+from fenics_contact.contact import Contact
+from fenics_contact.unknowns import Unknowns
+
+__all__ = ["WholeSpace"]
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+
+class WholeSpace:
+    """All unknowns: states, forces and matrices over them.
+
+    Attributes:
+        unknowns: The unknowns of the space.
+        constrained: Mask over this rank's unknowns: those with Dirichlet conditions.
+        load: External forces at them (force).
+        diagonal: Diagonal of the matrix assembled last (force/length).
+        outside: Squares of load and of diagonal times state at unknowns outside of the space.
+        iterations_per_round: Iterations of L-BFGS after which H₀ is made anew from the status: one
+            costs 1/15 to 1/35 of a factorisation, and pairs taken across changes of status are
+            worth little.
+        ready: Whether `fill` can be called; else `update` comes first.
+    """
+
+    iterations_per_round = 20
+
+    def __init__(
+        self,
+        u: fem.Function,
+        unknowns: Unknowns,
+        bulk: Bulk,
+        contacts: Sequence[Contact],
+        constrained: Mask,
+    ) -> None:
+        """Take over the parts of a problem; contacts speak of these unknowns from now on."""
+        self.u, self.unknowns, self.bulk = u, unknowns, bulk
+        self.contacts, self.constrained = contacts, constrained
+        self.motions = [c for contact in contacts for c in contact.free_motion.values()]
+        self.load = np.zeros(unknowns.n_local)
+        self.diagonal = np.zeros(unknowns.n_local)
+        self.outside = np.zeros(2)
+        self.ready = True
+        self._contact_vector = unknowns.vector()
+        self.enter()
+
+    def enter(self) -> None:
+        """Let the contacts speak of the unknowns of this space. Collective."""
+        first = 0
+        for contact in self.contacts:
+            contact.set_unknowns(self.unknowns, first)
+            first += len(contact.free_motion)
+
+    def vector(self) -> PETSc.Vec:
+        """A new vector over the unknowns. Collective."""
+        return self.unknowns.vector()
+
+    def linear_solver(self, *, symmetric: bool) -> dict[str, Any]:
+        """Options of the solver for `matrix`."""
+        return {
+            "ksp_type": "preonly",
+            "pc_type": "cholesky" if symmetric else "lu",
+            "pc_factor_mat_solver_type": "mumps",
+        }
+
+    def update(self, stiffness: PETSc.Mat) -> int:
+        """Take a new bulk tangent over all unknowns; number of factorisations. Collective."""
+        return 0
+
+    def state(self) -> Array:
+        """The present unknowns of this rank; a copy."""
+        motions = np.array([float(c.value) for c in self.motions])
+        return self.unknowns.joined(self.u.x.array[: self.unknowns.n_dofs], motions)
+
+    def set_state(self, state: Array) -> None:
+        """Make a state the present one. Collective."""
+        self.u.x.array[: self.unknowns.n_dofs] = state[: self.unknowns.n_dofs]
+        self.u.x.scatter_forward()
+        self._set_motions(state)
+
+    def _set_motions(self, state: Array) -> None:
+        for constant, value in zip(self.motions, self.unknowns.motions(state), strict=True):
+            constant.value = value
+
+    def part(self, state: Array) -> Array:
+        """What of a state of all unknowns is in this space."""
+        return state
+
+    def begin(self, load: Array) -> None:
+        """Start an increment under a load over all unknowns, u with its conditions. Collective."""
+        self.load = load
+
+    def complete(self) -> None:
+        """Find the unknowns outside of the space for those inside. Collective."""
+
+    def forget(self) -> None:
+        """Drop what was kept of earlier increments and could show in the digits of the next."""
+
+    def contact_force(self) -> Array:
+        """Contact part of the residual at the present state, this rank's unknowns. Collective."""
+        self._contact_vector.set(0.0)
+        for contact in self.contacts:
+            contact.add_force(self._contact_vector)
+        return self._contact_vector.array_r.copy()
+
+    def bulk_force(self) -> Array:
+        """The rest of the residual: the bulk's, and the forces on free supports. Collective."""
+        return self.with_supports(self.bulk.residual())
+
+    def bulk_energy(self) -> float:
+        """This rank's part of the potential of a linear bulk and its loads, up to a constant."""
+        # F(u) = K u + F(0), so that it is (F(u) + F(0))·u/2.
+        return float(0.5 * (self.bulk_force() - self.load) @ self.state())
+
+    def with_supports(self, residual: Array) -> Array:
+        """A residual over the dofs with that of the free supports, which their forces are."""
+        forces = [f for c in self.contacts for f in _numbers(c.applied_force)]
+        return self.unknowns.joined(residual, -np.array(forces))
+
+    def matrix(self, stiffness: PETSc.Mat, *, symmetric: bool) -> PETSc.Mat:
+        """A new matrix for `fill`. Collective.
+
+        Its pattern is that of the bulk and, with deformable or moving supports, of the pairs.
+
+        Args:
+            stiffness: Bulk tangent over all unknowns.
+            symmetric: Whether what will be filled in is symmetric.
+        """
+        different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
+        matrix = stiffness.copy()
+        for contact in self.contacts:
+            if contact.couples:
+                part = contact.stiffness_matrix(1.0, 1.0)
+                matrix.axpy(1.0, part, different)
+                part.destroy()
+        matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
+        matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+        return matrix
+
+    def fill(self, matrix: PETSc.Mat, stiffness: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
+        """Bulk tangent plus contact, conditions applied, dimensionless. Collective.
+
+        Args:
+            matrix: What to fill.
+            stiffness: Bulk tangent over all unknowns.
+            contacts: Contact's part, used up.
+
+        Returns:
+            How many factorisations of sparse matrices this leads to.
+        """
+        subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
+        if not any(c.couples for c in self.contacts):
+            stiffness.copy(matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        else:
+            matrix.zeroEntries()
+            matrix.axpy(1.0, stiffness, subset)
+        for part in contacts:
+            matrix.axpy(1.0, part, subset)
+            part.destroy()
+        start, _ = matrix.getOwnershipRange()
+        rows = (start + np.flatnonzero(self.constrained)).astype(PETSc.IntType)
+        scale = self.bulk.scale
+        matrix.zeroRowsColumns(rows, diag=scale)
+        diagonal = matrix.getDiagonal()
+        self.diagonal = diagonal.array.copy()
+        diagonal.destroy()
+        matrix.scale(1.0 / scale)
+        return 1
+
+
+def _numbers(forces: Mapping[int, Any]) -> list[float]:
+    """Values of numbers and scalar constants."""
+    return [float(f.value if isinstance(f, fem.Constant) else f) for f in forces.values()]

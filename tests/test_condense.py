@@ -1,0 +1,382 @@
+"""Condensation: the Schur complement, the same results as on all unknowns, one factorisation."""
+
+import logging
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+from scenes import CELLS, GRID, LEFT, RIGHT, TOP, block, close, owned, raised_everywhere
+from test_sliding import Slider
+from test_solver import PATH, kirchhoff, rub, walk
+
+import fenics_contact as fc
+from fenics_contact.condense import Condensation, touched, worthwhile
+
+pytestmark = pytest.mark.timeout(240)
+COMM = MPI.COMM_WORLD
+serial = pytest.mark.skipif(COMM.size > 1, reason="condensation takes one rank")
+
+# Both spaces solve to 1e-9 of the forces; a path adds up.
+SAME = 1e-7
+TIGHT = {"snes_rtol": 1e-12}
+
+
+def both(make, run):
+    """Results of ``run`` for a scene made with and without condensation."""
+    return [run(make(condensation=condensed)) for condensed in (True, False)]
+
+
+def assert_same(condensed, whole, rtol=SAME):
+    for name, value in whole.items():
+        # Slip is a difference of displacements.
+        scale = float(np.abs(whole["u"] if name == "slip" else value).max(initial=1e-300))
+        assert close(condensed[name], value, rtol, scale=scale), name
+
+
+# ---- the Schur complement ------------------------------------------------------------------------
+
+
+def dense(matrix):
+    pointers, columns, values = matrix.getValuesCSR()
+    result = np.zeros(matrix.getSize())
+    result[np.repeat(np.arange(len(result)), np.diff(pointers)), columns] = values
+    return result
+
+
+@serial
+@pytest.mark.parametrize("symmetric", [True, False])
+@pytest.mark.parametrize(("cell", "degree"), GRID)
+def test_schur_complement(cell, degree, symmetric):
+    """S, g and the recovered field against dense algebra: numpy, 1e-10 of the largest entry."""
+    scene = block(cell, degree, shuffled=True, up=-1.0)
+    if not symmetric:
+        v = ufl.TestFunction(scene.u.function_space)
+        turn = np.zeros((scene.dim, scene.dim))
+        turn[0, 1] = 30.0
+        scene.F += ufl.dot(fem.Constant(scene.mesh, turn) * scene.u, v) * ufl.dx(scene.mesh)
+    aside = fem.Constant(scene.mesh, 0.01)
+    bcs = [scene.hold(LEFT, i, aside) for i in range(scene.dim)]
+    problem, contact = scene.problem(fc.Frictionless(), bcs)
+    assert problem.bulk.symmetric == symmetric
+    K = dense(problem.bulk.stiffness)
+    n = len(K)
+    kept = touched([contact], problem.unknowns)
+    # All components of all nodes of the bottom, no others.
+    y = scene.u.function_space.tabulate_dof_coordinates()[:, scene.dim - 1]
+    assert np.array_equal(kept, np.flatnonzero(np.repeat(np.abs(y) < 1e-12, scene.dim)))
+    held = np.zeros(n, dtype=bool)
+    for i in range(scene.dim):
+        held[scene.facet_dofs(LEFT, i)] = True
+    inside = np.setdiff1d(np.flatnonzero(~held), kept)
+    made = Condensation(problem.bulk.stiffness, held, kept, symmetric=symmetric)
+    inverse = np.linalg.inv(K[np.ix_(inside, inside)])
+    away = K[np.ix_(kept, inside)] @ inverse
+    schur = K[np.ix_(kept, kept)] - away @ K[np.ix_(inside, kept)]
+    assert close(made.schur, schur, 1e-10)
+
+    rng = np.random.default_rng(3)
+    first, second = rng.normal(size=(2, n))
+    # The third is a combination of those before.
+    for force in (first, second, 2.5 * first - second, rng.normal(size=n)):
+        state = rng.normal(size=n)
+        if force is not second:
+            state[held] = 0.0
+        made.set_load(force, state)
+        prescribed = np.where(held & ~np.isin(np.arange(n), kept), state, 0.0)
+        lifted = force - K @ prescribed
+        assert close(made.load, lifted[kept] - away @ lifted[inside], 1e-10)
+        field = prescribed + 0.0
+        field[kept] = state[kept]
+        field[inside] = inverse @ (force - K @ field)[inside]
+        assert close(made.recover(state[kept]), field, 1e-10)
+
+
+@serial
+def test_nothing_holds_a_part():
+    """A stiffness that is singular with the kept unknowns held is refused."""
+    scene = block("triangle")
+    problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
+    none = np.zeros(0, dtype=np.int32)
+    with pytest.raises(RuntimeError, match="singular"):
+        stiffness = problem.bulk.stiffness.copy()
+        stiffness.zeroEntries()
+        Condensation(stiffness, np.zeros(18, dtype=bool), none + 1, symmetric=True)
+
+
+# ---- the same results ----------------------------------------------------------------------------
+
+
+def fields(made, steps=()):
+    """All of the final state and what the increments came to."""
+    contact = made.contact
+    found = {"u": owned(made.scene.u).copy(), "traction": contact.traction, "slip": contact.slip}
+    found["force"] = np.array([s.contacts["contact"].force for s in steps])
+    found["work"] = np.array([[s.energy.work, s.energy.elastic] for s in steps])
+    return found
+
+
+LAWS = {
+    "frictionless": fc.Frictionless(k_n=2e4),
+    "coulomb": fc.Coulomb(0.3, k_n=2e4, k_t=1e4),
+    "tresca": fc.Tresca(0.3, 8.0, k_n=2e4, k_t=1e4),
+}
+
+
+@serial
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(("cell", "degree"), [("quadrilateral", 1), ("triangle", 2)])
+def test_path(cell, degree, law, method):
+    """To and fro with prescribed values that change: states, forces, works; one factorisation.
+
+    Iterations are of the same order: the condensed Newton method is the same one.
+    """
+    iterations = {}
+
+    def run(made):
+        steps = walk(made)
+        iterations[made.problem._condensed] = sum(s.iterations for s in steps)
+        if made.problem._condensed:
+            assert [s.factorisations for s in steps] == [1, 0, 0, 0, 0, 0]
+        return fields(made, steps)
+
+    def make(**options):
+        return rub(LAWS[law], cell=cell, degree=degree, method=method, **options)
+
+    assert_same(*both(make, run))
+    assert iterations[True] <= 1.5 * iterations[False]
+
+
+@serial
+@pytest.mark.parametrize(("cell", "degree"), GRID)
+def test_every_cell(cell, degree):
+    """The start of the path with Coulomb friction on all cells and degrees."""
+    mesh = {"n": 4 if cell in ("triangle", "quadrilateral") else 2}
+
+    def make(**options):
+        return rub(cell=cell, degree=degree, mesh=mesh, **options)
+
+    assert_same(*both(make, lambda made: fields(made, walk(made, path=PATH[:4]))))
+
+
+@serial
+@pytest.mark.parametrize("cell", CELLS)
+def test_deformable_support(cell):
+    """A block slid over another, pairs found anew: the same, whatever was touched before."""
+    n = (7, 2)
+    results = []
+    for condensed in (True, False):
+        law = fc.Coulomb(0.3, k_n=1e7, k_t=1e7)
+        made = Slider(cell, law, start=0.4, n=n, condensation=condensed)
+        steps = [made.step(0.002, along) for along in (0.0, 0.3, 0.6)]
+        results.append(
+            {
+                "u": owned(made.u).copy(),
+                "traction": made.contact.traction,
+                "force": np.array([s.contacts["contact"].force for s in steps]),
+            }
+        )
+        if condensed:
+            assert sum(s.factorisations for s in steps) <= 3
+    assert_same(*results)
+
+
+@serial
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_driven_support(cell, method):
+    """A ball driven by a force, dragged by a displacement: its motion is one of those kept."""
+    results = []
+    for condensed in (True, False):
+        scene = block(cell, n=4 if cell == "triangle" else 2)
+        d = scene.dim
+        drag = fem.Constant(scene.mesh, 0.0)
+        motion = fc.Motion(
+            force=[None] * (d - 1) + [5.0], displacement=[drag] + [0.0] * (d - 2) + [None]
+        )
+        center = np.full(d, 0.5)
+        center[-1] = -2.0
+        problem, contact = scene.problem(
+            fc.Coulomb(0.3, k_n=2e4, k_t=1e4),
+            [scene.hold(TOP, i) for i in range(d)],
+            contact={"support": fc.Ball(center, 2.0, displacement=motion)},
+            method=method,
+            condensation=condensed,
+        )
+        for drag.value in (0.0, 0.01):
+            problem.solve()
+            problem.commit()
+        up = float(contact.free_motion[d - 1].value)
+        results.append(
+            {"u": owned(scene.u).copy(), "up": np.array([up]), "traction": contact.traction}
+        )
+    assert_same(*results)
+
+
+@serial
+def test_several_contacts_and_loads():
+    """A floor with friction and a wall, side and top loads in turn, nothing else that holds."""
+    results = []
+    for condensed in (True, False):
+        scene = block("triangle", 2, n=4)
+        v = ufl.TestFunction(scene.u.function_space)
+        side = fem.Constant(scene.mesh, scene.vector(side=-1.0))
+        scene.F -= ufl.dot(side, v) * ufl.ds(scene.mesh, subdomain_data=scene.tags)(RIGHT)
+        wall = fc.Contact(
+            scene.u,
+            fc.ContactSurface(scene.mesh, scene.tags, LEFT),
+            fc.HalfSpace((0, 0), (1, 0)),
+            fc.Frictionless(k_n=2e4),
+            name="wall",
+        )
+        floor = scene.contact(fc.Coulomb(0.2, k_n=2e4, k_t=1e4), name="floor")
+        problem = fc.ContactProblem(
+            scene.F, scene.u, contacts=[wall, floor], condensation=condensed
+        )
+        found = []
+        for push, up in ((-0.1, -2.0), (-1.0, -2.0), (-1.0, -3.0), (-0.3, -1.0)):
+            side.value[0] = push
+            scene.load(up=up)
+            step = problem.solve()
+            problem.commit()
+            found.append([r.force for r in step.contacts.values()])
+        # Both loads are two fields times numbers: factored once, and solved for once each.
+        if condensed:
+            assert len(problem._space.condensation._directions) == 2
+        results.append({"u": owned(scene.u).copy(), "forces": np.array(found)})
+    assert_same(*results)
+
+
+@serial
+def test_modulus_changed():
+    """A new modulus between increments: a new factorisation, and the results with it."""
+
+    def run(made):
+        steps = []
+        for E, move in zip((1000.0, 2000.0, 2000.0, 500.0), PATH[:4], strict=True):
+            made.scene.E.value = E
+            steps += walk(made, path=[move])
+        if made.problem._condensed:
+            assert [s.factorisations for s in steps] == [1, 1, 0, 1]
+        return fields(made, steps)
+
+    assert_same(*both(rub, run))
+
+
+@serial
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+def test_units(method):
+    """The same iterations and digits in other units, 1e-9 of the fields."""
+    results = []
+    for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1e9)]:
+        made = rub(
+            fc.Coulomb(0.3), length=length, pressure=pressure, method=method, condensation=True
+        )
+        steps = walk(made, length, PATH[:4])
+        iterations = [s.iterations for s in steps]
+        results.append((iterations, owned(made.scene.u) / length, made.contact.traction / pressure))
+    for iterations, u, traction in results[1:]:
+        assert iterations == results[0][0]
+        assert close(u, results[0][1], 1e-9)
+        assert close(traction, results[0][2], 1e-9)
+
+
+@serial
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+def test_failure_leaves_no_trace(method):
+    """An increment that fails leaves u, history and what comes next as if it had not been."""
+    made, twin = (rub(method=method, condensation=True) for _ in range(2))
+    for m in (made, twin):
+        walk(m, path=PATH[:2])
+    before = made.scene.u.x.array.copy(), made.contact.history.function.x.array.copy()
+    made.move(*PATH[2])
+    kept = made.problem._max_it
+    made.problem._max_it = 1
+    made.problem.snes.setTolerances(max_it=1)
+    with pytest.raises(fc.NotConverged):
+        made.problem.solve()
+    made.problem._max_it = kept
+    made.problem.snes.setTolerances(max_it=kept)
+    after = made.scene.u.x.array, made.contact.history.function.x.array
+    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
+    for m in (made, twin):
+        walk(m, path=PATH[2:])
+    assert_same(fields(made), fields(twin))
+
+
+@serial
+def test_an_indefinite_bulk():
+    """A bulk that gives way: neither K nor S is definite, and all is as on all unknowns."""
+    results = []
+    for condensed in (True, False):
+        scene = block("quadrilateral", up=-1.0)
+        v = ufl.TestFunction(scene.u.function_space)
+        pushed = fem.Constant(scene.mesh, 3e3) * scene.u[0].dx(0) * v[0].dx(0)
+        scene.F -= pushed * ufl.dx(scene.mesh)
+        problem, contact = scene.problem(
+            fc.Frictionless(k_n=5e3), scene.rollers(), condensation=condensed, petsc_options=TIGHT
+        )
+        problem.solve()
+        results.append({"u": owned(scene.u).copy(), "pressure": contact.pressure})
+    assert_same(*results)
+
+
+# ---- the choice ----------------------------------------------------------------------------------
+
+
+def test_the_choice(caplog):
+    """By default on one rank, for a linear bulk; it is logged; True where it cannot be raises."""
+    scene = block("triangle", n=4, up=-1.0)
+    law = fc.Frictionless(k_n=5e3)
+    with caplog.at_level(logging.INFO, logger="fenics_contact"):
+        problem, contact = scene.problem(law, scene.rollers())
+    assert problem._condensed == (COMM.size == 1)
+    if COMM.rank == 0:
+        said = "condensed onto 10 of 50" if COMM.size == 1 else "takes one rank"
+        assert any(said in record.getMessage() for record in caplog.records)
+    assert not scene.problem(law, scene.rollers(), condensation=False)[0]._condensed
+
+    def condensed(F, contacts, **options):
+        return fc.ContactProblem(
+            F, scene.u, bcs=scene.rollers(), contacts=contacts, condensation=True, **options
+        )
+
+    options = PETSc.Options().getAll()
+
+    def without_contact():
+        bcs = [scene.hold(LEFT, i) for i in range(2)]
+        fc.ContactProblem(scene.F, scene.u, bcs=bcs, condensation=True)
+
+    raised_everywhere(without_contact, ValueError, "condensation", "no contact")
+    F = kirchhoff(scene, scene.E)
+    raised_everywhere(lambda: condensed(F, [contact]), ValueError, "condensation", "not linear")
+    if COMM.size > 1:
+        raised_everywhere(lambda: condensed(scene.F, [contact]), ValueError, "one rank")
+    else:
+        given = {"pc_type": "lu"}
+        raised_everywhere(
+            lambda: condensed(scene.F, [contact], petsc_options=given), ValueError, "pc_type"
+        )
+    assert PETSc.Options().getAll() == options
+
+
+def test_what_is_worth_it():
+    """Small surfaces, and large ones of large bodies; not the whole of a body, nor gigabytes."""
+    assert worthwhile(50, 10, 2) and worthwhile(250_000, 1000, 2) and worthwhile(100_000, 1500, 3)
+    assert not worthwhile(10_000, 3000, 2)
+    assert not worthwhile(100_000, 6000, 3)
+    assert not worthwhile(10**8, 20_000, 3)
+    assert not worthwhile(1000, 0, 2)
+
+
+@pytest.mark.mpi
+def test_a_nonlinear_bulk_is_not_condensed():
+    """By default it iterates on all unknowns and says why."""
+    scene = block("quadrilateral", up=-1.0)
+    scene.F = kirchhoff(scene, scene.E)
+    problem, _ = scene.problem(fc.Frictionless(k_n=5e4), scene.rollers())
+    assert not problem._condensed
+    problem.solve()
