@@ -116,6 +116,8 @@ class Condensation:
         self._pc.setFromOptions()
         self._pc.setFactorSetUpSolverType()
         self._factor = self._pc.getFactorMatrix()
+        # MUMPS' estimate of its workspace is short where the Schur complement is most of it.
+        self._factor.setMumpsIcntl(14, 400)
         chosen = PETSc.IS().createGeneral(kept, comm=PETSc.COMM_SELF)
         _call("MatFactorSetSchurIS", _object(self._factor), _object(chosen))
         self._pc.setUp()
