@@ -205,6 +205,34 @@ def gathered(comm: MPI.Comm, rows: Array) -> Array:
     return np.concatenate(comm.allgather(np.asarray(rows)), axis=0)
 
 
+def sorted_by_place(places: Array, *columns: Array) -> Array:
+    """Rows (place, columns) in the order of the places, to 1e-9 of their extent.
+
+    For comparisons between meshes: two equal ones may be distributed differently.
+    """
+    size = float(np.abs(places).max(initial=0.0)) or 1.0
+    order = np.lexsort(np.round(places / size, 9).T)
+    return np.column_stack([places, *columns])[order]
+
+
+def nodal(u: fem.Function) -> Array:
+    """Values (all nodes, bs) at the owned nodes of all ranks, in the order of their places."""
+    space = u.function_space
+    d, bs = space.mesh.geometry.dim, space.dofmap.index_map_bs
+    n = space.dofmap.index_map.size_local
+    x, values = space.tabulate_dof_coordinates()[:n, :d], u.x.array.reshape(-1, bs)[:n]
+    comm = space.mesh.comm
+    return sorted_by_place(gathered(comm, x), gathered(comm, values))[:, d:]
+
+
+def at_points(contact: fc.Contact, rows: Array) -> Array:
+    """Rows (points, …) of all ranks, in the order of the points' places."""
+    comm = contact.surface.mesh.comm
+    rows = np.asarray(rows).reshape(len(contact.points), -1)
+    d = contact.points.shape[1]
+    return sorted_by_place(gathered(comm, contact.points), gathered(comm, rows))[:, d:]
+
+
 def close(actual: Any, expected: Any, rtol: float, *, scale: float | None = None) -> bool:
     """Largest difference within ``rtol`` of the largest expected entry (or ``scale``)."""
     actual, expected = np.asarray(actual, dtype=float), np.asarray(expected, dtype=float)

@@ -6,7 +6,7 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from scenes import GRID, TOP, block, close, gathered, owned, wave
+from scenes import GRID, TOP, at_points, block, close, nodal, owned, wave
 
 import fenics_contact as fc
 
@@ -44,7 +44,7 @@ def test_the_same_solution(cell, degree):
         assert step.method == method
         r = step.contacts["contact"]
         assert r.slip > 0 and not step.verdict.failures
-        states.append((gathered(COMM, owned(scene.u)), r.force))
+        states.append((nodal(scene.u), r.force))
         assert contact.history.values("slip").max(initial=0.0) == 0.0  # nothing is committed
     for a, b in zip(*states, strict=True):
         assert close(a, b, 1e-6)
@@ -85,7 +85,7 @@ def test_history_and_increments():
             push[0].value = np.interp(t, [1, 2, 4], [0, 0.05, -0.05])
 
         list(fc.increments(problem, load, 0.0, 4.0, steps=8))
-        ends.append(gathered(COMM, contact.history.rows()))
+        ends.append(at_points(contact, contact.history.rows()))
     assert close(*ends, 1e-5)
 
 
@@ -211,5 +211,5 @@ def test_a_nonlinear_bulk():
         law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
         problem, _ = scene.problem(law, bcs, contact={"support": cushion(2)}, method=method)
         problem.solve()
-        ends.append(gathered(COMM, owned(scene.u)))
+        ends.append(nodal(scene.u))
     assert close(*ends, 1e-6)

@@ -26,6 +26,7 @@ from scenes import (
     gathered,
     layers,
     raised_everywhere,
+    sorted_by_place,
 )
 
 import fenics_contact as fc
@@ -80,12 +81,6 @@ def expected_points(
     return np.reshape(x, (len(nodes) * n, d)), np.reshape(w, len(nodes) * n)
 
 
-def ordered(points: np.ndarray, *columns: np.ndarray) -> np.ndarray:
-    """Rows sorted by rounded coordinates."""
-    order = np.lexsort(np.round(points, 9).T)
-    return np.column_stack([points, *columns])[order]
-
-
 @pytest.mark.parametrize("ghost_mode", [GhostMode.none, GhostMode.shared_facet])
 @pytest.mark.parametrize(("cell", "degree"), GRID)
 def test_points_and_weights_are_those_of_gauss(cell, degree, ghost_mode):
@@ -100,8 +95,10 @@ def test_points_and_weights_are_those_of_gauss(cell, degree, ghost_mode):
     rule = facet_rule(cell, 2 * degree)
     x, w = expected_points(mesh, surface.facets, rule)
     assert COMM.allreduce(contact.quadrature.n_points) == COMM.allreduce(len(w))
-    actual = ordered(gathered(COMM, contact.points), gathered(COMM, contact.quadrature.weights))
-    expected = ordered(gathered(COMM, x), gathered(COMM, w))
+    actual = sorted_by_place(
+        gathered(COMM, contact.points), gathered(COMM, contact.quadrature.weights)
+    )
+    expected = sorted_by_place(gathered(COMM, x), gathered(COMM, w))
     assert close(actual, expected, 1e-12, scale=1.0)
 
 
@@ -162,8 +159,8 @@ def test_vertex_scheme_has_its_points_at_the_vertices(cell):
     contact = contact_on(surface, 1)
     d = dimension(cell)
     vertices = facet_vertices(mesh, surface.facets).reshape(-1, d)
-    actual = ordered(gathered(COMM, contact.points))
-    assert close(actual, ordered(gathered(COMM, vertices)), 1e-12, scale=1.0)
+    actual = sorted_by_place(gathered(COMM, contact.points))
+    assert close(actual, sorted_by_place(gathered(COMM, vertices)), 1e-12, scale=1.0)
     weights = gathered(COMM, contact.quadrature.weights)
     assert abs(weights.sum() - 1.0) <= 1e-12
     assert weights.min() > 0
