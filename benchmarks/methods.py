@@ -77,7 +77,7 @@ def dragged_cylinder(method: str, stiffness: float) -> Loading:
     )
 
     def load(t: float) -> None:
-        move.value[:] = 2.0 * max(t - 0.2, 0.0), -0.057 * min(5 * t, 1.0)
+        move.value[:] = 2.0 * max(t - 0.2, 0.0), -0.0143 * min(5 * t, 1.0)
 
     return problem, load, 10
 

@@ -13,6 +13,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+import dolfinx
 import numpy as np
 import numpy.typing as npt
 import scipy.spatial
@@ -22,7 +23,6 @@ from mpi4py import MPI
 from fenics_contact.contact import Contact
 from fenics_contact.parallel import collective_errors, gather_rows
 from fenics_contact.problem import ContactProblem
-from fenics_contact.surface import PointEvaluator
 
 __all__ = ["exists", "load", "save"]
 
@@ -147,9 +147,8 @@ def _find(comm: MPI.Comm, stored: Array, places: Array, size: float, path: str |
     return stored[row, width:]
 
 
-def _middles(space: fem.FunctionSpace) -> Array:
+def _middles(mesh: dolfinx.mesh.Mesh) -> Array:
     """Middles of this rank's cells, ghosts included, (n_cells, gdim)."""
-    mesh = space.mesh
     return mesh.geometry.x[mesh.geometry.dofmap].mean(axis=1)[:, : mesh.geometry.dim]
 
 
@@ -158,7 +157,7 @@ def _node_places(space: fem.FunctionSpace) -> Array:
     gdim, dofmap = space.mesh.geometry.dim, space.dofmap
     n_owned = dofmap.index_map.size_local
     n_cells = space.mesh.topology.index_map(space.mesh.topology.dim).size_local
-    cells, middles = dofmap.list[:n_cells], _middles(space)[:n_cells]
+    cells, middles = dofmap.list[:n_cells], _middles(space.mesh)[:n_cells]
     total = la.vector(dofmap.index_map, gdim + 1)
     sums = total.array.reshape(-1, gdim + 1)
     sums[:] = 0.0
@@ -171,10 +170,11 @@ def _node_places(space: fem.FunctionSpace) -> Array:
 
 def _point_places(contact: Contact) -> Array:
     """Coordinates of the owned points and middle of their cell, (n, 2 gdim). Collective."""
-    mesh = contact.surface.mesh
-    gdim = mesh.geometry.dim
-    middle = fem.Function(fem.functionspace(mesh, ("DG", 0, (gdim,))))
-    cells = middle.function_space.dofmap.list[:, 0]
-    middle.x.array.reshape(-1, gdim)[cells] = _middles(middle.function_space)
-    at_points = PointEvaluator(contact.quadrature, {"middle": middle})()["middle"]
-    return np.hstack([contact.points, at_points])
+    surface, rows = contact.surface, contact.quadrature.point_rows()
+    tdim = surface.mesh.topology.dim
+    surface.mesh.topology.create_connectivity(tdim - 1, tdim)
+    to_cell = surface.mesh.topology.connectivity(tdim - 1, tdim)
+    cells = np.array([to_cell.links(f)[0] for f in surface.facets], dtype=np.int64)
+    middles = np.empty_like(contact.points)
+    middles[rows] = _middles(surface.mesh)[cells][:, None]
+    return np.hstack([contact.points, middles])

@@ -248,8 +248,11 @@ def _polynomials(d: int, simplex: bool, n_points: int) -> Any:
     return chosen
 
 
-def _candidates(here: Array, there: Array) -> tuple[Any, Any]:
-    """Pairs of facets whose bounding balls overlap once the distance along the normal is ignored.
+def _candidates(here: Array, mean: Array, there: Array, looks: Array) -> tuple[Any, Any]:
+    """Pairs of facets that face each other and may overlap along the normal.
+
+    Their bounding balls overlap once the distance along the normal is ignored; ``mean`` and
+    ``looks`` are the facets' mean normals.
 
     Nearest first would miss far bodies: the balls are compared around the nearest neighbours.
     """
@@ -263,7 +266,8 @@ def _candidates(here: Array, there: Array) -> tuple[Any, Any]:
     found = tree.query_ball_point(centre, 1.01 * (np.hypot(nearest, radius + largest) + radius))
     first = np.repeat(np.arange(len(here)), [len(f) for f in found])
     second = np.concatenate([np.zeros(0, dtype=int), *(np.asarray(f, dtype=int) for f in found)])
-    return first, second
+    facing = np.einsum("pd,pd->p", mean[first], looks[second]) < 0
+    return first[facing], second[facing]
 
 
 def _cut_lines(
@@ -271,9 +275,7 @@ def _cut_lines(
 ) -> tuple[Any, Array, Array]:
     """Cut the facets of a plane problem at the ends of the opposite ones."""
     rule, shares = basix.make_quadrature(basix.CellType.interval, degree)
-    first, second = _candidates(here, there)
-    facing = np.einsum("pd,pd->p", mean[first], looks[second]) < 0
-    first, second = first[facing], second[facing]
+    first, second = _candidates(here, mean, there, looks)
     facets, points, weights = [], [], []
     for f in np.unique(first):
         origin, edge = here[f, 0], here[f, 1] - here[f, 0]
@@ -295,9 +297,7 @@ def _cut_polygons(
 ) -> tuple[Any, Array, Array]:
     """Cut the facets of a spatial problem into triangles, by polygons in the facet's plane."""
     rule, shares = basix.make_quadrature(basix.CellType.triangle, degree)
-    first, second = _candidates(here, there)
-    facing = np.einsum("pd,pd->p", mean[first], looks[second]) < 0
-    first, second = first[facing], second[facing]
+    first, second = _candidates(here, mean, there, looks)
     # Coordinates in the plane of every facet.
     e1 = here[:, 1] - here[:, 0]
     e1 -= np.einsum("fd,fd->f", e1, mean)[:, None] * mean
