@@ -7,16 +7,13 @@ Newton. Meshing and the compiling of forms are not counted, everything else is.
 
     OMP_NUM_THREADS=1 python benchmarks/half_cylinder.py --h 0.0165 --repeat 5
 
-Prints a Markdown table; ``--output`` is the folder for it and for a CSV file.
+Writes a table in Markdown and a CSV file.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
-import statistics
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -31,10 +28,12 @@ import fenics_contact as fc
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
 import hertz  # the mesh and the numbers of the demo
+import timing
 
 # By this the half-cylinder, which nothing else holds, is pushed into the plane for methods that
 # need contact to start with.
 PUSH = 0.05
+YARDSTICK = "one linear solve"
 
 
 class Body:
@@ -159,9 +158,7 @@ def package(body: Body, friction: float, steps: int, **options: Any) -> dict[str
 
 def methods(body: Body, arguments: argparse.Namespace) -> dict[str, Callable[[], dict[str, Any]]]:
     """What to time, by name."""
-    found: dict[str, Callable[[], dict[str, Any]]] = {
-        "one linear solve": lambda: linear_solve(body)
-    }
+    found: dict[str, Callable[[], dict[str, Any]]] = {YARDSTICK: lambda: linear_solve(body)}
     for friction in arguments.friction:
         found[f"by hand, Newton + MUMPS, μ = {friction:g}"] = lambda f=friction: by_hand(body, f)
         for steps in arguments.increments if friction else [1]:
@@ -179,65 +176,31 @@ def methods(body: Body, arguments: argparse.Namespace) -> dict[str, Callable[[],
 
 def main() -> None:
     """Run."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser = timing.parser(__doc__, "half_cylinder")
     parser.add_argument("--h", type=float, default=0.0165, help="cell size on Γc")
     parser.add_argument("--degree", type=int, default=2)
     parser.add_argument("--friction", type=float, nargs="*", default=[0.0, 0.2])
     parser.add_argument("--increments", type=int, nargs="*", default=[1, 40])
     parser.add_argument("--stiffness", type=float, default=10.0, help="k_n and k_t h/E")
-    parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--all", action="store_true", help="histories on all unknowns too")
     parser.add_argument("--only", help="methods whose name contains this")
-    parser.add_argument("--output", type=Path, help="folder for table.md and table.csv")
     arguments = parser.parse_args()
     if MPI.COMM_WORLD.size > 1:
         parser.error("the condensed problem takes one rank")
 
-    body = Body(arguments.h, arguments.degree)
+    body = Body(0.1 if arguments.short else arguments.h, arguments.degree)
     chosen = {
         name: run
         for name, run in methods(body, arguments).items()
-        if not arguments.only or arguments.only in name or name == "one linear solve"
+        if not arguments.only or arguments.only in name or name == YARDSTICK
     }
-    small = Body(0.5, arguments.degree)
-    for name, run in methods(small, arguments).items():  # compiles the forms
-        if name in chosen:
-            run()
-    times: dict[str, list[float]] = {name: [] for name in chosen}
-    results: dict[str, dict[str, Any]] = {}
-    for _ in range(arguments.repeat):
-        for name, run in chosen.items():
-            start = time.perf_counter()
-            results[name] = run()
-            times[name].append(time.perf_counter() - start)
-    unit = statistics.median(times["one linear solve"])
-    rows = [
-        {
-            "method": name,
-            "seconds": round(statistics.median(times[name]), 3),
-            "linear solves": round(statistics.median(times[name]) / unit, 2),
-            "iterations": results[name]["iterations"],
-            "factorisations": results[name]["factorisations"],
-            "shear per half": results[name].get("shear", ""),
-        }
-        for name in chosen
-    ]
-    table = [
-        f"Half-cylinder, {body.n_dofs} dofs, degree {arguments.degree}, h = {arguments.h:g}, "
-        f"k h/E = {arguments.stiffness:g}, medians of {arguments.repeat}",
-        "",
-        "| " + " | ".join(rows[0]) + " |",
-        "|" + "---|" * len(rows[0]),
-        *("| " + " | ".join(str(value) for value in row.values()) + " |" for row in rows),
-    ]
-    print("\n".join(table))
-    if arguments.output:
-        arguments.output.mkdir(parents=True, exist_ok=True)
-        (arguments.output / "table.md").write_text("\n".join(table) + "\n")
-        with open(arguments.output / "table.csv", "w", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+    small = methods(Body(0.5, arguments.degree), arguments)
+    first = {name: run for name, run in small.items() if name in chosen}
+    rows = timing.measure(chosen, repeat=arguments.repeat, first=first)
+    title = f"Half-cylinder, {body.n_dofs} dofs, degree {arguments.degree}, h = {body.h:g}, "
+    title += f"k h/E = {arguments.stiffness:g}, medians of {arguments.repeat}"
+    rows = timing.in_units_of(rows, YARDSTICK, "linear solves")
+    timing.write(arguments.output, "half_cylinder", title, rows)
 
 
 if __name__ == "__main__":

@@ -1,18 +1,16 @@
 """The three methods on three scenes with friction: iterations, factorisations and time.
 
-    python benchmarks/methods.py --output output/methods
+    python benchmarks/methods.py
 
 Scenes: the half-cylinder of the demo (μ = 0.2, ten increments), the cylinder dragged over a block
 (μ = 0.3, ten increments), and in space a ball pressed into a block and dragged (μ = 0.3, five
 increments), each at moderate and at high contact stiffness. Without the fallback: a method that
 fails is seen to fail, at the increment that is given. Writes a table in Markdown and a CSV; times
-are of the solves alone, medians of ``--repeats`` runs, without what is compiled once.
+are of the solves alone, medians of ``--repeat`` runs, without what is compiled once.
 """
 
 from __future__ import annotations
 
-import argparse
-import csv
 import statistics
 import sys
 import time
@@ -30,6 +28,7 @@ import fenics_contact as fc
 sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
 import hertz
 import ironing
+import timing
 
 METHODS = ("lbfgs", "newton", "alternating")
 STIFFNESSES = (10.0, 1000.0)
@@ -152,22 +151,14 @@ def measure(repeats: int) -> Iterator[dict[str, object]]:
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--output", type=Path, default=Path("output/methods"))
+    parser = timing.parser(__doc__, "methods")
     arguments = parser.parse_args()
-    arguments.output.mkdir(parents=True, exist_ok=True)
     rows = []
-    for row in measure(arguments.repeats):
+    for row in measure(1 if arguments.short else arguments.repeat):
         rows.append(row)
         print(*row.values(), sep="  ", flush=True)
-    with open(arguments.output / "methods.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
-    lines += ["| " + " | ".join(str(value) for value in row.values()) + " |" for row in rows]
-    (arguments.output / "methods.md").write_text("\n".join(lines) + "\n")
+    title = "The three methods on three scenes with friction"
+    timing.write(arguments.output, "methods", title, rows)
 
 
 if __name__ == "__main__":

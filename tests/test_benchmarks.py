@@ -1,0 +1,59 @@
+"""What the benchmarks share, and that they run."""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mpi4py import MPI
+from running import ROOT, environment
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+import timing
+
+pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="of one process")
+
+
+def test_fit_finds_a_power_law() -> None:
+    """A law y = 3 x^1.5, exactly: logarithms of doubles, so that 1e-12 is left."""
+    x = [10.0, 100.0, 1e3, 1e5]
+    assert timing.fit(x, [3 * v**1.5 for v in x]) == pytest.approx((3.0, 1.5), rel=1e-12)
+
+
+def test_times_are_medians_in_units_of_a_run(tmp_path: Path) -> None:
+    """Every run is made once small and `repeat` times; the unit's own row is 1."""
+    calls: list[str] = []
+
+    def run(name: str) -> dict[str, int]:
+        calls.append(name)
+        return {"calls": len(calls)}
+
+    runs = {name: lambda name=name: run(name) for name in ("one", "other")}
+    rows = timing.measure(runs, repeat=3, first=runs)
+    assert calls == ["one", "other"] * 4
+    assert [row["calls"] for row in rows] == [7, 8]
+    rows = timing.in_units_of(rows, "one", "units")
+    assert rows[0]["units"] == 1.0
+    assert rows[1]["units"] == pytest.approx(rows[1]["seconds"] / rows[0]["seconds"])
+    timing.write(tmp_path, "table", "A table", rows)
+    with open(tmp_path / "table.csv", newline="") as file:
+        assert [row["run"] for row in csv.DictReader(file)] == ["one", "other"]
+    assert "| one |" in (tmp_path / "table.md").read_text()
+
+
+@pytest.mark.slow
+def test_half_cylinder_runs(tmp_path: Path) -> None:
+    """The short benchmark ends well and every method finds the solution."""
+    command = [sys.executable, str(ROOT / "benchmarks" / "run.py"), "half_cylinder", "--short"]
+    command += ["--repeat", "1", "--output", str(tmp_path)]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "README.md").is_file()
+    with open(tmp_path / "half_cylinder" / "half_cylinder.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) > 3
+    assert all(float(row["seconds"]) > 0 and row["iterations"] != "none" for row in rows)
