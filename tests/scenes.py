@@ -228,7 +228,6 @@ def nodal(u: fem.Function) -> Array:
 def at_points(contact: fc.Contact, rows: Array) -> Array:
     """Rows (points, …) of all ranks, in the order of the points' places."""
     comm = contact.surface.mesh.comm
-    rows = np.asarray(rows).reshape(len(contact.points), -1)
     d = contact.points.shape[1]
     return sorted_by_place(gathered(comm, contact.points), gathered(comm, rows))[:, d:]
 
