@@ -226,6 +226,19 @@ DEMOS = [
         label="kind",
     ),
     demo(
+        "Cylinder dragged along a block",
+        "2 % for width and peak, the peak even to 1 %: the points of the cells; 1e-6: equilibrium; "
+        "1 % for the work: small displacements",
+        "ironing",
+        source={
+            "force": "equilibrium",
+            "over normal": "Coulomb",
+            "work": "energy",
+            "spread": "steady state",
+            "": "Johnson, sliding cylinder",
+        },
+    ),
+    demo(
         "Male–female fitting",
         "1e-7: equilibrium to the solver's tolerance; 1e-8 for homogeneity",
         "fitting",
