@@ -12,8 +12,20 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
+from petsc4py import PETSc
 
 __all__ = ["compile_form", "create_facet_submesh", "interpolation_points", "model_to_mesh"]
+
+# PETSc's line search for the least residual, renamed in 3.24; bound to Python since 3.23.
+_line_searches = getattr(getattr(PETSc, "SNESLineSearch", None), "Type", None)
+LEAST_RESIDUAL = getattr(_line_searches, "SECANT", "l2")
+# PETSc's error for a zero in a dense factorisation (PETSC_ERR_MAT_LU_ZRPVT).
+_ZERO_PIVOT = 71
+
+
+def is_singular(error: PETSc.Error) -> bool:
+    """Whether a dense matrix could not be factored."""
+    return bool(error.ierr == _ZERO_PIVOT)
 
 
 def create_facet_submesh(

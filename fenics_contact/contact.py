@@ -81,6 +81,7 @@ class Contact:
         free_motion: Components of the support's displacement that follow from the force on it, as
             scalar constants by number of the component: their values are results (length).
         applied_force: The forces on it, likewise (force).
+        softening: Factor of k_n and k_t, 1 but for the while in which stiffness is led up to it.
         gap_prescribed: Whether the gap was given apart from the geometry.
         n_unpaired: Points whose normal meets no opposite surface (deformable support).
         pairings: How often opposites were found: the couplings change with each.
@@ -139,6 +140,9 @@ class Contact:
         self._scale_known = False
         self._tributary: VertexAreas | None = None  # if a stiffness is that of Springs
         parameters = {n: self._parameter(n, v) for n, v in law.parameters().items()}
+        self.softening = fem.Constant(mesh, 1.0)
+        for n in {"k_n", "k_t"} & set(parameters):
+            parameters[n] = self.softening * parameters[n]
         if modulus is not None:
             self.set_modulus(modulus)
 

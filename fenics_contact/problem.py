@@ -18,14 +18,16 @@ from petsc4py import PETSc
 from fenics_contact import accuracy, compat
 from fenics_contact.alternating import Alternation
 from fenics_contact.bulk import Bulk
+from fenics_contact.chattering import StatusWatch
 from fenics_contact.condense import CondensedSpace, touched, worthwhile
 from fenics_contact.contact import Contact, Resultants, Status
+from fenics_contact.continuation import Continuation
 from fenics_contact.energy import Energy, EnergyState
 from fenics_contact.parallel import global_max, global_min, global_sum
 from fenics_contact.rigid import RigidMotions
 from fenics_contact.spaces import WholeSpace
 from fenics_contact.unknowns import Selection, Unknowns
-from fenics_contact.verdict import NotConverged, Verdict, check_laws
+from fenics_contact.verdict import NotConverged, Rung, Verdict, check_laws
 
 __all__ = ["ContactProblem", "Step"]
 
@@ -44,11 +46,21 @@ _ASTRAY = 1e3
 # Round-off in K u excuses a residual up to this share of the forces (or of the residual before the
 # first iteration), not more: a displacement grown without bounds would excuse anything.
 _MAX_FLOOR = 1e-5
+# An unknown with less than this share of the bulk's stiffness has none.
+_FELT = 1e-12
 # Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
 _TOUCHING = 1e-12
-# PETSc's error for one in a dense factorisation (PETSC_ERR_MAT_LU_ZRPVT).
-_ZERO_PIVOT = 71
+# Iterations of Newton's method without a lower residual after which another method takes over.
+_PATIENCE = 20
 
+_REASONS = PETSc.SNES.ConvergedReason
+_OUTCOMES = {
+    int(_REASONS.DIVERGED_LINEAR_SOLVE): "the matrix is singular",
+    int(_REASONS.DIVERGED_FNORM_NAN): "the residual is not finite",
+    int(_REASONS.DIVERGED_MAX_IT): "iterations used up",
+    int(_REASONS.DIVERGED_LINE_SEARCH): "no progress",
+    int(_REASONS.DIVERGED_DTOL): "no progress",
+}
 _COMMON = {
     "snes_rtol": 1e-9,
     "snes_stol": 0.0,
@@ -76,7 +88,10 @@ _METHODS: dict[str, dict[str, Any]] = {
     },
     "newton": {"snes_type": "newtonls", "snes_max_it": 100},
     "alternating": {},
+    "continuation": {},
 }
+# What takes over where a method fails.
+_LAST_RESORT = "continuation"
 
 
 @dataclass(frozen=True)
@@ -92,6 +107,7 @@ class Step:
         verdict: The independent check.
         contacts: Resultants of every contact, by name.
         energy: Works and energies of the increment.
+        rungs: Everything that was tried, in its order; the last is what found the solution.
         wall_seconds: Time of the solve on this rank.
         load: Load parameter, where `increments` set one.
     """
@@ -104,6 +120,7 @@ class Step:
     verdict: Verdict
     contacts: dict[str, Resultants]
     energy: Energy
+    rungs: tuple[Rung, ...]
     wall_seconds: float
     load: float | None = None
 
@@ -164,13 +181,14 @@ class ContactProblem:
             bcs: Dirichlet conditions on ``u`` or its components.
             contacts: Contacts of ``u``.
             method: "lbfgs" (quasi-Newton, H₀ = (K + αK_n + φK_t)⁻¹), "newton" (consistent
-                tangent), or "alternating" (minimum problems in turn, each by Newton's method with
-                a line search on the energy).
+                tangent), "continuation" (the same, from soft contact to stiff; alternating where
+                it is stuck), or "alternating" (minimum problems in turn, each by Newton's method
+                with a line search on the energy).
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
                 paper has 0; 1 needs a third of the iterations once a point sticks.
-            fallback: Whether to alternate where the method fails with no less than its usual
-                limit on iterations.
+            fallback: Whether to go on by continuation where the method fails with no less than its
+                usual limit on iterations.
             condensation: Whether to iterate on the unknowns that contact touches alone, all others
                 eliminated: for a linear bulk on one rank. By default where it can be done and is
                 worth it (`condense.worthwhile`), unless an option names a linear solver.
@@ -225,6 +243,7 @@ class ContactProblem:
         self._committed_energy = EnergyState.unloaded(self._committed, self.contacts)
         self._energy = self._committed_energy
         self._rate: Array | None = None
+        self._watch = StatusWatch(self.contacts)
         self._condensation = condensation
         self.prefix, self._method, self._fallback = prefix, method, fallback
         self._configure(method, dict(petsc_options or {}), prefix)
@@ -318,6 +337,7 @@ class ContactProblem:
         self._attach(consistent=not self._quasi_newton)
         snes.setUp()
         self._alternation = Alternation(self, default)
+        self._continuation = Continuation(self, default)
         for key in inserted:
             database.delValue(key)
         self._rtol = snes.getTolerances()[0]
@@ -480,15 +500,22 @@ class ContactProblem:
             return int(reasons.DIVERGED_FNORM_NAN)
         if self._norms["residual"] <= self._tolerance():
             return int(reasons.CONVERGED_FNORM_RELATIVE)
+        if self._watch.idle > _PATIENCE and self._may_climb():
+            return int(reasons.DIVERGED_LINE_SEARCH)
         return int(reasons.ITERATING)
 
     def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
-        if self._quasi_newton:
-            return  # H₀ is made between the rounds, and kept for all iterations of one
+        if not self._quasi_newton:  # else H₀ is made between the rounds, and kept during one
+            self._assemble_tangent(x, J)
+
+    def _assemble_tangent(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
+        """The consistent tangent of bulk and contact. Collective."""
+        residual = self._norms["residual"]  # SNES has just computed it at x
         self._set_u(x)
         self._update_bulk()
         for contact in self.contacts:
             contact.evaluate()
+        self._watch.note(residual)
         # Until enough points are closed to hold the body its tangent is singular: take H₀ of the
         # whole surface, as for the start of the quasi-Newton iteration.
         if self.motions.held(self.contacts, closed_only=True):
@@ -545,6 +572,7 @@ class ContactProblem:
             return False
         for contact in self.contacts:
             contact.evaluate()
+        self._watch.note(self._norms["residual"])
         consistent = not self.has_potential and self.motions.held(self.contacts, closed_only=True)
         parts = self._tangents() if consistent else self._stiffnesses(everywhere=False)
         self._clear_pairs(consistent=consistent)
@@ -605,70 +633,93 @@ class ContactProblem:
         self._update_space(stiffness_changed)
         self._approach()
         self._space.begin(self._load)
-        iterations, reason, method = self._iterate(ahead, stiffness_changed)
+        reason, rungs = self._iterate(ahead, stiffness_changed)
         self._space.complete()
         verdict = self._judge()
         if reason <= 0 or verdict.failures:
-            raise NotConverged(self.increment + 1, int(reason), iterations, verdict)
+            raise NotConverged(self.increment + 1, reason, verdict, rungs)
         return Step(
             increment=self.increment + 1,
-            reason=int(reason),
-            iterations=iterations,
-            method=method,
+            reason=reason,
+            iterations=sum(rung.iterations for rung in rungs),
+            method=rungs[-1].method,
             factorisations=self._factorisations,
             verdict=verdict,
             contacts={c.name: c.resultants() for c in self.contacts},
             energy=self._energy.since(self._committed_energy, self.contacts, self._comm),
+            rungs=tuple(rungs),
             wall_seconds=time.perf_counter() - start,
         )
 
-    def _iterate(self, ahead: float, stiffness_changed: bool) -> tuple[int, int, str]:
-        """Iterate from one start after another, then alternate if that failed. Collective.
+    def _iterate(self, ahead: float, stiffness_changed: bool) -> tuple[int, list[Rung]]:
+        """Iterate from one start after another, then by continuation. Collective.
 
         Returns:
-            Iterations, reason, and the method that found the solution.
+            Reason, and what was tried.
         """
-        iterations, reason = 0, int(PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE)
-        method = self._method
+        reason, rungs = int(PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE), []
         self._space.enter()
         try:
             starts = [self._space.part(start) / self._length for start in self._starts(ahead)]
-            tries = [(start, method) for start in starts]
-            if method == "alternating":
-                del tries[1:]
-            elif self._may_alternate():
-                tries.append((starts[0], "alternating"))
+            tries = [(start, self._method) for start in starts]
+            if self._may_climb():
+                tries.append((starts[0], _LAST_RESORT))
             for start, method in tries:
                 self._solution.array[:] = start
-                try:
-                    made, reason = self._solve_by(method, stiffness_changed)
-                except PETSc.Error as error:
-                    if error.ierr != _ZERO_PIVOT:
-                        raise
-                    continue  # a dense matrix that is singular
-                iterations += made
+                self._watch.start()
+                iterations, reason = self._solve_by(method, stiffness_changed)
+                rungs.append(Rung(method, iterations, self._outcome(reason)))
                 if reason > 0:
                     break
-            if method != self._method and self._comm.rank == 0:
-                logger.info("increment %d: %s failed, alternated", self.increment + 1, self._method)
+                if self._comm.rank == 0:
+                    logger.info("increment %d: %s", self.increment + 1, rungs[-1])
             self._set_u(self._solution)
         finally:
             self._whole.enter()
-        return iterations, int(reason), method
+        return int(reason), rungs
 
     def _solve_by(self, method: str, stiffness_changed: bool) -> tuple[int, int]:
         """Iterations and reason of one method, from ``_solution``. Collective."""
-        if method == "alternating":
-            return self._alternation.solve(self._solution)
-        if self._quasi_newton:
-            return self._solve_quasi_newton(stiffness_changed)
-        self.snes.solve(None, self._solution)
+        try:
+            if method == "alternating":
+                return self._alternation.solve(self._solution)
+            if method == "continuation":
+                return self._continuation.solve(self._solution)
+            if self._quasi_newton:
+                return self._solve_quasi_newton(stiffness_changed)
+            self.snes.solve(None, self._solution)
+        except PETSc.Error as error:
+            if not compat.is_singular(error):
+                raise
+            return self.snes.getIterationNumber(), int(_REASONS.DIVERGED_LINEAR_SOLVE)
         return self.snes.getIterationNumber(), self.snes.getConvergedReason()
 
-    def _may_alternate(self) -> bool:
-        """Whether to alternate after a failure: not if iterations are rationed by the caller."""
+    def _outcome(self, reason: int) -> str:
+        """What became of a rung, in words. Collective."""
+        if reason > 0:
+            return "converged"
+        words = _OUTCOMES.get(reason, f"SNES reason {reason}")
+        return "; ".join(filter(None, (words, self._watch.chattering())))
+
+    def _may_climb(self) -> bool:
+        """Whether to go on after a failure: not if iterations are rationed by the caller."""
         limit = self._max_it if self._quasi_newton else self.snes.getTolerances()[3]
-        return self._fallback and limit >= (_COMMON | _METHODS[self._method])["snes_max_it"]
+        return (
+            self._fallback
+            and self._method != _LAST_RESORT
+            and limit >= (_COMMON | _METHODS[self._method])["snes_max_it"]
+        )
+
+    def _hardness(self) -> float:
+        """Largest ratio of contact's stiffness to the bulk's at an unknown. Collective."""
+        diagonals = []
+        for contacts in ([], self.contacts):
+            parts = (c.stiffness_matrix(1.0, 1.0) for c in contacts)
+            self._space.fill(self._matrices[True], self._bulk_matrix, parts)
+            diagonals.append(self._space.diagonal.copy())
+        bulk, both = diagonals
+        felt = bulk > _FELT * self.bulk.scale  # the motion of a support has no stiffness
+        return global_max(self._comm, both[felt] / bulk[felt] - 1.0)
 
     def _check_before(self) -> None:
         self.bulk.check_finite()
@@ -727,7 +778,7 @@ class ContactProblem:
         Returns:
             Iterations and reason, the latter after a look at the residual itself.
         """
-        snes, reasons = self.snes, PETSc.SNES.ConvergedReason
+        snes, reasons = self.snes, _REASONS
         if not self._has_h0 or stiffness_changed:
             self._start_h0()
             self._has_h0 = True

@@ -12,7 +12,7 @@ from dolfinx import fem
 
 from fenics_contact import checkpoint as files
 from fenics_contact.problem import ContactProblem, Step
-from fenics_contact.verdict import NotConverged
+from fenics_contact.verdict import NotConverged, Rung
 
 __all__ = ["increments"]
 
@@ -53,7 +53,8 @@ def increments(
         checkpoint_every: Write it after every so many increments, and after the last.
 
     Yields:
-        The step, after its commit; ``load`` is its load parameter.
+        The step, after its commit; ``load`` is its load parameter, and ``rungs`` has what was tried
+        before the increment was cut, too.
 
     Raises:
         ValueError: ``load`` is no scalar constant or function, or ``steps`` has no sense.
@@ -71,6 +72,7 @@ def increments(
         problem.take_up_loads()
     direction = 1.0 if end >= start else -1.0
     unsaved = 0
+    failed: list[Rung] = []
     for target in ends:
         while direction * (target - at.load) > 0:
             # A remainder that is next to nothing is taken along.
@@ -81,9 +83,14 @@ def increments(
                 step = problem.solve(ahead=(goal - at.load) / at.last if at.last else 1.0)
             except BaseException as error:
                 apply(at.load)
-                if not isinstance(error, NotConverged) or at.cuts == max_cuts:
+                if not isinstance(error, NotConverged):
+                    raise
+                failed += error.rungs
+                if at.cuts == max_cuts:
+                    error.rungs = tuple(failed)
                     raise
                 at.cut(abs(goal - at.load))
+                failed.append(Rung("cut", 0, f"to {at.largest:g}"))
                 if problem.u.function_space.mesh.comm.rank == 0:
                     logger.warning(
                         "increment %d, to load %g, did not converge: cut to %g",
@@ -98,7 +105,8 @@ def increments(
             if checkpoint is not None and (unsaved >= checkpoint_every or goal == ends[-1]):
                 files.save(problem, checkpoint, dataclasses.astuple(at))
                 unsaved = 0
-            yield dataclasses.replace(step, load=goal)
+            tried, failed = (*failed, *step.rungs), []
+            yield dataclasses.replace(step, load=goal, rungs=tried)
 
 
 @dataclasses.dataclass

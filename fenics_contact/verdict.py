@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from fenics_contact.contact import Contact
 from fenics_contact.parallel import global_max
 
-__all__ = ["NotConverged", "Verdict", "check_laws"]
+__all__ = ["NotConverged", "Rung", "Verdict", "check_laws"]
 
 # The laws hold point by point up to rounding of their few operations.
 _LAW_TOLERANCE = 1e-10
@@ -137,24 +138,49 @@ def check_laws(contact: Contact) -> dict[str, float]:
     return found
 
 
+@dataclass(frozen=True)
+class Rung:
+    """One thing that was tried to solve an increment.
+
+    Attributes:
+        method: A method of `ContactProblem`; or "cut", where `increments` halved the increment.
+        iterations: SNES iterations.
+        outcome: "converged", or what went wrong, in words.
+    """
+
+    method: str
+    iterations: int
+    outcome: str
+
+    def __str__(self) -> str:
+        """For logs and messages."""
+        return f"{self.method}: {self.outcome} ({self.iterations} iterations)"
+
+
 class NotConverged(RuntimeError):
     """No solution of an increment was found. u and history are as before the increment.
 
     Attributes:
         increment: Its number, from 1.
-        reason: SNES reason (negative: diverged; positive: it claimed convergence).
+        reason: SNES reason of what was tried last (negative: diverged; positive: it claimed
+            convergence).
         iterations: SNES iterations made.
         verdict: The last state, as checked.
+        rungs: What was tried, in its order.
     """
 
-    def __init__(self, increment: int, reason: int, iterations: int, verdict: Verdict) -> None:
+    def __init__(
+        self, increment: int, reason: int, verdict: Verdict, rungs: Sequence[Rung] = ()
+    ) -> None:
         """Compose the message: what happened, the numbers, and what to try."""
-        self.increment, self.reason = increment, reason
-        self.iterations, self.verdict = iterations, verdict
+        self.increment, self.reason, self.verdict = increment, reason, verdict
+        self.rungs = tuple(rungs)
+        self.iterations = sum(rung.iterations for rung in rungs)
         what = "; ".join(verdict.failures) or "the last state passes the checks"
+        tried = ". ".join(str(rung) for rung in rungs)
         super().__init__(
-            f"increment {increment} did not converge: SNES reason {reason} after {iterations} "
-            f"iterations; {what}; forces are of size {verdict.force:.3e}. Try smaller increments, "
-            "a lower k_t, then a lower k_n, or method='newton'; -contact_snes_monitor shows the "
+            f"increment {increment} did not converge: SNES reason {reason} after {self.iterations} "
+            f"iterations; {what}; forces are of size {verdict.force:.3e}. Tried: {tried}. Try "
+            "smaller increments, a lower k_t, then a lower k_n; -contact_snes_monitor shows the "
             "iterations"
         )

@@ -166,23 +166,6 @@ def test_stiff_contact_from_a_cold_start(factor, friction):
     assert r.max_penetration < 1e-1 / factor
 
 
-@pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_used_by_itself_where_the_method_fails(method):
-    """Stiff friction that the direct methods do not solve from a cold start is solved all the same.
-
-    Without the fallback they say that they failed.
-    """
-    stiff = fc.Scaled(1e4)
-    law = fc.Coulomb(0.3, stiff, stiff)
-    _, problem, _ = pressed("quadrilateral", law, method, n=12, side=0.02, fallback=False)
-    with pytest.raises(fc.NotConverged):
-        problem.solve()
-    _, problem, _ = pressed("quadrilateral", law, method, n=12, side=0.02)
-    step = problem.solve()
-    assert step.method == "alternating"
-    assert not step.verdict.failures
-
-
 def test_rationed_iterations_are_not_exceeded():
     """Who limits the iterations gets no others instead."""
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)

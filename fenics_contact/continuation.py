@@ -1,0 +1,140 @@
+"""Continuation in the stiffness of contact: softer problems first, each the start of the next.
+
+Newton's method finds the solution of soft contact from far away, and that of stiff contact from the
+solution of one that is a little softer: the points that are closed, stick and slip are nearly those
+of the next one, and for a given status the equations are linear, or nearly so. Where a step of the
+stiffness does not succeed, a smaller one may. Where none does, the branch of solutions may end, as
+it can with friction, and the alternation finds another.
+"""
+
+from __future__ import annotations
+
+import logging
+import weakref
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+from fenics_contact import compat
+
+__all__ = ["OPTIONS", "Continuation"]
+
+logger = logging.getLogger("fenics_contact")
+
+OPTIONS = {
+    "snes_type": "newtonls",
+    "snes_rtol": 0.0,
+    "snes_stol": 0.0,
+    "snes_atol": 0.0,
+    "snes_max_it": 25,
+    # One secant step towards the least residual: with none Newton's method cycles earlier, and cp
+    # or bt, which go on until the residual falls, take steps too short for a change of status.
+    "snes_linesearch_type": compat.LEAST_RESIDUAL,
+    "snes_linesearch_max_it": 1,
+}
+# Factor of the stiffness from one problem to the next, and the least that is tried.
+_FACTOR = 10.0
+_LEAST_FACTOR = 1.2
+# Residual of the softer problems, as a share of the forces: they are starts, not results.
+_COARSE = 1e-3
+
+
+class Continuation:
+    """The method, on the unknowns, matrices and measures of a problem.
+
+    Attributes:
+        snes: Newton's method for one stiffness, prefix "continuation_" behind the problem's.
+    """
+
+    def __init__(self, problem: Any, set_defaults: Callable[[dict[str, Any], str], None]) -> None:
+        """Set up SNES; the matrix is that of the consistent tangent. Collective.
+
+        Args:
+            problem: The `ContactProblem`.
+            set_defaults: Puts options with a prefix into the database where they are not set.
+        """
+        self._problem = weakref.proxy(problem)
+        self._function: PETSc.Vec | None = None
+        prefix = f"{problem.prefix}continuation_"
+        self.snes = PETSc.SNES().create(problem.u.function_space.mesh.comm)
+        self.snes.setOptionsPrefix(prefix)
+        set_defaults(OPTIONS, prefix)
+        self.snes.setFromOptions()
+        self._coarse = 0.0
+
+    def _attach(self) -> None:
+        """Take the vectors, matrices and solver of the problem's present space."""
+        problem, snes = self._problem, self.snes
+        if self._function is not problem._function:
+            snes.reset()
+        self._function = problem._function
+        snes.setKSP(problem._solvers[True])
+        snes.setJacobian(
+            lambda _, x, J, P: self._problem._assemble_tangent(x, J), problem._matrices[True]
+        )
+        snes.setFunction(lambda _, x, f: self._problem._compute_residual(x, f), self._function)
+        snes.setConvergenceTest(lambda _, it, norms: self._test(norms[2]))
+
+    def solve(self, solution: PETSc.Vec) -> tuple[int, int]:
+        """Solve the problem from ``solution`` on. Collective.
+
+        Returns:
+            Newton iterations in all, and the reason as SNES has them.
+        """
+        problem = self._problem
+        self._attach()
+        share = min(1.0, 1.0 / max(problem._hardness(), 1.0))
+        iterations, solved, factor, kept = 0, 0.0, _FACTOR, solution.copy()
+        try:
+            while True:
+                self._soften(share)
+                made, reason = self._solve_one(solution)
+                iterations += made
+                if reason <= 0:
+                    kept.copy(solution)
+                    if solved and factor > _LEAST_FACTOR:
+                        factor = np.sqrt(factor)
+                        share = min(1.0, factor * solved)
+                        continue
+                    factor = _FACTOR
+                    share = min(1.0, factor * solved) if solved else share
+                    self._soften(share)
+                    made, reason = problem._alternation.solve(solution)
+                    iterations += made
+                    logger.debug("alternated at %.3g of the stiffness: reason %d", share, reason)
+                if reason <= 0 or share == 1.0:
+                    return iterations, reason
+                logger.debug("%.3g of the stiffness, %d iterations so far", share, iterations)
+                solved = share
+                solution.copy(kept)
+                share = min(1.0, factor * solved)
+        finally:
+            self._soften(1.0)
+            problem.drop_h0()
+
+    def _soften(self, share: float) -> None:
+        """Let the contacts have a share of their stiffness."""
+        for contact in self._problem.contacts:
+            contact.softening.value = share
+        self._coarse = _COARSE if share < 1.0 else 0.0
+
+    def _solve_one(self, solution: PETSc.Vec) -> tuple[int, int]:
+        problem, reasons = self._problem, PETSc.SNES.ConvergedReason
+        problem._watch.start()
+        try:
+            self.snes.solve(None, solution)
+        except PETSc.Error as error:
+            if not compat.is_singular(error):
+                raise
+            return self.snes.getIterationNumber(), int(reasons.DIVERGED_LINEAR_SOLVE)
+        return self.snes.getIterationNumber(), self.snes.getConvergedReason()
+
+    def _test(self, norm: float) -> int:
+        problem, reasons = self._problem, PETSc.SNES.ConvergedReason
+        if not np.isfinite(norm):
+            return int(reasons.DIVERGED_FNORM_NAN)
+        goal = max(problem._tolerance(), self._coarse * problem._norms["force"])
+        converged = problem._norms["residual"] <= goal
+        return int(reasons.CONVERGED_FNORM_RELATIVE if converged else reasons.ITERATING)

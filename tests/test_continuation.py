@@ -1,0 +1,147 @@
+"""Continuation in stiffness: stiff contact from a cold start, by every method; what was tried."""
+
+import logging
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import TOP, block, close, nodal
+from test_alternating import cushion, pressed
+
+import fenics_contact as fc
+
+COMM = MPI.COMM_WORLD
+SERIAL = pytest.mark.skipif(COMM.size > 1, reason="the same on several ranks, and slow there")
+
+
+@pytest.mark.parametrize(
+    ("cell", "degree"), [("triangle", 2), ("quadrilateral", 1), ("hexahedron", 1)]
+)
+def test_the_same_solution(cell, degree):
+    """Where Newton's method does it directly both satisfy the law to 1e-9: states agree to 1e-6."""
+    law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
+    states = []
+    for method in ("continuation", "newton"):
+        scene, problem, contact = pressed(cell, law, method, degree=degree, n=3, side=0.06)
+        step = problem.solve()
+        assert [rung.method for rung in step.rungs] == [method]
+        assert contact.softening.value == 1.0
+        states.append(nodal(scene.u))
+    assert close(*states, 1e-6)
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+@pytest.mark.parametrize(("factor", "friction"), [(1e6, 0.0), (1e8, 0.0), (1e4, 0.3), (1e6, 0.3)])
+def test_stiff_contact_from_a_cold_start(method, factor, friction):
+    """One increment from nothing: penetration is next to none, and the force that of hard contact.
+
+    Reference: the same at k_n h/E = 1e3, whose penetration, a thousandth of a cell, moves the force
+    by as much; 2e-2 with friction, where points that slipped may stick.
+    """
+    forces = []
+    for scaled in (fc.Scaled(1e3), fc.Scaled(factor)):
+        law = fc.Coulomb(friction, scaled, scaled) if friction else fc.Frictionless(scaled)
+        _, problem, _ = pressed("quadrilateral", law, method, n=8)
+        step = problem.solve()
+        forces.append(step.contacts["contact"].normal_force)
+    assert close(forces[1], forces[0], 2e-2 if friction else 1e-3)
+    assert step.contacts["contact"].max_penetration < 1e-1 / factor
+    assert [rung.method for rung in step.rungs] == [method, "continuation"]
+    assert step.method == "continuation" and step.rungs[-1].outcome == "converged"
+    assert step.rungs[0].outcome != "converged"
+    assert step.iterations == sum(rung.iterations for rung in step.rungs)
+
+
+def test_without_a_fallback_it_fails_and_says_why(caplog):
+    """Newton's method with full steps goes round in a cycle: the points that do are named.
+
+    That they sit under the middle of the ball, where contact is, is told from the geometry.
+    """
+    stiff = fc.Scaled(1e4)
+    law = fc.Coulomb(0.3, stiff, stiff)
+    options = {"snes_linesearch_type": "basic"}
+    _, problem, contact = pressed(
+        "quadrilateral", law, "newton", n=8, fallback=False, petsc_options=options
+    )
+    with caplog.at_level(logging.INFO, "fenics_contact"), pytest.raises(fc.NotConverged) as caught:
+        problem.solve()
+    (rung,) = caught.value.rungs
+    assert rung.method == "newton" and rung.iterations == caught.value.iterations == 100
+    for text in (rung.outcome, str(caught.value)):
+        assert "contact chatters" in text and "16 points keep changing between" in text
+    x = float(rung.outcome.split("at (")[1].split(",")[0])
+    assert 0.25 < x < 0.75
+    assert contact.softening.value == 1.0
+
+
+def test_every_rung_is_logged(caplog):
+    """What failed is in the log and in the step, in its order."""
+    stiff = fc.Scaled(1e4)
+    law = fc.Coulomb(0.3, stiff, stiff)
+    _, problem, _ = pressed("quadrilateral", law, "newton", n=8)
+    with caplog.at_level(logging.INFO, "fenics_contact"):
+        step = problem.solve()
+    texts = [record.getMessage() for record in caplog.records]
+    (first, *_) = COMM.allgather(texts)  # rank 0 speaks
+    assert len(step.rungs) == 2
+    assert any(str(step.rungs[0]) in text for text in first)
+
+
+def test_where_newton_is_stuck_the_alternation_goes_on():
+    """With no iterations for Newton's method every stiffness is left to the alternation."""
+    law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
+    ends = []
+    for options in ({}, {"continuation_snes_max_it": 0}):
+        scene, problem, _ = pressed("triangle", law, "continuation", petsc_options=options)
+        assert problem.solve().method == "continuation"
+        ends.append(nodal(scene.u))
+    assert close(*ends, 1e-6)
+
+
+def test_history_is_led_through():
+    """A cycle of loads with friction: softened problems leave nothing in the history.
+
+    Reference: L-BFGS, which solves the increments as they are; two solutions within the solver's
+    tolerance, and friction takes energy in every increment.
+    """
+    ends = []
+    for method in ("continuation", "lbfgs"):
+        scene = block("quadrilateral", 1, n=8)
+        push = [fem.Constant(scene.mesh, 0.0) for _ in range(2)]
+        bcs = [scene.hold(TOP, i, c) for i, c in enumerate(push)]
+        law = fc.Coulomb(0.3, fc.Scaled(100), fc.Scaled(100))
+        problem, _ = scene.problem(law, bcs, contact={"support": cushion(2)}, method=method)
+
+        def load(t, push=push):
+            push[1].value = -0.03 * min(t, 1.0)
+            push[0].value = np.interp(t, [1, 2, 4], [0, 0.05, -0.05])
+
+        steps = list(fc.increments(problem, load, 0.0, 4.0, steps=8))
+        assert all(step.energy.dissipation >= 0 for step in steps)
+        ends.append(nodal(scene.u))
+    assert close(*ends, 1e-5)
+
+
+def test_cut_increments_tell_what_was_tried():
+    """Every failed try, every cut and the success, in their order."""
+    scene = block("triangle", up=0.0)
+    push = fem.Constant(scene.mesh, 0.0)
+    bcs = [*scene.rollers(), scene.hold(TOP, 1, push)]
+    problem, _ = scene.problem(fc.Frictionless(k_n=1e4), bcs, fallback=False)
+    solve, fail = problem.solve, [True, True, False]
+
+    def failing(**kwargs):
+        problem._max_it, kept = (0 if fail.pop(0) else problem._max_it), problem._max_it
+        try:
+            return solve(**kwargs)
+        finally:
+            problem._max_it = kept
+            fail.append(False)
+
+    problem.solve = failing
+    first, *rest = fc.increments(problem, push, 0.0, -0.01)
+    names = [rung.method for rung in first.rungs]
+    assert names == ["lbfgs", "cut", "lbfgs", "cut", "lbfgs"]
+    assert [rung.outcome for rung in first.rungs[1::2]] == ["to 0.005", "to 0.0025"]
+    assert first.load == -0.0025 and all(len(step.rungs) == 1 for step in rest)
