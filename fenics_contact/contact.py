@@ -17,6 +17,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact import accuracy
+from fenics_contact.augmented import Multipliers
 from fenics_contact.history import History
 from fenics_contact.laws import Kinematics, Law, Scaled, Springs
 from fenics_contact.pairing import DeformableBody, Opposite
@@ -29,6 +30,7 @@ __all__ = ["Contact", "Resultants", "Status"]
 
 Array = npt.NDArray[np.float64]
 
+_ENFORCEMENTS = ("penalty", "augmented")
 # A direction with no more than this share across the normal counts as parallel to it.
 _PARALLEL = 1e-6
 
@@ -74,6 +76,8 @@ class Contact:
         surface, support, law: What was given.
         quadrature: The points of Γc.
         history: The committed state.
+        multipliers: λ_n and λ_t of augmented enforcement, None under penalty.
+        tolerance: What `enforcement_error` must come below, with multipliers.
         parameters: Every parameter of law and support given by a number, as a ``fem.Constant``
             by name ("friction", "k_n", "displacement" …): set ``.value`` to change it.
         entity_maps: For compiling `form` in a problem of one's own.
@@ -99,6 +103,8 @@ class Contact:
         gap: Any = None,
         weight: Any = None,
         modulus: Any = None,
+        enforcement: str = "penalty",
+        tolerance: float = 1e-5,
         name: str = "contact",
     ) -> None:
         """Bind the parts. Collective; compiles what evaluates the points.
@@ -115,6 +121,13 @@ class Contact:
             modulus: Young's modulus near Γc (stress), a number or function with one value per
                 cell, for `Scaled` stiffness. By default it is measured from the bulk form, by
                 `ContactProblem`.
+            enforcement: "penalty": k_n and k_t alone hold the body, which penetrates by p/k_n and
+                creeps by τ/k_t before it slips. "augmented": multipliers take the forces over from
+                these springs, round by round, until neither is left (`augmented`); k_n and k_t set
+                how fast.
+            tolerance: Of augmented enforcement: by how much of the largest pressure the springs
+                may still bear, see `enforcement_error`. The penetration is that share of the
+                penalty's.
             name: In messages and files.
 
         Raises:
@@ -135,6 +148,10 @@ class Contact:
             law.check_dimension(gdim)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
+        self.multipliers: Multipliers | None = None
+        self.tolerance = tolerance
+        if self._augments(enforcement):
+            self.multipliers = Multipliers(self.quadrature, degree, law)
         self.weight = self._scalar("weight", 1.0 if weight is None else weight)
         self._scale: fem.Function | None = None  # E/h, if a stiffness is Scaled
         self._scale_known = False
@@ -182,6 +199,8 @@ class Contact:
         fields = {"opening": 0, "penetration": 0, "normal_traction": 0}
         if law.has_friction:
             fields |= {"traction": gdim, "jump": gdim, "slip": law.n_modes(gdim)}
+        if self.multipliers is not None:
+            fields |= {"multiplier": 0}
         self.history = History(self.quadrature, fields)
 
         # All of contact is a sparse map from u to the jump at the points, and the law there.
@@ -223,6 +242,13 @@ class Contact:
                 "dissipated": law.dissipated(kinematics, response, parameters),
                 "slip_increment": ufl.as_vector(response.slip),
             }
+        if self.multipliers is not None:
+            expressions |= {"multiplier": kinematics.multiplier}
+            if law.has_friction:
+                assert kinematics.traction is not None
+                borne = kinematics.traction - response.traction
+                stretched = law.elastic_displacement(kinematics, borne, parameters)
+                expressions |= {"elastic_slip": stretched}
         self._evaluate_points = PointEvaluator(self.quadrature, expressions)
         self._acting = self._whole = _Reactions(self, law, parameters)
         self._frozen: _Reactions | None = None
@@ -232,6 +258,32 @@ class Contact:
         self.pairings = 0
         if self._opposite is not None:
             self.pair()
+
+    def _augments(self, enforcement: str) -> bool:
+        """Whether there are multipliers.
+
+        Raises:
+            ValueError: The law has no use for them, or the tolerance is none.
+        """
+        if enforcement not in _ENFORCEMENTS:
+            raise ValueError(
+                f"{self.name}: enforcement is {enforcement!r}; use one of {_ENFORCEMENTS}"
+            )
+        if not (np.ndim(self.tolerance) == 0 and 0.0 < self.tolerance < 1.0):
+            raise ValueError(
+                f"{self.name}: tolerance is {self.tolerance!r}; it must be a number between 0 and 1"
+            )
+        if enforcement == "penalty":
+            return False
+        springs = [n for n, v in self.law.parameters().items() if isinstance(v, Springs)]
+        if self.law.is_physical or springs:
+            what = f"{springs[0]} by Springs" if springs else type(self.law).__name__
+            raise ValueError(
+                f"{self.name}: {what} is the stiffness of something that is there, and multipliers "
+                'would take it away; use enforcement="penalty", or a law and stiffness that stand '
+                "for rigid contact"
+            )
+        return True
 
     def _relative(self, jump: Any) -> Any:
         """Displacement of the body relative to the support (UFL)."""
@@ -248,7 +300,11 @@ class Contact:
         """What a law, by default the contact's, sees of a displacement of the body (UFL)."""
         law = law or self.law
         normal = self._normal
-        total = increment = traction = None
+        total = increment = traction = multiplier = None
+        old_traction = self.history
+        if self.multipliers is not None:
+            old_traction = self.multipliers.fields
+            multiplier = old_traction.ufl("pressure")
 
         def tangential(vector: Any) -> Any:
             return vector - ufl.dot(vector, normal) * normal
@@ -259,8 +315,9 @@ class Contact:
             # The old traction and displacement are taken along the present normal: the support
             # may have moved on since the last commit.
             increment = tangential(self._relative(jump) - self.history.ufl("jump"))
-            traction = tangential(self.history.ufl("traction"))
-        return Kinematics(self._gap, ufl.dot(jump, normal), normal, total, increment, traction)
+            traction = tangential(old_traction.ufl("traction"))
+        u_n = ufl.dot(jump, normal)
+        return Kinematics(self._gap, u_n, normal, total, increment, traction, multiplier)
 
     # ---- forms -----------------------------------------------------------------------------------
 
@@ -631,6 +688,50 @@ class Contact:
         """Drop what was evaluated: the next look at a result evaluates the present ``u``."""
         self._points = None
 
+    def restore(self) -> None:
+        """Multipliers as at the last commit; what was evaluated is dropped. Collective."""
+        if self.multipliers is not None:
+            self.multipliers.restore(self.history)
+        self.forget()
+
+    def enforcement_error(self) -> float:
+        """What the springs bear at the last evaluated state, relative: 0 if exact. Collective.
+
+        The largest |Π p - λ_n| and |Π τ - λ_t| over the points, by the largest pressure or traction
+        now or at the last commit: what another round would change. k_n times the penetration is
+        that, and k_t times the elastic slip, as far as displacements of Γc can undo them.
+
+        Raises:
+            ValueError: There are no multipliers.
+        """
+        return self._augmented().error(self._values, self.history)
+
+    def augment(self) -> float:
+        """Let the multipliers bear what the springs did at the present ``u``. Collective.
+
+        One round: solve with `form`, then call this, until what it returns is small enough;
+        `commit` comes after the last. `ContactProblem` does it by itself.
+
+        Returns:
+            `enforcement_error` before.
+
+        Raises:
+            ValueError: There are no multipliers.
+        """
+        multipliers = self._augmented()
+        self.evaluate()
+        error = multipliers.error(self._values, self.history)
+        multipliers.update(self._values)
+        self.forget()
+        return error
+
+    def _augmented(self) -> Multipliers:
+        if self.multipliers is None:
+            raise ValueError(
+                f'{self.name}: there are no multipliers; make it with enforcement="augmented"'
+            )
+        return self.multipliers
+
     def check_input(self) -> None:
         """Refuse parameters that are out of range or not finite at some point of Γc. Collective.
 
@@ -690,6 +791,8 @@ class Contact:
                 "jump": points["jump"],
                 "slip": self.history.values("slip") + points["slip_increment"],
             }
+        if self.multipliers is not None:
+            values |= self.multipliers.committed(points)
         self.history.commit(values)
         self.committed_jump = points["jump"]
         if isinstance(self.support, DeformableBody) and self.support.update == "increment":
@@ -697,8 +800,11 @@ class Contact:
             self.pair(self.u)
             self.committed_jump = self._values["jump"]
             if self.law.has_friction:
-                self.history.commit(values | {"jump": self.committed_jump})
+                moved = values["jump"] + self.committed_jump - points["jump"]
+                self.history.commit(values | {"jump": moved})
             self._points = points  # results stay those of the solution
+        if self.multipliers is not None:
+            self.multipliers.restore(self.history)
 
     @property
     def _values(self) -> dict[str, Array]:

@@ -82,7 +82,10 @@ class Kinematics:
         tangential_displacement: u_t of eq. (21), relative to the support, shape (gdim,); None if
             the law gives no tangential traction.
         tangential_increment: Δu_t since the last commit, shape (gdim,); None without friction.
-        traction: Tangential traction τ at the last commit, shape (gdim,); None without friction.
+        traction: Tangential traction τ at the last commit, or the multiplier λ_t that replaces it,
+            shape (gdim,); None without friction.
+        multiplier: Pressure λ_n ≥ 0 that acts where the gap is closed and not penetrated; None
+            under penalty enforcement, where there is none.
     """
 
     gap: Expr
@@ -91,6 +94,7 @@ class Kinematics:
     tangential_displacement: Expr | None = None
     tangential_increment: Expr | None = None
     traction: Expr | None = None
+    multiplier: Expr | None = None
 
 
 @dataclass(frozen=True)
@@ -140,6 +144,11 @@ class Law:
     @property
     def has_tension(self) -> bool:
         """Whether r_n pulls where the gap is open: such points are never open."""
+        return False
+
+    @property
+    def is_physical(self) -> bool:
+        """Whether k_n and k_t are those of a layer that is there, and stand for no constraint."""
         return False
 
     @property
@@ -211,13 +220,19 @@ class Law:
     def stored(
         self, kinematics: Kinematics, response: Response, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """Energy per area in the springs, r_n²/2k_n + τ·K_t⁻¹τ/2."""
+        """Energy per area in the springs, r_n²/2k_n + τ·K_t⁻¹τ/2.
+
+        With multipliers the springs bear what these do not, in the end nothing.
+        """
         stored = ufl.as_ufl(0.0)
+        r_n, tau = response.normal_traction, response.traction
+        if kinematics.multiplier is not None:
+            r_n = r_n + kinematics.multiplier
+            tau = None if tau is None else tau - kinematics.traction
         if self.has_normal_stiffness:
-            stored += response.normal_traction**2 / (2 * parameters["k_n"])
-        if response.traction is not None:
-            stretched = self.elastic_displacement(kinematics, response.traction, parameters)
-            stored += ufl.dot(response.traction, stretched) / 2
+            stored += r_n**2 / (2 * parameters["k_n"])
+        if tau is not None:
+            stored += ufl.dot(tau, self.elastic_displacement(kinematics, tau, parameters)) / 2
         return stored
 
     def dissipated(
@@ -249,15 +264,24 @@ def clip(value: Expr, limit: Expr) -> Expr:
 
 
 def signorini(kinematics: Kinematics, k_n: Expr) -> tuple[Expr, Expr, Expr]:
-    """Regularised normal law, eq. (6-11): r_n, δ₊, δ₋ in closed form, point by point."""
+    """Regularised normal law, eq. (6-11): r_n, δ₊, δ₋ in closed form, point by point.
+
+    With a multiplier r_n = -⟨λ_n + k_n (u_n - s)⟩₊: where λ_n = -r_n the law is exact.
+    """
+    closing = kinematics.normal_displacement - kinematics.gap
     opening = positive_part(kinematics.gap - kinematics.normal_displacement)
-    penetration = positive_part(kinematics.normal_displacement - kinematics.gap)
-    return -k_n * penetration, opening, penetration
+    penetration = positive_part(closing)
+    if kinematics.multiplier is None:
+        return -k_n * penetration, opening, penetration
+    return -positive_part(kinematics.multiplier + k_n * closing), opening, penetration
 
 
 def signorini_potential(kinematics: Kinematics, k_n: Expr) -> Expr:
-    """½ k_n ⟨u_n - s⟩₊², eq. (19)."""
-    return k_n / 2 * positive_part(kinematics.normal_displacement - kinematics.gap) ** 2
+    """½ k_n ⟨u_n - s⟩₊², eq. (19); with a multiplier ⟨λ_n + k_n (u_n - s)⟩₊²/(2 k_n)."""
+    closing = kinematics.normal_displacement - kinematics.gap
+    if kinematics.multiplier is None:
+        return k_n / 2 * positive_part(closing) ** 2
+    return positive_part(kinematics.multiplier + k_n * closing) ** 2 / (2 * k_n)
 
 
 # ---- return maps: the closest point of the yield surface, and the excess of each mode ------------
@@ -374,6 +398,11 @@ class Foundation(Law):
     def has_tension(self) -> bool:
         """See `Law.has_tension`."""
         return self.tension
+
+    @property
+    def is_physical(self) -> bool:
+        """See `Law.is_physical`."""
+        return True
 
     @property
     def positive(self) -> frozenset[str]:
@@ -638,7 +667,7 @@ class Coulomb(FrictionLaw):
         r_n, opening, penetration = signorini(kinematics, parameters["k_n"])
         limit = -parameters["friction"] * r_n
         traction, slip = self.slide(kinematics, limit, parameters)
-        closed = ufl.gt(penetration, 0)
+        closed = ufl.lt(r_n, 0)
         slip = tuple(ufl.conditional(closed, mode, 0) for mode in slip)
         return Response(r_n, opening, penetration, traction, limit, slip)
 

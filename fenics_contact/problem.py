@@ -6,7 +6,7 @@ import logging
 import time
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,11 @@ _ASTRAY = 1e3
 _MAX_FLOOR = 1e-5
 # An unknown with less than this share of the bulk's stiffness has none.
 _FELT = 1e-12
+# Rounds with multipliers before it is given up.
+_MAX_ROUNDS = 60
+# Residual, relative, to which the first round is solved; share of a round's error to which the next
+# is; and the error, in units of the tolerance, from which on the next may be the last one.
+_FIRST_ROUND, _INNER, _NEARLY = 1e-4, 1e-2, 10.0
 # Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
 _TOUCHING = 1e-12
 # Iterations of Newton's method without a lower residual after which another method takes over.
@@ -102,6 +107,7 @@ class Step:
         increment: Number of the increment, from 1.
         reason: SNES reason of the last solve (positive: converged).
         iterations: SNES iterations in all.
+        rounds: Solutions one after another, with multipliers between them.
         method: The method that found the solution; see `ContactProblem`.
         factorisations: Sparse matrices factored; dense ones of a condensed problem do not count.
         verdict: The independent check.
@@ -115,6 +121,7 @@ class Step:
     increment: int
     reason: int
     iterations: int
+    rounds: int
     method: str
     factorisations: int
     verdict: Verdict
@@ -244,6 +251,7 @@ class ContactProblem:
         self._energy = self._committed_energy
         self._rate: Array | None = None
         self._watch = StatusWatch(self.contacts)
+        self._round_rtol = 0.0
         self._condensation = condensation
         self.prefix, self._method, self._fallback = prefix, method, fallback
         self._configure(method, dict(petsc_options or {}), prefix)
@@ -492,7 +500,8 @@ class ContactProblem:
         }
 
     def _tolerance(self) -> float:
-        return max(self._rtol * self._norms["force"], self._norms["floor"])
+        rtol = max(self._rtol, self._round_rtol)
+        return max(rtol * self._norms["force"], self._norms["floor"])
 
     def _test_convergence(self, norms: tuple[float, ...]) -> int:
         reasons = PETSc.SNES.ConvergedReason
@@ -619,7 +628,7 @@ class ContactProblem:
         except BaseException:
             self._whole.set_state(saved)
             for contact in self.contacts:
-                contact.forget()
+                contact.restore()
             raise
         return step
 
@@ -633,7 +642,7 @@ class ContactProblem:
         self._update_space(stiffness_changed)
         self._approach()
         self._space.begin(self._load)
-        reason, rungs = self._iterate(ahead, stiffness_changed)
+        reason, rungs, rounds = self._enforce(ahead, stiffness_changed)
         self._space.complete()
         verdict = self._judge()
         if reason <= 0 or verdict.failures:
@@ -642,6 +651,7 @@ class ContactProblem:
             increment=self.increment + 1,
             reason=reason,
             iterations=sum(rung.iterations for rung in rungs),
+            rounds=rounds,
             method=rungs[-1].method,
             factorisations=self._factorisations,
             verdict=verdict,
@@ -650,6 +660,47 @@ class ContactProblem:
             rungs=tuple(rungs),
             wall_seconds=time.perf_counter() - start,
         )
+
+    def _enforce(self, ahead: float, stiffness_changed: bool) -> tuple[int, list[Rung], int]:
+        """Solve, let multipliers take over what the springs bear, and again. Collective.
+
+        Returns:
+            Reason of the last solution, what was tried, and how many solutions there were.
+        """
+        augmented = [c for c in self.contacts if c.multipliers is not None]
+        if not augmented:
+            return *self._iterate(ahead, stiffness_changed), 1
+        rungs: list[Rung] = []
+        exact = False
+        # The first solutions need not be better than the multipliers they are found with.
+        self._round_rtol = _FIRST_ROUND
+        try:
+            for number in range(1, _MAX_ROUNDS + 1):
+                reason, tried = self._iterate(ahead, stiffness_changed)
+                for rung in tried:
+                    last = rungs[-1] if rungs else None
+                    if last and (last.method, last.outcome) == (rung.method, rung.outcome):
+                        rungs[-1] = replace(rung, iterations=last.iterations + rung.iterations)
+                    else:
+                        rungs.append(rung)
+                if reason <= 0:
+                    break
+                for contact in augmented:
+                    contact.evaluate()
+                errors = [c.enforcement_error() for c in augmented]
+                worst = max(e / c.tolerance for e, c in zip(errors, augmented, strict=True))
+                logger.debug("round %d: errors %s", number, errors)
+                if worst <= 1.0 and exact:
+                    break
+                ahead, stiffness_changed = 0.0, False
+                exact = worst <= _NEARLY
+                self._round_rtol = 0.0 if exact else min(_FIRST_ROUND, _INNER * min(errors))
+                if number < _MAX_ROUNDS and worst > 1.0:
+                    for contact in augmented:
+                        contact.augment()
+        finally:
+            self._round_rtol = 0.0
+        return reason, rungs, number
 
     def _iterate(self, ahead: float, stiffness_changed: bool) -> tuple[int, list[Rung]]:
         """Iterate from one start after another, then by continuation. Collective.
@@ -747,7 +798,7 @@ class ContactProblem:
         """
         present = self._whole.state()
         starts = [present]
-        if self._rate is not None:
+        if self._rate is not None and ahead:
             self._whole.set_state(present + ahead * self._rate)
             for bc in self._bcs:
                 bc.set(self.u.x.array)
@@ -834,6 +885,7 @@ class ContactProblem:
         )
         absolute = float(global_sum(self._comm, np.abs(bulk).sum() + np.abs(contact).sum()))
         n_dofs = float(global_sum(self._comm, self._n_owned))
+        augmented = [c for c in self.contacts if c.multipliers is not None]
         return Verdict(
             residual=self._norms["residual"],
             force=self._norms["force"],
@@ -841,6 +893,8 @@ class ContactProblem:
             imbalance=float(np.abs(imbalance).max()),
             imbalance_tolerance=np.sqrt(n_dofs) * 2 * self._tolerance() + 1e-12 * absolute,
             laws={c.name: check_laws(c) for c in self.contacts},
+            enforcement={c.name: c.enforcement_error() for c in augmented},
+            enforcement_tolerance={c.name: c.tolerance for c in augmented},
         )
 
     def commit(self) -> None:
@@ -861,7 +915,7 @@ class ContactProblem:
         """
         self._whole.set_state(self._committed)
         for contact in self.contacts:
-            contact.forget()
+            contact.restore()
 
     def committed_state(self) -> tuple[Array, Array]:
         """This rank's unknowns at the last commit, and by how much that increment moved them."""

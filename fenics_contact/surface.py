@@ -191,15 +191,17 @@ class SurfaceQuadrature:
         return rows[np.argsort(self.surface._parent_facets[:n_cells])]
 
     def interpolation_matrix(self, space: fem.FunctionSpace) -> PETSc.Mat:
-        """Sparse matrix from the dofs of a displacement to its values at the points. Collective.
+        """Sparse matrix from the dofs of a function to its values at the points. Collective.
 
         Args:
-            space: Vector-valued space on the mesh of the body, block size d.
+            space: On the mesh of the body or on the submesh; scalar (d = 1), or vector-valued with
+                block size d.
 
         Returns:
             Matrix with d rows per point, (d n_points, n_dofs).
         """
-        values = self.space(space.dofmap.bs)
+        scalar = not space.ufl_element().reference_value_shape
+        values = self.space(None if scalar else space.dofmap.bs)
         form = compat.compile_form(
             ufl.inner(ufl.TrialFunction(space), ufl.TestFunction(values)) * self.ds,
             self.surface.entity_maps,

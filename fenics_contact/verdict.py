@@ -27,6 +27,8 @@ class Verdict:
         imbalance: Largest component of load + contact + reactions (force).
         imbalance_tolerance: Largest imbalance that passes (force).
         laws: Largest violations by contact and by law, relative; see `check_laws`.
+        enforcement: `Contact.enforcement_error` of the contacts with multipliers, by name.
+        enforcement_tolerance: What passes, by name.
     """
 
     residual: float
@@ -35,6 +37,8 @@ class Verdict:
     imbalance: float
     imbalance_tolerance: float
     laws: dict[str, dict[str, float]] = field(default_factory=dict)
+    enforcement: dict[str, float] = field(default_factory=dict)
+    enforcement_tolerance: dict[str, float] = field(default_factory=dict)
 
     @property
     def failures(self) -> list[str]:
@@ -53,6 +57,13 @@ class Verdict:
                 for law, value in laws.items()
                 if not value <= _LAW_TOLERANCE
             ]
+        for contact, error in self.enforcement.items():
+            allowed = self.enforcement_tolerance[contact]
+            if not error <= allowed:
+                found.append(
+                    f"{contact}: penetration or elastic slip left, {error:.3e} of the largest "
+                    f"traction in the springs, above {allowed:.3e}"
+                )
         return found
 
 
@@ -64,7 +75,8 @@ def check_laws(contact: Contact) -> dict[str, float]:
 
     Returns:
         Largest violations, relative to the largest value concerned. "complementarity"
-        (eq. 6-11: r_n ≤ 0, δ± ≥ 0, δ₊δ₋ = 0, r_n δ₊ = 0, s - u_n = δ₊ - δ₋, r_n = -k_n δ₋), or
+        (eq. 6-11: r_n ≤ 0, δ± ≥ 0, δ₊δ₋ = 0, r_n δ₊ = 0, s - u_n = δ₊ - δ₋, r_n = -k_n δ₋;
+        with multipliers r_n = -k_n (u_n - s) - λ_n where that is < 0), or
         where the law bears tension "stiffness" (r_n = -k_n (u_n - s)). With friction, by the law's
         yield functions g_j: "cone" (g_j ≤ 0), "slip" (eq. 44: Δβ ≥ 0, the change of the traction
         is that of adherence and associated slip, Δτ = -K_t (Δu_t + Σ Δβ_j ∂g_j/∂τ)) and
@@ -99,6 +111,9 @@ def check_laws(contact: Contact) -> dict[str, float]:
         elastic = k_n * (v["normal_displacement"] - v["gap"])
         parts = (k_n * v["normal_displacement"], k_n * v["gap"])  # whose round-off is in r_n
         violations.append(relative(worst(r_n + elastic), r_n, *parts))
+    elif law.has_normal_stiffness and contact.multipliers is not None:
+        slack = -r_n - v["multiplier"] - v["parameter k_n"] * (penetration - opening)
+        violations.append(relative(worst(np.minimum(-r_n, slack)), r_n, v["multiplier"]))
     elif law.has_normal_stiffness:
         elastic = v["parameter k_n"] * penetration
         violations.append(relative(worst(np.maximum(r_n, 0), r_n + elastic), r_n))

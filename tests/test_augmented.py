@@ -1,0 +1,354 @@
+"""Augmented enforcement: no penetration and no creep, with springs as soft as the body."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import GRID, TOP, Block, at_points, block, close, gathered, raised_everywhere, wave
+
+import fenics_contact as fc
+from fenics_contact import checkpoint
+from fenics_contact import problem as module
+
+COMM = MPI.COMM_WORLD
+E = 1000.0
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+
+# k h/E: springs no stiffer than a few layers of cells, and springs that are as good as rigid.
+SOFT, STIFF = fc.Scaled(10.0), fc.Scaled(1e5)
+AUGMENTED = {"enforcement": "augmented"}
+
+
+def values(contact: fc.Contact, name: str) -> np.ndarray:
+    return gathered(COMM, contact.values[name])
+
+
+def bulge(scene: Block, depth: float = 0.01) -> fc.Obstacle:
+    """A floor that is lower to the sides, by the depth times the distance squared."""
+    x = ufl.SpatialCoordinate(scene.mesh)
+    return fc.Obstacle(depth * (x[0] - 0.4) ** 2, scene.vector(up=-1.0))
+
+
+# ---- patch tests ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("cell", "degree"), GRID)
+def test_patch(cell: str, degree: int) -> None:
+    """Uniform compression on a shuffled mesh: uniform pressure and no penetration at any point.
+
+    Reference: the load; u_n = 0. The first solution has the pressure, which the multiplier takes
+    over: the penetration is then round-off of the solution, 1e-10 of what the penalty has.
+    """
+    p, k_n = 2.0, 5e3
+    scene = block(cell, degree, up=-p, shuffled=True)
+    problem, contact = scene.problem(
+        fc.Frictionless(k_n),
+        scene.rollers(),
+        contact=AUGMENTED | {"tolerance": 1e-9},
+        petsc_options={"snes_rtol": 1e-12},
+    )
+    step = problem.solve()
+    assert close(gathered(COMM, contact.pressure), np.full(len(values(contact, "gap")), p), 1e-9)
+    assert np.abs(gathered(COMM, contact.gap)).max() <= 1e-9 * p / k_n
+    assert step.rounds <= 3
+    assert step.verdict.enforcement["contact"] <= 1e-9 and not step.verdict.failures
+    # The springs bear nothing: their energy is round-off squared.
+    assert abs(step.energy.springs) <= 1e-15 * p**2 / k_n
+
+
+# ---- the limit of the penalty --------------------------------------------------------------------
+
+LAWS = {
+    "frictionless": (2, lambda k: fc.Frictionless(k)),
+    "coulomb": (2, lambda k: fc.Coulomb(0.3, k, k)),
+    "tresca": (2, lambda k: fc.Tresca(0.3, 10.0, k, k)),
+    "prescribed": (2, lambda k: fc.Tresca(0.3, 10.0, k_t=k, unilateral=False)),
+    "cone": (3, lambda k: fc.Coulomb(0.3, k, k)),
+    "polygon": (3, lambda k: fc.Coulomb(0.3, k, k, modes=6)),
+    "ellipse": (3, lambda k: fc.Coulomb(0.3, k, k, transverse_friction=0.5, direction=(1, 1, 0))),
+}
+# Down, aside so that some of the surface slips, back through zero, up and away: (side, down).
+PATH = [(0.0, 0.02), (0.004, 0.02), (0.012, 0.02), (-0.002, 0.02), (-0.002, -0.01)]
+
+
+def walk(law: str, stiffness: fc.Scaled, path=PATH, **options):
+    """A block whose top is moved along the path, on a floor that bulges under it."""
+    d, make = LAWS[law]
+    cell, n = ("quadrilateral", (6, 3)) if d == 2 else ("hexahedron", (3, 3, 2))
+    scene = block(cell, 1, n=n, surface={"quadrature_scheme": "vertex"})
+    move = fem.Constant(scene.mesh, np.zeros(d))
+    bcs = [fem.dirichletbc(move, scene.facet_dofs(TOP), scene.u.function_space)]
+    contact = {"support": bulge(scene), **options}
+    problem, contact = scene.problem(make(stiffness), bcs, contact=contact, method="newton")
+    found = []
+    for side, down in path:
+        move.value[:] = scene.vector(side=side, up=-down)
+        if d == 3:
+            move.value[1] = side / 2
+        step = problem.solve()
+        problem.commit()
+        fields = contact.traction, contact.slip
+        found.append((step, *(at_points(contact, f) for f in fields)))
+    return found, contact
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="of the laws; ranks are compared below")
+@pytest.mark.parametrize("law", LAWS)
+def test_limit_of_the_penalty(law: str) -> None:
+    """Every law, over a path with slip, reversal and separation: as very stiff springs have it.
+
+    One point for each node, so that nothing is projected. Reference: the penalty at 1e5 E/h, which
+    is off by its elastic displacement, about 1e-5 of the body's; to 1e-3 of the largest traction
+    and of the largest slip of the path, which the penalty at 10 E/h misses by far.
+    """
+    augmented, _ = walk(law, SOFT, **AUGMENTED)
+    stiff, _ = walk(law, STIFF)
+    soft, _ = walk(law, SOFT)
+    for i in (1, 2):
+        exact = [s[i] for s in stiff]
+        scale = max(np.abs(e).max(initial=0.0) for e in exact)
+        ours, theirs = (
+            max(np.abs(s[i] - e).max(initial=0.0) for s, e in zip(run, exact, strict=True))
+            for run in (augmented, soft)
+        )
+        if scale > 0:
+            assert ours <= 1e-3 * scale
+            assert theirs > 1e-2 * scale
+    assert all(not step.verdict.failures for step, *_ in augmented)
+
+
+# ---- stick ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_stick_is_stick(degree: int) -> None:
+    """Sheared to and fro below the limit, a block stays where it is, however often.
+
+    ν = 0, so that the pressure makes no shear. The elastic slip of the penalty is τ/k_t, 1e-4 here.
+    Linear elements: what the tolerance leaves is 1e-5 of p/k_t, p ≤ 16 from the bending; twice that
+    for the quadrature points, which lie inside of the nodes' envelope by as much. Quadratic ones
+    keep what multipliers of one degree less do not see, the bubble of each edge: a twentieth of
+    τ/k_t. Neither adds up: the second six increments leave what the first did, within the half that
+    the last round of each may differ by.
+    """
+    scene = block("quadrilateral", degree, nu=0.0, n=3, up=-10.0)
+    k_t = 1e4
+    problem, contact = scene.problem(fc.Coulomb(1.0, k_n=1e4, k_t=k_t), [], contact=AUGMENTED)
+    moved, felt = [], []
+    for i in range(12):
+        scene.load(up=-10.0, side=np.cos(i))
+        problem.solve()
+        problem.commit()
+        moved.append(np.abs(gathered(COMM, contact.tangential_displacement)).max())
+        felt.append(np.abs(gathered(COMM, contact.tangential_traction)).max())
+        assert np.all(gathered(COMM, contact.status) == fc.Status.STICK)
+    assert max(felt) > 0.9
+    assert max(moved) <= (2 * 1e-5 * 16.0 if degree == 1 else 0.05 * max(felt)) / k_t
+    assert max(moved[6:]) <= 1.5 * max(moved[:6])
+
+
+def test_projection_leaves_no_creep_behind() -> None:
+    """Solving again what is committed changes nothing, to the last round's tolerance.
+
+    With quadratic displacements the tractions at the points are not the multipliers; the history
+    must hold what reproduces them.
+    """
+    scene = block("triangle", 2, n=4, up=-10.0, side=4.0, surface={"quadrature_degree": 6})
+    problem, contact = scene.problem(
+        fc.Coulomb(0.3, k_n=1e4, k_t=1e4),
+        [],
+        contact=AUGMENTED,
+        petsc_options={"snes_rtol": 1e-11},
+    )
+    scene.load(up=-10.0, side=1.0)
+    problem.solve()
+    before = contact.traction.copy()
+    problem.commit()
+    step = problem.solve()
+    assert step.rounds <= 2
+    assert close(gathered(COMM, contact.traction), gathered(COMM, before), 1e-4)
+    assert np.abs(gathered(COMM, contact.slip_increment)).max() <= 1e-4 * 1.0 / E
+
+
+# ---- forms, supports, ranks, files ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", ["frictionless", "coulomb", "tresca", "cone", "ellipse"])
+def test_force_and_tangent_with_multipliers(law: str) -> None:
+    """The tangent is the derivative of the force, and the force that of the potential.
+
+    By central differences along a rough direction at a rough state, λ not zero; step 1e-6 of the
+    displacements: to 1e-6, but for points that change status on the way (none within the step).
+    """
+    d, make = LAWS[law]
+    cell = "triangle" if d == 2 else "tetrahedron"
+    scene = block(cell, 2, n=2, shuffled=True)
+    contact = scene.contact(make(fc.Scaled(3.0)), modulus=E, **AUGMENTED)
+    rows = contact.multipliers.fields.rows()
+    rough = wave(d, 3)(contact.points.T).T
+    rows[:, 0] = 0.01 * E * np.abs(rough[:, 0])
+    rows[:, 1:] = 0.01 * E * rough[:, : rows.shape[1] - 1]
+    contact.multipliers.fields.set_rows(rows)
+    u, size = scene.u, 0.02
+    base, way = fem.Function(u.function_space), fem.Function(u.function_space)
+    base.interpolate(lambda x: size * wave(d, 1)(x))
+    way.interpolate(wave(d, 2))
+    n = u.function_space.dofmap.index_map.size_local * d
+
+    def at(t: float) -> tuple[np.ndarray, float]:
+        u.x.array[:] = base.x.array + t * way.x.array
+        force = contact._unknowns.vector()
+        contact.add_force(force)
+        energy = COMM.allreduce(contact.energy()) if contact.law.has_potential else 0.0
+        return force.array.copy(), energy
+
+    step = 1e-6 * size
+    (f1, e1), (f0, e0) = at(step), at(-step)
+    force, _ = at(0.0)
+    tangent = contact.tangent_matrix()
+    right, left = tangent.createVecs()
+    right.array[:] = way.x.array[:n]
+    tangent.mult(right, left)
+    assert close(gathered(COMM, (f1 - f0) / (2 * step)), gathered(COMM, left.array), 1e-6)
+    if contact.law.has_potential:
+        power = COMM.allreduce(float(force @ way.x.array[:n]))
+        assert (e1 - e0) / (2 * step) == pytest.approx(power, rel=1e-6)
+
+
+def test_by_hand() -> None:
+    """`augment` by itself, as for a problem of one's own: the same multipliers as the problem's."""
+    made = []
+    for by_hand in (False, True):
+        scene = block("quadrilateral", 1, n=4, up=-10.0)
+        problem, contact = scene.problem(
+            fc.Frictionless(), scene.rollers(), contact={"support": bulge(scene)} | AUGMENTED
+        )
+        if by_hand:
+            contact.tolerance = 0.999  # one round of the problem's
+            errors = []
+            for _ in range(12):
+                problem.solve()
+                errors.append(contact.augment())
+            assert errors[0] > 1e-3 and errors[-1] <= 1e-5
+        else:
+            problem.solve()
+        made.append(gathered(COMM, contact.pressure))
+    assert close(made[1], made[0], 1e-4)
+
+
+def test_support_driven_by_a_force() -> None:
+    """The support's free motion with multipliers: the force is carried, nothing penetrates.
+
+    Reference: the block is held at its top, the floor pressed up by 10; ν = 0: it shortens by
+    10/E, so that the floor moves up by that, and by p/k_n = 1e-3 more under the penalty.
+    """
+    scene = block("quadrilateral", 1, nu=0.0)
+    motion = fc.Motion(force=(None, 10.0), displacement=(0.0, None))
+    bcs = [scene.hold(TOP, 1), *scene.rollers()]
+    problem, contact = scene.problem(
+        fc.Coulomb(0.3, k_n=1e4, k_t=1e4),
+        bcs,
+        contact={"support": scene.floor(displacement=motion)} | AUGMENTED,
+    )
+    step = problem.solve()
+    assert step.contacts["contact"].normal_force == pytest.approx(10.0, rel=1e-8)
+    assert float(contact.free_motion[1].value) == pytest.approx(10.0 / E, rel=1e-5)
+
+
+def test_same_on_any_number_of_ranks() -> None:
+    """All ranks together find what each finds alone: to 1e-5, ten times the rounds' tolerance."""
+    found = []
+    for comm in (COMM, MPI.COMM_SELF):
+        scene = block("triangle", 2, n=6, up=-10.0, side=1.0, comm=comm)
+        law = fc.Coulomb(0.3)
+        contact = {"support": bulge(scene), "tolerance": 1e-6} | AUGMENTED
+        problem, contact = scene.problem(law, [scene.hold(TOP, 0, 0.001)], contact=contact)
+        problem.solve()
+        found.append(at_points(contact, contact.traction))
+    assert close(found[0], found[1], 1e-5)
+
+
+def test_checkpoint(tmp_path: Path) -> None:
+    """A history taken up from a file goes on as the one that wrote it: multipliers are part of it.
+
+    To 1e-9 of the tractions: both start from the same numbers.
+    """
+    folder = Path(COMM.bcast(str(tmp_path)))
+    made = []
+    for take_up in (False, True):
+        scene = block("triangle", 2, n=3, up=-10.0)
+        law = fc.Coulomb(0.3, k_n=1e4, k_t=1e4)
+        problem, contact = scene.problem(law, [], contact=AUGMENTED)
+        if take_up:
+            checkpoint.load(problem, folder / "state.npz")
+        else:
+            scene.load(up=-10.0, side=1.0)
+            problem.solve()
+            problem.commit()
+            checkpoint.save(problem, folder / "state.npz")
+        scene.load(up=-10.0, side=2.0)
+        problem.solve()
+        made.append(at_points(contact, contact.traction))
+    assert close(made[1], made[0], 1e-9)
+
+
+# ---- failures ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("what", ["iterations", "rounds"])
+def test_failure_leaves_no_trace(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Too few iterations or rounds: `NotConverged`; u, history and multipliers bit for bit."""
+    scene = block("quadrilateral", 1, n=4, up=-10.0)
+    problem, contact = scene.problem(
+        fc.Coulomb(0.3, k_n=1e4, k_t=1e4), [], contact={"support": bulge(scene)} | AUGMENTED
+    )
+    problem.solve()
+    problem.commit()
+
+    def state() -> list[np.ndarray]:
+        functions = (scene.u, contact.history.function, contact.multipliers.fields.function)
+        return [f.x.array.copy() for f in functions]
+
+    before = state()
+    if what == "rounds":
+        monkeypatch.setattr(module, "_MAX_ROUNDS", 2)
+    else:
+        problem.snes.setTolerances(max_it=1)
+        problem._max_it = 1
+    scene.load(up=-30.0, side=5.0)
+    words = ("elastic slip",) if what == "rounds" else ("increment 2",)
+    raised_everywhere(problem.solve, fc.NotConverged, *words)
+    assert all(np.array_equal(a, b) for a, b in zip(before, state(), strict=True))
+    monkeypatch.undo()
+
+
+BAD = {
+    "enforcement": ({"enforcement": "lagrange"}, fc.Frictionless(), ("enforcement", "lagrange")),
+    "zero": ({"tolerance": 0.0}, fc.Frictionless(), ("tolerance", "0.0")),
+    "nan": ({"tolerance": float("nan")}, fc.Frictionless(), ("tolerance", "nan")),
+    "one": ({"tolerance": 1.0}, fc.Frictionless(), ("tolerance",)),
+    "foundation": ({}, fc.Foundation(k_n=1e3), ("Foundation", "penalty")),
+    "springs": ({}, fc.Coulomb(0.3, fc.Springs(1e3), 1e3), ("Springs", "penalty")),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_arguments(case: str) -> None:
+    """Refused by `Contact`, on all ranks, by name."""
+    options, law, words = BAD[case]
+    scene = block("quadrilateral", 1, surface={"quadrature_scheme": "vertex"})
+    call = lambda: scene.contact(law, **(AUGMENTED | options))  # noqa: E731
+    raised_everywhere(call, ValueError, "contact", *words)
+
+
+def test_no_multipliers_under_penalty() -> None:
+    """The penalty has none to update."""
+    scene = block("quadrilateral", 1)
+    contact = scene.contact(fc.Frictionless(k_n=1e3))
+    raised_everywhere(contact.augment, ValueError, "augmented")
+    assert contact.multipliers is None
