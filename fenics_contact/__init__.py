@@ -3,6 +3,7 @@
 from fenics_contact import elasticity
 from fenics_contact._version import __version__
 from fenics_contact.contact import Contact, Resultants, Status
+from fenics_contact.errors import ErrorBudget, estimate_errors
 from fenics_contact.laws import Coulomb, Foundation, Frictionless, Scaled, Springs, Tresca
 from fenics_contact.pairing import DeformableBody
 from fenics_contact.problem import ContactProblem, Step
@@ -19,6 +20,7 @@ __all__ = [
     "Coulomb",
     "Cylinder",
     "DeformableBody",
+    "ErrorBudget",
     "Foundation",
     "Frictionless",
     "HalfSpace",
@@ -34,5 +36,6 @@ __all__ = [
     "Verdict",
     "__version__",
     "elasticity",
+    "estimate_errors",
     "increments",
 ]

@@ -203,9 +203,13 @@ class Condensation:
 
     def recover(self, kept: Array) -> Array:
         """All unknowns under the load of `set_load`, (n,), from those kept, (n_kept,)."""
+        return self.particular + self.extended(kept)
+
+    def extended(self, kept: Array) -> Array:
+        """All unknowns without load, (n,), that follow from those kept, (n_kept,)."""
         state = np.zeros_like(self.particular)
         state[self._kept] = kept
-        return self.particular + state - self._solve(self._product(state))
+        return state - self._solve(self._product(state))
 
 
 class CondensedSpace(WholeSpace):
@@ -285,6 +289,10 @@ class CondensedSpace(WholeSpace):
         self.load = load[self.unknowns.kept]
         outside = np.stack([load, self._whole.diagonal * state])[:, self._is_outside]
         self.outside = np.sum(outside**2, axis=1)
+
+    def extended(self, change: Array) -> Array:
+        """See `WholeSpace.extended`: one back-substitution."""
+        return self.condensation.extended(change)
 
     def complete(self) -> None:
         """One back-substitution for the unknowns eliminated."""

@@ -19,7 +19,7 @@ from petsc4py import PETSc
 from fenics_contact import accuracy
 from fenics_contact.augmented import Multipliers
 from fenics_contact.history import History
-from fenics_contact.laws import Kinematics, Law, Scaled, Springs
+from fenics_contact.laws import Foundation, Kinematics, Law, Scaled, Springs
 from fenics_contact.pairing import DeformableBody, Opposite
 from fenics_contact.parallel import gather_rows, global_max, global_min, global_sum
 from fenics_contact.supports import Motion, Placement, Support, nonzero_vector
@@ -413,14 +413,21 @@ class Contact:
             comm=self.surface.mesh.comm,
         )
 
-    def add_force(self, residual: PETSc.Vec) -> None:
+    def add_force(self, residual: PETSc.Vec, traction: Array | None = None) -> None:
         """Add `form`, assembled at the present ``u``, to a vector over the unknowns. Collective.
 
         The integrals are sums over the points, -Dᵀ w t with D the map from the unknowns to the
         points: the law is evaluated on Γc alone, whatever the element of the bulk.
+
+        Args:
+            residual: Added to (force).
+            traction: Other ones than the law's, (n_points, gdim) (stress).
         """
-        self._update_jump()
-        traction = self._acting.evaluate_traction()["traction"]
+        if traction is None:
+            self._update_jump()
+            traction = self._acting.evaluate_traction()["traction"]
+        else:
+            traction = self._values["weight"][:, None] * traction
         self._reaction.array[:] = -(self.quadrature.weights[:, None] * traction).ravel()
         self._felt_map.multTransposeAdd(self._reaction, residual, residual)
 
@@ -490,7 +497,15 @@ class Contact:
         if self.law.has_tangential:
             share = np.broadcast_to(np.asarray(tangential), (n,))
             blocks += share[:, None, None] * self.tangential_stiffness
-        return self._matrix(values["weight"][:, None, None] * blocks)
+        return self.spring_matrix(blocks)
+
+    def spring_matrix(self, blocks: Array) -> PETSc.Mat:
+        """Stiffness of springs at the points, new, over the unknowns. Collective.
+
+        Args:
+            blocks: Stiffness of every point, (n_points, gdim, gdim) (stress/length).
+        """
+        return self._matrix(self._values["weight"][:, None, None] * blocks)
 
     def at_points(self, displacement: Array) -> Array:
         """Displacement relative to the support: (n_local_unknowns,) to (n_points, gdim).
@@ -619,6 +634,11 @@ class Contact:
     def rigid(self) -> bool:
         """Whether the support is rigid: its reactions are then external to the mesh."""
         return self._opposite is None
+
+    @property
+    def regularised(self) -> bool:
+        """Whether the stiffness stands for none at all, and is not that of physical springs."""
+        return self._tributary is None and not isinstance(self.law, Foundation)
 
     @property
     def couples(self) -> bool:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import time
 import weakref
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -116,6 +117,8 @@ class Step:
         rungs: Everything that was tried, in its order; the last is what found the solution.
         wall_seconds: Time of the solve on this rank.
         load: Load parameter, where `increments` set one.
+        increment_error: Errors by the size of the increments so far, by quantity, where
+            `increments` estimates them; see `ErrorBudget`.
     """
 
     increment: int
@@ -130,6 +133,7 @@ class Step:
     rungs: tuple[Rung, ...]
     wall_seconds: float
     load: float | None = None
+    increment_error: dict[str, float] | None = None
 
     def summary(self) -> str:
         """One line for people."""
@@ -241,6 +245,7 @@ class ContactProblem:
         self.motions.check_held(self.contacts)
 
         self._length = self.motions.size
+        self._load: Array = np.zeros(self.unknowns.n_local)
         self._factorisations = 0
         self._norms = {"residual": 0.0, "force": 0.0, "floor": 0.0}
         self.committed_force = self._start_residual = 0.0
@@ -601,6 +606,63 @@ class ContactProblem:
             self._bulk_matrix.destroy()
             self._bulk_matrix = self.unknowns.widened(self.bulk.stiffness, rows=True)
         return changed
+
+    # ---- the neighbourhood of a solution ---------------------------------------------------------
+
+    @property
+    def load(self) -> Array:
+        """External forces of the last solve at this rank's unknowns (force)."""
+        return self._load
+
+    @property
+    def constrained(self) -> npt.NDArray[np.bool_]:
+        """Mask over this rank's unknowns: those with Dirichlet conditions."""
+        return self._constrained
+
+    def present_state(self) -> Array:
+        """This rank's unknowns as they are now; a copy (length)."""
+        return self._whole.state()
+
+    @contextmanager
+    def linearised(
+        self, springs: Sequence[Array]
+    ) -> Iterator[Callable[[Sequence[Array] | None], Array]]:
+        """Solve with the bulk's tangent and given springs on Γc, about the present state.
+
+        Collective.
+
+        Args:
+            springs: For every contact the stiffness at its points, (n_points, gdim, gdim)
+                (stress/length).
+
+        Yields:
+            A function of the tractions that are added on the body, one array (n_points, gdim) for
+            every contact, or of None for the residual that is left; it returns the change of this
+            rank's unknowns. Collective.
+        """
+        space, ksp = self._space, self._solvers[True]
+        space.begin(self._load)
+        space.enter()
+        right, left = space.vector(), space.vector()
+
+        def solve(tractions: Sequence[Array] | None) -> Array:
+            right.set(0.0)
+            if tractions is None:
+                right.array[:] = space.bulk_force() + space.contact_force()
+            else:
+                for contact, traction in zip(self.contacts, tractions, strict=True):
+                    contact.add_force(right, traction)
+            right.array[space.constrained] = 0.0
+            right.scale(-1.0 / self.bulk.scale)
+            ksp.solve(right, left)
+            return space.extended(left.array_r.copy())
+
+        try:
+            matrices = (c.spring_matrix(s) for c, s in zip(self.contacts, springs, strict=True))
+            self._assemble_matrix(self._matrices[True], matrices)
+            yield solve
+        finally:
+            self._whole.enter()
 
     # ---- solving ---------------------------------------------------------------------------------
 

@@ -98,6 +98,10 @@ class WholeSpace:
         """What of a state of all unknowns is in this space."""
         return state
 
+    def extended(self, change: Array) -> Array:
+        """The change of all unknowns that one of those in this space brings along. Collective."""
+        return change
+
     def begin(self, load: Array) -> None:
         """Start an increment under a load over all unknowns, u with its conditions. Collective."""
         self.load = load

@@ -11,6 +11,7 @@ import numpy as np
 from dolfinx import fem
 
 from fenics_contact import checkpoint as files
+from fenics_contact.errors import quantities
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.verdict import NotConverged, Rung
 
@@ -30,6 +31,7 @@ def increments(
     *,
     steps: int | Sequence[float] = 1,
     max_cuts: int = 6,
+    estimate: bool = False,
     checkpoint: str | Path | None = None,
     checkpoint_every: int = 1,
 ) -> Iterator[Step]:
@@ -48,6 +50,9 @@ def increments(
         steps: Number of equal increments; or the ends of the increments themselves, monotonic
             from ``start`` to ``end``.
         max_cuts: How often an increment may be halved.
+        estimate: Whether to tell the error that the size of the increments makes: every one is
+            solved twice, whole, which is not committed, and in two halves, which are. The steps at
+            the ends of whole ones have ``increment_error``.
         checkpoint: File to keep the last committed state in (``.npz``). If it is there when the
             history starts, the history goes on behind it; see `checkpoint.save`.
         checkpoint_every: Write it after every so many increments, and after the last.
@@ -57,15 +62,25 @@ def increments(
         before the increment was cut, too.
 
     Raises:
-        ValueError: ``load`` is no scalar constant or function, or ``steps`` has no sense.
+        ValueError: ``load`` is no scalar constant or function, ``steps`` has no sense, or the
+            checkpoint is of a history without ``estimate``.
         NotConverged: An increment failed even when cut; u, history and load are those of the last
             committed one.
     """
     ends = _ends(start, end, steps)
     apply = _setter(load)
     at = _Progress(float(start))
+    error = dict.fromkeys(quantities(problem), 0.0) if estimate else {}
     if checkpoint is not None and files.exists(problem, checkpoint):
-        at = _Progress(*files.load(problem, checkpoint))
+        n = len(dataclasses.fields(_Progress))
+        numbers = files.load(problem, checkpoint)
+        at = _Progress(*numbers[:n])
+        if len(numbers) != n + len(error):
+            raise ValueError(
+                f"{checkpoint} is of a history {'without' if estimate else 'with'} estimate; go on "
+                "in the same way, or remove it to start anew"
+            )
+        error = dict(zip(error, numbers[n:], strict=True))
         logger.info("going on from %s, at load %g", checkpoint, at.load)
     apply(at.load)
     if problem.increment:
@@ -73,40 +88,66 @@ def increments(
     direction = 1.0 if end >= start else -1.0
     unsaved = 0
     failed: list[Rung] = []
+    halves: list[float] = []  # of an increment that was solved whole, with these results
+    whole: dict[str, float] = {}
     for target in ends:
         while direction * (target - at.load) > 0:
             # A remainder that is next to nothing is taken along.
             within = abs(target - at.load) <= 1.01 * at.largest
             goal = target if within else at.load + direction * at.largest
             try:
-                apply(goal)
-                step = problem.solve(ahead=(goal - at.load) / at.last if at.last else 1.0)
-            except BaseException as error:
+                if estimate and not halves:
+                    _solve_to(goal, problem, apply, at)
+                    whole = quantities(problem)
+                    problem.restore()
+                    halves = [0.5 * (at.load + goal), goal]
+                goal = halves[0] if halves else goal
+                step = _solve_to(goal, problem, apply, at)
+            except BaseException as failure:
                 apply(at.load)
-                if not isinstance(error, NotConverged):
+                halves = []
+                if not isinstance(failure, NotConverged):
                     raise
-                failed += error.rungs
+                failed += failure.rungs
                 if at.cuts == max_cuts:
-                    error.rungs = tuple(failed)
+                    failure.rungs = tuple(failed)
                     raise
                 at.cut(abs(goal - at.load))
                 failed.append(Rung("cut", 0, f"to {at.largest:g}"))
                 if problem.u.function_space.mesh.comm.rank == 0:
                     logger.warning(
                         "increment %d, to load %g, did not converge: cut to %g",
-                        error.increment,
+                        failure.increment,
                         goal,
                         at.largest,
                     )
                 continue
             problem.commit()
             at.advance(goal)
+            halves = halves[1:]
+            found = None
+            if estimate and not halves:
+                # Of first order in the size of the increments: half of the error of the whole one,
+                # which is as much as the difference, is left in the halves.
+                now = quantities(problem)
+                error = {name: error[name] + whole[name] - now[name] for name in now}
+                found = dict(error)
             unsaved += 1
-            if checkpoint is not None and (unsaved >= checkpoint_every or goal == ends[-1]):
-                files.save(problem, checkpoint, dataclasses.astuple(at))
+            # Halves belong together: between them the whole one's results would be lost.
+            due = unsaved >= checkpoint_every and not halves
+            if checkpoint is not None and (due or goal == ends[-1]):
+                files.save(problem, checkpoint, [*dataclasses.astuple(at), *error.values()])
                 unsaved = 0
             tried, failed = (*failed, *step.rungs), []
-            yield dataclasses.replace(step, load=goal, rungs=tried)
+            yield dataclasses.replace(step, load=goal, rungs=tried, increment_error=found)
+
+
+def _solve_to(
+    goal: float, problem: ContactProblem, apply: Callable[[float], None], at: _Progress
+) -> Step:
+    """Solve for a load parameter from the last committed one. Collective."""
+    apply(goal)
+    return problem.solve(ahead=(goal - at.load) / at.last if at.last else 1.0)
 
 
 @dataclasses.dataclass

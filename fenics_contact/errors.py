@@ -1,0 +1,354 @@
+"""How wrong a solution is, part by part: enforcement, discretisation, increments, solver.
+
+Each part is estimated apart, in the unit that a user looks at: contact force, peak pressure and
+displacement. Enforcement and solver are what one more step would change, from a linear solve with
+the tangent of the state; discretisation is told from the jump of the stresses between cells; the
+increments from halves of themselves (`increments`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import dolfinx.fem.petsc
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from fenics_contact import compat
+from fenics_contact.contact import Contact, Status
+from fenics_contact.parallel import global_max, global_sum
+from fenics_contact.problem import ContactProblem
+from fenics_contact.surface import PointEvaluator
+
+__all__ = ["ErrorBudget", "estimate_errors", "quantities"]
+
+Array = npt.NDArray[np.float64]
+
+DISPLACEMENT = "displacement"
+# What to change where a part dominates.
+_REMEDIES = {
+    "enforcement": "a higher k_n and k_t",
+    "discretisation": "a finer mesh at the contact, or a higher degree",
+    "increments": "more increments",
+    "solver": "a smaller snes_rtol",
+}
+# Updates of the springs' rest lengths: each leaves about 1/(1 + k_n h/E) of the penetration in the
+# shortest waves, and far less in the long ones that forces are made of.
+_UPDATES = 3
+
+
+@dataclass(frozen=True)
+class ErrorBudget:
+    """Estimated errors of a solution, the same on every rank.
+
+    Attributes:
+        values: The quantities: of every contact "normal force" (force), "friction force" (force)
+            and "peak pressure" (stress), after the contact's name where there are several; and
+            "displacement", that of the loads along themselves (length), or without loads the
+            largest one.
+        parts: Estimates "enforcement", "discretisation", "increments" and "solver": absolute
+            errors by quantity, signed as value minus truth where a sign is known. A part that
+            could not be told has no entry.
+    """
+
+    values: dict[str, float]
+    parts: dict[str, dict[str, float]]
+
+    def relative(self, part: str) -> dict[str, float]:
+        """A part's errors without sign, relative to the quantities."""
+        return {
+            name: abs(error) / (abs(self.values[name]) or 1.0)
+            for name, error in self.parts[part].items()
+        }
+
+    @property
+    def total(self) -> dict[str, float]:
+        """Sum of all parts without their signs, relative to the quantities."""
+        total = dict.fromkeys(self.values, 0.0)
+        for part in self.parts:
+            for name, error in self.relative(part).items():
+                total[name] += error
+        return total
+
+    @property
+    def dominant(self) -> str:
+        """The part with the largest relative error in any quantity."""
+        return max(self.parts, key=lambda part: max(self.relative(part).values(), default=0.0))
+
+    def __str__(self) -> str:
+        """The table of parts and quantities, in per cent, and what to change."""
+        names = list(self.values)
+        width = max(14, *(len(name) + 2 for name in names))
+        lines = [f"{'error in %':<16}" + "".join(f"{name:>{width}}" for name in names)]
+        for part in _REMEDIES:
+            found = self.relative(part) if part in self.parts else {}
+            cells = [f"{100 * found[n]:.2g}" if n in found else "not told" for n in names]
+            lines.append(f"{part:<16}" + "".join(f"{cell:>{width}}" for cell in cells))
+        lines.append(f"{self.dominant} dominates: {_REMEDIES[self.dominant]} would help most")
+        return "\n".join(lines)
+
+
+def quantities(problem: ContactProblem) -> dict[str, float]:
+    """The quantities of an `ErrorBudget` at the problem's present state. Collective."""
+    found: dict[str, float] = {}
+    for contact in problem.contacts:
+        r = contact.resultants()
+        found |= _named(problem, contact, r.normal_force, r.tangential_force, r.max_pressure)
+    return found | {DISPLACEMENT: _displacement(problem, problem.present_state())}
+
+
+def estimate_errors(
+    problem: ContactProblem,
+    stress: Any,
+    *,
+    strain: Any = None,
+    increments: Mapping[str, float] | None = None,
+) -> ErrorBudget:
+    """Estimate the errors of the last solution, before or after its commit. Collective.
+
+    Costs a factorisation of the tangent (a dense one where the problem is condensed) and a
+    smoothing of stress and strain.
+
+    Args:
+        problem: A problem that has been solved; it stays as it is.
+        stress: σ(u) of the bulk (UFL), shape (d, d) or (3, 3).
+        strain: ε(u), of the shape of the stress; by default the symmetric gradient.
+        increments: Errors of the increments, as ``Step.increment_error`` has them.
+
+    Raises:
+        ValueError: Shapes that do not fit.
+    """
+    u = problem.u
+    stress = ufl.as_ufl(stress)
+    strain = ufl.sym(ufl.grad(u)) if strain is None else ufl.as_ufl(strain)
+    if stress.ufl_shape != strain.ufl_shape or len(stress.ufl_shape) != 2:
+        raise ValueError(
+            f"stress has shape {stress.ufl_shape}, strain {strain.ufl_shape}; both must be (d, d), "
+            "or (3, 3) with a strain given"
+        )
+    values = quantities(problem)
+    parts = _linear_parts(problem, values)
+    parts["discretisation"] = _discretisation(problem, stress, strain, values)
+    if increments is not None:
+        parts["increments"] = dict(increments)
+    return ErrorBudget(values, {name: parts[name] for name in _REMEDIES if name in parts})
+
+
+def _named(
+    problem: ContactProblem, contact: Contact, normal: float, friction: float, peak: float
+) -> dict[str, float]:
+    before = f"{contact.name}: " if len(problem.contacts) > 1 else ""
+    found = {f"{before}normal force": normal}
+    if contact.law.has_tangential:
+        found[f"{before}friction force"] = friction
+    return found | {f"{before}peak pressure": peak}
+
+
+def _displacement(problem: ContactProblem, state: Array) -> float:
+    """Displacement of the loads along themselves; without loads the largest one."""
+    comm, load = problem.u.function_space.mesh.comm, problem.load
+    size, work = global_sum(comm, [np.abs(load).sum(), load @ state])
+    if size > 0:
+        return float(work / size)
+    return global_max(comm, np.abs(state[: problem.unknowns.n_dofs]))
+
+
+# ---- enforcement and solver ----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Springs:
+    """A contact's springs at the present state, linearised with their status as it is.
+
+    Attributes:
+        traction: On the body, (n_points, gdim) (stress).
+        stiffness: What the traction loses per displacement, (n_points, gdim, gdim).
+        stretch: Displacement that is in the springs and would not be there without regularisation,
+            (n_points, gdim) (length).
+    """
+
+    traction: Array
+    stiffness: Array
+    stretch: Array
+
+    @classmethod
+    def of(cls, contact: Contact) -> _Springs:
+        law, values, status = contact.law, contact.values, contact.status
+        normal, traction = values["normal"], contact.traction
+        tangential, pressure = contact.tangential_traction, contact.pressure
+        closed = status != Status.OPEN
+        d = normal.shape[1]
+        stiffness = np.zeros((len(normal), d, d))
+        stretch = np.zeros_like(normal)
+        if law.has_normal_stiffness:
+            # A slipping point's friction follows the pressure, unless its limit is given.
+            follows = closed & (status == Status.SLIP) & (pressure > 0) & (not law.has_potential)
+            ratio = np.where(follows, 1.0, 0.0) / np.where(pressure > 0, pressure, 1.0)
+            direction = normal - ratio[:, None] * tangential
+            k_n = np.where(closed, values["parameter k_n"], 0.0)
+            stiffness += k_n[:, None, None] * np.einsum("qi,qj->qij", direction, normal)
+            stretch += (closed * pressure / values["parameter k_n"])[:, None] * normal
+        if law.has_tangential:
+            k_t, stick = contact.tangential_stiffness, status == Status.STICK
+            stiffness += np.where(stick[:, None, None], k_t, 0.0)
+            # K_t has no inverse along the normal, where τ has no part.
+            along = np.einsum("q,qi,qj->qij", values["parameter k_t"], normal, normal)
+            stretch -= np.linalg.solve(k_t + along, tangential[:, :, None])[:, :, 0]
+        return cls(traction, stiffness, stretch)
+
+    def change(self, jump: Array) -> Array:
+        """Of the traction, by a change of the relative displacement, (n_points, gdim)."""
+        return -np.einsum("qij,qj->qi", self.stiffness, jump)
+
+
+def _linear_parts(
+    problem: ContactProblem, values: Mapping[str, float]
+) -> dict[str, dict[str, float]]:
+    """What the springs and the residual that is left have changed in the quantities."""
+    contacts = problem.contacts
+    springs = [_Springs.of(contact) for contact in contacts]
+    regularised = [c.regularised for c in contacts]
+    found = {}
+    with problem.linearised([s.stiffness for s in springs]) as solve:
+        way = solve(None)
+        jumps = [contact.at_points(way) for contact in contacts]
+        changes = [s.change(jump) for s, jump in zip(springs, jumps, strict=True)]
+        found["solver"] = _differences(problem, values, changes, way)
+        # The springs' rest lengths follow what they carry: the augmented Lagrangian's update.
+        shifts = [np.where(r, s.stretch, 0.0) for r, s in zip(regularised, springs, strict=True)]
+        sums = [shift.copy() for shift in shifts]
+        for _ in range(_UPDATES):
+            way = solve([s.change(total) for s, total in zip(springs, sums, strict=True)])
+            jumps = [total + c.at_points(way) for c, total in zip(contacts, sums, strict=True)]
+            changes = [s.change(jump) for s, jump in zip(springs, jumps, strict=True)]
+            for i, (change, r) in enumerate(zip(jumps, regularised, strict=True)):
+                if r:
+                    sums[i] = shifts[i] + change
+    found["enforcement"] = _differences(problem, values, changes, way)
+    return found
+
+
+def _differences(
+    problem: ContactProblem, values: Mapping[str, float], changes: list[Array], way: Array
+) -> dict[str, float]:
+    """Present quantities minus those after a change of tractions and displacements."""
+    comm = problem.u.function_space.mesh.comm
+    after: dict[str, float] = {}
+    for contact, change in zip(problem.contacts, changes, strict=True):
+        normal, measure = contact.values["normal"], contact.measure
+        pressure = contact.pressure - np.sum(change * normal, axis=1)
+        side = change - np.sum(change * normal, axis=1)[:, None] * normal
+        friction = np.linalg.norm(contact.tangential_traction + side, axis=1)
+        if contact.law.has_friction:
+            friction = np.minimum(friction, _limit(contact, pressure))
+        sums = global_sum(comm, [measure @ pressure, measure @ friction])
+        peak = global_max(comm, pressure)
+        after |= _named(problem, contact, float(sums[0]), float(sums[1]), peak)
+    after[DISPLACEMENT] = _displacement(problem, problem.present_state() + way)
+    return {name: values[name] - after[name] for name in values}
+
+
+def _limit(contact: Contact, pressure: Array) -> Array:
+    """Largest friction at the points under another pressure (stress)."""
+    limit, present = contact.values["limit"], contact.pressure
+    if contact.law.has_potential:
+        return limit  # given
+    return limit * np.clip(pressure, 0, None) / np.where(present > 0, present, 1.0)
+
+
+# ---- discretisation ------------------------------------------------------------------------------
+
+
+def _discretisation(
+    problem: ContactProblem, stress: Any, strain: Any, values: Mapping[str, float]
+) -> dict[str, float]:
+    """From stresses and strains smoothed over the mesh (Zienkiewicz and Zhu).
+
+    With η² = ∫ (σ* - σ):(ε* - ε) the potential energy is off by η²/2. Per elastic energy that is
+    the relative error of what a prescribed displacement needs as force, or of how far a force
+    goes. The peak is compared with that of the smoothed stress on Γc.
+    """
+    u, contacts = problem.u, problem.contacts
+    mesh = u.function_space.mesh
+    weight = contacts[0].weight if contacts else 1.0
+    degree = u.function_space.ufl_element().degree
+    dx = ufl.dx(mesh, metadata={"quadrature_degree": 2 * degree})
+    smooth_stress, smooth_strain = _smoothed(mesh, [stress, strain], degree, weight, dx)
+    gap = ufl.inner(smooth_stress - stress, smooth_strain - strain)
+    forms = [weight * gap * dx, weight * ufl.inner(stress, strain) * dx]
+    local = [fem.assemble_scalar(compat.compile_form(form)) for form in forms]
+    squares, twice = global_sum(mesh.comm, local)
+    state = problem.present_state()
+    share = abs(squares / twice) if twice else 0.0
+    work = float(global_sum(mesh.comm, problem.load @ state))
+    loaded = float(np.clip(work / twice, 0.0, 1.0)) if twice else 0.0
+    driven = 1.0 - loaded
+    found: dict[str, float] = {}
+    for contact in contacts:
+        d, values_at = mesh.geometry.dim, contact.values
+        plane = ufl.as_tensor([[smooth_stress[i, j] for j in range(d)] for i in range(d)])
+        outward = ufl.dot(plane, ufl.FacetNormal(mesh))
+        traction = PointEvaluator(contact.quadrature, {"traction": outward})()["traction"]
+        normal = np.sum(traction * values_at["normal"], axis=1)
+        side = np.linalg.norm(traction - normal[:, None] * values_at["normal"], axis=1)
+        closed = contact.status != Status.OPEN
+        friction = float(global_sum(mesh.comm, (contact.measure * closed) @ side))
+        peak = global_max(mesh.comm, np.where(closed, -normal, 0.0))
+        r = contact.resultants()
+        found |= _named(
+            problem,
+            contact,
+            share * driven * r.normal_force,
+            r.tangential_force - friction,
+            r.max_pressure - peak,
+        )
+    if not np.any(global_sum(mesh.comm, np.abs(problem.load).sum())):
+        loaded = 0.0 if _largest_is_prescribed(problem, state) else 1.0
+    found[DISPLACEMENT] = -share * loaded * values[DISPLACEMENT]
+    return found
+
+
+def _largest_is_prescribed(problem: ContactProblem, state: Array) -> bool:
+    n = problem.unknowns.n_dofs
+    held, size = problem.constrained[:n], np.abs(state[:n])
+    comm = problem.u.function_space.mesh.comm
+    return global_max(comm, size[held]) >= global_max(comm, size[~held])
+
+
+def _smoothed(
+    mesh: dolfinx.mesh.Mesh, tensors: list[Any], degree: int, weight: Any, dx: ufl.Measure
+) -> list[Any]:
+    """L2 projections of symmetric tensors onto continuous functions of a degree. Collective."""
+    space = fem.functionspace(mesh, ("Lagrange", degree))
+    p, q = ufl.TrialFunction(space), ufl.TestFunction(space)
+    mass = fem.petsc.assemble_matrix(compat.compile_form(weight * p * q * dx))
+    mass.assemble()
+    ksp = PETSc.KSP().create(mesh.comm)
+    ksp.setOperators(mass)
+    ksp.setType(PETSc.KSP.Type.CG)
+    ksp.getPC().setType(PETSc.PC.Type.JACOBI)
+    ksp.setTolerances(rtol=1e-8)
+    results = []
+    for tensor in tensors:
+        n = tensor.ufl_shape[0]
+        rows: list[list[Any]] = [[None] * n for _ in range(n)]
+        for i in range(n):
+            for j in range(i + 1):
+                function = fem.Function(space)
+                right = fem.petsc.assemble_vector(
+                    compat.compile_form(weight * tensor[i, j] * q * dx)
+                )
+                right.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
+                ksp.solve(right, function.x.petsc_vec)
+                function.x.scatter_forward()
+                right.destroy()
+                rows[i][j] = rows[j][i] = function
+        results.append(ufl.as_tensor(rows))
+    ksp.destroy()
+    mass.destroy()
+    return results

@@ -1,0 +1,232 @@
+"""The error budget: every part against an error that is known, from a formula or a better run."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import GRID, TOP, block, close, nodal, raised_everywhere, stress
+
+import fenics_contact as fc
+from fenics_contact.errors import quantities
+
+COMM = MPI.COMM_WORLD
+# Effectivity that is asked of an estimate: estimated over true error.
+USEFUL = (0.3, 3.0)
+
+
+def budget(scene, problem, **kwargs):
+    return fc.estimate_errors(problem, stress(scene.u, scene.E, scene.nu), **kwargs)
+
+
+class Press:
+    """A block pressed on a ball and moved along it."""
+
+    def __init__(self, *, cell="quadrilateral", degree=1, n=8, k=1e4, friction=0.3, **options):
+        """Make it, unloaded."""
+        scene = self.scene = block(cell, degree, n=n)
+        d = scene.dim
+        self.push = [fem.Constant(scene.mesh, 0.0) for _ in range(d)]
+        bcs = [scene.hold(TOP, i, c) for i, c in enumerate(self.push)]
+        centre = np.full(d, 0.5)
+        centre[-1] = -2.0
+        law = fc.Coulomb(friction, k, k) if friction else fc.Frictionless(k)
+        contact = {"support": fc.Ball(centre, 2.0)}
+        self.problem, self.contact = scene.problem(law, bcs, contact=contact, **options)
+
+    def load(self, t: float) -> None:
+        """Down, and half as far to the side."""
+        self.push[-1].value, self.push[0].value = -0.03 * t, 0.015 * t
+
+    def solved(self, steps=1, **kwargs):
+        """The last step."""
+        return list(fc.increments(self.problem, self.load, steps=steps, **kwargs))[-1]
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+@pytest.mark.parametrize(("cell", "degree"), GRID)
+def test_enforcement_of_uniform_pressure(cell, degree, method):
+    """A block on a plane sinks in by p/k_n, which is the whole error and its estimate (1e-8).
+
+    Pressure and force are given: there is no error in them. Nor is there one of discretisation.
+    """
+    p, k = 3.0, 2e3
+    scene = block(cell, degree, n=2, up=-p)
+    problem, _ = scene.problem(fc.Frictionless(k), scene.rollers(), method=method)
+    problem.solve()
+    found = budget(scene, problem)
+    assert close(found.parts["enforcement"]["displacement"], p / k, 1e-8)
+    size = found.values
+    for part in ("enforcement", "discretisation", "solver"):
+        for name in ("normal force", "peak pressure"):
+            assert abs(found.parts[part][name]) <= 1e-8 * size[name], (part, name)
+    assert abs(found.parts["discretisation"]["displacement"]) <= 1e-8 * size["displacement"]
+    assert close(size["peak pressure"], p, 1e-8)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_enforcement(friction):
+    """Against the same mesh with 300 times the stiffness, whose own error is 300 times less."""
+    soft, stiff = (Press(friction=friction, k=k, n=16) for k in (1e4, 3e6))
+    soft.solved(steps=2)
+    stiff.solved(steps=2)
+    found, truth = budget(soft.scene, soft.problem), quantities(stiff.problem)
+    for name in ("normal force", "peak pressure"):
+        ratio = found.parts["enforcement"][name] / (found.values[name] - truth[name])
+        assert USEFUL[0] < ratio < USEFUL[1], (name, ratio)
+
+
+@pytest.mark.parametrize(("cell", "degree", "n"), [("quadrilateral", 1, 12), ("triangle", 1, 8)])
+def test_discretisation(cell, degree, n):
+    """Against a mesh of four times the cells each way: force of a prescribed displacement."""
+    coarse, fine = (Press(cell=cell, degree=degree, n=i, friction=0.0) for i in (n, 4 * n))
+    coarse.solved()
+    fine.solved()
+    found, truth = budget(coarse.scene, coarse.problem), quantities(fine.problem)
+    name = "normal force"
+    ratio = found.parts["discretisation"][name] / (found.values[name] - truth[name])
+    assert USEFUL[0] < ratio < USEFUL[1], ratio
+
+
+def test_increments():
+    """Against 32 increments: the friction under a contact that grows."""
+    ends = {}
+    for steps in (1, 2, 4, 32):
+        made = Press(n=16)
+        options = {"steps": steps, "estimate": steps < 32}
+        end = list(fc.increments(made.problem, made.load, **options))
+        assert len(end) == (2 * steps if steps < 32 else steps)
+        assert [s.increment_error is None for s in end[:2]] == [True, steps == 32]
+        ends[steps] = quantities(made.problem), end[-1].increment_error
+    truth, name = ends[32][0], "friction force"
+    for steps in (1, 2, 4):
+        values, error = ends[steps]
+        ratio = error[name] / (values[name] - truth[name])
+        assert USEFUL[0] < ratio < USEFUL[1], (steps, ratio)
+
+
+@pytest.mark.parametrize("condensation", [None, False])
+def test_solver(condensation):
+    """A residual left on purpose: what was left shows to 1 %, for a residual of 1e-3."""
+    options = {"petsc_options": {"snes_rtol": 1e-3}}
+    rough = Press(friction=0.0, condensation=condensation, **options)
+    exact = Press(friction=0.0, condensation=condensation)
+    rough.solved()
+    exact.solved()
+    found, truth = budget(rough.scene, rough.problem), quantities(exact.problem)
+    name = "normal force"
+    error = found.values[name] - truth[name]
+    assert abs(error) > 1e-7 * truth[name]
+    assert close(found.parts["solver"][name], error, 0.01)
+
+
+def test_nothing_is_changed():
+    """An estimate between two increments leaves state, history and the next increment as they are.
+
+    1e-9: on the way the tangent's solver is used, and the next increment starts from H₀ again.
+    """
+    plain, asked = Press(), Press()
+    for made in (plain, asked):
+        made.load(0.5)
+        made.problem.solve()
+        before = made.scene.u.x.array.copy(), made.contact.history.function.x.array.copy()
+        if made is asked:
+            budget(made.scene, made.problem)
+            now = made.scene.u.x.array, made.contact.history.function.x.array
+            assert all(COMM.allgather(all(map(np.array_equal, before, now))))
+        made.problem.commit()
+        if made is asked:
+            again = budget(made.scene, made.problem)
+            assert set(again.parts) == {"enforcement", "discretisation", "solver"}
+        made.load(1.0)
+        made.problem.solve()
+    assert close(nodal(asked.scene.u), nodal(plain.scene.u), 1e-9)
+
+
+def test_the_same_before_and_after_the_commit():
+    """1e-6: of the springs the same is left either way, once from the increment, once committed."""
+    made = Press()
+    made.load(1.0)
+    made.problem.solve()
+    before = budget(made.scene, made.problem)
+    made.problem.commit()
+    after = budget(made.scene, made.problem)
+    for part in before.parts:
+        for name, value in before.parts[part].items():
+            assert close(after.parts[part][name], value, 1e-6, scale=abs(before.values[name]))
+
+
+def test_the_table():
+    """Four lines, one for each part, and what dominates; several contacts by name."""
+    made = Press(k=1e3)
+    step = made.solved(estimate=True)
+    found = budget(made.scene, made.problem, increments=step.increment_error)
+    lines = str(found).splitlines()
+    assert [line.split()[0] for line in lines[1:5]] == list(found.parts)
+    assert found.dominant in lines[5]
+    total = found.total["normal force"]
+    assert close(total, sum(found.relative(p)["normal force"] for p in found.parts), 1e-14)
+    assert "not told" in str(budget(made.scene, made.problem))
+
+    scene = block("quadrilateral", 1, n=4, up=-1.0)
+    contacts = [scene.contact(fc.Frictionless(k_n=1e3), name=name) for name in ("one", "other")]
+    problem = fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=contacts)
+    problem.solve()
+    assert set(quantities(problem)) == {
+        f"{c}: {q}" for c in ("one", "other") for q in ("normal force", "peak pressure")
+    } | {"displacement"}
+
+
+def test_physical_springs_are_no_error():
+    """The stiffness of a foundation is meant: no part of the displacement is due to it."""
+    scene = block("quadrilateral", 1, n=2, up=-1.0)
+    problem, _ = scene.problem(fc.Foundation(1e3), scene.rollers())
+    problem.solve()
+    assert budget(scene, problem).parts["enforcement"]["displacement"] == 0.0
+
+
+def test_units_do_not_matter():
+    """In metres and pascals the relative errors are the same, to 1e-8."""
+    found = []
+    for length, pressure in ((1.0, 1.0), (1e-3, 1e6)):
+        scene = block("triangle", 2, n=3, size=[length] * 2, E=1e3 * pressure)
+        law = fc.Coulomb(0.3, fc.Scaled(10.0), fc.Scaled(10.0))
+        ball = fc.Ball((0.5 * length, -2.0 * length), 2.0 * length)
+        bcs = [scene.hold(TOP, 0, 0.01 * length), scene.hold(TOP, 1, -0.03 * length)]
+        problem, _ = scene.problem(law, bcs, contact={"support": ball}, method="newton")
+        problem.solve()
+        made = budget(scene, problem)
+        found.append([v for part in made.parts for v in made.relative(part).values()])
+    assert close(found[1], found[0], 1e-8, scale=1.0)
+
+
+def test_shapes_are_checked():
+    """Stress and strain of different shapes, on all ranks."""
+    made = Press(n=2)
+    made.solved()
+    u = made.scene.u
+    raised_everywhere(
+        lambda: fc.estimate_errors(made.problem, ufl.Identity(3), strain=ufl.sym(ufl.grad(u))),
+        ValueError,
+        "shape",
+    )
+    raised_everywhere(lambda: fc.estimate_errors(made.problem, u), ValueError, "shape")
+
+
+def test_the_estimate_goes_on_from_a_checkpoint(tmp_path):
+    """Broken off and taken up: the same error at the end; not from a file without (1e-7)."""
+    folder = COMM.bcast(str(tmp_path))
+    whole = Press()
+    end = whole.solved(3, estimate=True).increment_error
+    path = f"{folder}/state.npz"
+    broken, after = Press(), Press()
+    for step in fc.increments(broken.problem, broken.load, steps=3, estimate=True, checkpoint=path):
+        if step.increment == 4:
+            break
+    again = after.solved(3, estimate=True, checkpoint=path).increment_error
+    values = quantities(whole.problem)
+    for name, error in end.items():
+        assert close(again[name], error, 1e-7, scale=abs(values[name]))
+    raised_everywhere(
+        lambda: Press().solved(3, checkpoint=path), ValueError, "estimate", "remove it"
+    )
