@@ -15,6 +15,7 @@ code is 1 if the displacements miss the converged ones by more than 0.3 %.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -61,11 +62,12 @@ def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
     return mesh, dolfinx.mesh.meshtags(mesh, 1, facets[order], values[order])
 
 
-def solve(cells: int, degree: int, increments: int) -> tuple[fc.Contact, dict[str, Any]]:
+def solve(arguments: argparse.Namespace) -> tuple[fc.Contact, dict[str, Any]]:
     """Build and load the block, and measure. Collective."""
     start = time.perf_counter()
-    mesh, tags = make_mesh(cells)
-    V = fem.functionspace(mesh, ("Lagrange", degree, (2,)))
+    mesh, tags = make_mesh(arguments.cells)
+    increments = arguments.increments
+    V = fem.functionspace(mesh, ("Lagrange", arguments.degree, (2,)))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
     shear, lame = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
     load = fem.Constant(mesh, PETSc.ScalarType(0.0))
@@ -82,8 +84,10 @@ def solve(cells: int, degree: int, increments: int) -> tuple[fc.Contact, dict[st
     contact = fc.Contact(u, surface, fc.HalfSpace(point=(0, 0), normal=(0, 1)), law)
     problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method="newton")
     quiet = None if mesh.comm.rank == 0 else True
-    history = fc.increments(problem, load, 0.0, 1.0, steps=increments)
-    made = list(tqdm(history, "GRECO block", increments, disable=quiet, unit="increment"))
+    options = {"steps": increments, "estimate": arguments.errors}
+    history = fc.increments(problem, load, 0.0, 1.0, **options)
+    expected = 2 * increments if arguments.errors else increments
+    made = list(tqdm(history, "GRECO block", expected, disable=quiet, unit="increment"))
 
     resultants = contact.resultants()
     moved = 1e3 * along_bottom(u)
@@ -101,6 +105,9 @@ def solve(cells: int, degree: int, increments: int) -> tuple[fc.Contact, dict[st
         "converged_reasons": [step.reason for step in made],
         "wall_seconds": time.perf_counter() - start,
     }
+    if arguments.errors:
+        budget = fc.estimate_errors(problem, stress, increments=made[-1].increment_error)
+        result["errors"] = dataclasses.asdict(budget)
     return contact, result
 
 
@@ -141,6 +148,8 @@ def report(result: dict[str, Any]) -> None:
     print(f"{result['tangential_force']:.2f} N/mm ({SHEAR})")
     for name, (low, high) in result["zones_mm"].items():
         print(f"{name:>8}: {low:.2f} to {high:.2f} mm")
+    if "errors" in result:
+        print(fc.ErrorBudget(**result["errors"]))
 
 
 def main() -> int:
@@ -151,9 +160,10 @@ def main() -> int:
     parser.add_argument("--cells", type=int, default=40, help="cells along each side")
     parser.add_argument("--degree", type=int, default=2, help="degree of the displacement")
     parser.add_argument("--increments", type=int, default=1, help="load increments")
+    parser.add_argument("--errors", action="store_true", help="estimate the errors, part by part")
     parser.add_argument("--output", type=Path, default=Path("output/greco_block"), help="folder")
     arguments, _ = parser.parse_known_args()
-    contact, result = solve(arguments.cells, arguments.degree, arguments.increments)
+    contact, result = solve(arguments)
     comm, folder = MPI.COMM_WORLD, arguments.output
     if comm.rank == 0:
         folder.mkdir(parents=True, exist_ok=True)

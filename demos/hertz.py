@@ -9,6 +9,7 @@ thickness.
     python demos/hertz.py                                  # the paper's mesh, both frictions
     python demos/hertz.py --h 0.05 --degree 2 --friction 0.2 --increments 80
     python demos/hertz.py --load 1 --h 0.02 --friction 0   # thin contact: Hertz's own theory
+    python demos/hertz.py --errors                         # how wrong it is, and what to change
     python demos/hertz.py --convergence                    # error against h
     mpirun -n 2 python demos/hertz.py
 
@@ -23,6 +24,7 @@ The exit code is 1 if a result misses its reference by more than its tolerance.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 import time
 from collections.abc import Iterable
@@ -168,10 +170,11 @@ def solve(arguments: argparse.Namespace, friction: float) -> tuple[Scene, dict[s
     # Without friction the state does not depend on the way there: one increment.
     steps = arguments.increments or (80 if friction > 0 else 1)
     history: Iterable[fc.Step] = fc.increments(
-        scene.problem, scene.pressure, 0.0, load, steps=steps
+        scene.problem, scene.pressure, 0.0, load, steps=steps, estimate=arguments.errors
     )
     quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
-    history = tqdm(history, f"μ = {friction:g}", steps, disable=quiet, unit="increment")
+    expected = 2 * steps if arguments.errors else steps
+    history = tqdm(history, f"μ = {friction:g}", expected, disable=quiet, unit="increment")
     made = list(history)
     space = scene.u.function_space
     result = measure(scene.contact, scene.u) | {
@@ -186,6 +189,11 @@ def solve(arguments: argparse.Namespace, friction: float) -> tuple[Scene, dict[s
         "converged_reasons": [step.reason for step in made],
         "wall_seconds": time.perf_counter() - start,
     }
+    if arguments.errors:
+        budget = fc.estimate_errors(
+            scene.problem, scene.stress, increments=made[-1].increment_error
+        )
+        result["errors"] = dataclasses.asdict(budget)
     return scene, result
 
 
@@ -286,6 +294,8 @@ def report(result: dict[str, Any]) -> None:
             line += f"{show(entry['value']):>20}{entry['error']:12.2g}{entry['tolerance']:10.2g}"
             line += "" if entry["passed"] else "  MISSED"
         print(line)
+    if "errors" in result:
+        print(f"\n{fc.ErrorBudget(**result['errors'])}")
 
 
 def show(value: Any) -> str:
@@ -396,6 +406,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--k-n", type=float, help="normal stiffness, MPa/mm; default 10 E/h")
     parser.add_argument("--k-t", type=float, help="tangential stiffness, MPa/mm; default 10 E/h")
     parser.add_argument("--solver", choices=("lbfgs", "newton"), default="lbfgs")
+    parser.add_argument("--errors", action="store_true", help="estimate the errors, part by part")
     parser.add_argument("--convergence", action="store_true", help="errors over h, and their rate")
     parser.add_argument("--output", type=Path, default=Path("output/hertz"), help="folder to write")
     # PETSc reads its own options, such as -contact_snes_monitor, from the same command line.

@@ -25,6 +25,7 @@ into some 50 MPa. Such elements want a ``--stiffness`` of a few E/h, and only th
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -126,7 +127,8 @@ def solve(
         fc.Frictionless(fc.Scaled(arguments.stiffness)),
         gap=-OVERSIZE,
     )
-    step = fc.ContactProblem(body.residual(v), u, bcs=bcs, contacts=[contact]).solve()
+    problem = fc.ContactProblem(body.residual(v), u, bcs=bcs, contacts=[contact])
+    step = problem.solve()
 
     points = contact.gather()
     mean = float(points["pressure"] @ points["measure"] / points["measure"].sum())
@@ -141,18 +143,18 @@ def solve(
         name: (exact, TOLERANCE) for name, exact in zip(values, (p, bore, surface), strict=False)
     }
     references["unevenness of the pressure"] = (0.0, EVENNESS)
-    return (
-        contact,
-        body,
-        {
-            "kind": kind,
-            "references": output.compare(values, references),
-            "dofs": V.dofmap.index_map.size_global * 2,
-            "iterations": step.iterations,
-            "unpaired_points": contact.n_unpaired,
-            "wall_seconds": time.perf_counter() - start,
-        },
-    )
+    result = {
+        "kind": kind,
+        "references": output.compare(values, references),
+        "dofs": V.dofmap.index_map.size_global * 2,
+        "iterations": step.iterations,
+        "unpaired_points": contact.n_unpaired,
+        "wall_seconds": time.perf_counter() - start,
+    }
+    if arguments.errors:
+        budget = fc.estimate_errors(problem, body.stress, strain=body.strain(u))
+        result["errors"] = dataclasses.asdict(budget)
+    return contact, body, result
 
 
 def draw(folder: Path, contact: fc.Contact, body: LinearElastic, result: dict[str, Any]) -> None:
@@ -207,6 +209,7 @@ def main() -> int:
     parser.add_argument("--h", type=float, default=1.0, help="cell size of the inner ring, mm")
     parser.add_argument("--degree", type=int, default=2, help="degree of the displacement")
     parser.add_argument("--stiffness", type=float, default=100, help="normal stiffness over E/h")
+    parser.add_argument("--errors", action="store_true", help="estimate the errors, part by part")
     parser.add_argument("--output", type=Path, default=Path("output/shrink_fit"), help="folder")
     arguments, _ = parser.parse_known_args()
     comm, runs = MPI.COMM_WORLD, []
@@ -220,6 +223,8 @@ def main() -> int:
             print(f"{kind}: {result['dofs']} dofs, {result['iterations']} iterations, ", end="")
             print(f"{result['wall_seconds']:.2f} s")
             print(output.table(result["references"]))
+            if "errors" in result:
+                print(fc.ErrorBudget(**result["errors"]))
         runs.append(result)
     output.write_json(arguments.output / "result.json", {"runs": runs}, comm)
     passed = all(e["passed"] for run in runs for e in run["references"].values())

@@ -25,6 +25,7 @@ radius or peak miss by more than 2 %.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -138,19 +139,19 @@ def solve(
     }
     exact = hertz(case, arguments.depth, force)
     references = {name: (value, TOLERANCE) for name, value in exact.items()}
-    return (
-        contact,
-        body,
-        {
-            "case": case,
-            "depth": arguments.depth,
-            "references": output.compare(values, references),
-            "force": force,
-            "dofs": V.dofmap.index_map.size_global * 3,
-            "iterations": step.iterations,
-            "wall_seconds": time.perf_counter() - start,
-        },
-    )
+    result = {
+        "case": case,
+        "depth": arguments.depth,
+        "references": output.compare(values, references),
+        "force": force,
+        "dofs": V.dofmap.index_map.size_global * 3,
+        "iterations": step.iterations,
+        "wall_seconds": time.perf_counter() - start,
+    }
+    if arguments.errors:
+        budget = fc.estimate_errors(problem, body.stress, strain=body.strain(u))
+        result["errors"] = dataclasses.asdict(budget)
+    return contact, body, result
 
 
 def draw(path: Path, runs: list[tuple[dict[str, Any], dict[str, np.ndarray]]]) -> None:
@@ -189,6 +190,7 @@ def main() -> int:
     parser.add_argument("--cells", type=int, default=8, help="cells per contact radius")
     parser.add_argument("--degree", type=int, default=2, help="degree of the displacement")
     parser.add_argument("--stiffness", type=float, default=30, help="normal stiffness over E/h")
+    parser.add_argument("--errors", action="store_true", help="estimate the errors, part by part")
     parser.add_argument("--output", type=Path, default=Path("output/sphere"), help="folder")
     arguments, _ = parser.parse_known_args()
     comm, drawn = MPI.COMM_WORLD, []
@@ -201,6 +203,8 @@ def main() -> int:
             print(f"{case}: {result['dofs']} dofs, {result['iterations']} iterations, ", end="")
             print(f"{result['wall_seconds']:.2f} s")
             print(output.table(result["references"]))
+            if "errors" in result:
+                print(fc.ErrorBudget(**result["errors"]))
     if comm.rank == 0:
         draw(arguments.output / "pressure.png", drawn)
     runs = [result for result, _ in drawn]

@@ -16,7 +16,7 @@ import dolfinx.fem.petsc
 import numpy as np
 import numpy.typing as npt
 import ufl
-from dolfinx import fem
+from dolfinx import fem, la
 from petsc4py import PETSc
 
 from fenics_contact import compat
@@ -324,31 +324,38 @@ def _smoothed(
     mesh: dolfinx.mesh.Mesh, tensors: list[Any], degree: int, weight: Any, dx: ufl.Measure
 ) -> list[Any]:
     """L2 projections of symmetric tensors onto continuous functions of a degree. Collective."""
+    pairs = [(t, i, j) for t in tensors for i in range(t.ufl_shape[0]) for j in range(i + 1)]
     space = fem.functionspace(mesh, ("Lagrange", degree))
     p, q = ufl.TrialFunction(space), ufl.TestFunction(space)
     mass = fem.petsc.assemble_matrix(compat.compile_form(weight * p * q * dx))
     mass.assemble()
+    all_at_once = fem.functionspace(mesh, ("Lagrange", degree, (len(pairs),)))
+    components = ufl.as_vector([t[i, j] for t, i, j in pairs])
+    right = fem.Function(all_at_once)
+    form = weight * ufl.dot(components, ufl.TestFunction(all_at_once)) * dx
+    fem.assemble_vector(right.x.array, compat.compile_form(form))
+    right.x.scatter_reverse(la.InsertMode.add)
     ksp = PETSc.KSP().create(mesh.comm)
     ksp.setOperators(mass)
     ksp.setType(PETSc.KSP.Type.CG)
     ksp.getPC().setType(PETSc.PC.Type.JACOBI)
     ksp.setTolerances(rtol=1e-8)
-    results = []
-    for tensor in tensors:
-        n = tensor.ufl_shape[0]
-        rows: list[list[Any]] = [[None] * n for _ in range(n)]
-        for i in range(n):
-            for j in range(i + 1):
-                function = fem.Function(space)
-                right = fem.petsc.assemble_vector(
-                    compat.compile_form(weight * tensor[i, j] * q * dx)
-                )
-                right.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
-                ksp.solve(right, function.x.petsc_vec)
-                function.x.scatter_forward()
-                right.destroy()
-                rows[i][j] = rows[j][i] = function
-        results.append(ufl.as_tensor(rows))
+    known, found = fem.Function(space), fem.Function(all_at_once)
+    for c in range(len(pairs)):
+        known.x.array[:] = right.x.array[c :: len(pairs)]
+        solution = fem.Function(space)
+        ksp.solve(known.x.petsc_vec, solution.x.petsc_vec)
+        solution.x.scatter_forward()
+        found.x.array[c :: len(pairs)] = solution.x.array
     ksp.destroy()
     mass.destroy()
-    return results
+    place = {(id(t), i, j): c for c, (t, i, j) in enumerate(pairs)}
+    return [
+        ufl.as_tensor(
+            [
+                [found[place[id(t), max(i, j), min(i, j)]] for j in range(t.ufl_shape[0])]
+                for i in range(t.ufl_shape[0])
+            ]
+        )
+        for t in tensors
+    ]
