@@ -128,8 +128,13 @@ class Scene:
     pressure: fem.Constant
 
 
-def build(arguments: argparse.Namespace, friction: float, h: float, load: float) -> Scene:
-    """Mesh, elasticity and contact, the mesh made for the pressure ``load``. Collective."""
+def build(
+    arguments: argparse.Namespace, friction: float, h: float, load: float, **options: Any
+) -> Scene:
+    """Mesh, elasticity and contact, the mesh made for the pressure ``load``. Collective.
+
+    ``options`` are PETSc's.
+    """
     a, _ = hertz(load)
     mesh, tags = make_mesh(h, 1.3 * a)
 
@@ -158,7 +163,9 @@ def build(arguments: argparse.Namespace, friction: float, h: float, load: float)
         law = fc.Frictionless(**{n: k for n, k in stiffness.items() if n == "k_n"})
     surface = fc.ContactSurface(mesh, tags, CONTACT)
     contact = fc.Contact(u, surface, fc.HalfSpace(point=(0, 0), normal=(0, 1)), law)
-    problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method=arguments.solver)
+    problem = fc.ContactProblem(
+        F, u, bcs=bcs, contacts=[contact], method=arguments.solver, petsc_options=options
+    )
     return Scene(problem, contact, u, stress, pressure)
 
 
