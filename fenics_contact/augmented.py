@@ -47,9 +47,10 @@ class TraceProjection:
 
         Args:
             quadrature: The points.
-            degree: Of the functions.
+            degree: Of the displacement element; that of the functions is one less, and at least 1.
         """
-        space = fem.functionspace(quadrature.surface.submesh, ("Lagrange", degree))
+        trace = ("Lagrange", max(1, degree - 1))
+        space = fem.functionspace(quadrature.surface.submesh, trace)
         self._basis = quadrature.interpolation_matrix(space)
         self._values = self._basis.createVecLeft()
         self._weights = self._basis.createVecLeft()
@@ -98,7 +99,7 @@ class Multipliers:
         self._law = law
         friction = {"traction": quadrature.surface.mesh.geometry.dim} if law.has_friction else {}
         self.fields = History(quadrature, {"pressure": 0} | friction)
-        self._project = TraceProjection(quadrature, max(1, degree - 1))
+        self._project = TraceProjection(quadrature, degree)
 
     def _next(self, values: Mapping[str, Array]) -> dict[str, Array]:
         """The multipliers that the tractions of an evaluated contact make."""

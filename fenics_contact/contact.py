@@ -17,9 +17,9 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact import accuracy
-from fenics_contact.augmented import Multipliers
+from fenics_contact.augmented import Multipliers, TraceProjection
 from fenics_contact.history import History
-from fenics_contact.laws import Foundation, Kinematics, Law, Scaled, Springs
+from fenics_contact.laws import Kinematics, Law, Scaled, Springs
 from fenics_contact.pairing import DeformableBody, Opposite
 from fenics_contact.parallel import gather_rows, global_max, global_min, global_sum
 from fenics_contact.supports import Motion, Placement, Support, nonzero_vector
@@ -149,6 +149,7 @@ class Contact:
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
         self.multipliers: Multipliers | None = None
+        self._projection: TraceProjection | None = None
         self.tolerance = tolerance
         if self._augments(enforcement):
             self.multipliers = Multipliers(self.quadrature, degree, law)
@@ -638,7 +639,29 @@ class Contact:
     @property
     def regularised(self) -> bool:
         """Whether the stiffness stands for none at all, and is not that of physical springs."""
-        return self._tributary is None and not isinstance(self.law, Foundation)
+        return self._tributary is None and not self.law.is_physical
+
+    def borne_by_springs(self) -> Array:
+        """What of the traction the springs bear in place of rigid contact: (n_points, gdim).
+
+        As far as displacements of Γc can answer it, see `augmented`: (stress). Zero where the
+        stiffness is physical. Collective.
+        """
+        values = self._values
+        if not self.regularised:
+            return np.zeros_like(values["x"])
+        if self._projection is None:
+            degree = self.u.function_space.ufl_element().degree
+            self._projection = TraceProjection(self.quadrature, degree)
+        pressure = np.zeros(self.quadrature.n_points)
+        if self.law.has_normal_stiffness:
+            pressure = self._projection(self.pressure)
+        side = self._projection(self.tangential_traction)
+        if self.multipliers is not None:
+            pressure = pressure - self.multipliers.fields.values("pressure")
+            if self.law.has_friction:
+                side = side - self.multipliers.fields.values("traction")
+        return side - pressure[:, None] * values["normal"]
 
     @property
     def couples(self) -> bool:

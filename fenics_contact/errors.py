@@ -165,8 +165,8 @@ class _Springs:
     Attributes:
         traction: On the body, (n_points, gdim) (stress).
         stiffness: What the traction loses per displacement, (n_points, gdim, gdim).
-        stretch: Displacement that is in the springs and would not be there without regularisation,
-            (n_points, gdim) (length).
+        stretch: Displacement that is in the springs because their stiffness stands for none at
+            all, as far as displacements of Γc can answer it, (n_points, gdim) (length).
     """
 
     traction: Array
@@ -182,6 +182,7 @@ class _Springs:
         d = normal.shape[1]
         stiffness = np.zeros((len(normal), d, d))
         stretch = np.zeros_like(normal)
+        borne = contact.borne_by_springs()
         if law.has_normal_stiffness:
             # A slipping point's friction follows the pressure, unless its limit is given.
             follows = closed & (status == Status.SLIP) & (pressure > 0) & (not law.has_potential)
@@ -189,13 +190,15 @@ class _Springs:
             direction = normal - ratio[:, None] * tangential
             k_n = np.where(closed, values["parameter k_n"], 0.0)
             stiffness += k_n[:, None, None] * np.einsum("qi,qj->qij", direction, normal)
-            stretch += (closed * pressure / values["parameter k_n"])[:, None] * normal
+            along = -np.sum(borne * normal, axis=1)
+            stretch += (along / values["parameter k_n"])[:, None] * normal
         if law.has_tangential:
             k_t, stick = contact.tangential_stiffness, status == Status.STICK
             stiffness += np.where(stick[:, None, None], k_t, 0.0)
-            # K_t has no inverse along the normal, where τ has no part.
+            # K_t has no inverse along the normal, where nothing acts: any stiffness will do.
             along = np.einsum("q,qi,qj->qij", values["parameter k_t"], normal, normal)
-            stretch -= np.linalg.solve(k_t + along, tangential[:, :, None])[:, :, 0]
+            side = borne - np.sum(borne * normal, axis=1)[:, None] * normal
+            stretch -= np.linalg.solve(k_t + along, side[:, :, None])[:, :, 0]
         return cls(traction, stiffness, stretch)
 
     def change(self, jump: Array) -> Array:
@@ -209,19 +212,17 @@ def _linear_parts(
     """What the springs and the residual that is left have changed in the quantities."""
     contacts = problem.contacts
     springs = [_Springs.of(contact) for contact in contacts]
-    regularised = [c.regularised for c in contacts]
     found = {}
     with problem.linearised([s.stiffness for s in springs]) as solve:
         way = solve(None)
         jumps = [contact.at_points(way) for contact in contacts]
         changes = [s.change(jump) for s, jump in zip(springs, jumps, strict=True)]
         found["solver"] = _differences(problem, values, changes, way)
-        # The springs' rest lengths follow what they carry: one update of an augmented Lagrangian.
+        # The springs' rest lengths follow what they carry: a round of augmented enforcement.
         # It leaves 1/(1 + k_n h/E) of the error in the shortest waves and far less in the long ones
-        # that forces are made of. More updates find pressures that no displacement can answer.
-        shifts = [np.where(r, s.stretch, 0.0) for r, s in zip(regularised, springs, strict=True)]
-        way = solve([s.change(shift) for s, shift in zip(springs, shifts, strict=True)])
-        jumps = [shift + c.at_points(way) for c, shift in zip(contacts, shifts, strict=True)]
+        # that forces are made of.
+        way = solve([s.change(s.stretch) for s in springs])
+        jumps = [s.stretch + c.at_points(way) for c, s in zip(contacts, springs, strict=True)]
         changes = [s.change(jump) for s, jump in zip(springs, jumps, strict=True)]
     found["enforcement"] = _differences(problem, values, changes, way)
     return found

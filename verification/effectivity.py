@@ -175,11 +175,12 @@ def page(rows: list[Row]) -> str:
     lines = [
         "# Effectivity of the error estimates",
         "",
-        "Written by `python verification/effectivity.py`. Effectivity is estimated over true error; "
-        f"values outside of {USEFUL[0]:g} to {USEFUL[1]:g} are bold. Errors are relative to the "
-        "quantity. A part is compared with a solution in which its cause is next to absent and all "
-        "else equal; all parts together (the sum of their sizes) with the exact or converged values "
-        "of the demos. Where signs differ, the parts cancel in truth, and the sum is too large.",
+        "Written by `python verification/effectivity.py`. Effectivity is estimated over true "
+        f"error; values outside of {USEFUL[0]:g} to {USEFUL[1]:g} are bold. Errors are relative to "
+        "the quantity. A part is compared with a solution in which its cause is next to absent and "
+        "all else equal; all parts together (the sum of their sizes) with the exact or converged "
+        "values of the demos. Where signs differ, the parts cancel in truth, and the sum is too "
+        "large.",
         "",
         "| part | estimates | median | useful |",
         "|---|---|---|---|",
