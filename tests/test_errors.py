@@ -233,7 +233,7 @@ def test_the_estimate_goes_on_from_a_checkpoint(tmp_path):
 
 
 def test_multipliers_leave_no_error_of_enforcement():
-    """With multipliers within 1e-5 of the tractions ten times that is left at most, here of 13 %."""
+    """With multipliers within 1e-5 of the tractions at most 1e-4 is left, of some 10 %."""
     left = {}
     for enforcement in ("penalty", "augmented"):
         scene = block("quadrilateral", 1, n=8)
