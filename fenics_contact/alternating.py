@@ -23,6 +23,8 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
+from fenics_contact.callbacks import Callbacks
+
 __all__ = ["OPTIONS", "Alternation"]
 
 Array = npt.NDArray[np.float64]
@@ -70,6 +72,7 @@ class Alternation:
         self._function: PETSc.Vec | None = None
         self.snes = self._make_snes(f"{problem.prefix}alternating_", OPTIONS, set_defaults)
         self._finish = self._make_snes(f"{problem.prefix}finishing_", _FINISH, set_defaults)
+        self._callbacks = Callbacks()
         self._goal = 0.0
 
     def _make_snes(
@@ -89,15 +92,21 @@ class Alternation:
         problem = self._problem
         new = self._function is not problem._function
         self._function = problem._function
+        this: Alternation = weakref.proxy(self)
         for snes in (self.snes, self._finish):
             if new:
                 snes.reset()
             snes.setKSP(problem._solvers[False])
-            snes.setJacobian(lambda _, x, J, P: self._assemble(x, J), problem._matrices[False])
-            snes.setFunction(lambda _, x, f: self._problem._compute_residual(x, f), self._function)
-            snes.setConvergenceTest(lambda _, it, norms: self._test(norms[2]))
+            self._callbacks.attach(
+                snes,
+                lambda x, f: this._problem._compute_residual(x, f),
+                self._function,
+                lambda x, J: this._assemble(x, J),
+                problem._matrices[False],
+                lambda: this._test(),
+            )
         if problem.bulk.linear:
-            self.snes.setObjective(lambda _, x: self._problem._energy_at(x))
+            self._callbacks.set_objective(self.snes, lambda x: this._problem._energy_at(x))
 
     def solve(self, solution: PETSc.Vec) -> tuple[int, int]:
         """Solve the problem from ``solution`` on. Collective.
@@ -153,21 +162,16 @@ class Alternation:
 
     def _minimise(self, solution: PETSc.Vec) -> int:
         """Newton's method with the line search on the energy, then without any."""
-        self.snes.solve(None, solution)
-        made: int = self.snes.getIterationNumber()
-        if self.snes.getConvergedReason() <= 0:
+        made, reason = self._callbacks.solve(self.snes, solution)
+        if reason <= 0:
             # The last digits of the residual are below the rounding of the energy.
-            self._finish.solve(None, solution)
-            made += self._finish.getIterationNumber()
+            made += self._callbacks.solve(self._finish, solution)[0]
         return made
 
-    def _test(self, norm: float) -> int:
+    def _test(self) -> int:
         reasons = PETSc.SNES.ConvergedReason
-        if not np.isfinite(norm):
-            return int(reasons.DIVERGED_FNORM_NAN)
-        if self._problem._norms["residual"] <= self._goal:
-            return int(reasons.CONVERGED_FNORM_RELATIVE)
-        return int(reasons.ITERATING)
+        converged = self._problem._norms["residual"] <= self._goal
+        return int(reasons.CONVERGED_FNORM_RELATIVE if converged else reasons.ITERATING)
 
     def _assemble(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
         problem = self._problem

@@ -10,7 +10,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact import compat
-from fenics_contact.parallel import global_max
+from fenics_contact.parallel import collective_errors, global_max
 
 __all__ = ["Bulk"]
 
@@ -95,7 +95,7 @@ class Bulk:
             same = self._fingerprint is not None and np.array_equal(fingerprint, self._fingerprint)
             if self._u.function_space.mesh.comm.allreduce(not same) == 0:
                 return False
-            self._fingerprint = fingerprint
+        self._fingerprint = None  # until the matrix is complete
         self.stiffness.zeroEntries()
         fem.petsc.assemble_matrix(self.stiffness, self._compiled_tangent)
         self.stiffness.assemble()
@@ -103,6 +103,8 @@ class Bulk:
         self.scale = diagonal.norm(PETSc.NormType.NORM_INFINITY)
         self.symmetric = self._is_symmetric(diagonal)
         diagonal.destroy()
+        if self.linear:
+            self._fingerprint = fingerprint
         return True
 
     def check_elastic(self) -> None:
@@ -142,7 +144,8 @@ class Bulk:
 
     def _assemble(self, target: fem.Function) -> None:
         target.x.array[:] = 0.0
-        fem.assemble_vector(target.x.array, self._compiled)
+        with collective_errors(self._u.function_space.mesh.comm):
+            fem.assemble_vector(target.x.array, self._compiled)
         target.x.scatter_reverse(dolfinx.la.InsertMode.add)
 
     def _owned(self, function: fem.Function) -> Array:

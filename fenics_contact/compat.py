@@ -21,11 +21,24 @@ _line_searches = getattr(getattr(PETSc, "SNESLineSearch", None), "Type", None)
 LEAST_RESIDUAL = getattr(_line_searches, "SECANT", "l2")
 # PETSc's error for a zero in a dense factorisation (PETSC_ERR_MAT_LU_ZRPVT).
 _ZERO_PIVOT = 71
+# MUMPS' errors INFOG(1) for workspace that is too small, or memory that was not to be had.
+_NO_MEMORY = (-5, -7, -8, -9, -11, -13, -14, -15, -17, -18, -19, -20)
 
 
 def is_singular(error: PETSc.Error) -> bool:
     """Whether a dense matrix could not be factored."""
     return bool(error.ierr == _ZERO_PIVOT)
+
+
+def refused_memory(pc: PETSc.PC) -> bool:
+    """Whether a factorisation failed because it did not get its memory."""
+    if not pc.getFailedReason():
+        return False
+    if pc.getFailedReason() == PETSc.PC.FailedReason.FACTOR_OUTMEMORY:
+        return True
+    mumps = pc.getType() in ("lu", "cholesky") and pc.getFactorSolverType() == "mumps"
+    # PETSc has no reason of its own for some of MUMPS' errors.
+    return mumps and pc.getFactorMatrix().getMumpsInfog(1) in _NO_MEMORY
 
 
 def create_facet_submesh(

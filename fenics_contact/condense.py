@@ -18,6 +18,7 @@ import numpy.typing as npt
 import petsc4py
 from petsc4py import PETSc
 
+from fenics_contact import compat
 from fenics_contact.contact import Contact
 from fenics_contact.spaces import Mask, WholeSpace
 from fenics_contact.unknowns import Selection, Unknowns
@@ -95,6 +96,7 @@ class Condensation:
 
         Raises:
             RuntimeError: The stiffness is singular even with the kept unknowns held.
+            MemoryError: There is not enough.
         """
         self._stiffness, self._kept = stiffness, kept
         outside = np.ones(constrained.size, dtype=np.bool_)
@@ -122,6 +124,11 @@ class Condensation:
         _call("MatFactorSetSchurIS", _object(self._factor), _object(chosen))
         self._pc.setUp()
         error = self._factor.getMumpsInfog(1)
+        if compat.refused_memory(self._pc):
+            raise MemoryError(
+                f"condensing {constrained.size} unknowns onto {kept.size} was refused its memory "
+                f"(MUMPS error {error}): use condensation=False, or several ranks"
+            )
         self.schur = self._schur_complement()
         if error < 0 or not np.all(np.isfinite(self.schur)):
             raise RuntimeError(

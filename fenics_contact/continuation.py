@@ -18,6 +18,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact import compat
+from fenics_contact.callbacks import Callbacks
 
 __all__ = ["OPTIONS", "Continuation"]
 
@@ -62,6 +63,7 @@ class Continuation:
         self.snes.setOptionsPrefix(prefix)
         set_defaults(OPTIONS, prefix)
         self.snes.setFromOptions()
+        self._callbacks = Callbacks()
         self._coarse = 0.0
 
     def _attach(self) -> None:
@@ -71,14 +73,18 @@ class Continuation:
             snes.reset()
         self._function = problem._function
         snes.setKSP(problem._solvers[True])
-        snes.setJacobian(
-            lambda _, x, J, P: self._problem._assemble_tangent(x, J), problem._matrices[True]
+        this: Continuation = weakref.proxy(self)
+        self._callbacks.attach(
+            snes,
+            lambda x, f: this._problem._compute_residual(x, f),
+            self._function,
+            lambda x, J: this._problem._assemble_tangent(x, J),
+            problem._matrices[True],
+            lambda: this._test(),
         )
-        snes.setFunction(lambda _, x, f: self._problem._compute_residual(x, f), self._function)
-        snes.setConvergenceTest(lambda _, it, norms: self._test(norms[2]))
 
-    def solve(self, solution: PETSc.Vec) -> tuple[int, int]:
-        """Solve the problem from ``solution`` on. Collective.
+    def solve(self) -> tuple[int, int]:
+        """Solve the problem from its ``_solution`` on. Collective.
 
         Returns:
             Newton iterations in all, and the reason as SNES has them.
@@ -86,14 +92,14 @@ class Continuation:
         problem = self._problem
         self._attach()
         share = min(1.0, 1.0 / max(problem._hardness(), 1.0))
-        iterations, solved, factor, kept = 0, 0.0, _FACTOR, solution.copy()
+        iterations, solved, factor, kept = 0, 0.0, _FACTOR, problem._solution.copy()
         try:
             while True:
                 self._soften(share)
-                made, reason = self._solve_one(solution)
+                made, reason = self._solve_one()
                 iterations += made
                 if reason <= 0:
-                    kept.copy(solution)
+                    kept.copy(problem._solution)
                     if solved and factor > _LEAST_FACTOR:
                         factor = np.sqrt(factor)
                         share = min(1.0, factor * solved)
@@ -101,14 +107,14 @@ class Continuation:
                     factor = _FACTOR
                     share = min(1.0, factor * solved) if solved else share
                     self._soften(share)
-                    made, reason = problem._alternation.solve(solution)
+                    made, reason = problem._alternation.solve(problem._solution)
                     iterations += made
                     logger.debug("alternated at %.3g of the stiffness: reason %d", share, reason)
                 if reason <= 0 or share == 1.0:
                     return iterations, reason
                 logger.debug("%.3g of the stiffness, %d iterations so far", share, iterations)
                 solved = share
-                solution.copy(kept)
+                problem._solution.copy(kept)
                 share = min(1.0, factor * solved)
         finally:
             self._soften(1.0)
@@ -120,21 +126,22 @@ class Continuation:
             contact.softening.value = share
         self._coarse = _COARSE if share < 1.0 else 0.0
 
-    def _solve_one(self, solution: PETSc.Vec) -> tuple[int, int]:
-        problem, reasons = self._problem, PETSc.SNES.ConvergedReason
+    def _solve_one(self) -> tuple[int, int]:
+        """Iterations and reason of Newton's method for the present stiffness. Collective."""
+        problem = self._problem
         problem._watch.start()
         try:
-            self.snes.solve(None, solution)
+            return self._callbacks.solve(self.snes, problem._solution)
         except PETSc.Error as error:
             if not compat.is_singular(error):
                 raise
-            return self.snes.getIterationNumber(), int(reasons.DIVERGED_LINEAR_SOLVE)
-        return self.snes.getIterationNumber(), self.snes.getConvergedReason()
+            problem._recover()
+            self._attach()
+            reason = PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
+            return self.snes.getIterationNumber(), int(reason)
 
-    def _test(self, norm: float) -> int:
+    def _test(self) -> int:
         problem, reasons = self._problem, PETSc.SNES.ConvergedReason
-        if not np.isfinite(norm):
-            return int(reasons.DIVERGED_FNORM_NAN)
         goal = max(problem._tolerance(), self._coarse * problem._norms["force"])
         converged = problem._norms["residual"] <= goal
         return int(reasons.CONVERGED_FNORM_RELATIVE if converged else reasons.ITERATING)

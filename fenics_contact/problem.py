@@ -19,6 +19,7 @@ from petsc4py import PETSc
 from fenics_contact import accuracy, compat
 from fenics_contact.alternating import Alternation
 from fenics_contact.bulk import Bulk
+from fenics_contact.callbacks import Callbacks
 from fenics_contact.chattering import StatusWatch
 from fenics_contact.condense import CondensedSpace, touched, worthwhile
 from fenics_contact.contact import Contact, Resultants, Status
@@ -343,7 +344,7 @@ class ContactProblem:
         snes = PETSc.SNES().create(self._comm)
         snes.setOptionsPrefix(prefix)
         snes.setSolution(self._solution)
-        self.snes = snes
+        self.snes, self._callbacks = snes, Callbacks()
         self._attach(consistent=False)
         snes.setFromOptions()
         self._quasi_newton = snes.getType() == PETSc.SNES.Type.QN
@@ -444,11 +445,14 @@ class ContactProblem:
         # collective.
         this: ContactProblem = weakref.proxy(self)
         self.snes.setKSP(self._solvers[consistent])
-        self.snes.setFunction(lambda _, x, f: this._compute_residual(x, f), self._function)
-        self.snes.setJacobian(
-            lambda _, x, J, P: this._compute_jacobian(x, J), self._matrices[consistent]
+        self._callbacks.attach(
+            self.snes,
+            lambda x, f: this._compute_residual(x, f),
+            self._function,
+            lambda x, J: this._compute_jacobian(x, J),
+            self._matrices[consistent],
+            lambda: this._test_convergence(),
         )
-        self.snes.setConvergenceTest(lambda _, it, norms: this._test_convergence(norms))
 
     @property
     def has_potential(self) -> bool:
@@ -508,10 +512,8 @@ class ContactProblem:
         rtol = max(self._rtol, self._round_rtol)
         return max(rtol * self._norms["force"], self._norms["floor"])
 
-    def _test_convergence(self, norms: tuple[float, ...]) -> int:
+    def _test_convergence(self) -> int:
         reasons = PETSc.SNES.ConvergedReason
-        if not np.isfinite(norms[2]):
-            return int(reasons.DIVERGED_FNORM_NAN)
         if self._norms["residual"] <= self._tolerance():
             return int(reasons.CONVERGED_FNORM_RELATIVE)
         if self._watch.idle > _PATIENCE and self._may_climb():
@@ -687,10 +689,12 @@ class ContactProblem:
         saved = self._whole.state()
         try:
             step = self._solve(start, ahead)
-        except BaseException:
+        except BaseException as error:
             self._whole.set_state(saved)
             for contact in self.contacts:
                 contact.restore()
+            if not isinstance(error, NotConverged | ValueError):
+                self._recover()
             raise
         return step
 
@@ -797,15 +801,21 @@ class ContactProblem:
             if method == "alternating":
                 return self._alternation.solve(self._solution)
             if method == "continuation":
-                return self._continuation.solve(self._solution)
+                return self._continuation.solve()
             if self._quasi_newton:
                 return self._solve_quasi_newton(stiffness_changed)
-            self.snes.solve(None, self._solution)
+            return self._callbacks.solve(self.snes, self._solution)
         except PETSc.Error as error:
             if not compat.is_singular(error):
                 raise
+            self._recover()
             return self.snes.getIterationNumber(), int(_REASONS.DIVERGED_LINEAR_SOLVE)
-        return self.snes.getIterationNumber(), self.snes.getConvergedReason()
+
+    def _recover(self) -> None:
+        """Replace what an error of PETSc may have left locked or half done. Collective."""
+        self._solution, self._function = self._space.vector(), self._space.vector()
+        self.snes.reset()
+        self._make_matrices()
 
     def _outcome(self, reason: int) -> str:
         """What became of a rung, in words. Collective."""
@@ -903,8 +913,7 @@ class ContactProblem:
             snes.setTolerances(
                 max_it=min(self._space.iterations_per_round, self._max_it - iterations)
             )
-            snes.solve(None, self._solution)
-            iterations += snes.getIterationNumber()
+            iterations += self._callbacks.solve(snes, self._solution)[0]
             self._compute_residual(self._solution, self._function)
             residual = self._norms["residual"]
             if residual <= self._tolerance():

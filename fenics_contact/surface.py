@@ -13,7 +13,7 @@ from dolfinx import fem, la
 from petsc4py import PETSc
 
 from fenics_contact import compat
-from fenics_contact.parallel import gather_rows, global_min
+from fenics_contact.parallel import collective_errors, gather_rows, global_min
 
 __all__ = ["ContactSurface", "PointEvaluator", "SurfaceQuadrature", "VertexAreas"]
 
@@ -321,7 +321,8 @@ class PointEvaluator:
 def _assemble(form: fem.Form, vector: la.Vector) -> npt.NDArray[np.float64]:
     """Assemble into ``vector``, ghosts consistent. Collective."""
     vector.array[:] = 0.0
-    fem.assemble_vector(vector.array, form)
+    with collective_errors(form.mesh.comm):
+        fem.assemble_vector(vector.array, form)
     vector.scatter_reverse(la.InsertMode.add)
     vector.scatter_forward()
     return vector.array

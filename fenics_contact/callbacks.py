@@ -1,0 +1,96 @@
+"""Callbacks of SNES that keep an error until SNES has returned.
+
+PETSc carries no exception of Python: what leaves a callback comes out as an error code of PETSc's
+own, and leaves vectors locked behind it. So SNES is told that the residual is not a number, which
+ends it in good order, and then the error is raised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+from fenics_contact import compat
+
+__all__ = ["Callbacks"]
+
+
+class Callbacks:
+    """The callbacks of one SNES, which is no part of it: SNES keeps them, and would keep itself."""
+
+    def __init__(self) -> None:
+        """No error yet."""
+        self._error: BaseException | None = None
+
+    def attach(
+        self,
+        snes: PETSc.SNES,
+        residual: Callable[[PETSc.Vec, PETSc.Vec], None],
+        vector: PETSc.Vec,
+        jacobian: Callable[[PETSc.Vec, PETSc.Mat], None],
+        matrix: PETSc.Mat,
+        reason: Callable[[], int],
+    ) -> None:
+        """Give SNES its callbacks, which must not keep the SNES.
+
+        Args:
+            snes: The solver.
+            residual: Computes it at x, into f.
+            vector: For the residual.
+            jacobian: Assembles the matrix at x.
+            matrix: That matrix.
+            reason: Whether to end, by what ``residual`` left; only asked where that is finite.
+        """
+
+        def test(_: Any, iteration: int, norms: tuple[float, float, float]) -> int:
+            lost = int(PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN)
+            return int(self._run(reason, otherwise=lost)) if np.isfinite(norms[2]) else lost
+
+        def compute(_: Any, x: PETSc.Vec, f: PETSc.Vec) -> None:
+            self._run(residual, x, f)
+            if self._error is not None:
+                f.set(np.nan)
+
+        snes.setFunction(compute, vector)
+        snes.setJacobian(lambda _, x, J, P: self._run(jacobian, x, J), matrix)
+        snes.setConvergenceTest(test)
+
+    def set_objective(self, snes: PETSc.SNES, energy: Callable[[PETSc.Vec], float]) -> None:
+        """Give the line search of SNES what it is to lower."""
+        snes.setObjective(lambda _, x: self._run(energy, x, otherwise=np.nan))
+
+    def solve(self, snes: PETSc.SNES, x: PETSc.Vec) -> tuple[int, int]:
+        """Let SNES solve from ``x`` on. Collective.
+
+        Returns:
+            Iterations and reason.
+
+        Raises:
+            BaseException: The first that a callback raised.
+            MemoryError: The factorisation did not get its memory.
+        """
+        try:
+            snes.solve(None, x)
+        finally:
+            error, self._error = self._error, None
+            if error is not None:
+                raise error
+        reason = snes.getConvergedReason()
+        if reason <= 0 and compat.refused_memory(snes.getKSP().getPC()):
+            raise MemoryError(
+                "the factorisation was refused its memory: use more ranks, an iterative solver, or "
+                "a coarser mesh; if options limit MUMPS, raise the limit (mat_mumps_icntl_14, "
+                "mat_mumps_icntl_23)"
+            )
+        return snes.getIterationNumber(), reason
+
+    def _run(self, function: Callable[..., Any], *arguments: Any, otherwise: Any = None) -> Any:
+        if self._error is None:
+            try:
+                return function(*arguments)
+            except BaseException as error:
+                self._error = error
+        return otherwise
