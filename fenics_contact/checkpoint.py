@@ -9,7 +9,6 @@ of its node or point, and the middle of the cells around it, which tells apart w
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,6 +19,7 @@ import scipy.spatial
 from dolfinx import fem, la
 from mpi4py import MPI
 
+from fenics_contact import files
 from fenics_contact.contact import Contact
 from fenics_contact.parallel import collective_errors, gather_rows
 from fenics_contact.problem import ContactProblem
@@ -112,16 +112,9 @@ def load(problem: ContactProblem, path: str | Path) -> list[float]:
 
 
 def _write(path: Path, arrays: dict[str, Array]) -> None:
-    """Write the archive, to the disk itself, and put it in place."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with open(temporary, "wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    """Write the archive and put it in place."""
+    with files.replacing(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def _gather(problem: ContactProblem, places: Array, values: list[Array]) -> Array:

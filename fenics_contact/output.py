@@ -16,9 +16,9 @@ import ufl
 from dolfinx import fem, io
 from mpi4py import MPI
 
-from fenics_contact import compat
+from fenics_contact import compat, files
 from fenics_contact.contact import Contact
-from fenics_contact.parallel import gather_rows, global_max, global_min
+from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_min
 
 __all__ = [
     "at_node",
@@ -195,19 +195,33 @@ def table(entries: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def write_json(path: str | os.PathLike[str], data: Mapping[str, Any], comm: MPI.Comm) -> None:
-    """Write ``data`` on the first rank, to a temporary name that replaces the file. Collective."""
-    if comm.rank == 0:
-        path = Path(path)
-        temporary = path.with_name(path.name + ".part")
-        temporary.write_text(json.dumps(data, indent=2, default=float, allow_nan=False) + "\n")
-        temporary.replace(path)
-    comm.barrier()
+    """Write ``data`` on the first rank; the file is complete or as before. Collective.
+
+    Raises:
+        OSError: It cannot be written (on the other ranks RuntimeError).
+        ValueError: ``data`` holds numbers that are not finite.
+    """
+    with collective_errors(comm):
+        if comm.rank == 0:
+            text = json.dumps(data, indent=2, default=float, allow_nan=False) + "\n"
+            with files.replacing(path) as temporary:
+                temporary.write_text(text)
 
 
 def _write(path: Path, functions: list[fem.Function], time: float) -> None:
     comm = functions[0].function_space.mesh.comm
-    if comm.rank == 0:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    comm.barrier()
-    with io.VTKFile(comm, str(path), "w") as file:
-        file.write_function(functions, time)
+    with files.replacing_set(comm, path, b"</VTKFile>") as temporary:
+        with collective_errors(comm):
+            failure = _write_vtk(comm, temporary, functions, time)
+            if failure:
+                raise OSError(f"{path} cannot be written: {failure}")
+
+
+def _write_vtk(comm: MPI.Comm, path: Path, functions: list[fem.Function], time: float) -> str:
+    """What went wrong. The error itself would keep the file, whose destructor writes again."""
+    try:
+        with io.VTKFile(comm, str(path), "w") as file:
+            file.write_function(functions, time)
+    except RuntimeError as error:
+        return str(error)
+    return ""

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.mesh import CellType
 
+from fenics_contact import files
 from fenics_contact.contact import Status
 
 __all__ = ["figure", "plot_deformation", "plot_tractions"]
@@ -85,8 +86,7 @@ def plot_deformation(
     axes.autoscale_view()
     axes.margins(0.03)
     figure.legend(loc="outside lower center", ncols=3)
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
+    _save(figure, path)
 
 
 def plot_tractions(
@@ -152,8 +152,7 @@ def plot_tractions(
     axes.set_ylim(bottom=0.0)
     axes.grid(alpha=0.25)
     axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
+    _save(figure, path)
 
 
 @contextmanager
@@ -176,9 +175,18 @@ def figure(
     )
     try:
         yield axes
-        drawn.savefig(path, dpi=150)
+        _save(drawn, path)
     finally:
         plt.close(drawn)
+
+
+def _save(figure: Any, path: str | os.PathLike[str]) -> None:
+    """Write a figure; the file is complete or as before."""
+    try:
+        with files.replacing(path) as temporary:
+            figure.savefig(temporary, dpi=150)
+    finally:
+        _pyplot().close(figure)
 
 
 def _pyplot() -> Any:

@@ -969,9 +969,19 @@ class ContactProblem:
         )
 
     def commit(self) -> None:
-        """Make the solved state the start of the next increment, history included. Collective."""
-        for contact in self.contacts:
-            contact.commit()
+        """Make the solved state the start of the next increment, history included. Collective.
+
+        If it fails, the history is as before.
+        """
+        before = [c.history.function.x.array.copy() for c in self.contacts]
+        try:
+            for contact in self.contacts:
+                contact.commit()
+        except BaseException:
+            for contact, values in zip(self.contacts, before, strict=True):
+                contact.history.function.x.array[:] = values
+            self.restore()
+            raise
         state = self._whole.state()
         self._rate = state - self._committed
         self._committed = state

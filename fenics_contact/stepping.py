@@ -12,6 +12,7 @@ from dolfinx import fem
 
 from fenics_contact import checkpoint as files
 from fenics_contact.errors import quantities
+from fenics_contact.parallel import collective_errors
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.verdict import NotConverged, Rung
 
@@ -68,7 +69,13 @@ def increments(
             committed one.
     """
     ends = _ends(start, end, steps)
-    apply = _setter(load)
+    comm = problem.u.function_space.mesh.comm
+    set_load = _setter(load)
+
+    def apply(value: float) -> None:
+        with collective_errors(comm):
+            set_load(value)
+
     at = _Progress(float(start))
     error = dict.fromkeys(quantities(problem), 0.0) if estimate else {}
     if checkpoint is not None and files.exists(problem, checkpoint):
@@ -114,7 +121,7 @@ def increments(
                     raise
                 at.cut(abs(goal - at.load))
                 failed.append(Rung("cut", 0, f"to {at.largest:g}"))
-                if problem.u.function_space.mesh.comm.rank == 0:
+                if comm.rank == 0:
                     logger.warning(
                         "increment %d, to load %g, did not converge: cut to %g",
                         failure.increment,

@@ -1,0 +1,296 @@
+"""Faults put in on purpose: all ranks end with the error, and nothing is lost or half done.
+
+After every fault the state is that of the last commit, to the bit; and the same problem then makes
+the increment with the result of one that never failed (1e-8: two solutions within the solver's
+tolerance of 1e-9).
+"""
+
+import json
+import os
+import resource
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+from scenes import close, nodal, raised_everywhere
+from test_solver import PATH, identical, rub, snapshot, walk
+
+import fenics_contact as fc
+from fenics_contact import output, parallel, plotting, surface
+
+COMM = MPI.COMM_WORLD
+LAST = COMM.size - 1
+METHODS = ("lbfgs", "newton", "continuation", "alternating")[: 4 if COMM.size == 1 else 2]
+
+# Long enough for a loaded machine; what hangs is ended.
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+
+
+class Fault(Exception):
+    """What nothing in the package raises."""
+
+
+def shared_folder(tmp_path: Path) -> Path:
+    """Rank 0's folder, on all ranks."""
+    return Path(COMM.bcast(str(tmp_path)))
+
+
+def failing(function, after, error=Fault, *, rank=None):
+    """The function, that raises at a call later than ``after``, on all ranks or on one."""
+    calls = [0]
+
+    def call(*args, **kwargs):
+        calls[0] += 1
+        if calls[0] > after and rank in (None, COMM.rank):
+            raise error("put in on purpose")
+        return function(*args, **kwargs)
+
+    return call
+
+
+def survives(made, call, kind, *words):
+    """The call raises on all ranks, leaves no trace, and what comes after is as without it."""
+    before, increment = snapshot(made), made.problem.increment
+    raised_everywhere(call, kind, *words)
+    assert identical(snapshot(made), before)
+    assert made.problem.increment == increment
+    assert made.contact.softening.value == 1.0
+
+
+def goes_on(made, twin):
+    """The increment is made after all."""
+    for m in (made, twin):
+        walk(m, path=PATH[2:3])
+    assert close(nodal(made.scene.u), nodal(twin.scene.u), 1e-8)
+
+
+def pair(method="lbfgs", **kwargs):
+    """Two that have made two increments and are loaded for the third."""
+    both = [rub(method=method, **kwargs) for _ in range(2)]
+    for made in both:
+        walk(made, path=PATH[:2])
+        made.move(*PATH[2])
+    return both
+
+
+# ---- in a solve ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("condensation", [None, False])
+@pytest.mark.parametrize("method", METHODS)
+def test_an_exception_in_a_callback(method, condensation, monkeypatch):
+    """It comes out as it is, from the residual, and from the matrix where SNES asks for one."""
+    if COMM.size > 1 and condensation is None:
+        pytest.skip("condensation is for one rank")
+    made, twin = pair(method, condensation=condensation)
+    names = {"newton": "_assemble_tangent", "continuation": "_assemble_tangent"}
+    for name in filter(None, ("_measure_norms", names.get(method))):
+        for after in (1, 3) if name == "_measure_norms" else (0,):
+            with monkeypatch.context() as patch:
+                patch.setattr(made.problem, name, failing(getattr(made.problem, name), after))
+                survives(made, made.problem.solve, Fault, "on purpose")
+    goes_on(made, twin)
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+def test_one_rank_raises(method, monkeypatch):
+    """In the assembly on its own cells or facets, as if its memory were at an end.
+
+    The other ranks get the text.
+    """
+    made, twin = pair(method)
+    for after in (0, 4):
+        with monkeypatch.context() as patch:
+            broken = failing(fem.assemble_vector, after, MemoryError, rank=LAST)
+            patch.setattr(surface.fem, "assemble_vector", broken)
+            survives(made, made.problem.solve, (MemoryError, RuntimeError), "on purpose")
+    goes_on(made, twin)
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+def test_snes_is_stopped(method):
+    """By a limit that somebody set, in whichever iteration; and by an interrupt from outside."""
+    made, twin = pair(method)
+    limit = made.problem._max_it
+    for allowed in (0, 1):
+        made.problem._max_it = allowed
+        made.problem.snes.setTolerances(max_it=allowed)
+        survives(made, made.problem.solve, fc.NotConverged, "iterations used up")
+    made.problem._max_it = limit
+    made.problem.snes.setTolerances(max_it=limit)
+    kept = made.problem._test_convergence
+    made.problem._test_convergence = failing(kept, 1, KeyboardInterrupt)
+    before = snapshot(made)
+    with pytest.raises(KeyboardInterrupt):
+        made.problem.solve()
+    assert identical(snapshot(made), before)
+    made.problem._test_convergence = kept
+    goes_on(made, twin)
+
+
+@pytest.mark.parametrize(
+    ("method", "condensation", "prefix"),
+    [
+        ("lbfgs", False, "contact_"),
+        ("newton", False, "contact_tangent_"),
+        pytest.param(
+            "lbfgs",
+            True,
+            "contact_interior_",
+            marks=pytest.mark.skipif(COMM.size > 1, reason="condensation is for one rank"),
+        ),
+    ],
+)
+def test_memory_refused(method, condensation, prefix):
+    """MUMPS may take 1 MB, which is not enough for this mesh: MemoryError, not a wrong answer."""
+    made = rub(mesh={"n": 64}, method=method, condensation=condensation)
+    made.move(*PATH[0])
+    options, key = PETSc.Options(), f"{prefix}mat_mumps_icntl_23"
+    options[key] = 1
+    try:
+        survives(made, made.problem.solve, MemoryError, "refused its memory")
+    finally:
+        del options[key]
+    assert made.problem.solve().verdict.failures == []
+
+
+def test_a_load_fails_on_one_rank():
+    """The user's own function raises on one rank: all end, the load is that of before."""
+    made = rub()
+
+    def load(t):
+        if t == 2.0 and COMM.rank == LAST:
+            raise ValueError("no such load")
+        made.move(0.0, 0.01 * t)
+
+    done = []
+
+    def run():
+        done.extend(s.load for s in fc.increments(made.problem, load, 0.0, 2.0, steps=2))
+
+    raised_everywhere(run, ValueError, "no such load")
+    assert done == [1.0] and made.problem.increment == 1
+    assert made.push[-1].value == -0.01
+
+
+# ---- in a commit ---------------------------------------------------------------------------------
+
+
+def test_a_commit_fails():
+    """The second contact's evaluation fails: the first one's history is as before, too."""
+    made, twin = pair()
+    problem = made.problem
+    before = snapshot(made)
+    problem.solve()
+    update = made.contact.history.commit
+
+    def broken(values):
+        update(values)  # already written when it fails
+        raise Fault("put in on purpose")
+
+    made.contact.history.commit = broken
+    raised_everywhere(problem.commit, Fault, "on purpose")
+    made.contact.history.commit = update
+    assert identical(snapshot(made), before)
+    assert problem.increment == 2
+    goes_on(made, twin)
+
+
+# ---- a full disk ---------------------------------------------------------------------------------
+
+
+@contextmanager
+def full_disk(size: int):
+    """No file of this process can grow beyond so many bytes, whoever writes it."""
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, old[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    COMM.barrier()
+    found = {name: (folder / name).read_bytes() for name in sorted(os.listdir(folder))}
+    COMM.barrier()
+    return found
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="the limit would hit what MPI keeps in files, too")
+@pytest.mark.parametrize("kind", ["checkpoint", "json", "body", "surface", "picture"])
+@pytest.mark.parametrize("first", [True, False])
+def test_a_full_disk(kind, first, tmp_path):
+    """A file that could not be written is not there, or as it was; the next one is whole."""
+    made = rub()
+    walk(made, path=PATH[:2])
+    points = made.contact.gather()
+    write = {
+        "checkpoint": lambda: fc.checkpoint.save(made.problem, tmp_path / "state.npz"),
+        "json": lambda: output.write_json(tmp_path / "r.json", {"x": [1.5] * 1000}, COMM),
+        "body": lambda: output.write_body(tmp_path, made.scene.u),
+        "surface": lambda: output.write_surface(tmp_path, made.contact),
+        "picture": lambda: plotting.plot_tractions(tmp_path / "p.png", points),
+    }[kind]
+    if kind == "picture":
+        write()  # the fonts' cache is written once
+        os.remove(tmp_path / "p.png")
+    if not first:
+        write()
+    before, state = files(tmp_path), snapshot(made)
+    for size in (0, 500):
+        with full_disk(size), pytest.raises((OSError, RuntimeError)):
+            write()
+        assert files(tmp_path) == before
+        assert identical(snapshot(made), state)
+    write()
+    after = files(tmp_path)
+    assert after and set(before) <= set(after)
+    if kind == "json":
+        assert json.loads(after["r.json"])["x"] == [1.5] * 1000
+
+
+@pytest.mark.parametrize("kind", ["json", "body", "surface"])
+def test_writing_fails_on_one_rank(kind, tmp_path, monkeypatch):
+    """All ranks end, and no half of it is there."""
+    folder = shared_folder(tmp_path)
+    made = rub()
+    write = {
+        "json": lambda: output.write_json(folder / "r.json", {"x": 1}, COMM),
+        "body": lambda: output.write_body(folder, made.scene.u),
+        "surface": lambda: output.write_surface(folder, made.contact),
+    }[kind]
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", failing(os.replace, 0, OSError))
+        raised_everywhere(write, (OSError, RuntimeError), "on purpose")
+    assert files(folder) == {}
+    write()
+    assert files(folder)
+
+
+def test_files_in_parallel_are_read_again(tmp_path):
+    """Every file that a collection names is beside it (one for each rank, and one for all)."""
+    folder = shared_folder(tmp_path)
+    made = rub()
+    output.write_body(folder, made.scene.u)
+    found = files(folder)
+    named = [w.split(b'"')[1].decode() for w in found["displacement.pvd"].split(b"file=")[1:]]
+    assert named and all(name in found for name in named)
+    assert all(data.rstrip().endswith(b"</VTKFile>") for data in found.values())
+
+
+def test_errors_are_shared():
+    """The rank that raises keeps its error; the others get its text, and its type if it can be."""
+
+    def call(kind):
+        with parallel.collective_errors(COMM):
+            if COMM.rank == LAST:
+                raise kind("put in on purpose")
+
+    raised_everywhere(lambda: call(ValueError), ValueError, "on purpose")
+    raised_everywhere(lambda: call(Fault), (Fault, RuntimeError), "on purpose")
+    assert np.all(COMM.allgather(1) == np.ones(COMM.size))
