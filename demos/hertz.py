@@ -79,9 +79,12 @@ def hertz(load: float) -> tuple[float, float]:
     return a, 2 * force / (np.pi * a)
 
 
-def make_mesh(h: float, fine: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
+def make_mesh(
+    h: float, fine: float, grading: float = 0.3, coarsest: float = R / 4
+) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
     """Quarter disc touching y = 0 at the origin, cells of size ``h`` up to x = ``fine``.
 
+    Beyond they grow by ``grading`` times the distance, up to the size ``coarsest``.
     Cells are curved (second order), so that the gap at every point is that of the circle.
     Collective.
     """
@@ -106,7 +109,7 @@ def make_mesh(h: float, fine: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.Me
 
             def size(dim: int, tag: int, x: float, y: float, z: float, lc: float) -> float:
                 away = np.hypot(max(0.0, x - fine), max(0.0, y - fine / 2))
-                return min(h + 0.3 * away, max(h, R / 4))
+                return min(h + grading * away, max(h, coarsest))
 
             gmsh.model.mesh.setSizeCallback(size)
             gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
