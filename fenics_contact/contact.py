@@ -142,16 +142,20 @@ class Contact:
         mesh = surface.mesh
         self._gdim = gdim = mesh.geometry.dim
         degree = _displacement_degree(u, mesh, name)
-        self.quadrature = surface.quadrature(degree)
-
         try:
             law.check_dimension(gdim)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
-        self.multipliers: Multipliers | None = None
         self._projection: TraceProjection | None = None
         self.tolerance = tolerance
-        if self._augments(enforcement):
+        augments = self._augments(enforcement)
+        # Linear elements hold a curved gap at their nodes alone (docs/enforcement.md). But between
+        # two meshes, and on quadrilaterals of any shape, nodes carry no uniform pressure over.
+        nodal = augments and degree == 1 and not isinstance(support, DeformableBody)
+        nodal = nodal and surface.submesh.topology.cell_name() != "quadrilateral"
+        self.quadrature = surface.quadrature(degree, nodal=nodal)
+        self.multipliers: Multipliers | None = None
+        if augments:
             self.multipliers = Multipliers(self.quadrature, degree, law)
         self.weight = self._scalar("weight", 1.0 if weight is None else weight)
         self._scale: fem.Function | None = None  # E/h, if a stiffness is Scaled

@@ -42,7 +42,7 @@ class ContactSurface:
         tags: int | Sequence[int],
         *,
         quadrature_degree: int | None = None,
-        quadrature_scheme: str = "default",
+        quadrature_scheme: str | None = None,
     ) -> None:
         """Collect the facets and make their submesh. Collective.
 
@@ -53,12 +53,14 @@ class ContactSurface:
             quadrature_degree: Degree of the rule on Γc. By default twice the degree of the
                 displacement element (`SurfaceQuadrature.default_degree`).
             quadrature_scheme: "default" (Gauss) or "vertex" (one point per facet vertex, the
-                contact springs of the paper's section 4).
+                contact springs of the paper's section 4). By default Gauss, but the vertices for
+                multipliers of linear elements on a rigid support, if no degree is given either and
+                the facets are edges or triangles.
 
         Raises:
             ValueError: Wrong dimension, a tag that no facet has, an interior facet with the tag.
         """
-        if quadrature_scheme not in _SCHEMES:
+        if quadrature_scheme is not None and quadrature_scheme not in _SCHEMES:
             raise ValueError(f"quadrature_scheme is {quadrature_scheme!r}; use one of {_SCHEMES}")
         if quadrature_degree is not None and quadrature_degree < 1:
             raise ValueError(f"quadrature_degree is {quadrature_degree}; it must be at least 1")
@@ -72,10 +74,17 @@ class ContactSurface:
         self._facet_tags = facet_tags
         self._ids = tuple(int(tag) for tag in np.unique(np.atleast_1d(np.asarray(tags))))
 
-    def quadrature(self, element_degree: int) -> SurfaceQuadrature:
-        """The rule on Γc for a displacement element of this degree. Collective."""
+    def quadrature(self, element_degree: int, *, nodal: bool = False) -> SurfaceQuadrature:
+        """The rule on Γc for a displacement element of this degree. Collective.
+
+        Args:
+            element_degree: Of the displacement.
+            nodal: Whether the vertices are to be preferred, where the caller left the choice.
+        """
         degree = self.quadrature_degree or SurfaceQuadrature.default_degree(element_degree)
-        return SurfaceQuadrature(self, degree, self.quadrature_scheme)
+        free = self.quadrature_degree is None and self.quadrature_scheme is None
+        scheme = "vertex" if nodal and free else self.quadrature_scheme or "default"
+        return SurfaceQuadrature(self, degree, scheme)
 
     def measure(self, degree: int, scheme: str = "default") -> ufl.Measure:
         """The surface measure of Γc with a quadrature rule (all of Γc, nothing else)."""
@@ -240,7 +249,7 @@ class VertexAreas:
         if surface.quadrature_scheme != "vertex":
             raise ValueError(
                 f"{name}: Springs stand at the vertices of Γc, and quadrature_scheme is "
-                f"{surface.quadrature_scheme!r}; make the ContactSurface with "
+                f"{surface.quadrature_scheme or 'default'!r}; make the ContactSurface with "
                 'quadrature_scheme="vertex", or give the stiffness per area'
             )
         self._name = name

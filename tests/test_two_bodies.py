@@ -73,7 +73,9 @@ def elasticity(u, v, nu: float):
     return ufl.inner(stress, ufl.sym(ufl.grad(v))) * ufl.dx
 
 
-def pressed(cell, degree, nu, law, *, n=(3, 4), surface=LOWER, confined=True, **options):
+def pressed(
+    cell, degree, nu, law, *, n=(3, 4), surface=LOWER, confined=True, contact=None, **options
+):
     """Two blocks on rollers, the top moved down by 0.01; the sides held if confined."""
     mesh, tags = two_blocks(cell, n)
     d = mesh.geometry.dim
@@ -95,9 +97,8 @@ def pressed(cell, degree, nu, law, *, n=(3, 4), surface=LOWER, confined=True, **
             )
             bcs.append(hold(i, fixed, side))
     opposite = UPPER if surface == LOWER else LOWER
-    contact = fc.Contact(
-        u, fc.ContactSurface(mesh, tags, surface), fc.DeformableBody(tags, opposite), law
-    )
+    support, arguments = fc.DeformableBody(tags, opposite), contact or {}
+    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, surface), support, law, **arguments)
     problem = fc.ContactProblem(elasticity(u, v, nu), u, bcs=bcs, contacts=[contact], **options)
     return problem, contact, down
 
