@@ -15,7 +15,6 @@ code is 1 if the displacements miss the converged ones by more than 0.3 %.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -107,7 +106,7 @@ def solve(arguments: argparse.Namespace) -> tuple[fc.Contact, dict[str, Any]]:
     }
     if arguments.errors:
         budget = fc.estimate_errors(problem, stress, increments=made[-1].increment_error)
-        result["errors"] = dataclasses.asdict(budget)
+        result["errors"] = budget.numbers()
     return contact, result
 
 

@@ -24,7 +24,6 @@ The exit code is 1 if a result misses its reference by more than its tolerance.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import sys
 import time
 from collections.abc import Iterable
@@ -203,7 +202,7 @@ def solve(arguments: argparse.Namespace, friction: float) -> tuple[Scene, dict[s
         budget = fc.estimate_errors(
             scene.problem, scene.stress, increments=made[-1].increment_error
         )
-        result["errors"] = dataclasses.asdict(budget)
+        result["errors"] = budget.numbers()
     return scene, result
 
 

@@ -25,7 +25,6 @@ into some 50 MPa. Such elements want a ``--stiffness`` of a few E/h, and only th
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -153,7 +152,7 @@ def solve(
     }
     if arguments.errors:
         budget = fc.estimate_errors(problem, body.stress, strain=body.strain(u))
-        result["errors"] = dataclasses.asdict(budget)
+        result["errors"] = budget.numbers()
     return contact, body, result
 
 

@@ -25,7 +25,6 @@ radius or peak miss by more than 2 %.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -150,7 +149,7 @@ def solve(
     }
     if arguments.errors:
         budget = fc.estimate_errors(problem, body.stress, strain=body.strain(u))
-        result["errors"] = dataclasses.asdict(budget)
+        result["errors"] = budget.numbers()
     return contact, body, result
 
 

@@ -2,6 +2,7 @@
 
 from fenics_contact import elasticity
 from fenics_contact._version import __version__
+from fenics_contact.adaptation import Level, adapt
 from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.errors import ErrorBudget, estimate_errors
 from fenics_contact.laws import Coulomb, Foundation, Frictionless, Scaled, Springs, Tresca
@@ -24,6 +25,7 @@ __all__ = [
     "Foundation",
     "Frictionless",
     "HalfSpace",
+    "Level",
     "Motion",
     "NotConverged",
     "Obstacle",
@@ -35,6 +37,7 @@ __all__ = [
     "Tresca",
     "Verdict",
     "__version__",
+    "adapt",
     "elasticity",
     "estimate_errors",
     "increments",

@@ -9,7 +9,7 @@ increments from halves of themselves (`increments`).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import dolfinx.fem.petsc
@@ -51,10 +51,18 @@ class ErrorBudget:
         parts: Estimates "enforcement", "discretisation", "increments" and "solver": absolute
             errors by quantity, signed as value minus truth where a sign is known. A part that
             could not be told has no entry.
+        energy: Error of discretisation in the energy norm, relative.
+        cells: Squares of that error, of every cell that this rank owns (force times length).
     """
 
     values: dict[str, float]
     parts: dict[str, dict[str, float]]
+    energy: float = 0.0
+    cells: Array | None = field(default=None, repr=False, compare=False)
+
+    def numbers(self) -> dict[str, Any]:
+        """All but the cells, for files; ``ErrorBudget(**numbers)`` has them again."""
+        return {"values": self.values, "parts": self.parts, "energy": self.energy}
 
     def relative(self, part: str) -> dict[str, float]:
         """A part's errors without sign, relative to the quantities."""
@@ -130,10 +138,12 @@ def estimate_errors(
         )
     values = quantities(problem)
     parts = _linear_parts(problem, values)
-    parts["discretisation"] = _discretisation(problem, stress, strain, values)
+    smooth = _Smoothed(problem, stress, strain)
+    parts["discretisation"] = _discretisation(problem, smooth, values)
     if increments is not None:
         parts["increments"] = dict(increments)
-    return ErrorBudget(values, {name: parts[name] for name in _REMEDIES if name in parts})
+    parts = {name: parts[name] for name in _REMEDIES if name in parts}
+    return ErrorBudget(values, parts, float(np.sqrt(smooth.share)), smooth.squares)
 
 
 def _named(
@@ -259,34 +269,53 @@ def _limit(contact: Contact, pressure: Array) -> Array:
 # ---- discretisation ------------------------------------------------------------------------------
 
 
-def _discretisation(
-    problem: ContactProblem, stress: Any, strain: Any, values: Mapping[str, float]
-) -> dict[str, float]:
-    """From stresses and strains smoothed over the mesh (Zienkiewicz and Zhu).
+class _Smoothed:
+    """Stresses and strains beside smooth ones (Zienkiewicz and Zhu).
 
-    With η² = ∫ (σ* - σ):(ε* - ε) the potential energy is off by η²/2. Per elastic energy that is
-    the relative error of what a prescribed displacement needs as force, or of how far a force
-    goes. The peak is compared with that of the smoothed stress on Γc.
+    Attributes:
+        stress: Smooth σ* (UFL).
+        squares: η² = ∫ (σ* - σ):(ε* - ε) of every owned cell (force times length).
+        twice_energy: ∫ σ:ε (force times length).
+        share: Sum of the squares over that.
     """
-    u, contacts = problem.u, problem.contacts
-    mesh = u.function_space.mesh
-    weight = contacts[0].weight if contacts else 1.0
-    degree = u.function_space.ufl_element().degree
-    dx = ufl.dx(mesh, metadata={"quadrature_degree": 2 * degree})
-    smooth_stress, smooth_strain = _smoothed(mesh, [stress, strain], degree, weight, dx)
-    gap = ufl.inner(smooth_stress - stress, smooth_strain - strain)
-    forms = [weight * gap * dx, weight * ufl.inner(stress, strain) * dx]
-    local = [fem.assemble_scalar(compat.compile_form(form)) for form in forms]
-    squares, twice = global_sum(mesh.comm, local)
-    state = problem.present_state()
-    share = abs(squares / twice) if twice else 0.0
+
+    def __init__(self, problem: ContactProblem, stress: Any, strain: Any) -> None:
+        """Smooth. Collective."""
+        u = problem.u
+        mesh = u.function_space.mesh
+        weight = problem.contacts[0].weight if problem.contacts else 1.0
+        degree = u.function_space.ufl_element().degree
+        dx = ufl.dx(mesh, metadata={"quadrature_degree": 2 * degree})
+        self.stress, smooth_strain = _smoothed(mesh, [stress, strain], degree, weight, dx)
+        gap = ufl.inner(self.stress - stress, smooth_strain - strain)
+        q = ufl.TestFunction(fem.functionspace(mesh, ("DG", 0)))
+        both = [weight * q * density * dx for density in (gap, ufl.inner(stress, strain))]
+        n = mesh.topology.index_map(mesh.topology.dim).size_local
+        # Every cell has one value, by its own number.
+        self.squares, energies = (
+            fem.assemble_vector(compat.compile_form(form)).array[:n].copy() for form in both
+        )
+        total, self.twice_energy = global_sum(mesh.comm, [self.squares.sum(), energies.sum()])
+        self.share = abs(total / self.twice_energy) if self.twice_energy else 0.0
+
+
+def _discretisation(
+    problem: ContactProblem, smooth: _Smoothed, values: Mapping[str, float]
+) -> dict[str, float]:
+    """The potential energy is off by η²/2.
+
+    Per elastic energy that is the relative error of what a prescribed displacement needs as force,
+    or of how far a force goes. The peak is compared with that of the smooth stress on Γc.
+    """
+    contacts, mesh = problem.contacts, problem.u.function_space.mesh
+    state, twice, share = problem.present_state(), smooth.twice_energy, smooth.share
     work = float(global_sum(mesh.comm, problem.load @ state))
     loaded = float(np.clip(work / twice, 0.0, 1.0)) if twice else 0.0
     driven = 1.0 - loaded
     found: dict[str, float] = {}
     for contact in contacts:
         d, values_at = mesh.geometry.dim, contact.values
-        plane = ufl.as_tensor([[smooth_stress[i, j] for j in range(d)] for i in range(d)])
+        plane = ufl.as_tensor([[smooth.stress[i, j] for j in range(d)] for i in range(d)])
         outward = ufl.dot(plane, ufl.FacetNormal(mesh))
         traction = PointEvaluator(contact.quadrature, {"traction": outward})()["traction"]
         normal = np.sum(traction * values_at["normal"], axis=1)
