@@ -125,9 +125,9 @@ class Contact:
                 creeps by τ/k_t before it slips. "augmented": multipliers take the forces over from
                 these springs, round by round, until neither is left (`augmented`); k_n and k_t set
                 how fast.
-            tolerance: Of augmented enforcement: by how much of the largest pressure the springs
-                may still bear, see `enforcement_error`. The penetration is that share of the
-                penalty's.
+            tolerance: Of augmented enforcement: how much of the largest traction the springs may
+                still bear, between 0 and 1, see `enforcement_error`. To the functions of the
+                multipliers the penetration is that share of the penalty's.
             name: In messages and files.
 
         Raises:
