@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 import ufl
 from dolfinx import fem, mesh
+from dolfinx.mesh import GhostMode
 from mpi4py import MPI
 from timing import draw, parser, write
 
@@ -24,7 +25,9 @@ BASE, TOP, AXIS = 1, 2, 3
 
 def half_block(n: int) -> tuple[mesh.Mesh, mesh.MeshTags]:
     """[0, 1] x [-1, 0], its base, top and axis tagged. Collective."""
-    made = mesh.create_rectangle(MPI.COMM_WORLD, [(0, -1), (1, 0)], (n, n))
+    made = mesh.create_rectangle(
+        MPI.COMM_WORLD, [(0, -1), (1, 0)], (n, n), ghost_mode=GhostMode.none
+    )
     found = {
         tag: mesh.locate_entities_boundary(made, 1, lambda x, i=i, at=at: np.isclose(x[i], at))
         for tag, i, at in ((BASE, 1, -1), (TOP, 1, 0), (AXIS, 0, 0))

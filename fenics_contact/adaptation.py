@@ -55,7 +55,8 @@ def adapt(
     """Solve on finer and finer meshes. Collective.
 
     Args:
-        mesh: The first one: triangles or tetrahedra with straight edges.
+        mesh: The first one: triangles or tetrahedra with straight edges, no
+            ghost cells.
         facet_tags: Of its boundary; every mesh gets them.
         solve: Makes the problem on a mesh with tags and leads it through its loads; returns the
             problem, the stress σ(u) (UFL), and where that is (3, 3) the strain.
@@ -76,6 +77,11 @@ def adapt(
             f"the mesh has cells {mesh.topology.cell_type.name} of degree "
             f"{mesh.geometry.cmap.degree}; only triangles and tetrahedra with straight edges "
             "can be split: take such a mesh, and snap= for curved sides"
+        )
+    if mesh.comm.allreduce(mesh.topology.index_map(mesh.topology.dim).num_ghosts):
+        raise ValueError(
+            "the mesh has ghost cells, through which DOLFINx hands down no tags: make it with "
+            "ghost_mode=dolfinx.mesh.GhostMode.none"
         )
     if not 0.0 < share <= 1.0 or levels < 1:
         raise ValueError(f"share is {share!r}, levels {levels!r}; use 0 < share <= 1, levels >= 1")
@@ -121,7 +127,9 @@ def _split(
     finer.topology.create_connectivity(d - 1, d)
     finer_tags = dolfinx.mesh.transfer_meshtag(tags, finer, parents, facets)
     for tag, place in snap.items():
-        nodes = dolfinx.mesh.entities_to_geometry(finer, d - 1, finer_tags.find(tag)).ravel()
-        nodes = np.unique(nodes)
+        sides = finer_tags.find(tag)
+        if not sides.size:
+            continue  # DOLFINx 0.9 crashes without any
+        nodes = np.unique(dolfinx.mesh.entities_to_geometry(finer, d - 1, sides))
         finer.geometry.x[nodes, :d] = place(finer.geometry.x[nodes, :d])
     return finer, finer_tags

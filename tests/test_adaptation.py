@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from dolfinx.mesh import GhostMode
 from mpi4py import MPI
 from scenes import BOTTOM as INSIDE
 from scenes import TOP as OUTSIDE
@@ -21,7 +22,7 @@ K = 1e5
 
 def half_block(n: int):
     """[0, 1] x [-1, 0] in triangles, with tags."""
-    mesh = dolfinx.mesh.create_rectangle(COMM, [(0, -1), (1, 0)], (n, n))
+    mesh = dolfinx.mesh.create_rectangle(COMM, [(0, -1), (1, 0)], (n, n), ghost_mode=GhostMode.none)
     sides = ((BASE, 1, -1), (TOP, 1, 0), (AXIS, 0, 0))
     found = [
         dolfinx.mesh.locate_entities_boundary(mesh, 1, lambda x, i=i, at=at: np.isclose(x[i], at))
@@ -117,8 +118,10 @@ def test_curved_sides():
         return problem, body.stress, body.strain(u)
 
     last = list(fc.adapt(mesh, tags, solve, levels=3, snap={INSIDE: onto}))[-1]
-    nodes = dolfinx.mesh.entities_to_geometry(last.mesh, 1, last.facet_tags.find(INSIDE)).ravel()
-    radius = np.linalg.norm(last.mesh.geometry.x[nodes], axis=1)
+    sides, radius = last.facet_tags.find(INSIDE), np.ones(0)
+    if sides.size:
+        nodes = dolfinx.mesh.entities_to_geometry(last.mesh, 1, sides).ravel()
+        radius = np.linalg.norm(last.mesh.geometry.x[nodes], axis=1)
     worst = COMM.allreduce(float(np.abs(radius - 1).max(initial=0.0)), op=MPI.MAX)
     assert worst < 1e-14
 
@@ -130,3 +133,6 @@ def test_input():
     mesh, tags = half_block(2)
     raised_everywhere(lambda: list(fc.adapt(mesh, tags, pressed, share=0.0)), ValueError, "share")
     raised_everywhere(lambda: list(fc.adapt(mesh, tags, pressed, levels=0)), ValueError, "levels")
+    mesh, tags = block_mesh("triangle", ghost_mode=GhostMode.shared_facet)
+    if COMM.size > 1:
+        raised_everywhere(lambda: list(fc.adapt(mesh, tags, pressed)), ValueError, "GhostMode.none")
