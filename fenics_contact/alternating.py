@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import logging
 import weakref
-from collections.abc import Callable
 from itertools import chain
 from typing import Any
 
@@ -24,6 +23,7 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from fenics_contact.callbacks import Callbacks
+from fenics_contact.defaults import Defaults
 
 __all__ = ["OPTIONS", "Alternation"]
 
@@ -61,30 +61,28 @@ class Alternation:
         snes: Newton's method for the subproblems, prefix "alternating_" behind the problem's.
     """
 
-    def __init__(self, problem: Any, set_defaults: Callable[[dict[str, Any], str], None]) -> None:
+    def __init__(self, problem: Any, defaults: Defaults, solver: dict[str, Any]) -> None:
         """Set up SNES; the matrices are those of H₀. Collective.
 
         Args:
             problem: The `ContactProblem`.
-            set_defaults: Puts options with a prefix into the database where they are not set.
+            defaults: What takes the options.
+            solver: Options of the linear solver; none: it is that of H₀.
         """
         self._problem = weakref.proxy(problem)
         self._function: PETSc.Vec | None = None
-        self.snes = self._make_snes(f"{problem.prefix}alternating_", OPTIONS, set_defaults)
-        self._finish = self._make_snes(f"{problem.prefix}finishing_", _FINISH, set_defaults)
+        self._shares_solver = not solver
+        self.snes = self._make_snes(f"{problem.prefix}alternating_", OPTIONS | solver, defaults)
+        self._finish = self._make_snes(f"{problem.prefix}finishing_", _FINISH | solver, defaults)
         self._callbacks = Callbacks()
         self._goal = 0.0
 
-    def _make_snes(
-        self,
-        prefix: str,
-        options: dict[str, Any],
-        set_defaults: Callable[[dict[str, Any], str], None],
-    ) -> PETSc.SNES:
+    def _make_snes(self, prefix: str, options: dict[str, Any], defaults: Defaults) -> PETSc.SNES:
         snes = PETSc.SNES().create(self._problem.u.function_space.mesh.comm)
         snes.setOptionsPrefix(prefix)
-        set_defaults(options, prefix)
-        snes.setFromOptions()
+        defaults.set(options, prefix)
+        with defaults.present():
+            snes.setFromOptions()
         return snes
 
     def _attach(self) -> None:
@@ -96,13 +94,14 @@ class Alternation:
         for snes in (self.snes, self._finish):
             if new:
                 snes.reset()
-            snes.setKSP(problem._solvers[False])
+            if self._shares_solver:
+                snes.setKSP(problem._solvers[False])
             self._callbacks.attach(
                 snes,
                 lambda x, f: this._problem._compute_residual(x, f),
                 self._function,
                 lambda x, J: this._assemble(x, J),
-                problem._matrices[False],
+                problem._matrix(False),
                 lambda: this._test(),
             )
         if problem.bulk.linear:

@@ -237,6 +237,7 @@ class CondensedSpace(WholeSpace):
         self.u, self.unknowns, self.bulk = whole.u, unknowns, whole.bulk
         self.contacts, self.motions = whole.contacts, whole.motions
         self.constrained = whole.constrained[unknowns.kept]
+        self.prescribed: Array = np.zeros(int(self.constrained.sum()))
         self.load: Array = np.zeros(unknowns.n_local)
         self.diagonal: Array = np.zeros(unknowns.n_local)
         self.outside = np.zeros(2)
@@ -248,7 +249,7 @@ class CondensedSpace(WholeSpace):
         self._contact_vector = unknowns.vector()
         self._condensation: Condensation | None = None
 
-    def linear_solver(self, *, symmetric: bool) -> dict[str, Any]:
+    def linear_solver(self, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
         """LU; LAPACK's routine for symmetric matrices takes half of it but twice a solution's."""
         return {"ksp_type": "preonly", "pc_type": "lu"}
 
@@ -294,6 +295,7 @@ class CondensedSpace(WholeSpace):
         state = self._whole.state()
         self.condensation.set_load(load, state)
         self.load = load[self.unknowns.kept]
+        self.prescribed = self.state()[self.constrained]
         outside = np.stack([load, self._whole.diagonal * state])[:, self._is_outside]
         self.outside = np.sum(outside**2, axis=1)
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import logging
 import weakref
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.callbacks import Callbacks
+from fenics_contact.defaults import Defaults
 
 __all__ = ["OPTIONS", "Continuation"]
 
@@ -49,20 +49,23 @@ class Continuation:
         snes: Newton's method for one stiffness, prefix "continuation_" behind the problem's.
     """
 
-    def __init__(self, problem: Any, set_defaults: Callable[[dict[str, Any], str], None]) -> None:
+    def __init__(self, problem: Any, defaults: Defaults, solver: dict[str, Any]) -> None:
         """Set up SNES; the matrix is that of the consistent tangent. Collective.
 
         Args:
             problem: The `ContactProblem`.
-            set_defaults: Puts options with a prefix into the database where they are not set.
+            defaults: What takes the options.
+            solver: Options of the linear solver; none: it is that of the consistent tangent.
         """
         self._problem = weakref.proxy(problem)
         self._function: PETSc.Vec | None = None
         prefix = f"{problem.prefix}continuation_"
         self.snes = PETSc.SNES().create(problem.u.function_space.mesh.comm)
         self.snes.setOptionsPrefix(prefix)
-        set_defaults(OPTIONS, prefix)
-        self.snes.setFromOptions()
+        self._shares_solver = not solver
+        defaults.set(OPTIONS | solver, prefix)
+        with defaults.present():
+            self.snes.setFromOptions()
         self._callbacks = Callbacks()
         self._coarse = 0.0
 
@@ -72,14 +75,15 @@ class Continuation:
         if self._function is not problem._function:
             snes.reset()
         self._function = problem._function
-        snes.setKSP(problem._solvers[True])
+        if self._shares_solver:
+            snes.setKSP(problem._solvers[True])
         this: Continuation = weakref.proxy(self)
         self._callbacks.attach(
             snes,
             lambda x, f: this._problem._compute_residual(x, f),
             self._function,
             lambda x, J: this._problem._assemble_tangent(x, J),
-            problem._matrices[True],
+            problem._matrix(True),
             lambda: this._test(),
         )
 

@@ -16,7 +16,7 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact import accuracy, compat
+from fenics_contact import accuracy, compat, linear
 from fenics_contact.alternating import Alternation
 from fenics_contact.bulk import Bulk
 from fenics_contact.callbacks import Callbacks
@@ -24,6 +24,7 @@ from fenics_contact.chattering import StatusWatch
 from fenics_contact.condense import CondensedSpace, touched, worthwhile
 from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.continuation import Continuation
+from fenics_contact.defaults import Defaults
 from fenics_contact.energy import Energy, EnergyState
 from fenics_contact.parallel import global_max, global_min, global_sum
 from fenics_contact.rigid import RigidMotions
@@ -182,6 +183,7 @@ class ContactProblem:
         phi: float = 1.0,
         fallback: bool = True,
         condensation: bool | None = None,
+        linear_solver: str | None = None,
         petsc_options: Mapping[str, Any] | None = None,
         prefix: str = "contact_",
     ) -> None:
@@ -204,6 +206,11 @@ class ContactProblem:
             condensation: Whether to iterate on the unknowns that contact touches alone, all others
                 eliminated: for a linear bulk on one rank. By default where it can be done and is
                 worth it (`condense.worthwhile`), unless an option names a linear solver.
+            linear_solver: How systems over all unknowns are solved: "direct" (MUMPS) or "multigrid"
+                (GAMG: a V-cycle as H₀ of L-BFGS, or inside CG and GMRES for Newton's method). By
+                default multigrid for three-dimensional problems that it solves sooner, and where
+                the factors would not fit in half of the memory; supports that move freely need
+                "direct". The log says what was chosen.
             petsc_options: Options without prefix; they win over the method's, the command line
                 over both.
             prefix: Prefix of the options.
@@ -213,6 +220,11 @@ class ContactProblem:
         """
         if method not in _METHODS:
             raise ValueError(f"method is {method!r}; use one of {sorted(_METHODS)}")
+        if linear_solver not in (None, *linear.KINDS):
+            raise ValueError(
+                f"linear_solver is {linear_solver!r}; use one of {sorted(linear.KINDS)}, or None "
+                "for the one that suits the size of the problem"
+            )
         for name, share in (("alpha", alpha), ("phi", phi)):
             if not 0.0 <= share <= 1.0:
                 raise ValueError(f"{name} is {share!r}; it must lie between 0 and 1")
@@ -258,7 +270,7 @@ class ContactProblem:
         self._rate: Array | None = None
         self._watch = StatusWatch(self.contacts)
         self._round_rtol = 0.0
-        self._condensation = condensation
+        self._condensation, self._linear_solver = condensation, linear_solver
         self.prefix, self._method, self._fallback = prefix, method, fallback
         self._configure(method, dict(petsc_options or {}), prefix)
 
@@ -317,43 +329,50 @@ class ContactProblem:
 
     def _configure(self, method: str, given: dict[str, Any], prefix: str) -> None:
         """Set up SNES and its two linear solvers: for H₀, and for the consistent tangent."""
-        self._solvers: dict[bool, PETSc.KSP] = {}
-        database = PETSc.Options()
-        inserted = []
-
-        def default(options: Mapping[str, Any], prefix: str) -> None:
-            for name, value in options.items():
-                if not database.hasName(prefix + name):
-                    database.setValue(prefix + name, value)
-                    inserted.append(prefix + name)
-
+        options = self._options = Defaults()
+        options.set(given, prefix)
+        options.set(_COMMON | _METHODS[method], prefix)
         solvers = [part + name for part in ("", "tangent_") for name in _NAMES_A_SOLVER]
-        named = [s for s in solvers if s in given or database.hasName(prefix + s)]
+        named = [name for name in solvers if options.get(prefix + name) is not None]
         self._condensed = self._choose_condensation(named)
+        self._whole.linear_kind = self._choose_linear_solver(named)
         self._set_space()
-        default(given, prefix)
-        default(_COMMON | _METHODS[method], prefix)
-        for consistent in (False, True):
-            ksp = PETSc.KSP().create(self._comm)
-            ksp.setOptionsPrefix(prefix + ("tangent_" if consistent else ""))
-            options = self._space.linear_solver(symmetric=self._symmetric(consistent))
-            default(options, ksp.getOptionsPrefix())
-            ksp.setFromOptions()
-            self._solvers[consistent] = ksp
-        self._allocate_matrices()
-        snes = PETSc.SNES().create(self._comm)
+        self._quasi_newton = options.get(prefix + "snes_type") == PETSc.SNES.Type.QN
+        newton = linear.newton_options(self._space.linear_kind)
+        if not self._quasi_newton:
+            options.set(newton, prefix)
+        snes = self.snes = PETSc.SNES().create(self._comm)
         snes.setOptionsPrefix(prefix)
         snes.setSolution(self._solution)
-        self.snes, self._callbacks = snes, Callbacks()
-        self._attach(consistent=False)
-        snes.setFromOptions()
-        self._quasi_newton = snes.getType() == PETSc.SNES.Type.QN
+        self._callbacks = Callbacks()
+        self._solvers: dict[bool, PETSc.KSP] = {}
+        for consistent in (False, True):
+            # Tolerances that follow the residual are for a solver that SNES has made.
+            own = consistent and not self._quasi_newton
+            ksp = snes.getKSP() if own else PETSc.KSP().create(self._comm)
+            ksp.setOptionsPrefix(prefix + ("tangent_" if consistent else ""))
+            symmetric = self._symmetric(consistent)
+            options.set(
+                self._space.linear_solver(symmetric=symmetric, accurate=not self._quasi_newton),
+                ksp.getOptionsPrefix(),
+            )
+            with options.present():
+                ksp.setFromOptions()
+            self._solvers[consistent] = ksp
+        self._forget_matrices()
         self._attach(consistent=not self._quasi_newton)
-        snes.setUp()
-        self._alternation = Alternation(self, default)
-        self._continuation = Continuation(self, default)
-        for key in inserted:
-            database.delValue(key)
+        with options.present():
+            snes.setFromOptions()
+            snes.setUp()
+
+        def newton_solver(symmetric: bool) -> dict[str, Any]:
+            """Options of one for Newton's method; none where that of H₀ or the tangent is one."""
+            if not newton:
+                return {}
+            return self._space.linear_solver(symmetric=symmetric, accurate=True) | newton
+
+        self._alternation = Alternation(self, options, newton_solver(self._symmetric(False)))
+        self._continuation = Continuation(self, options, newton_solver(self._symmetric(True)))
         self._rtol = snes.getTolerances()[0]
         self._max_it = snes.getTolerances()[3]
 
@@ -375,6 +394,8 @@ class ContactProblem:
             obstacle = f"it takes one rank, and there are {self._comm.size}"
         elif solvers:
             obstacle = f"the options name a linear solver ({', '.join(solvers)})"
+        elif self._linear_solver == "multigrid":
+            obstacle = "linear_solver is 'multigrid', and it takes a factorisation"
         if self._condensation and obstacle:
             raise ValueError(
                 f"condensation is True, but {obstacle}; leave it out, or give condensation=False"
@@ -385,9 +406,37 @@ class ContactProblem:
             n, n_touched = self.unknowns.n_local, touched(self.contacts, self.unknowns).size
             if not worthwhile(n, n_touched, len(self.u)):
                 obstacle = f"contact touches {n_touched} of {n} unknowns, too many to gain by it"
+            elif not self.unknowns.n_motions and self._linear_solver is None:
+                n_bytes = linear.factor_bytes(n, len(self.u), symmetric=self.bulk.symmetric)
+                obstacle = linear.too_large(n_bytes, self._comm)
+                if not obstacle and linear.quicker(n, len(self.u), condensed=True):
+                    obstacle = f"multigrid is quicker for {n} unknowns"
         if obstacle and self._comm.rank == 0:
             logger.info("iterating on all unknowns: %s", obstacle)
         return obstacle is None
+
+    def _choose_linear_solver(self, solvers: Sequence[str]) -> str:
+        """How to solve systems over all unknowns, one of `linear.KINDS`. Collective.
+
+        Args:
+            solvers: Options given that name a linear solver; they win.
+        """
+        kind, reason = self._linear_solver, "the caller's choice"
+        if kind is None:
+            n = self.unknowns.first_motion
+            n_bytes = linear.factor_bytes(n, len(self.u), symmetric=self._symmetric(False))
+            if not self._symmetric(True):  # L-BFGS keeps the factors of both
+                n_bytes += linear.factor_bytes(n, len(self.u), symmetric=False)
+            reason = linear.too_large(n_bytes, self._comm) or ""
+            if not reason and linear.quicker(n, len(self.u), condensed=False):
+                reason = "it is quicker for as many"
+            kind = "multigrid" if reason and not self._condensed and not solvers else "direct"
+        if kind == "multigrid" and self.unknowns.n_motions:
+            kind, reason = "direct", "supports that move freely are no nodes with rigid motions"
+        if reason and self._comm.rank == 0 and not self._condensed:
+            n = self.unknowns.first_motion
+            logger.info("linear systems of %d unknowns, solver %s: %s", n, kind, reason)
+        return kind
 
     def _set_space(self, kept: npt.NDArray[np.int32] | None = None) -> None:
         """Take the space to iterate in: all unknowns, or those kept, by default those touched.
@@ -423,19 +472,24 @@ class ContactProblem:
 
     def _make_matrices(self) -> None:
         """New matrices for new couplings, or to forget all that was factored. Collective."""
-        self._allocate_matrices()
+        self._forget_matrices()
         self._attach(consistent=not self._quasi_newton)
 
-    def _allocate_matrices(self) -> None:
-        """Allocate the matrices of H₀ and of the consistent tangent. Collective."""
+    def _forget_matrices(self) -> None:
+        """Drop the matrices of H₀ and of the consistent tangent. Collective."""
         self._matrices: dict[bool, PETSc.Mat] = {}
-        for consistent, ksp in self._solvers.items():
+        for ksp in self._solvers.values():
+            ksp.reset()
+        self._has_h0 = False
+
+    def _matrix(self, consistent: bool) -> PETSc.Mat:
+        """The matrix of H₀ or of the consistent tangent, made when first needed. Collective."""
+        if consistent not in self._matrices:
             symmetric = self._symmetric(consistent)
             matrix = self._space.matrix(self._bulk_matrix, symmetric=symmetric)
-            ksp.reset()
-            ksp.setOperators(matrix)
+            self._solvers[consistent].setOperators(matrix)
             self._matrices[consistent] = matrix
-        self._has_h0 = False
+        return self._matrices[consistent]
 
     def _attach(self, *, consistent: bool) -> None:
         """Give SNES its callbacks and the linear solver for H₀ or the consistent tangent."""
@@ -450,7 +504,7 @@ class ContactProblem:
             lambda x, f: this._compute_residual(x, f),
             self._function,
             lambda x, J: this._compute_jacobian(x, J),
-            self._matrices[consistent],
+            self._matrix(consistent),
             lambda: this._test_convergence(),
         )
 
@@ -462,7 +516,10 @@ class ContactProblem:
     # ---- SNES callbacks --------------------------------------------------------------------------
 
     def _set_u(self, x: PETSc.Vec) -> None:
-        self._space.set_state(x.array_r * self._length)
+        state = x.array_r * self._length
+        # A V-cycle moves the prescribed unknowns too, which nothing would bring back.
+        state[self._space.constrained] = self._space.prescribed
+        self._space.set_state(state)
 
     def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         self._set_u(x)
@@ -570,7 +627,7 @@ class ContactProblem:
     def _start_h0(self) -> None:
         """H₀ = (K + αK_n + φK_t)⁻¹, all of Γc closed and sticking (section 5). Collective."""
         self._clear_pairs(consistent=False)
-        self._assemble_matrix(self._matrices[False], self._stiffnesses(everywhere=True))
+        self._assemble_matrix(self._matrix(False), self._stiffnesses(everywhere=True))
 
     def drop_h0(self) -> None:
         """Say that the matrix of H₀ was used for something else."""
@@ -592,7 +649,7 @@ class ContactProblem:
         consistent = not self.has_potential and self.motions.held(self.contacts, closed_only=True)
         parts = self._tangents() if consistent else self._stiffnesses(everywhere=False)
         self._clear_pairs(consistent=consistent)
-        self._assemble_matrix(self._matrices[consistent], parts)
+        self._assemble_matrix(self._matrix(consistent), parts)
         return True
 
     def _clear_pairs(self, *, consistent: bool | None = None) -> None:
@@ -661,7 +718,7 @@ class ContactProblem:
 
         try:
             matrices = (c.spring_matrix(s) for c, s in zip(self.contacts, springs, strict=True))
-            self._assemble_matrix(self._matrices[True], matrices)
+            self._assemble_matrix(self._matrix(True), matrices)
             yield solve
         finally:
             self._whole.enter()
@@ -688,7 +745,8 @@ class ContactProblem:
         start = time.perf_counter()
         saved = self._whole.state()
         try:
-            step = self._solve(start, ahead)
+            with self._options.present():
+                step = self._solve(start, ahead)
         except BaseException as error:
             self._whole.set_state(saved)
             for contact in self.contacts:
@@ -838,7 +896,7 @@ class ContactProblem:
         diagonals = []
         for contacts in ([], self.contacts):
             parts = (c.stiffness_matrix(1.0, 1.0) for c in contacts)
-            self._space.fill(self._matrices[True], self._bulk_matrix, parts)
+            self._space.fill(self._matrix(True), self._bulk_matrix, parts)
             diagonals.append(self._space.diagonal.copy())
         bulk, both = diagonals
         felt = bulk > _FELT * self.bulk.scale  # the motion of a support has no stiffness

@@ -21,7 +21,7 @@ from fenics_contact.contact import Contact, Status
 from fenics_contact.parallel import gather_rows, global_min, global_sum
 from fenics_contact.unknowns import Unknowns
 
-__all__ = ["RigidMotions"]
+__all__ = ["RigidMotions", "rigid_motions"]
 
 Array = npt.NDArray[np.float64]
 
@@ -72,7 +72,9 @@ class RigidMotions:
         modes: list[Array] = []
         for b in range(n_bodies):
             of = f" of body {b + 1}, near {np.round((low[b] + high[b]) / 2, 6).tolist()}"
-            kinds = _motions(x - (low[b] + high[b]) / 2, float(np.linalg.norm(high[b] - low[b])))
+            kinds = rigid_motions(
+                x - (low[b] + high[b]) / 2, float(np.linalg.norm(high[b] - low[b]))
+            )
             for name, mode in kinds.items():
                 self.names.append(name + (of if n_bodies > 1 else ""))
                 modes.append(np.where(body[:, None] == b, mode, 0.0).ravel())
@@ -293,7 +295,7 @@ def _unbalanced(rays: Array, resultant: Array) -> float:
     return float(found.fun) if found.status == 0 else 0.0
 
 
-def _motions(arm: Array, size: float) -> dict[str, Array]:
+def rigid_motions(arm: Array, size: float) -> dict[str, Array]:
     """Rigid motions of points at ``arm`` from the centre, (n, gdim), by name."""
     n, d = arm.shape
     motions = {}

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
+from fenics_contact import linear
 from fenics_contact.bulk import Bulk
 from fenics_contact.contact import Contact
 from fenics_contact.unknowns import Unknowns
@@ -26,6 +27,7 @@ class WholeSpace:
     Attributes:
         unknowns: The unknowns of the space.
         constrained: Mask over this rank's unknowns: those with Dirichlet conditions.
+        prescribed: Values at them, in the present increment.
         load: External forces at them (force).
         diagonal: Diagonal of the matrix assembled last (force/length).
         outside: Squares of load and of diagonal times state at unknowns outside of the space.
@@ -33,9 +35,11 @@ class WholeSpace:
             costs 1/15 to 1/35 of a factorisation, and pairs taken across changes of status are
             worth little.
         ready: Whether `fill` can be called; else `update` comes first.
+        linear_kind: How linear systems are solved, one of `linear.KINDS`.
     """
 
     iterations_per_round = 20
+    linear_kind = "direct"
 
     def __init__(
         self,
@@ -49,10 +53,12 @@ class WholeSpace:
         self.u, self.unknowns, self.bulk = u, unknowns, bulk
         self.contacts, self.constrained = contacts, constrained
         self.motions = [c for contact in contacts for c in contact.free_motion.values()]
+        self.prescribed: Array = np.zeros(int(constrained.sum()))
         self.load = np.zeros(unknowns.n_local)
         self.diagonal = np.zeros(unknowns.n_local)
         self.outside = np.zeros(2)
         self.ready = True
+        self._near_nullspace: PETSc.NullSpace | None = None
         self._contact_vector = unknowns.vector()
         self.enter()
 
@@ -67,13 +73,9 @@ class WholeSpace:
         """A new vector over the unknowns. Collective."""
         return self.unknowns.vector()
 
-    def linear_solver(self, *, symmetric: bool) -> dict[str, Any]:
-        """Options of the solver for `matrix`."""
-        return {
-            "ksp_type": "preonly",
-            "pc_type": "cholesky" if symmetric else "lu",
-            "pc_factor_mat_solver_type": "mumps",
-        }
+    def linear_solver(self, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
+        """Options of the solver for `matrix`; see `linear.options`."""
+        return linear.options(self.linear_kind, symmetric=symmetric, accurate=accurate)
 
     def update(self, stiffness: PETSc.Mat) -> int:
         """Take a new bulk tangent over all unknowns; number of factorisations. Collective."""
@@ -105,6 +107,7 @@ class WholeSpace:
     def begin(self, load: Array) -> None:
         """Start an increment under a load over all unknowns, u with its conditions. Collective."""
         self.load = load
+        self.prescribed = self.state()[self.constrained]
 
     def complete(self) -> None:
         """Find the unknowns outside of the space for those inside. Collective."""
@@ -151,6 +154,10 @@ class WholeSpace:
                 part.destroy()
         matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+        if matrix.getBlockSize() == len(self.u):  # no supports move freely
+            if self._near_nullspace is None:
+                self._near_nullspace = linear.near_nullspace(self.u.function_space)
+            matrix.setNearNullSpace(self._near_nullspace)
         return matrix
 
     def fill(self, matrix: PETSc.Mat, stiffness: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
@@ -181,7 +188,7 @@ class WholeSpace:
         self.diagonal = diagonal.array.copy()
         diagonal.destroy()
         matrix.scale(1.0 / scale)
-        return 1
+        return int(self.linear_kind == "direct")
 
 
 def _numbers(forces: Mapping[int, Any]) -> list[float]:

@@ -1,0 +1,263 @@
+"""Multigrid for the systems over all unknowns: the same solutions as by factorisation."""
+
+import logging
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+from scenes import GRID, LEFT, TOP, at_points, block, close, nodal, raised_everywhere
+from test_solver import PATH, rub, walk
+from test_two_bodies import BOTTOM, LOWER, UPPER, elasticity, two_blocks
+from test_two_bodies import TOP as LID
+
+import fenics_contact as fc
+from fenics_contact import linear
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+COMM = MPI.COMM_WORLD
+
+# Residuals of 1e-12 of the forces, so that what is left is rounding times the condition, 1e4.
+TIGHT = {"snes_rtol": 1e-12}
+SAME = 1e-8
+
+
+def both(make):
+    """What ``make(**options)`` gives by multigrid and by factorisation of all unknowns."""
+    return [
+        make(linear_solver=kind, condensation=False, petsc_options=TIGHT) for kind in linear.KINDS
+    ]
+
+
+def assert_same_path(cell, degree, method, n, path):
+    """A block to and fro on a round cushion with friction, its top prescribed: fields to 1e-8."""
+
+    def make(**options):
+        made = rub(cell=cell, degree=degree, mesh={"n": n}, method=method, **options)
+        steps = walk(made, path=path)
+        if options["linear_solver"] == "multigrid":
+            assert [s.factorisations for s in steps] == [0] * len(path)
+        assert made.contact.resultants().slip > 0
+        if options["linear_solver"] == "multigrid" and method != "alternating":
+            assert made.problem.snes.getKSP().getPC().getMGLevels() > 1
+        return nodal(made.scene.u), at_points(made.contact, made.contact.traction)
+
+    direct, multigrid = both(make)
+    for by_factors, by_cycles in zip(direct, multigrid, strict=True):
+        assert close(by_cycles, by_factors, SAME)
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+@pytest.mark.parametrize(("cell", "degree"), [case for case in GRID if case != ("hexahedron", 2)])
+def test_same_path(cell, degree, method):
+    """On all cells; with prescribed values, which a V-cycle must not move."""
+    n = (16 if cell in ("triangle", "quadrilateral") else 8) // degree
+    assert_same_path(cell, degree, method, n, PATH[:3])
+
+
+@pytest.mark.parametrize(("cell", "n"), [("triangle", 8), ("hexahedron", 4)])
+def test_same_path_by_alternation(cell, n):
+    """It has linear solvers of its own."""
+    assert_same_path(cell, 1, "alternating", n, PATH[2:3])
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_nothing_but_contact_holds_the_body(cell, method):
+    """A block that stands on a floor with friction, pressed and pushed: K itself is singular."""
+
+    def make(**options):
+        scene = block(cell, n=16 if cell == "triangle" else 6, side=0.2, up=-1.0)
+        law = fc.Coulomb(0.5, k_n=2e4, k_t=1e4)
+        problem, contact = scene.problem(law, [], method=method, **options)
+        problem.solve()
+        assert close(contact.resultants().force, -scene.vector(side=0.2, up=-1.0), 1e-9)
+        return nodal(scene.u)
+
+    direct, multigrid = both(make)
+    assert close(multigrid, direct, SAME)
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_two_bodies(cell, method):
+    """A block on a block with friction, meshes that do not match, the upper one held by nothing."""
+
+    def make(**options):
+        n = (12, 9) if cell == "quadrilateral" else (6, 5)
+        mesh, tags = two_blocks(cell, n, widths=(1.0, 0.71), shift=0.1)  # no two nodes in one place
+        d = mesh.geometry.dim
+        space = fem.functionspace(mesh, ("Lagrange", 1, (d,)))
+        u, v = fem.Function(space), ufl.TestFunction(space)
+        load = np.zeros(d)
+        load[0], load[-1] = 300.0, -2000.0
+        ds = ufl.ds(mesh, subdomain_data=tags)
+        F = elasticity(u, v, 0.3) - ufl.dot(fem.Constant(mesh, load), v) * ds(LID)
+        dofs = fem.locate_dofs_topological(space, d - 1, tags.find(BOTTOM))
+        bcs = [fem.dirichletbc(np.zeros(d), dofs, space)]
+        surface = fc.ContactSurface(mesh, tags, UPPER)
+        contact = fc.Contact(u, surface, fc.DeformableBody(tags, LOWER), fc.Coulomb(0.3))
+        problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method=method, **options)
+        problem.solve()
+        return nodal(u)
+
+    direct, multigrid = both(make)
+    assert close(multigrid, direct, SAME)
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+def test_units(method):
+    """The same iterations and digits in other units, 1e-9 of the field."""
+    found = []
+    for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1e9)]:
+        made = rub(
+            cell="hexahedron",
+            mesh={"n": 6, "size": np.full(3, length)},
+            length=length,
+            pressure=pressure,
+            method=method,
+            linear_solver="multigrid",
+            petsc_options=TIGHT,
+        )
+        steps = walk(made, length, PATH[:2])
+        found.append(([s.iterations for s in steps], nodal(made.scene.u) / length))
+    for iterations, u in found[1:]:
+        assert iterations == found[0][0]
+        assert close(u, found[0][1], 1e-9)
+
+
+def krylov_iterations(n: int, *, rotations: bool) -> int:
+    """Of conjugate gradients for a slender beam, clamped at one end, n cells across."""
+    scene = block("hexahedron", n=(10 * n, n, n), size=(10.0, 1.0, 1.0))
+    bcs = [scene.hold(LEFT, i) for i in range(3)]
+    problem, _ = scene.problem(fc.Frictionless(), bcs, method="newton", linear_solver="multigrid")
+    matrix, solver = problem._matrix(False), problem._solvers[False]
+    problem._space.fill(matrix, problem._bulk_matrix, [])
+    if not rotations:
+        matrix.setNearNullSpace(PETSc.NullSpace())
+    force, found = matrix.createVecs()
+    force.array[:] = np.where(problem._constrained, 0.0, 1.0)
+    with problem._options.present():
+        solver.solve(force, found)
+    assert solver.getConvergedReason() > 0
+    return solver.getIterationNumber()
+
+
+def test_iterations_hardly_grow_with_the_mesh():
+    """The rotations on the levels of multigrid are what keeps the iterations where they are.
+
+    Theory of smoothed aggregation: they do not depend on the mesh; without the rotations they do.
+    """
+    coarse, fine = (krylov_iterations(n, rotations=True) for n in (2, 4))
+    assert fine <= 1.5 * coarse
+    assert krylov_iterations(4, rotations=False) > 1.5 * fine
+
+
+# ---- the choice ----------------------------------------------------------------------------------
+
+
+def said(caplog) -> str:
+    """What was logged, on rank 0."""
+    return COMM.bcast("\n".join(r.getMessage() for r in caplog.records))
+
+
+def test_wrong_values():
+    """Another name is refused, and so is condensation by multigrid; nothing is left behind."""
+    scene = block("triangle", up=-1.0)
+    before = PETSc.Options().getAll()
+
+    def make(**options):
+        scene.problem(fc.Frictionless(), scene.rollers(), **options)
+
+    for wrong in ("lu", "", 3):
+        raised_everywhere(lambda w=wrong: make(linear_solver=w), ValueError, "linear_solver")
+    if COMM.size == 1:
+        raised_everywhere(
+            lambda: make(linear_solver="multigrid", condensation=True), ValueError, "multigrid"
+        )
+    assert PETSc.Options().getAll() == before
+
+
+def test_chosen_where_factors_do_not_fit(caplog, monkeypatch):
+    """By memory: no condensation and no factor of more than half of it; the log says so."""
+    scene = block("quadrilateral", n=8, up=-1.0)
+    with caplog.at_level(logging.INFO, logger="fenics_contact"):
+        problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
+        assert problem._whole.linear_kind == "direct"
+        monkeypatch.setattr(linear, "memory", lambda comm: 1e4)
+        problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
+    assert not problem._condensed
+    assert problem._whole.linear_kind == "multigrid"
+    assert "GiB of memory" in said(caplog) and "multigrid" in said(caplog)
+    assert problem.solve().factorisations == 0
+    wanted, _ = scene.problem(fc.Frictionless(), scene.rollers(), linear_solver="direct")
+    assert wanted._whole.linear_kind == "direct"
+
+
+def test_chosen_where_it_is_quicker():
+    """In three dimensions, for many unknowns; for more if one factorisation serves a history."""
+    assert not linear.quicker(10_000, 3, condensed=False)
+    assert linear.quicker(100_000, 3, condensed=False)
+    assert not linear.quicker(100_000, 3, condensed=True)
+    assert linear.quicker(1_000_000, 3, condensed=True)
+    assert not linear.quicker(1_000_000, 2, condensed=False)
+
+
+def test_a_support_that_moves_freely(caplog):
+    """Its motions are no nodes: factors, and the log says why."""
+    scene = block("triangle", n=4)
+    motion = fc.Motion(force=(None, 5.0))
+    ball = fc.Ball((0.5, -2.0), 2.0, displacement=motion)
+    with caplog.at_level(logging.INFO, logger="fenics_contact"):
+        problem, contact = scene.problem(
+            fc.Frictionless(k_n=2e4),
+            [scene.hold(TOP, i) for i in range(2)],
+            contact={"support": ball},
+            linear_solver="multigrid",
+        )
+    assert problem._whole.linear_kind == "direct"
+    assert "move freely" in said(caplog)
+    problem.solve()
+    assert close(contact.resultants().force[1], 5.0, 1e-8)
+
+
+def test_options_reach_the_levels():
+    """What the caller gives for solvers inside of solvers holds, and is not left behind."""
+    before = PETSc.Options().getAll()
+    made = rub(
+        linear_solver="multigrid",
+        petsc_options={"mg_levels_pc_type": "jacobi", "mg_levels_ksp_max_it": 3},
+        mesh={"n": 16},
+    )
+    walk(made, path=PATH[:1])
+    smoother = made.problem._solvers[False].getPC().getMGSmoother(1)
+    assert smoother.getPC().getType() == "jacobi"
+    assert smoother.getTolerances()[3] == 3
+    assert PETSc.Options().getAll() == before
+
+
+# ---- what it takes -------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="MUMPS on one rank")
+@pytest.mark.parametrize(("cell", "n"), [("hexahedron", 14), ("triangle", 100)])
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_memory_of_factors(cell, n, symmetric):
+    """The estimate against what MUMPS says it took, within a factor of 1.5."""
+    scene = block(cell, n=n)
+    problem, _ = scene.problem(fc.Frictionless(), scene.rollers(), condensation=False)
+    matrix = problem._bulk_matrix.copy()
+    held = np.flatnonzero(problem._constrained).astype(np.int32)
+    matrix.zeroRowsColumns(held, diag=problem.bulk.scale)
+    matrix.shift(problem.bulk.scale * 1e-6)  # nothing holds the height
+    matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+    pc = PETSc.PC().create(COMM)
+    pc.setOperators(matrix)
+    pc.setType("cholesky" if symmetric else "lu")
+    pc.setFactorSolverType("mumps")
+    pc.setUp()
+    taken = 1e6 * pc.getFactorMatrix().getMumpsInfog(22)
+    estimate = linear.factor_bytes(problem.unknowns.n_local, scene.dim, symmetric=symmetric)
+    assert taken / 1.5 < estimate < 1.5 * taken
