@@ -46,8 +46,8 @@ _MAX_STALLS = 10
 # A round that ends with more than this times the lowest residual, or none, has gone astray: the
 # next one starts where that was.
 _ASTRAY = 1e3
-# Round-off in K u excuses a residual up to this share of the forces (or of the residual before the
-# first iteration), not more: a displacement grown without bounds would excuse anything.
+# Round-off in K u excuses a residual up to this share of the forces (or of the largest residual an
+# increment began with), not more: a displacement grown without bounds would excuse anything.
 _MAX_FLOOR = 1e-5
 # An unknown with less than this share of the bulk's stiffness has none.
 _FELT = 1e-12
@@ -167,6 +167,8 @@ class ContactProblem:
         snes: The PETSc solver.
         increment: Number of committed increments.
         committed_force: Size of the forces at the last commit (force).
+        committed_start: Largest residual that a committed increment began with (force): what moved
+            the body, where no force is left.
         initial_penetration: Largest penetration of the undeformed body (length), 0 if none; an
             interference by a prescribed gap is none.
     """
@@ -261,7 +263,7 @@ class ContactProblem:
         self._load: Array = np.zeros(self.unknowns.n_local)
         self._factorisations = 0
         self._norms = {"residual": 0.0, "force": 0.0, "floor": 0.0}
-        self.committed_force = self._start_residual = 0.0
+        self.committed_force = self.committed_start = self._start_residual = 0.0
         self._committed = self._whole.state()
         for contact in self.contacts:
             contact.evaluate()
@@ -934,12 +936,12 @@ class ContactProblem:
                 bc.set(self.u.x.array)
             starts.append(self._whole.state())
         residuals = []
-        self._start_residual = 0.0
+        self._start_residual = self.committed_start
         for guess in starts:
             self._solution.array[:] = self._space.part(guess) / self._length
             self._compute_residual(self._solution, self._function)
             residuals.append(self._norms["residual"])
-        self._start_residual = residuals[0]
+        self._start_residual = max(self._start_residual, residuals[0])
         return [starts[i] for i in np.argsort(residuals, kind="stable")]
 
     def _approach(self) -> None:
@@ -1045,6 +1047,7 @@ class ContactProblem:
         self._committed = state
         self._committed_energy = self._energy.between([c.committed_jump for c in self.contacts])
         self.committed_force = self._norms["force"]
+        self.committed_start = self._start_residual
         self.increment += 1
 
     def restore(self) -> None:
@@ -1061,10 +1064,12 @@ class ContactProblem:
         rate = np.zeros_like(self._committed) if self._rate is None else self._rate
         return self._committed.copy(), rate.copy()
 
-    def set_committed(self, state: Array, rate: Array, increment: int, force: float) -> None:
+    def set_committed(
+        self, state: Array, rate: Array, increment: int, force: float, start: float
+    ) -> None:
         """Take up a history where another run left it; the contacts' are set apart. Collective."""
         self._committed, self._rate = state.copy(), rate.copy()
-        self.committed_force, self.increment = force, increment
+        self.committed_force, self.committed_start, self.increment = force, start, increment
         self.restore()
         self.restart_solver()
 
