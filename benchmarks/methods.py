@@ -1,4 +1,4 @@
-"""The three methods on three scenes with friction: iterations, factorisations and time.
+"""The four methods on three scenes with friction: iterations, factorisations and time.
 
     python benchmarks/methods.py
 
@@ -30,7 +30,7 @@ import hertz
 import ironing
 import timing
 
-METHODS = ("lbfgs", "newton", "alternating")
+METHODS = ("lbfgs", "newton", "continuation", "alternating")
 STIFFNESSES = (10.0, 1000.0)
 Loading = tuple[fc.ContactProblem, Callable[[float], None], int]
 
