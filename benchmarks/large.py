@@ -92,8 +92,9 @@ class Body:
         return ufl.inner(stress, ufl.sym(ufl.grad(v))) * ufl.dx
 
     def ds(self) -> ufl.Measure:
-        """On Γc."""
-        return ufl.Measure("ds", domain=self.mesh, subdomain_data=self.tags)(1)
+        """On Γc, with the points that the package takes for linear displacements."""
+        points = {"quadrature_degree": 2}
+        return ufl.Measure("ds", self.mesh, subdomain_data=self.tags, metadata=points)(1)
 
 
 def graded(cells: int) -> np.ndarray:
@@ -170,7 +171,8 @@ def by_hand(body: Body, kind: str) -> dict[str, Any]:
     distance = ufl.sqrt(ufl.dot(arm, arm))
     n = -arm / distance  # from the body to the ball
     pressure = k * ufl.max_value(ufl.dot(u, n) - (distance - RADIUS), 0.0)
-    trial = -k * (u - ufl.dot(u, n) * n)
+    jump = u + ufl.as_vector([0, 0, DEPTH])  # relative to the ball
+    trial = -k * (jump - ufl.dot(jump, n) * n)
     size = ufl.sqrt(ufl.dot(trial, trial) + 1e-30)
     traction = ufl.conditional(
         ufl.lt(size, FRICTION * pressure), trial, FRICTION * pressure / size * trial

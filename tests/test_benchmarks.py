@@ -79,3 +79,18 @@ def test_enforcement_and_quadrature_run(tmp_path: Path) -> None:
         assert float(ours["peak pressure, error"]) <= 0.1 * float(theirs["peak pressure, error"])
         assert int(ours["iterations"]) <= 2 * int(theirs["iterations"])
     assert len(list((tmp_path / "quadrature").glob("*.csv"))) == 2
+
+
+@pytest.mark.slow
+def test_large_runs(tmp_path: Path) -> None:
+    """On a small block every run ends well, with one force to 1e-6: also the script by hand's."""
+    command = [sys.executable, str(ROOT / "benchmarks" / "large.py"), "--cells", "8"]
+    command += ["--repeat", "1", "--output", str(tmp_path)]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stdout + done.stderr
+    with open(tmp_path / "large.csv", newline="") as file:
+        rows = {row["run"]: row for row in csv.DictReader(file)}
+    assert all(row["iterations"] not in ("none", "failed") for row in rows.values())
+    forces = [float(row["force"]) for row in rows.values() if row["force"]]
+    assert len(forces) == 6
+    assert forces == pytest.approx(forces[:1] * 6, rel=1e-6)
