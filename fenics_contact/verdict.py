@@ -62,7 +62,8 @@ class Verdict:
             if not error <= allowed:
                 found.append(
                     f"{contact}: penetration or elastic slip left, {error:.3e} of the largest "
-                    f"traction in the springs, above {allowed:.3e}"
+                    f"traction in the springs, above {allowed:.3e}; a larger tolerance, or "
+                    "k_n and k_t nearer to 10 E/h, take fewer rounds"
                 )
         return found
 
