@@ -164,7 +164,8 @@ def build(
     else:
         law = fc.Frictionless(**{n: k for n, k in stiffness.items() if n == "k_n"})
     surface = fc.ContactSurface(mesh, tags, CONTACT)
-    contact = fc.Contact(u, surface, fc.HalfSpace(point=(0, 0), normal=(0, 1)), law)
+    plane = fc.HalfSpace(point=(0, 0), normal=(0, 1))
+    contact = fc.Contact(u, surface, plane, law, accuracy=arguments.accuracy)
     problem = fc.ContactProblem(
         F, u, bcs=bcs, contacts=[contact], method=arguments.solver, petsc_options=options
     )
@@ -178,6 +179,8 @@ def solve(arguments: argparse.Namespace, friction: float) -> tuple[Scene, dict[s
     scene = build(arguments, friction, arguments.h, load)
     # Without friction the state does not depend on the way there: one increment.
     steps = arguments.increments or (80 if friction > 0 else 1)
+    if arguments.accuracy is not None and not arguments.increments:
+        steps = scene.problem.increments_wanted
     history: Iterable[fc.Step] = fc.increments(
         scene.problem, scene.pressure, 0.0, load, steps=steps, estimate=arguments.errors
     )
@@ -412,6 +415,9 @@ def parse() -> argparse.Namespace:
         "--increments", type=int, help="load increments; 1 without friction, 80 with it"
     )
     parser.add_argument("--load", type=float, default=PAPER_LOAD, help="pressure on the top, MPa")
+    parser.add_argument(
+        "--accuracy", help="draft, standard, fine or a relative error: sets all but the mesh"
+    )
     parser.add_argument("--k-n", type=float, help="normal stiffness, MPa/mm; default 10 E/h")
     parser.add_argument("--k-t", type=float, help="tangential stiffness, MPa/mm; default 10 E/h")
     parser.add_argument("--solver", choices=("lbfgs", "newton"), default="lbfgs")
@@ -420,6 +426,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--output", type=Path, default=Path("output/hertz"), help="folder to write")
     # PETSc reads its own options, such as -contact_snes_monitor, from the same command line.
     arguments, _ = parser.parse_known_args()
+    if arguments.accuracy is not None and arguments.accuracy[0].isdigit():
+        arguments.accuracy = float(arguments.accuracy)
     if not (arguments.h > 0 and arguments.degree >= 1 and arguments.load > 0):
         parser.error("--h and --load must be positive, --degree at least 1")
     return arguments

@@ -2,6 +2,7 @@
 
 from fenics_contact import elasticity
 from fenics_contact._version import __version__
+from fenics_contact.accuracy import Accuracy
 from fenics_contact.adaptation import Level, adapt
 from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.errors import ErrorBudget, estimate_errors
@@ -14,6 +15,7 @@ from fenics_contact.surface import ContactSurface
 from fenics_contact.verdict import NotConverged, Verdict
 
 __all__ = [
+    "Accuracy",
     "Ball",
     "Contact",
     "ContactProblem",

@@ -16,7 +16,7 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact import accuracy
+from fenics_contact.accuracy import DEFAULT_FACTOR, Accuracy, modulus_over_height
 from fenics_contact.augmented import Multipliers, TraceProjection
 from fenics_contact.history import History
 from fenics_contact.laws import Kinematics, Law, Scaled, Springs
@@ -31,6 +31,8 @@ __all__ = ["Contact", "Resultants", "Status"]
 Array = npt.NDArray[np.float64]
 
 _ENFORCEMENTS = ("penalty", "augmented")
+# Of augmented enforcement, where nothing is said.
+_TOLERANCE = 1e-5
 # A direction with no more than this share across the normal counts as parallel to it.
 _PARALLEL = 1e-6
 
@@ -77,6 +79,7 @@ class Contact:
         quadrature: The points of Γc.
         history: The committed state.
         multipliers: λ_n and λ_t of augmented enforcement, None under penalty.
+        accuracy: What was chosen for the accuracy wanted, None if none was said.
         tolerance: What `enforcement_error` must come below, with multipliers.
         parameters: Every parameter of law and support given by a number, as a ``fem.Constant``
             by name ("friction", "k_n", "displacement" …): set ``.value`` to change it.
@@ -103,8 +106,9 @@ class Contact:
         gap: Any = None,
         weight: Any = None,
         modulus: Any = None,
-        enforcement: str = "penalty",
-        tolerance: float = 1e-5,
+        accuracy: str | float | None = None,
+        enforcement: str | None = None,
+        tolerance: float | None = None,
         name: str = "contact",
     ) -> None:
         """Bind the parts. Collective; compiles what evaluates the points.
@@ -121,13 +125,16 @@ class Contact:
             modulus: Young's modulus near Γc (stress), a number or function with one value per
                 cell, for `Scaled` stiffness. By default it is measured from the bulk form, by
                 `ContactProblem`.
-            enforcement: "penalty": k_n and k_t alone hold the body, which penetrates by p/k_n and
-                creeps by τ/k_t before it slips. "augmented": multipliers take the forces over from
-                these springs, round by round, until neither is left (`augmented`); k_n and k_t set
-                how fast.
-            tolerance: Of augmented enforcement: how much of the largest traction the springs may
-                still bear, between 0 and 1, see `enforcement_error`. To the functions of the
-                multipliers the penetration is that share of the penalty's.
+            accuracy: "draft", "standard", "fine", or the relative error wanted in contact force and
+                pressure: sets enforcement, tolerance and stiffness where they are not given, the
+                solver's tolerance and the number of increments; see `Accuracy`.
+            enforcement: By default "penalty": k_n and k_t alone hold the body, which penetrates by
+                p/k_n and creeps by τ/k_t before it slips. "augmented": multipliers take the forces
+                over from these springs, round by round, until neither is left (`augmented`); k_n
+                and k_t set how fast.
+            tolerance: Of augmented enforcement, by default 1e-5: how much of the largest traction
+                the springs may still bear, between 0 and 1, see `enforcement_error`. To the
+                functions of the multipliers the penetration is that share of the penalty's.
             name: In messages and files.
 
         Raises:
@@ -147,6 +154,12 @@ class Contact:
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
         self._projection: TraceProjection | None = None
+        self.accuracy = None if accuracy is None else Accuracy.of(accuracy)
+        chosen = self.accuracy
+        if enforcement is None:
+            enforcement = chosen.enforcement if chosen and self._may_augment() else "penalty"
+        if tolerance is None:
+            tolerance = chosen.tolerance if chosen else _TOLERANCE
         self.tolerance = tolerance
         augments = self._augments(enforcement)
         # Linear elements hold a curved gap at their nodes alone (docs/enforcement.md). But between
@@ -280,8 +293,8 @@ class Contact:
             )
         if enforcement == "penalty":
             return False
-        springs = [n for n, v in self.law.parameters().items() if isinstance(v, Springs)]
-        if self.law.is_physical or springs:
+        if not self._may_augment():
+            springs = [n for n, v in self.law.parameters().items() if isinstance(v, Springs)]
             what = f"{springs[0]} by Springs" if springs else type(self.law).__name__
             raise ValueError(
                 f"{self.name}: {what} is the stiffness of something that is there, and multipliers "
@@ -289,6 +302,11 @@ class Contact:
                 "for rigid contact"
             )
         return True
+
+    def _may_augment(self) -> bool:
+        """Whether the stiffness stands for none at all."""
+        springs = (isinstance(v, Springs) for v in self.law.parameters().values())
+        return not self.law.is_physical and not any(springs)
 
     def _relative(self, jump: Any) -> Any:
         """Displacement of the body relative to the support (UFL)."""
@@ -572,7 +590,7 @@ class Contact:
             value = float(modulus)
             modulus = fem.Function(fem.functionspace(self.surface.mesh, ("DG", 0)))
             modulus.x.array[:] = value
-        scale = accuracy.modulus_over_height(self.surface, modulus)
+        scale = modulus_over_height(self.surface, modulus)
         self._scale.x.array[:] = scale.x.array
         self._scale_known = True
 
@@ -589,7 +607,8 @@ class Contact:
             if self._scale is None:
                 self._scale = fem.Function(fem.functionspace(self.surface.submesh, ("Lagrange", 1)))
                 self._scale.x.array[:] = 1.0
-            return self._to_ufl(name, value.factor) * self._scale
+            factor = self.accuracy.factor if self.accuracy else DEFAULT_FACTOR
+            return self._to_ufl(name, value.factor or factor) * self._scale
         positive = name in self.law.positive
         if np.ndim(value) == 0 and isinstance(value, int | float | np.number):
             bad = not np.isfinite(value) or value < 0 or (positive and value == 0)
@@ -643,7 +662,7 @@ class Contact:
     @property
     def regularised(self) -> bool:
         """Whether the stiffness stands for none at all, and is not that of physical springs."""
-        return self._tributary is None and not self.law.is_physical
+        return self._may_augment()
 
     def borne_by_springs(self) -> Array:
         """What of the traction the springs bear in place of rigid contact: (n_points, gdim).

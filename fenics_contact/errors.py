@@ -51,18 +51,41 @@ class ErrorBudget:
         parts: Estimates "enforcement", "discretisation", "increments" and "solver": absolute
             errors by quantity, signed as value minus truth where a sign is known. A part that
             could not be told has no entry.
+        wanted: The relative error that the contacts' ``accuracy`` stands for, if it was said.
+        h: Mean size of the facets of the contacts that bear pressure (length).
+        degree: Of the displacement.
         energy: Error of discretisation in the energy norm, relative.
         cells: Squares of that error, of every cell that this rank owns (force times length).
     """
 
     values: dict[str, float]
     parts: dict[str, dict[str, float]]
+    wanted: float | None = None
+    h: float = 0.0
+    degree: int = 1
     energy: float = 0.0
     cells: Array | None = field(default=None, repr=False, compare=False)
 
     def numbers(self) -> dict[str, Any]:
         """All but the cells, for files; ``ErrorBudget(**numbers)`` has them again."""
-        return {"values": self.values, "parts": self.parts, "energy": self.energy}
+        names = ("values", "parts", "wanted", "h", "degree", "energy")
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def h_wanted(self) -> float:
+        """Size of facets that discretisation needs for the accuracy wanted; at most the present.
+
+        The pressure ends like a square root: whatever the degree, energies, and forces with them,
+        come closer as h³ at most, and pressures as h^(3/2).
+        """
+        if self.wanted is None:
+            return self.h
+        needed = self.h
+        for name, error in self.relative("discretisation").items():
+            rate = min(self.degree, 1.5) * (1 if name.endswith("pressure") else 2)
+            if error > self.wanted:
+                needed = min(needed, self.h * (self.wanted / error) ** (1 / rate))
+        return needed
 
     def relative(self, part: str) -> dict[str, float]:
         """A part's errors without sign, relative to the quantities."""
@@ -95,6 +118,10 @@ class ErrorBudget:
             cells = [f"{100 * found[n]:.2g}" if n in found else "not told" for n in names]
             lines.append(f"{part:<16}" + "".join(f"{cell:>{width}}" for cell in cells))
         lines.append(f"{self.dominant} dominates: {_REMEDIES[self.dominant]} would help most")
+        if self.wanted is not None:
+            size = f"facets of {self.h_wanted:.2g} at the contact, now {self.h:.2g}"
+            enough = "the mesh is fine enough" if self.h_wanted >= self.h else f"it takes {size}"
+            lines.append(f"for the accuracy of {self.wanted:.2g} {enough}")
         return "\n".join(lines)
 
 
@@ -142,8 +169,29 @@ def estimate_errors(
     parts["discretisation"] = _discretisation(problem, smooth, values)
     if increments is not None:
         parts["increments"] = dict(increments)
-    parts = {name: parts[name] for name in _REMEDIES if name in parts}
-    return ErrorBudget(values, parts, float(np.sqrt(smooth.share)), smooth.squares)
+    return ErrorBudget(
+        values,
+        {name: parts[name] for name in _REMEDIES if name in parts},
+        wanted=problem.accuracy.error if problem.accuracy else None,
+        h=_facet_size(problem),
+        degree=u.function_space.ufl_element().degree,
+        energy=float(np.sqrt(smooth.share)),
+        cells=smooth.squares,
+    )
+
+
+def _facet_size(problem: ContactProblem) -> float:
+    """Mean of the sizes of the facets under pressure, area^(1/(d-1)) (length). Collective."""
+    sums = np.zeros(2)
+    for contact in problem.contacts:
+        quadrature = contact.quadrature
+        rows = quadrature.point_rows()
+        area = quadrature.weights[rows].sum(axis=1)
+        bears = np.any(contact.pressure[rows] > 0, axis=1)
+        d = problem.u.function_space.mesh.geometry.dim
+        sums += [np.sum(bears * area ** (1 / (d - 1))), np.count_nonzero(bears)]
+    size, count = global_sum(problem.u.function_space.mesh.comm, sums)
+    return float(size / count) if count else 0.0
 
 
 def _named(

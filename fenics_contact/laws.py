@@ -38,13 +38,16 @@ class Scaled:
 
     E comes from the bulk form itself, h is the cell's height over its facet on Γc, so that the
     penetration is about 1/factor of the elastic displacement over the first layer of cells.
+
+    Args to the constructor:
+        factor: The multiple; by default that of the contact's ``accuracy``, or 10.
     """
 
-    factor: float
+    factor: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse a factor that is no positive number."""
-        if not (0.0 < self.factor < float("inf")):
+        if self.factor is not None and not (0.0 < self.factor < float("inf")):
             raise ValueError(f"factor is {self.factor!r}; it must be a number greater than zero")
 
 
@@ -355,7 +358,7 @@ class Frictionless(Law):
             `Springs`.
     """
 
-    k_n: Any = Scaled(10.0)
+    k_n: Any = Scaled()
 
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """See `Law.response`."""
@@ -642,8 +645,8 @@ class Coulomb(FrictionLaw):
     """
 
     friction: Any
-    k_n: Any = Scaled(10.0)
-    k_t: Any = Scaled(10.0)
+    k_n: Any = Scaled()
+    k_t: Any = Scaled()
     modes: int | None = None
     transverse_friction: Any = None
     direction: Any = None
@@ -689,8 +692,8 @@ class Tresca(FrictionLaw):
 
     friction: Any
     pressure: Any
-    k_n: Any = Scaled(10.0)
-    k_t: Any = Scaled(10.0)
+    k_n: Any = Scaled()
+    k_t: Any = Scaled()
     unilateral: bool = True
     modes: int | None = None
     transverse_friction: Any = None

@@ -165,6 +165,7 @@ class ContactProblem:
         contacts: The contacts.
         bulk: The bulk form.
         snes: The PETSc solver.
+        accuracy: That of the contact that wants most, None if not every contact says one.
         increment: Number of committed increments.
         committed_force: Size of the forces at the last commit (force).
         committed_start: Largest residual that a committed increment began with (force): what moved
@@ -234,6 +235,9 @@ class ContactProblem:
         self.u = u
         self.contacts = list(contacts)
         self.bulk = Bulk(F, u)
+        said = [c.accuracy for c in self.contacts if c.accuracy is not None]
+        all_say = bool(said) and len(said) == len(self.contacts)
+        self.accuracy = min(said, key=lambda a: a.error) if all_say else None
         self.increment = 0
         self._comm = u.function_space.mesh.comm
         self._bcs = list(bcs)
@@ -333,6 +337,10 @@ class ContactProblem:
         """Set up SNES and its two linear solvers: for H₀, and for the consistent tangent."""
         options = self._options = Defaults()
         options.set(given, prefix)
+        if self.accuracy is not None:
+            options.set({"snes_rtol": self.accuracy.rtol}, prefix)
+            if self._comm.rank == 0:
+                logger.info("accuracy %s", self.accuracy)
         options.set(_COMMON | _METHODS[method], prefix)
         solvers = [part + name for part in ("", "tangent_") for name in _NAMES_A_SOLVER]
         named = [name for name in solvers if options.get(prefix + name) is not None]
@@ -669,6 +677,12 @@ class ContactProblem:
         return changed
 
     # ---- the neighbourhood of a solution ---------------------------------------------------------
+
+    @property
+    def increments_wanted(self) -> int:
+        """How many increments a load history takes for the accuracy; 1 if none is said."""
+        friction = any(c.law.has_friction for c in self.contacts)
+        return self.accuracy.increments if self.accuracy and friction else 1
 
     @property
     def load(self) -> Array:

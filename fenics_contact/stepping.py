@@ -30,7 +30,7 @@ def increments(
     start: float = 0.0,
     end: float = 1.0,
     *,
-    steps: int | Sequence[float] = 1,
+    steps: int | Sequence[float] | None = None,
     max_cuts: int = 6,
     estimate: bool = False,
     checkpoint: str | Path | None = None,
@@ -48,8 +48,8 @@ def increments(
             constants, functions, the forces on supports.
         start: The load parameter now; not solved for.
         end: Its value at the last increment.
-        steps: Number of equal increments; or the ends of the increments themselves, monotonic
-            from ``start`` to ``end``.
+        steps: Number of equal increments, by default what the contacts' ``accuracy`` takes, or 1;
+            or the ends of the increments themselves, monotonic from ``start`` to ``end``.
         max_cuts: How often an increment may be halved.
         estimate: Whether to tell the error that the size of the increments makes: every one is
             solved twice, whole, which is not committed, and in two halves, which are. The steps at
@@ -68,7 +68,7 @@ def increments(
         NotConverged: An increment failed even when cut; u, history and load are those of the last
             committed one.
     """
-    ends = _ends(start, end, steps)
+    ends = _ends(start, end, problem.increments_wanted if steps is None else steps)
     comm = problem.u.function_space.mesh.comm
     set_load = _setter(load)
 

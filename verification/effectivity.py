@@ -61,7 +61,9 @@ def half_cylinder(
 ) -> tuple[dict[str, float], fc.ErrorBudget]:
     """Quantities and error budget; stiffness ``factor`` E/h with h = 0.21 whatever the mesh."""
     stiffness = factor * hertz.E / 0.21
-    options = argparse.Namespace(h=h, degree=degree, k_n=stiffness, k_t=stiffness, solver="lbfgs")
+    options = argparse.Namespace(
+        h=h, degree=degree, k_n=stiffness, k_t=stiffness, solver="lbfgs", accuracy=None
+    )
     scene = hertz.build(options, friction, h, hertz.PAPER_LOAD, snes_rtol=rtol)
     history = fc.increments(
         scene.problem, scene.pressure, 0.0, hertz.PAPER_LOAD, steps=steps, estimate=True

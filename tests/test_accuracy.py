@@ -1,0 +1,140 @@
+"""Accuracy in one word: what it chooses, what wins over it, whether the error is as wanted."""
+
+import itertools
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import TOP, block, raised_everywhere, stress
+
+import fenics_contact as fc
+from fenics_contact.accuracy import DEFAULT_FACTOR, PRESETS
+from fenics_contact.errors import quantities
+
+COMM = MPI.COMM_WORLD
+
+
+class Press:
+    """A block of quadratic cells pressed on a ball and moved along it."""
+
+    def __init__(self, law=None, **contact):
+        """Make it, unloaded."""
+        scene = self.scene = block("quadrilateral", 2, n=8)
+        self.push = [fem.Constant(scene.mesh, 0.0) for _ in range(2)]
+        bcs = [scene.hold(TOP, i, c) for i, c in enumerate(self.push)]
+        contact |= {"support": fc.Ball((0.5, -2.0), 2.0)}
+        self.problem, self.contact = scene.problem(
+            law or fc.Coulomb(0.3), bcs, contact=contact, method="newton"
+        )
+
+    def run(self, **kwargs):
+        """All steps of pressing down, and half as far to the side."""
+
+        def load(t):
+            self.push[1].value, self.push[0].value = -0.03 * t, 0.015 * t
+
+        return list(fc.increments(self.problem, load, **kwargs))
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """Forces with multipliers to 1e-8 and 200 increments."""
+    made = Press(
+        fc.Coulomb(0.3, fc.Scaled(10), fc.Scaled(10)), enforcement="augmented", tolerance=1e-8
+    )
+    made.run(steps=200)
+    return quantities(made.problem)
+
+
+@pytest.mark.parametrize("wanted", [*PRESETS, 3e-3])
+def test_the_error_is_as_wanted(wanted, truth):
+    """But for the mesh, which is the same: normal and friction force and peak pressure."""
+    made = Press(accuracy=wanted)
+    steps = made.run()
+    accuracy = fc.Accuracy.of(wanted)
+    assert len(steps) == accuracy.increments
+    found = quantities(made.problem)
+    for name in ("normal force", "friction force", "peak pressure"):
+        assert abs(found[name] / truth[name] - 1) <= accuracy.error, name
+
+
+def test_choices():
+    """Less error takes no less of anything; multipliers take over where stiffness gets dear."""
+    chosen = [fc.Accuracy.of(error) for error in (0.5, 0.05, 0.01, 1e-3, 1e-6, 1e-8)]
+    for rough, fine in itertools.pairwise(chosen):
+        assert fine.factor >= rough.factor
+        assert fine.rtol <= rough.rtol
+        assert fine.tolerance <= rough.tolerance
+        assert fine.increments >= rough.increments
+    assert [c.enforcement for c in chosen] == ["penalty"] * 2 + ["augmented"] * 4
+    assert all(fc.Accuracy.of(word) == fc.Accuracy.of(error) for word, error in PRESETS.items())
+    assert "augmented" in str(chosen[-1]) and "1e-08" in str(chosen[-1])
+
+
+def test_what_is_given_wins():
+    """Stiffness, enforcement, tolerance, solver and increments of the caller's own."""
+    made = Press(fc.Coulomb(0.3, k_n=fc.Scaled(7), k_t=1e3), accuracy="fine", enforcement="penalty")
+    assert made.contact.multipliers is None
+    assert float(made.contact.parameters["k_n"].value) == 7.0
+    assert float(made.contact.parameters["k_t"].value) == 1e3
+    assert made.problem.snes.getTolerances()[0] == fc.Accuracy.of("fine").rtol
+    assert len(made.run(steps=2)) == 2
+    plain = Press()
+    assert float(plain.contact.parameters["k_n"].value) == DEFAULT_FACTOR
+    assert plain.problem.accuracy is None and plain.problem.increments_wanted == 1
+    assert Press(fc.Frictionless(), accuracy="fine").problem.increments_wanted == 1
+    given = Press(accuracy="fine", tolerance=1e-3).contact
+    assert given.tolerance == 1e-3 and given.multipliers is not None
+
+
+def test_physical_stiffness_stays():
+    """A foundation is none of the regularisation's business: no multipliers, no other stiffness."""
+    made = Press(fc.Foundation(1e4, 1e3), accuracy="fine").contact
+    assert made.multipliers is None
+    assert float(made.parameters["k_n"].value) == 1e4
+
+
+def test_the_strictest_of_several():
+    """The solver stops where the contact that wants most is content; all must have said one."""
+    for words, error in ((("draft", "fine"), 1e-3), (("draft", None), None)):
+        scene = block("triangle", 1, n=2, up=-1.0)
+        contacts = [
+            scene.contact(fc.Frictionless(), name=str(i), accuracy=w) for i, w in enumerate(words)
+        ]
+        problem = fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=contacts)
+        assert (problem.accuracy and problem.accuracy.error) == error
+        rtol = fc.Accuracy.of(error).rtol if error else 1e-9
+        assert problem.snes.getTolerances()[0] == rtol
+
+
+def test_the_mesh_it_takes():
+    """On the mesh that the budget asks for, the error of discretisation is as wanted, within 2.
+
+    The estimate's rates are those of a contact that ends in the middle of cells; a mesh may be
+    lucky or not.
+    """
+    wanted = 5e-3
+    made = Press(fc.Frictionless(), accuracy=wanted)
+    made.run()
+    scene = made.scene
+    budget = fc.estimate_errors(made.problem, stress(scene.u, scene.E, scene.nu))
+    assert budget.wanted == wanted
+    assert budget.h == pytest.approx(1 / 8, rel=1e-12)
+    assert 0 < budget.h_wanted < budget.h
+    assert "takes facets" in str(budget)
+    worst = max(budget.relative("discretisation").values())
+    n = int(np.ceil(1 / budget.h_wanted))
+    finer = block("quadrilateral", 2, n=n)
+    bcs = [finer.hold(TOP, 0, 0.015), finer.hold(TOP, 1, -0.03)]
+    contact = {"support": fc.Ball((0.5, -2.0), 2.0), "accuracy": wanted}
+    problem, _ = finer.problem(fc.Frictionless(), bcs, contact=contact, method="newton")
+    problem.solve()
+    again = fc.estimate_errors(problem, stress(finer.u, finer.E, finer.nu))
+    assert max(again.relative("discretisation").values()) < min(worst, 2 * wanted)
+
+
+@pytest.mark.parametrize("wanted", ["best", 0.0, -1.0, 2.0, float("nan"), [0.1, 0.2]])
+def test_other_words(wanted):
+    """No such word, or no relative error: said on all ranks, with those there are."""
+    raised_everywhere(lambda: Press(accuracy=wanted), ValueError, "standard", "between")
