@@ -715,7 +715,7 @@ class ContactProblem:
             every contact, or of None for the residual that is left; it returns the change of this
             rank's unknowns. Collective.
         """
-        space, ksp = self._space, self._solvers[True]
+        space = self._space
         space.begin(self._load)
         space.enter()
         right, left = space.vector(), space.vector()
@@ -735,7 +735,15 @@ class ContactProblem:
         try:
             matrices = (c.spring_matrix(s) for c, s in zip(self.contacts, springs, strict=True))
             self._assemble_matrix(self._matrix(True), matrices)
+            # The tangent's own solver may be a V-cycle and no more; after a factorisation GMRES
+            # ends with its first iteration.
+            ksp = PETSc.KSP().create(self._comm)
+            ksp.setOperators(self._matrix(True))
+            ksp.setType(PETSc.KSP.Type.GMRES)
+            ksp.setPC(self._solvers[True].getPC())
+            ksp.setTolerances(rtol=1e-8, max_it=1000)
             yield solve
+            ksp.destroy()
         finally:
             self._whole.enter()
 

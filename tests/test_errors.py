@@ -244,3 +244,16 @@ def test_multipliers_leave_no_error_of_enforcement():
         left[enforcement] = budget(scene, problem).relative("enforcement")["normal force"]
     assert left["penalty"] > 0.05
     assert left["augmented"] < 1e-4
+
+
+def test_multigrid_gives_the_same_budget():
+    """The tangent's solver is a V-cycle there: to 1e-6, for systems are solved to 1e-8."""
+    found = []
+    for kind in ("direct", "multigrid"):
+        made = Press(cell="hexahedron", n=4, condensation=False, linear_solver=kind)
+        made.solved()
+        found.append(budget(made.scene, made.problem))
+    direct, multigrid = found
+    for part in ("enforcement", "discretisation"):
+        for name, value in direct.relative(part).items():
+            assert close(multigrid.relative(part)[name], value, 1e-6, scale=1.0)
