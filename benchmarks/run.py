@@ -22,7 +22,7 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).parent
-HELPERS = ("run", "timing", "plain")
+HELPERS = ("run", "timing", "costs")
 
 
 def main() -> int:
@@ -38,10 +38,9 @@ def main() -> int:
     if unknown:
         parser.error(f"there is no benchmark {unknown}; there are {names}")
     threads = os.environ.get("OMP_NUM_THREADS", "not set")
-    parts = [
-        f"# Benchmarks\n\n{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
-    ]
-    parts[0] += f", OMP_NUM_THREADS {threads}, {time.strftime('%Y-%m-%d')}.\n"
+    machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
+    date = time.strftime("%Y-%m-%d")
+    parts = [f"# Benchmarks\n\n{machine}, OMP_NUM_THREADS {threads}, {date}.\n"]
     failed = []
     with tempfile.TemporaryDirectory() as cache:
         for name in arguments.names or names:
@@ -56,15 +55,12 @@ def main() -> int:
                 continue
             print(f"== {name}: {time.perf_counter() - start:.0f} s", flush=True)
             parts += [path.read_text() for path in sorted(folder.glob("*.md"))]
-            parts += [f"![]({path.relative_to(arguments.output)})\n" for path in _pictures(folder)]
+            pictures = sorted(folder.glob("*.png"))
+            parts += [f"![]({path.relative_to(arguments.output)})\n" for path in pictures]
     arguments.output.mkdir(parents=True, exist_ok=True)
     (arguments.output / "README.md").write_text("\n".join(parts))
     print(f"{arguments.output / 'README.md'}; failed: {failed or 'none'}")
     return int(bool(failed))
-
-
-def _pictures(folder: Path) -> list[Path]:
-    return sorted(folder.glob("*.png"))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import dolfinx.fem.petsc
 import numpy as np
 import numpy.typing as npt
@@ -59,7 +61,8 @@ class Bulk:
         derivative = ufl.derivative(form, u, ufl.TrialFunction(u.function_space))
         self.tangent_form = ufl.algorithms.expand_derivatives(derivative)
         self.linear = u not in self.tangent_form.coefficients()
-        self._compiled = compat.compile_form(form)
+        kinds = dict.fromkeys(integral.integral_type() for integral in form.integrals())
+        self._parts = [_Part(form, kind, u) for kind in kinds]
         self._compiled_tangent = compat.compile_form(self.tangent_form)
         self.stiffness: PETSc.Mat = fem.petsc.create_matrix(self._compiled_tangent)
         self.symmetric = True
@@ -88,13 +91,20 @@ class Bulk:
                         "check what set it"
                     )
 
+    def is_current(self) -> bool:
+        """Whether the tangent is that of the present data: False if it may differ. Collective."""
+        if not self.linear:
+            return False
+        same = self._fingerprint is not None and np.array_equal(
+            self._tangent_data(), self._fingerprint
+        )
+        return self._u.function_space.mesh.comm.allreduce(not same) == 0
+
     def update(self) -> bool:
         """Assemble the tangent at ``u`` if it may have changed; True if it did. Collective."""
-        if self.linear:
-            fingerprint = self._tangent_data()
-            same = self._fingerprint is not None and np.array_equal(fingerprint, self._fingerprint)
-            if self._u.function_space.mesh.comm.allreduce(not same) == 0:
-                return False
+        if self.is_current():
+            return False
+        fingerprint = self._tangent_data()
         self._fingerprint = None  # until the matrix is complete
         self.stiffness.zeroEntries()
         fem.petsc.assemble_matrix(self.stiffness, self._compiled_tangent)
@@ -120,14 +130,10 @@ class Bulk:
             )
 
     def update_load(self) -> Array:
-        """Assemble F(0), minus the external forces, at this rank's owned dofs. Collective."""
-        u = self._u.x.array
-        saved = u.copy()
-        u[:] = 0.0
-        try:
-            self._assemble(self._load)
-        finally:
-            u[:] = saved
+        """F(0), minus the external forces, at this rank's owned dofs. Collective."""
+        with collective_errors(self._u.function_space.mesh.comm):
+            self._load.x.array[:] = sum(part.at_rest() for part in self._parts)
+        self._load.x.scatter_reverse(dolfinx.la.InsertMode.add)
         return self._owned(self._load)
 
     def residual(self) -> Array:
@@ -139,14 +145,12 @@ class Bulk:
 
     def assemble_residual(self) -> Array:
         """F(u) by assembly, whatever the bulk. Collective."""
-        self._assemble(self._image)
-        return self._owned(self._image).copy()
-
-    def _assemble(self, target: fem.Function) -> None:
-        target.x.array[:] = 0.0
+        self._image.x.array[:] = 0.0
         with collective_errors(self._u.function_space.mesh.comm):
-            fem.assemble_vector(target.x.array, self._compiled)
-        target.x.scatter_reverse(dolfinx.la.InsertMode.add)
+            for part in self._parts:
+                part.assemble(self._image.x.array)
+        self._image.x.scatter_reverse(dolfinx.la.InsertMode.add)
+        return self._owned(self._image).copy()
 
     def _owned(self, function: fem.Function) -> Array:
         dofmap = function.function_space.dofmap
@@ -154,9 +158,7 @@ class Bulk:
 
     def _tangent_data(self) -> Array:
         """All numbers the tangent depends on, to see whether the user changed one."""
-        values = [np.ravel(c.value) for c in self.tangent_form.constants()]
-        values += [f.x.array for f in self.tangent_form.coefficients()]
-        return np.concatenate(values) if values else np.zeros(0)
+        return _data(self.tangent_form.constants(), self.tangent_form.coefficients())
 
     def _is_symmetric(self, probe: PETSc.Vec) -> bool:
         """Compare products with the matrix and its transpose for one rough vector."""
@@ -171,3 +173,50 @@ class Bulk:
         image.destroy()
         mirrored.destroy()
         return bool(symmetric)
+
+
+class _Part:
+    """The integrals of F of one kind: over cells, over exterior facets ...
+
+    Taken apart no further, so that every integral keeps the quadrature rule it has in F.
+    """
+
+    def __init__(self, form: ufl.Form, kind: str, u: fem.Function) -> None:
+        """Compile. Collective."""
+        mine = ufl.Form([i for i in form.integrals() if i.integral_type() == kind])
+        still = ufl.replace(mine, {u: ufl.zero(u.ufl_shape)})
+        self._vanishes = ufl.algorithms.expand_derivatives(still).empty()
+        self._compiled = compat.compile_form(mine)
+        self._u = u
+        self._constants = mine.constants()
+        self._coefficients = [c for c in mine.coefficients() if c is not u]
+        self._at_rest: Array = np.zeros(u.x.array.size)
+        self._fingerprint: Array | None = None
+
+    def assemble(self, target: Array) -> None:
+        """Add to ``target``, ghosts not collected."""
+        fem.assemble_vector(target, self._compiled)
+
+    def at_rest(self) -> Array:
+        """Values at u = 0, ghosts not collected; assembled if they may have changed."""
+        if self._vanishes:
+            return self._at_rest
+        fingerprint = _data(self._constants, self._coefficients)
+        if self._fingerprint is None or not np.array_equal(fingerprint, self._fingerprint):
+            self._fingerprint = None  # until the assembly is complete
+            u = self._u.x.array
+            saved = u.copy()
+            u[:] = 0.0
+            self._at_rest[:] = 0.0
+            try:
+                self.assemble(self._at_rest)
+            finally:
+                u[:] = saved
+            self._fingerprint = fingerprint
+        return self._at_rest
+
+
+def _data(constants: Sequence[fem.Constant], coefficients: Sequence[fem.Function]) -> Array:
+    """All numbers that a form depends on, to see whether the user changed one."""
+    values = [np.ravel(c.value) for c in constants] + [f.x.array for f in coefficients]
+    return np.concatenate(values) if values else np.zeros(0)

@@ -19,15 +19,8 @@ __all__ = ["compile_form", "create_facet_submesh", "interpolation_points", "mode
 # PETSc's line search for the least residual, renamed in 3.24; bound to Python since 3.23.
 _line_searches = getattr(getattr(PETSc, "SNESLineSearch", None), "Type", None)
 LEAST_RESIDUAL = getattr(_line_searches, "SECANT", "l2")
-# PETSc's error for a zero in a dense factorisation (PETSC_ERR_MAT_LU_ZRPVT).
-_ZERO_PIVOT = 71
 # MUMPS' errors INFOG(1) for workspace that is too small, or memory that was not to be had.
 _NO_MEMORY = (-5, -7, -8, -9, -11, -13, -14, -15, -17, -18, -19, -20)
-
-
-def is_singular(error: PETSc.Error) -> bool:
-    """Whether a dense matrix could not be factored."""
-    return bool(error.ierr == _ZERO_PIVOT)
 
 
 def refused_memory(pc: PETSc.PC) -> bool:

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import weakref
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,8 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.contact import Contact
+from fenics_contact.dense import PartlyFactored
+from fenics_contact.energy import Forces
 from fenics_contact.spaces import Mask, WholeSpace
 from fenics_contact.unknowns import Selection, Unknowns
 
@@ -72,8 +76,7 @@ class Condensation:
 
     Attributes:
         schur: The condensed stiffness, (n_kept, n_kept), Fortran order (force/length).
-        particular: Displacement of the unknowns eliminated under the load, those kept at rest.
-        load: The condensed external force, (n_kept,) (force).
+        response: What the load of `set_load` makes of the body with the unknowns kept at rest.
     """
 
     def __init__(
@@ -104,10 +107,10 @@ class Condensation:
         self._held = np.flatnonzero(outside & constrained).astype(np.int32)
         self._eliminated = np.flatnonzero(outside & ~constrained).astype(np.int32)
         self._right, self._left = stiffness.createVecs()
-        self._directions: list[tuple[Array, Array]] = []
+        self._directions: list[tuple[Array, Response]] = []
         matrix = stiffness.copy()
         diagonal = matrix.getDiagonal()
-        scale = diagonal.norm(PETSc.NormType.NORM_INFINITY)
+        self._scale = scale = diagonal.norm(PETSc.NormType.NORM_INFINITY)
         matrix.zeroRowsColumns(self._held, diag=scale)
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         self._pc = PETSc.PC().create(stiffness.comm)
@@ -138,8 +141,7 @@ class Condensation:
             )
         # Solutions with the kept unknowns at rest, and not of the whole.
         self._factor.setMumpsIcntl(26, 0)
-        self.particular: Array = np.zeros(constrained.size)
-        self.load: Array = np.zeros(kept.size)
+        self.response = Response.none(constrained.size, kept.size)
 
     def _schur_complement(self) -> Array:
         n = self._kept.size
@@ -175,48 +177,92 @@ class Condensation:
             force: External force on all unknowns, (n,) (force).
             state: Displacements, of which those prescribed outside of the kept count, (n,).
         """
-        prescribed: Array = np.zeros_like(state)
-        prescribed[self._held] = state[self._held]
-        lifted: Array = force - self._product(prescribed) if prescribed.any() else force
-        eliminated = self._combined(lifted)
-        self.load = (lifted - self._product(eliminated))[self._kept]
-        self.particular = eliminated + prescribed
-
-    def _combined(self, force: Array) -> Array:
-        """`_solve`, as a combination of earlier solutions as far as the loads are combinations.
-
-        The loads of a history are a few fields, each times a number.
-        """
-        rest: Array = np.zeros_like(force)
-        rest[self._eliminated] = force[self._eliminated]
-        size = np.linalg.norm(rest)
-        result: Array = np.zeros_like(force)
-        for direction, solution in self._directions:
-            share = direction @ rest
-            rest -= share * direction
-            result += share * solution
-        remainder = np.linalg.norm(rest)
+        # The loads of a history are a few fields, each times a number: what was found for earlier
+        # ones serves as far as the new one is a combination of them.
+        rest: Array = np.concatenate([force, self._scale * state[self._held]])
+        size = float(np.linalg.norm(rest))
+        shares: list[float] = []
+        for direction, _ in self._directions:
+            shares.append(float(direction @ rest))
+            rest -= shares[-1] * direction
+        responses = [response for _, response in self._directions]
+        remainder = float(np.linalg.norm(rest))
         if remainder > _SAME * size:
-            solution = self._solve(rest)
-            result += solution
-            if np.isfinite(remainder):
-                self._directions.append((rest / remainder, solution / remainder))
+            known = bool(np.isfinite(remainder))
+            shares.append(remainder if known else 1.0)
+            scaled = np.asarray(rest / shares[-1], dtype=np.float64)
+            responses.append(self._respond(scaled))
+            if known:
+                self._directions.append((scaled, responses[-1]))
                 del self._directions[:-_DIRECTIONS]
-        return result
+        self.response = Response.none(force.size, self._kept.size).plus(shares, responses)
+
+    def _respond(self, given: Array) -> Response:
+        """By one back-substitution, and one more if values are prescribed and the force is none."""
+        force, values = np.split(given, [self._right.getSize()])
+        prescribed: Array = np.zeros_like(force)
+        prescribed[self._held] = values / self._scale
+        lift = self._product(prescribed) if values.any() else np.zeros_like(force)
+        field = prescribed + self._solve(force - lift)
+        image = self._product(field)
+        load = (force - image)[self._kept]
+        # Apart: the share of the prescribed values in the condensed load.
+        by_values = np.zeros_like(load)
+        if values.any():
+            still = field if not force.any() else prescribed - self._solve(lift)
+            by_values = -self._product(still)[self._kept]
+        at_field = force.copy()
+        at_field[self._held] = image[self._held]
+        at_field[self._kept] = 0.0
+        return Response(field, at_field, load, by_values)
 
     def forget(self) -> None:
         """Drop the solutions for earlier loads."""
         self._directions = []
 
-    def recover(self, kept: Array) -> Array:
-        """All unknowns under the load of `set_load`, (n,), from those kept, (n_kept,)."""
-        return self.particular + self.extended(kept)
+    def recover(self, kept: Array, particular: Array) -> Array:
+        """All unknowns, (n,).
+
+        Args:
+            kept: Those kept, (n_kept,).
+            particular: The displacement with these at rest, (n,); see `Response`.
+        """
+        return particular + self.extended(kept)
 
     def extended(self, kept: Array) -> Array:
         """All unknowns without load, (n,), that follow from those kept, (n_kept,)."""
-        state = np.zeros_like(self.particular)
+        state = np.zeros(self._right.getSize())
         state[self._kept] = kept
         return state - self._solve(self._product(state))
+
+
+@dataclass
+class Response:
+    """Of a body to its loads and prescribed values, linear in them; the unknowns kept at rest.
+
+    Attributes:
+        field: Displacement p of all unknowns, zero at those kept, (n,).
+        forces: K p at the unknowns eliminated, zero at those kept, (n,) (force).
+        load: The condensed external force g, (n_kept,) (force).
+        by_values: The part of it that the prescribed values make, (n_kept,) (force).
+    """
+
+    field: Array
+    forces: Array
+    load: Array
+    by_values: Array
+
+    @classmethod
+    def none(cls, n: int, n_kept: int) -> Response:
+        """To nothing."""
+        return cls(np.zeros(n), np.zeros(n), np.zeros(n_kept), np.zeros(n_kept))
+
+    def plus(self, shares: Sequence[float], others: Sequence[Response]) -> Response:
+        """This and shares of others added, in place."""
+        for share, other in zip(shares, others, strict=True):
+            for name in ("field", "forces", "load", "by_values"):
+                getattr(self, name)[:] += share * getattr(other, name)
+        return self
 
 
 class CondensedSpace(WholeSpace):
@@ -242,20 +288,23 @@ class CondensedSpace(WholeSpace):
         self.diagonal: Array = np.zeros(unknowns.n_local)
         self.outside = np.zeros(2)
         self.ready = False
+        self.mark = object()
+        self._fixed: Array | None = None  # the constant part of the matrices
+        self._factored: weakref.WeakValueDictionary[int, PartlyFactored]
+        self._factored = weakref.WeakValueDictionary()  # by the handles of the matrices
+        self._places: Array | None = None
         self._whole, self._prefix = whole, prefix
         self._kept_dofs = unknowns.kept[: unknowns.n_dofs]
-        self._is_outside = np.ones(whole.unknowns.n_local, dtype=np.bool_)
-        self._is_outside[unknowns.kept] = False
         self._contact_vector = unknowns.vector()
         self._condensation: Condensation | None = None
 
     def linear_solver(self, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
-        """LU; LAPACK's routine for symmetric matrices takes half of it but twice a solution's."""
-        return {"ksp_type": "preonly", "pc_type": "lu"}
+        """That of `prepare`."""
+        return {"ksp_type": "preonly"}
 
     def update(self, stiffness: PETSc.Mat) -> int:
         """Factor and condense a new bulk tangent over all unknowns."""
-        self._condensation = None  # its memory first
+        self._condensation = self._fixed = None  # their memory first
         self._condensation = Condensation(
             stiffness,
             self._whole.constrained,
@@ -263,6 +312,7 @@ class CondensedSpace(WholeSpace):
             symmetric=self.bulk.symmetric,
             prefix=self._prefix,
         )
+        self.mark = object()
         self.ready = True
         diagonal = stiffness.getDiagonal()
         self._whole.diagonal = diagonal.array.copy()
@@ -296,24 +346,52 @@ class CondensedSpace(WholeSpace):
         self.condensation.set_load(load, state)
         self.load = load[self.unknowns.kept]
         self.prescribed = self.state()[self.constrained]
-        outside = np.stack([load, self._whole.diagonal * state])[:, self._is_outside]
-        self.outside = np.sum(outside**2, axis=1)
+        kept = self.unknowns.kept
+        squares = [v @ v - v[kept] @ v[kept] for v in (load, self._whole.diagonal * state)]
+        self.outside[:] = np.clip(squares, 0.0, None)
 
     def extended(self, change: Array) -> Array:
         """See `WholeSpace.extended`: one back-substitution."""
         return self.condensation.extended(change)
 
-    def complete(self) -> None:
+    @property
+    def behind(self) -> Array | None:
+        """The displacement that the load makes of the unknowns eliminated, those kept at rest."""
+        return self.condensation.response.field
+
+    def complete(self, behind: Array | None) -> None:
         """One back-substitution for the unknowns eliminated."""
-        self._whole.set_state(self.condensation.recover(self.state()))
+        assert behind is not None
+        self._whole.set_state(self.condensation.recover(self.state(), behind))
 
     def bulk_force(self) -> Array:
         """S x - g: the residual of the bulk and of free supports."""
-        return self.condensation.schur @ self.state() - self.condensation.load
+        return self.condensation.schur @ self.state() - self.condensation.response.load
 
     def bulk_energy(self) -> float:
         """Potential of S and g, up to a constant."""
-        return float(0.5 * (self.bulk_force() - self.condensation.load) @ self.state())
+        load = self.condensation.response.load
+        return float(0.5 * (self.bulk_force() - load) @ self.state())
+
+    def forces(self, bulk: Array, reaction: Array) -> Forces:
+        """Forces at the unknowns kept, at the field with these at rest, and at prescribed values.
+
+        With u = N x + p, p the response to the load, and K symmetric, NᵀK p = -g_u is the part of
+        the prescribed values in g, and the products of these forces with differences of these
+        unknowns are those of K u, of the loads and of the reactions with differences of u.
+        """
+        x, response = self.state(), self.condensation.response
+        own = bulk + response.load  # S x
+        internal = [own - response.by_values, response.forces, x]
+        external = [response.load - response.by_values + reaction, response.forces, x]
+        unknowns = [x, response.field, -response.by_values]
+        joined = (np.concatenate(part) for part in (unknowns, internal, external))
+        return Forces(*joined)
+
+    @property
+    def components(self) -> Indices:
+        """Direction of every dof."""
+        return np.remainder(self._kept_dofs, len(self.u), dtype=np.int32)
 
     def forget(self) -> None:
         """Drop the solutions for earlier loads."""
@@ -327,23 +405,58 @@ class CondensedSpace(WholeSpace):
         matrix.assemble()
         return matrix
 
+    def prepare(self, ksp: PETSc.KSP, matrix: PETSc.Mat) -> None:
+        """Have a solver factor a matrix of `matrix` where contact acts, and the rest once."""
+        if self._places is None:
+            gdim, space = len(self.u), self.u.function_space
+            self._places = np.full((self.unknowns.n_local, gdim), np.nan)
+            nodes = space.tabulate_dof_coordinates()[:, :gdim]
+            self._places[: self.unknowns.n_dofs] = nodes[self._kept_dofs // gdim]
+        ksp.setOperators(matrix)
+        ksp.pc.setType("python")
+        solver = self._factored[matrix.handle] = PartlyFactored(self._places)
+        ksp.pc.setPythonContext(solver)
+
     def fill(self, matrix: PETSc.Mat, stiffness: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
         """S plus contact, conditions applied, dimensionless; no sparse factorisation."""
-        array = matrix.getDenseArray()
-        array[:] = self.condensation.schur
-        for part in contacts:
-            pointers, columns, values = part.getValuesCSR()
-            array[np.repeat(np.arange(len(array)), np.diff(pointers)), columns] += values
-            part.destroy()
+        scale = self.bulk.scale
         held = np.flatnonzero(self.constrained)
-        array[held] = 0.0
-        array[:, held] = 0.0
-        array[held, held] = self.bulk.scale
-        self.diagonal = np.diag(array).copy()
-        self._whole.diagonal[self.unknowns.kept] = self.diagonal  # for the round-off of contact
-        array /= self.bulk.scale
+        fixed = self._fixed
+        if fixed is None:
+            fixed = np.asarray(self.condensation.schur / scale, dtype=np.float64)
+            fixed[held] = fixed[:, held] = 0.0
+            fixed[held, held] = 1.0
+            self._fixed = fixed
+        rows, columns, values = _entries(list(contacts))
+        acts = (values != 0.0) & ~self.constrained[rows] & ~self.constrained[columns]
+        rows, columns, values = rows[acts], columns[acts], values[acts] / scale
+        array = matrix.getDenseArray()
+        solver = self._factored[matrix.handle]
+        if solver.fixed is fixed:
+            before = solver.added[:2]
+            array[before] = fixed[before]
+        else:
+            array[:] = fixed
+        array[rows, columns] += values
         matrix.assemble()
+        solver.set_parts(fixed, rows, columns, values)
+        self.diagonal = scale * np.diag(array)
+        self._whole.diagonal[self.unknowns.kept] = self.diagonal  # for the round-off of contact
         return 0
+
+
+def _entries(parts: Sequence[PETSc.Mat]) -> tuple[Indices, Indices, Array]:
+    """Rows, columns and values of the sum of matrices, which are used up."""
+    if not parts:
+        return np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros(0)
+    total, *others = parts
+    for part in others:
+        total.axpy(1.0, part, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        part.destroy()
+    pointers, columns, values = total.getValuesCSR()
+    total.destroy()
+    rows = np.repeat(np.arange(pointers.size - 1, dtype=np.int32), np.diff(pointers))
+    return rows, columns, values
 
 
 def _object(item: PETSc.Object) -> ctypes.c_void_p:

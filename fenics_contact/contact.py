@@ -655,6 +655,11 @@ class Contact:
     # ---- pairs -----------------------------------------------------------------------------------
 
     @property
+    def pairs_anew(self) -> bool:
+        """Whether opposites are found anew, on the deformed bodies, at every commit."""
+        return isinstance(self.support, DeformableBody) and self.support.update == "increment"
+
+    @property
     def rigid(self) -> bool:
         """Whether the support is rigid: its reactions are then external to the mesh."""
         return self._opposite is None
@@ -861,7 +866,7 @@ class Contact:
             values |= self.multipliers.committed(points)
         self.history.commit(values)
         self.committed_jump = points["jump"]
-        if isinstance(self.support, DeformableBody) and self.support.update == "increment":
+        if self.pairs_anew:
             # The traction stays with the points of Γc; what they slip over has moved on.
             self.pair(self.u)
             self.committed_jump = self._values["jump"]

@@ -132,17 +132,8 @@ class Continuation:
 
     def _solve_one(self) -> tuple[int, int]:
         """Iterations and reason of Newton's method for the present stiffness. Collective."""
-        problem = self._problem
-        problem._watch.start()
-        try:
-            return self._callbacks.solve(self.snes, problem._solution)
-        except PETSc.Error as error:
-            if not compat.is_singular(error):
-                raise
-            problem._recover()
-            self._attach()
-            reason = PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
-            return self.snes.getIterationNumber(), int(reason)
+        self._problem._watch.start()
+        return self._callbacks.solve(self.snes, self._problem._solution)
 
     def _test(self) -> int:
         problem, reasons = self._problem, PETSc.SNES.ConvergedReason

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,7 @@ from mpi4py import MPI
 from fenics_contact.contact import Contact
 from fenics_contact.parallel import global_sum
 
-__all__ = ["Energy", "EnergyState"]
+__all__ = ["Energy", "EnergyState", "Forces"]
 
 Array = npt.NDArray[np.float64]
 
@@ -44,38 +45,51 @@ class Energy:
 
 
 @dataclass(frozen=True)
-class EnergyState:
-    """Forces and places at one state, on this rank; what lies between two is an `Energy`.
+class Forces:
+    """Forces at one state, in coordinates of which the unknowns of all states are.
 
     Attributes:
-        unknowns: Displacements and free motions.
+        unknowns: Displacements and free motions on this rank.
         internal, external: Forces of the bulk, and loads with reactions, at the unknowns.
-        contacts: Of each contact the tractions on the body, its displacement relative to the
-            support, and that of the support as far as it is prescribed: (3, n_points, gdim).
-        springs: Energy in the contact's springs on this rank.
     """
 
     unknowns: Array
     internal: Array
     external: Array
+
+    @classmethod
+    def none(cls, unknowns: Array) -> Forces:
+        """No forces."""
+        return cls(unknowns, np.zeros_like(unknowns), np.zeros_like(unknowns))
+
+
+@dataclass(frozen=True)
+class EnergyState:
+    """Forces and places at one state, on this rank; what lies between two is an `Energy`.
+
+    Attributes:
+        forces: At the unknowns, by the mark of the coordinates they are in.
+        contacts: Of each contact the tractions on the body, its displacement relative to the
+            support, and that of the support as far as it is prescribed: (3, n_points, gdim).
+        springs: Energy in the contact's springs on this rank.
+    """
+
+    forces: dict[Any, Forces]
     contacts: list[Array]
     springs: float
 
     @classmethod
-    def unloaded(cls, unknowns: Array, contacts: Sequence[Contact]) -> EnergyState:
-        """No forces anywhere."""
-        none = np.zeros_like(unknowns)
+    def unloaded(cls, forces: dict[Any, Forces], contacts: Sequence[Contact]) -> EnergyState:
+        """No forces on Γc."""
         ways = [np.stack([0 * c.points, c.values["jump"], c.values["shift"]]) for c in contacts]
-        return cls(unknowns, none, none, ways, 0.0)
+        return cls(forces, ways, 0.0)
 
     @classmethod
-    def at(
-        cls, unknowns: Array, internal: Array, external: Array, contacts: Sequence[Contact]
-    ) -> EnergyState:
+    def at(cls, forces: dict[Any, Forces], contacts: Sequence[Contact]) -> EnergyState:
         """The state that ``contacts`` have evaluated."""
         ways = [np.stack([c.traction, c.values["jump"], c.values["shift"]]) for c in contacts]
         springs = sum(float(c.measure @ c.values["stored"]) for c in contacts)
-        return cls(unknowns, internal, external, ways, springs)
+        return cls(forces, ways, springs)
 
     def between(self, jumps: Sequence[Array]) -> EnergyState:
         """The same state with the displacements relative to supports taken between new pairs."""
@@ -83,17 +97,19 @@ class EnergyState:
         return dataclasses.replace(self, contacts=ways)
 
     def since(self, before: EnergyState, contacts: Sequence[Contact], comm: MPI.Comm) -> Energy:
-        """Energies on the way from ``before`` to here. Collective."""
-        way = self.unknowns - before.unknowns
+        """Energies on the way from ``before`` to here, in coordinates both have. Collective."""
+        mark = next(mark for mark in self.forces if mark in before.forces)
+        old, new = before.forces[mark], self.forces[mark]
+        way = new.unknowns - old.unknowns
         # Work, elastic, springs, dissipation, and work of the tractions.
         sums = np.zeros(5)
-        sums[0] = 0.5 * (before.external + self.external) @ way
-        sums[1] = 0.5 * (before.internal + self.internal) @ way
+        sums[0] = 0.5 * (old.external + new.external) @ way
+        sums[1] = 0.5 * (old.internal + new.internal) @ way
         sums[2] = self.springs - before.springs
-        for contact, old, new in zip(contacts, before.contacts, self.contacts, strict=True):
-            mean = contact.measure[:, None] * 0.5 * (old[0] + new[0])
-            sums[0] += np.sum(mean * (new[2] - old[2]))
-            sums[4] -= np.sum(mean * (new[1] - old[1]))
+        for contact, there, here in zip(contacts, before.contacts, self.contacts, strict=True):
+            mean = contact.measure[:, None] * 0.5 * (there[0] + here[0])
+            sums[0] += np.sum(mean * (here[2] - there[2]))
+            sums[4] -= np.sum(mean * (here[1] - there[1]))
             if contact.law.has_friction:
                 sums[3] += contact.measure @ contact.values["dissipated"]
         work, elastic, springs, dissipation, tractions = (float(v) for v in global_sum(comm, sums))

@@ -155,6 +155,7 @@ def estimate_errors(
     Raises:
         ValueError: Shapes that do not fit.
     """
+    problem.complete()
     u = problem.u
     stress = ufl.as_ufl(stress)
     strain = ufl.sym(ufl.grad(u)) if strain is None else ufl.as_ufl(strain)

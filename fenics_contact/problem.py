@@ -25,7 +25,7 @@ from fenics_contact.condense import CondensedSpace, touched, worthwhile
 from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.continuation import Continuation
 from fenics_contact.defaults import Defaults
-from fenics_contact.energy import Energy, EnergyState
+from fenics_contact.energy import Energy, EnergyState, Forces
 from fenics_contact.parallel import global_max, global_min, global_sum
 from fenics_contact.rigid import RigidMotions
 from fenics_contact.spaces import WholeSpace
@@ -56,6 +56,8 @@ _MAX_ROUNDS = 60
 # Residual, relative, to which the first round is solved; share of a round's error to which the next
 # is; and the error, in units of the tolerance, from which on the next may be the last one.
 _FIRST_ROUND, _INNER, _NEARLY = 1e-4, 1e-2, 10.0
+# A start with up to this many times the residual of the best is taken first if its points slip.
+_FAR = 100.0
 # Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
 _TOUCHING = 1e-12
 # Iterations of Newton's method without a lower residual after which another method takes over.
@@ -121,6 +123,8 @@ class Step:
         load: Load parameter, where `increments` set one.
         increment_error: Errors by the size of the increments so far, by quantity, where
             `increments` estimates them; see `ErrorBudget`.
+        complete: Whether all of u is that of the increment; else `ContactProblem.complete` makes
+            it so.
     """
 
     increment: int
@@ -136,6 +140,7 @@ class Step:
     wall_seconds: float
     load: float | None = None
     increment_error: dict[str, float] | None = None
+    complete: bool = True
 
     def summary(self) -> str:
         """One line for people."""
@@ -181,7 +186,7 @@ class ContactProblem:
         *,
         bcs: Sequence[fem.DirichletBC] = (),
         contacts: Sequence[Contact] = (),
-        method: str = "lbfgs",
+        method: str | None = None,
         alpha: float = 1.0,
         phi: float = 1.0,
         fallback: bool = True,
@@ -200,7 +205,9 @@ class ContactProblem:
             method: "lbfgs" (quasi-Newton, H₀ = (K + αK_n + φK_t)⁻¹), "newton" (consistent
                 tangent), "continuation" (the same, from soft contact to stiff; alternating where
                 it is stuck), or "alternating" (minimum problems in turn, each by Newton's method
-                with a line search on the energy).
+                with a line search on the energy). By default "lbfgs" on all unknowns, where a
+                factorisation costs as much as dozens of iterations, and "newton" condensed, where
+                it costs as much as ten.
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
                 paper has 0; 1 needs a third of the iterations once a point sticks.
@@ -221,7 +228,7 @@ class ContactProblem:
         Raises:
             ValueError: Input that has no sense; the text says what and what to do. On all ranks.
         """
-        if method not in _METHODS:
+        if method is not None and method not in _METHODS:
             raise ValueError(f"method is {method!r}; use one of {sorted(_METHODS)}")
         if linear_solver not in (None, *linear.KINDS):
             raise ValueError(
@@ -271,13 +278,16 @@ class ContactProblem:
         self._committed = self._whole.state()
         for contact in self.contacts:
             contact.evaluate()
-        self._committed_energy = EnergyState.unloaded(self._committed, self.contacts)
-        self._energy = self._committed_energy
+        forces: dict[object, Forces] = {self._whole.mark: Forces.none(self._committed)}
+        self._energy = self._committed_energy = EnergyState.unloaded(forces, self.contacts)
+        # What the present and the committed state need to be completed, and their loads.
+        self._behind: Array | None = None
+        self._committed_lag: tuple[Array | None, Array] = None, self._load
         self._rate: Array | None = None
         self._watch = StatusWatch(self.contacts)
         self._round_rtol = 0.0
         self._condensation, self._linear_solver = condensation, linear_solver
-        self.prefix, self._method, self._fallback = prefix, method, fallback
+        self.prefix, self._fallback = prefix, fallback
         self._configure(method, dict(petsc_options or {}), prefix)
 
     # ---- construction ----------------------------------------------------------------------------
@@ -333,7 +343,7 @@ class ContactProblem:
                     )
         return worst
 
-    def _configure(self, method: str, given: dict[str, Any], prefix: str) -> None:
+    def _configure(self, method: str | None, given: dict[str, Any], prefix: str) -> None:
         """Set up SNES and its two linear solvers: for H₀, and for the consistent tangent."""
         options = self._options = Defaults()
         options.set(given, prefix)
@@ -341,12 +351,13 @@ class ContactProblem:
             options.set({"snes_rtol": self.accuracy.rtol}, prefix)
             if self._comm.rank == 0:
                 logger.info("accuracy %s", self.accuracy)
-        options.set(_COMMON | _METHODS[method], prefix)
         solvers = [part + name for part in ("", "tangent_") for name in _NAMES_A_SOLVER]
         named = [name for name in solvers if options.get(prefix + name) is not None]
         self._condensed = self._choose_condensation(named)
         self._whole.linear_kind = self._choose_linear_solver(named)
         self._set_space()
+        self._method = method or ("newton" if self._condensed else "lbfgs")
+        options.set(_COMMON | _METHODS[self._method], prefix)
         self._quasi_newton = options.get(prefix + "snes_type") == PETSc.SNES.Type.QN
         newton = linear.newton_options(self._space.linear_kind)
         if not self._quasi_newton:
@@ -490,14 +501,14 @@ class ContactProblem:
         self._matrices: dict[bool, PETSc.Mat] = {}
         for ksp in self._solvers.values():
             ksp.reset()
-        self._has_h0 = False
+        self._has_h0 = self._predicts = False
 
     def _matrix(self, consistent: bool) -> PETSc.Mat:
         """The matrix of H₀ or of the consistent tangent, made when first needed. Collective."""
         if consistent not in self._matrices:
             symmetric = self._symmetric(consistent)
             matrix = self._space.matrix(self._bulk_matrix, symmetric=symmetric)
-            self._solvers[consistent].setOperators(matrix)
+            self._space.prepare(self._solvers[consistent], matrix)
             self._matrices[consistent] = matrix
         return self._matrices[consistent]
 
@@ -695,7 +706,8 @@ class ContactProblem:
         return self._constrained
 
     def present_state(self) -> Array:
-        """This rank's unknowns as they are now; a copy (length)."""
+        """This rank's unknowns as they are now, completed; a copy (length). Collective."""
+        self.complete()
         return self._whole.state()
 
     @contextmanager
@@ -715,6 +727,8 @@ class ContactProblem:
             every contact, or of None for the residual that is left; it returns the change of this
             rank's unknowns. Collective.
         """
+        self.complete()
+        self._predicts = False  # by the matrix that is about to be used
         space = self._space
         space.begin(self._load)
         space.enter()
@@ -749,13 +763,17 @@ class ContactProblem:
 
     # ---- solving ---------------------------------------------------------------------------------
 
-    def solve(self, *, ahead: float = 1.0) -> Step:
+    def solve(self, *, ahead: float = 1.0, field: bool = True) -> Step:
         """Solve the next increment with the loads and conditions as they are now. Collective.
 
         The history does not change: `commit` does that.
 
         Args:
             ahead: Size of this increment in units of the last one, for the guess to start from.
+            field: Whether to find all of u. If not, and if the problem is condensed, u may stay
+                behind: then only what contact touches, all results of the contacts included, is
+                that of the increment, and the verdict is on the condensed equations. `complete`
+                brings up the rest, for a fifteenth to a thirtieth of a factorisation.
 
         Returns:
             What was done, the verdict included.
@@ -767,12 +785,13 @@ class ContactProblem:
                 can balance.
         """
         start = time.perf_counter()
-        saved = self._whole.state()
+        saved = self._whole.state(), self._load, self._behind
         try:
             with self._options.present():
-                step = self._solve(start, ahead)
+                step = self._solve(start, ahead, field)
         except BaseException as error:
-            self._whole.set_state(saved)
+            state, self._load, self._behind = saved
+            self._whole.set_state(state)
             for contact in self.contacts:
                 contact.restore()
             if not isinstance(error, NotConverged | ValueError):
@@ -780,7 +799,10 @@ class ContactProblem:
             raise
         return step
 
-    def _solve(self, start: float, ahead: float) -> Step:
+    def _solve(self, start: float, ahead: float, field: bool) -> Step:
+        pairings = [c.pairings for c in self.contacts]
+        if self._behind is not None and not (self.bulk.is_current() and pairings == self._pairings):
+            self.complete()  # what it takes is about to go
         self._check_before()
         for bc in self._bcs:
             bc.set(self.u.x.array)
@@ -791,8 +813,8 @@ class ContactProblem:
         self._approach()
         self._space.begin(self._load)
         reason, rungs, rounds = self._enforce(ahead, stiffness_changed)
-        self._space.complete()
-        verdict = self._judge()
+        lags = not field and self._may_lag()
+        verdict = self._judge_kept() if lags else self._judge_all()
         if reason <= 0 or verdict.failures:
             raise NotConverged(self.increment + 1, reason, verdict, rungs)
         return Step(
@@ -807,7 +829,53 @@ class ContactProblem:
             energy=self._energy.since(self._committed_energy, self.contacts, self._comm),
             rungs=tuple(rungs),
             wall_seconds=time.perf_counter() - start,
+            complete=not lags,
         )
+
+    def _may_lag(self) -> bool:
+        """Whether u can stay behind: energies and pairs must be found without it. Collective."""
+        if not (self._condensed and self.bulk.symmetric):
+            return False
+        if self.increment == 0 and not self._committed.any():
+            nothing = Forces.none(np.zeros(1))
+            self._committed_energy.forces.setdefault(self._space.mark, nothing)
+        follows = any(contact.pairs_anew for contact in self.contacts)
+        return self._space.mark in self._committed_energy.forces and not follows
+
+    def complete(self) -> Verdict | None:
+        """Bring all of u up to the increment solved last, if it is behind. Collective.
+
+        See `solve` with ``field=False``, and `increments`. The field is checked apart from how it
+        was found: the product of the bulk's matrix with it must meet loads and contact forces.
+
+        Returns:
+            The verdict; None if nothing was behind.
+
+        Raises:
+            NotConverged: The equations do not hold on all of u.
+        """
+        if self._behind is None:
+            return None
+        committed = self._committed_lag[0] is self._behind
+        self._space.complete(self._behind)
+        self._behind = None
+        state, image = self.unknowns.vector(), self.unknowns.vector()
+        state.array[:] = self._whole.state()
+        self._bulk_matrix.mult(state, image)
+        self._whole.begin(self._load)
+        bulk = image.array_r - self._load
+        verdict, reaction = self._judge(self._whole, bulk, laws=False)
+        energy = self._committed_energy if committed else self._energy
+        energy.forces[self._whole.mark] = self._whole.forces(bulk, reaction)
+        if committed:
+            self._committed = self._whole.state()
+            self._committed_lag = None, self._load
+        for vector in (state, image):
+            vector.destroy()
+        if verdict.failures:
+            number = self.increment + (not committed)
+            raise NotConverged(number, int(self.snes.getConvergedReason()), verdict, [])
+        return verdict
 
     def _enforce(self, ahead: float, stiffness_changed: bool) -> tuple[int, list[Rung], int]:
         """Solve, let multipliers take over what the springs bear, and again. Collective.
@@ -857,6 +925,7 @@ class ContactProblem:
             Reason, and what was tried.
         """
         reason, rungs = int(PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE), []
+        factored = self._predicts
         self._space.enter()
         try:
             starts = [self._space.part(start) / self._length for start in self._starts(ahead)]
@@ -875,23 +944,20 @@ class ContactProblem:
             self._set_u(self._solution)
         finally:
             self._whole.enter()
+        newton = method not in ("alternating", "continuation") and not self._quasi_newton
+        made = sum(rung.iterations for rung in rungs[-1:])
+        self._predicts = reason > 0 and newton and (factored or made > 0)
         return int(reason), rungs
 
     def _solve_by(self, method: str, stiffness_changed: bool) -> tuple[int, int]:
         """Iterations and reason of one method, from ``_solution``. Collective."""
-        try:
-            if method == "alternating":
-                return self._alternation.solve(self._solution)
-            if method == "continuation":
-                return self._continuation.solve()
-            if self._quasi_newton:
-                return self._solve_quasi_newton(stiffness_changed)
-            return self._callbacks.solve(self.snes, self._solution)
-        except PETSc.Error as error:
-            if not compat.is_singular(error):
-                raise
-            self._recover()
-            return self.snes.getIterationNumber(), int(_REASONS.DIVERGED_LINEAR_SOLVE)
+        if method == "alternating":
+            return self._alternation.solve(self._solution)
+        if method == "continuation":
+            return self._continuation.solve()
+        if self._quasi_newton:
+            return self._solve_quasi_newton(stiffness_changed)
+        return self._callbacks.solve(self.snes, self._solution)
 
     def _recover(self) -> None:
         """Replace what an error of PETSc may have left locked or half done. Collective."""
@@ -947,8 +1013,12 @@ class ContactProblem:
     def _starts(self, ahead: float) -> list[Array]:
         """Displacements to start from, the one nearest to equilibrium first. Collective.
 
-        The present state, and that state moved on by as much as the last increment moved it: in
-        proportional loading that is the solution.
+        The present state; that state moved on by as much as the last increment moved it: in
+        proportional loading that is the solution; and that state with one step of Newton's method
+        on the tangent in which the last increment ended. At the present state itself no point has
+        slipped yet, and all closed ones stick: from there Newton's method takes ten steps to let
+        them slip again, one after another from the edge of the contact inwards. The last start has
+        the right ones slipping, and comes first unless it is far off.
         """
         present = self._whole.state()
         starts = [present]
@@ -957,6 +1027,9 @@ class ContactProblem:
             for bc in self._bcs:
                 bc.set(self.u.x.array)
             starts.append(self._whole.state())
+        predicts = self._predicts
+        if predicts:
+            starts.append(self._predicted(present))
         residuals = []
         self._start_residual = self.committed_start
         for guess in starts:
@@ -964,7 +1037,21 @@ class ContactProblem:
             self._compute_residual(self._solution, self._function)
             residuals.append(self._norms["residual"])
         self._start_residual = max(self._start_residual, residuals[0])
+        if predicts and residuals[-1] <= _FAR * min(residuals):
+            residuals[-1] = 0.0
         return [starts[i] for i in np.argsort(residuals, kind="stable")]
+
+    def _predicted(self, present: Array) -> Array:
+        """One Newton step from a state on the tangent factored last. Collective."""
+        self._predicts = False
+        self._solution.array[:] = self._space.part(present) / self._length
+        self._compute_residual(self._solution, self._function)
+        step = self._solution.duplicate()
+        self._solvers[True].solve(self._function, step)
+        moved = present.copy()
+        moved[self._space.unknowns.kept] -= self._length * step.array_r
+        step.destroy()
+        return moved
 
     def _approach(self) -> None:
         """Move bodies that nothing holds yet to first touch, along their load. Collective."""
@@ -1016,39 +1103,84 @@ class ContactProblem:
             if not self._refresh_h0():
                 return iterations, int(reasons.DIVERGED_FNORM_NAN)
 
-    def _judge(self) -> Verdict:
-        """Recompute everything from u by assembly, past SNES and its residual. Collective."""
-        contact = self._whole.contact_force()
+    def _judge_all(self) -> Verdict:
+        """Complete u and judge by assembly, past SNES and its residual. Collective."""
+        self._space.complete(self._space.behind)
+        self._behind = None
+        for contact in self.contacts:
+            contact.evaluate()
         bulk = self._whole.with_supports(self.bulk.assemble_residual())
+        verdict, reaction = self._judge(self._whole, bulk)
+        forces: dict[object, Forces] = {self._whole.mark: self._whole.forces(bulk, reaction)}
+        if self._condensed and self.bulk.symmetric:
+            forces[self._space.mark] = self._forces_kept()
+        self._energy = EnergyState.at(forces, self.contacts)
+        return verdict
+
+    def _judge_kept(self) -> Verdict:
+        """Judge the condensed equations; u stays behind. One rank only."""
+        self._behind = self._space.behind
+        for contact in self.contacts:
+            contact.evaluate()
+        self._space.enter()
+        try:
+            verdict, _ = self._judge(self._space, self._space.bulk_force())
+        finally:
+            self._whole.enter()
+        forces: dict[object, Forces] = {self._space.mark: self._forces_kept()}
+        self._energy = EnergyState.at(forces, self.contacts)
+        return verdict
+
+    def _forces_kept(self) -> Forces:
+        self._space.enter()
+        try:
+            bulk, contact = self._space.bulk_force(), self._space.contact_force()
+        finally:
+            self._whole.enter()
+        return self._space.forces(bulk, np.where(self._space.constrained, bulk + contact, 0.0))
+
+    def _judge(self, space: WholeSpace, bulk: Array, *, laws: bool = True) -> tuple[Verdict, Array]:
+        """Recompute residual, balance and laws at evaluated contacts. Collective.
+
+        Args:
+            space: The unknowns on which the residual is looked at; entered.
+            bulk: Residual of the bulk on these.
+            laws: Whether to check the laws, too.
+
+        Returns:
+            The verdict, and the reactions at the unknowns.
+        """
+        contact = space.contact_force()
         total = bulk + contact
-        self._measure_norms(self._whole, total, contact)
-        gdim = len(self.u)
-        reaction = np.where(self._constrained, total, 0.0)
-        on_dofs = (v[: self._n_owned].reshape(-1, gdim) for v in (bulk, reaction))
-        by_component = np.stack([v.sum(axis=0) for v in on_dofs])
+        self._measure_norms(space, total, contact)
+        components, gdim = space.components, len(self.u)
+        reaction = np.where(space.constrained, total, 0.0)
+        by_component = np.stack(
+            [
+                np.bincount(components, vector[: components.size], minlength=gdim)
+                for vector in (bulk, reaction)
+            ]
+        )
         bulk_sum, reaction_sum = global_sum(self._comm, by_component)
         # ∑F(u) - ∫ (r_n n + τ) = reactions, the middle one by quadrature, not by assembly.
         imbalance = bulk_sum - reaction_sum
         for c in self.contacts:
-            c.evaluate()
             if c.rigid:  # between two bodies of the mesh contact forces are internal
                 imbalance = imbalance - c.resultants().force
-        self._energy = EnergyState.at(
-            self._whole.state(), bulk + self._load, self._load + reaction, self.contacts
-        )
         absolute = float(global_sum(self._comm, np.abs(bulk).sum() + np.abs(contact).sum()))
-        n_dofs = float(global_sum(self._comm, self._n_owned))
-        augmented = [c for c in self.contacts if c.multipliers is not None]
-        return Verdict(
+        n_dofs = float(global_sum(self._comm, components.size))
+        augmented = [c for c in self.contacts if c.multipliers is not None and laws]
+        verdict = Verdict(
             residual=self._norms["residual"],
             force=self._norms["force"],
             tolerance=self._tolerance(),
             imbalance=float(np.abs(imbalance).max()),
             imbalance_tolerance=np.sqrt(n_dofs) * 2 * self._tolerance() + 1e-12 * absolute,
-            laws={c.name: check_laws(c) for c in self.contacts},
+            laws={c.name: check_laws(c) for c in self.contacts} if laws else {},
             enforcement={c.name: c.enforcement_error() for c in augmented},
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
         )
+        return verdict, reaction
 
     def commit(self) -> None:
         """Make the solved state the start of the next increment, history included. Collective.
@@ -1067,6 +1199,7 @@ class ContactProblem:
         state = self._whole.state()
         self._rate = state - self._committed
         self._committed = state
+        self._committed_lag = self._behind, self._load
         self._committed_energy = self._energy.between([c.committed_jump for c in self.contacts])
         self.committed_force = self._norms["force"]
         self.committed_start = self._start_residual
@@ -1078,11 +1211,16 @@ class ContactProblem:
         The history needs no restoring: it changes at `commit` alone. Collective.
         """
         self._whole.set_state(self._committed)
+        self._behind, self._load = self._committed_lag
         for contact in self.contacts:
             contact.restore()
 
     def committed_state(self) -> tuple[Array, Array]:
-        """This rank's unknowns at the last commit, and by how much that increment moved them."""
+        """This rank's unknowns at the last commit, and by how much that increment moved them.
+
+        Collective: u is completed, if it is behind.
+        """
+        self.complete()
         rate = np.zeros_like(self._committed) if self._rate is None else self._rate
         return self._committed.copy(), rate.copy()
 
@@ -1091,6 +1229,7 @@ class ContactProblem:
     ) -> None:
         """Take up a history where another run left it; the contacts' are set apart. Collective."""
         self._committed, self._rate = state.copy(), rate.copy()
+        self._committed_lag = None, self._load
         self.committed_force, self.committed_start, self.increment = force, start, increment
         self.restore()
         self.restart_solver()
@@ -1098,8 +1237,14 @@ class ContactProblem:
     def take_up_loads(self) -> None:
         """Take the loads as they are now for those of the committed state. Collective."""
         self._load = -self._whole.with_supports(self.bulk.update_load())
-        self._judge()
-        self._committed_energy = self._energy
+        self._committed_lag = None, self._load
+        self._whole.begin(self._load)
+        for contact in self.contacts:
+            contact.evaluate()
+        bulk = self._whole.with_supports(self.bulk.assemble_residual())
+        _, reaction = self._judge(self._whole, bulk, laws=False)
+        forces: dict[object, Forces] = {self._whole.mark: self._whole.forces(bulk, reaction)}
+        self._energy = self._committed_energy = EnergyState.at(forces, self.contacts)
 
     def restart_solver(self) -> None:
         """Drop what the solver has kept from earlier increments. Collective."""

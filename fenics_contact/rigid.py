@@ -281,9 +281,15 @@ class RigidMotions:
 def _unbalanced(rays: Array, resultant: Array) -> float:
     """The least Σ|resultant - rays·x| over x ≥ 0; rays (n_free, n_rays) of unit length.
 
-    As a linear programme: least squares without negatives (nnls) may end far from its optimum.
+    Least squares without negatives find at once that there is nothing left, but where there is they
+    may end far from their optimum: then a linear programme, which takes ten times as long.
     """
     m, n = rays.shape
+    try:
+        if np.abs(rays @ scipy.optimize.nnls(rays, resultant)[0] - resultant).sum() < _BALANCED:
+            return 0.0
+    except RuntimeError:
+        pass  # too many iterations; so the linear programme
     tolerance = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
     found = scipy.optimize.linprog(
         np.concatenate([np.zeros(n), np.ones(2 * m)]),

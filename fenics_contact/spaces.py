@@ -13,6 +13,7 @@ from petsc4py import PETSc
 from fenics_contact import linear
 from fenics_contact.bulk import Bulk
 from fenics_contact.contact import Contact
+from fenics_contact.energy import Forces
 from fenics_contact.unknowns import Unknowns
 
 __all__ = ["WholeSpace"]
@@ -36,6 +37,7 @@ class WholeSpace:
             worth little.
         ready: Whether `fill` can be called; else `update` comes first.
         linear_kind: How linear systems are solved, one of `linear.KINDS`.
+        mark: Of the coordinates that `forces` are in.
     """
 
     iterations_per_round = 20
@@ -59,6 +61,7 @@ class WholeSpace:
         self.outside = np.zeros(2)
         self.ready = True
         self._near_nullspace: PETSc.NullSpace | None = None
+        self.mark: object = WholeSpace
         self._contact_vector = unknowns.vector()
         self.enter()
 
@@ -109,8 +112,31 @@ class WholeSpace:
         self.load = load
         self.prescribed = self.state()[self.constrained]
 
-    def complete(self) -> None:
-        """Find the unknowns outside of the space for those inside. Collective."""
+    @property
+    def behind(self) -> Array | None:
+        """What `complete` needs of the present increment; None: nothing is outside."""
+        return None
+
+    def complete(self, behind: Array | None) -> None:
+        """Find the unknowns outside of the space for those inside. Collective.
+
+        Args:
+            behind: What the attribute was in the increment that set those inside.
+        """
+
+    def forces(self, bulk: Array, reaction: Array) -> Forces:
+        """For the energies: forces at the present state, in the coordinates of ``mark``.
+
+        Args:
+            bulk: Residual of the bulk, (n,) (force).
+            reaction: Forces at the constrained unknowns, zero at others, (n,) (force).
+        """
+        return Forces(self.state(), bulk + self.load, self.load + reaction)
+
+    @property
+    def components(self) -> npt.NDArray[np.int32]:
+        """Direction of every dof of this rank, (n_dofs,)."""
+        return np.arange(self.unknowns.n_dofs, dtype=np.int32) % len(self.u)
 
     def forget(self) -> None:
         """Drop what was kept of earlier increments and could show in the digits of the next."""
@@ -159,6 +185,10 @@ class WholeSpace:
                 self._near_nullspace = linear.near_nullspace(self.u.function_space)
             matrix.setNearNullSpace(self._near_nullspace)
         return matrix
+
+    def prepare(self, ksp: PETSc.KSP, matrix: PETSc.Mat) -> None:
+        """Give a solver a matrix of `matrix`. Collective."""
+        ksp.setOperators(matrix)
 
     def fill(self, matrix: PETSc.Mat, stiffness: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
         """Bulk tangent plus contact, conditions applied, dimensionless. Collective.

@@ -35,6 +35,7 @@ def increments(
     estimate: bool = False,
     checkpoint: str | Path | None = None,
     checkpoint_every: int = 1,
+    field: str | int = "every",
 ) -> Iterator[Step]:
     """Lead the load parameter from ``start`` to ``end``; solve and commit increments. Collective.
 
@@ -57,18 +58,25 @@ def increments(
         checkpoint: File to keep the last committed state in (``.npz``). If it is there when the
             history starts, the history goes on behind it; see `checkpoint.save`.
         checkpoint_every: Write it after every so many increments, and after the last.
+        field: When all of u is found: "every" increment; at the "last" only; or a number: every so
+            many increments, and at the last. Where the problem is condensed, increments in between
+            save the larger part of their cost; there only the contacts' results are those of the
+            increment, u is behind except on Γc until `ContactProblem.complete`, and
+            ``Step.complete`` says so. Before a checkpoint is written u is completed.
 
     Yields:
         The step, after its commit; ``load`` is its load parameter, and ``rungs`` has what was tried
         before the increment was cut, too.
 
     Raises:
-        ValueError: ``load`` is no scalar constant or function, ``steps`` has no sense, or the
-            checkpoint is of a history without ``estimate``.
+        ValueError: ``load`` is no scalar constant or function, ``steps`` or ``field`` has no sense,
+            or the checkpoint is of a history without ``estimate``.
         NotConverged: An increment failed even when cut; u, history and load are those of the last
             committed one.
     """
     ends = _ends(start, end, problem.increments_wanted if steps is None else steps)
+    if field not in ("every", "last") and not (isinstance(field, int | np.integer) and field >= 1):
+        raise ValueError(f'field is {field!r}; it must be "every", "last", or a number from 1')
     comm = problem.u.function_space.mesh.comm
     set_load = _setter(load)
 
@@ -93,7 +101,7 @@ def increments(
     if problem.increment:
         problem.take_up_loads()
     direction = 1.0 if end >= start else -1.0
-    unsaved = 0
+    unsaved = behind = 0
     failed: list[Rung] = []
     halves: list[float] = []  # of an increment that was solved whole, with these results
     whole: dict[str, float] = {}
@@ -109,7 +117,8 @@ def increments(
                     problem.restore()
                     halves = [0.5 * (at.load + goal), goal]
                 goal = halves[0] if halves else goal
-                step = _solve_to(goal, problem, apply, at)
+                wanted = goal == ends[-1] or field == "every" or estimate or behind + 1 == field
+                step = _solve_to(goal, problem, apply, at, field=wanted)
             except BaseException as failure:
                 apply(at.load)
                 halves = []
@@ -118,6 +127,7 @@ def increments(
                 failed += failure.rungs
                 if at.cuts == max_cuts:
                     failure.rungs = tuple(failed)
+                    problem.complete()
                     raise
                 at.cut(abs(goal - at.load))
                 failed.append(Rung("cut", 0, f"to {at.largest:g}"))
@@ -139,6 +149,7 @@ def increments(
                 now = quantities(problem)
                 error = {name: error[name] + whole[name] - now[name] for name in now}
                 found = dict(error)
+            behind = 0 if step.complete else behind + 1
             unsaved += 1
             # Halves belong together: between them the whole one's results would be lost.
             due = unsaved >= checkpoint_every and not halves
@@ -150,11 +161,16 @@ def increments(
 
 
 def _solve_to(
-    goal: float, problem: ContactProblem, apply: Callable[[float], None], at: _Progress
+    goal: float,
+    problem: ContactProblem,
+    apply: Callable[[float], None],
+    at: _Progress,
+    *,
+    field: bool = True,
 ) -> Step:
     """Solve for a load parameter from the last committed one. Collective."""
     apply(goal)
-    return problem.solve(ahead=(goal - at.load) / at.last if at.last else 1.0)
+    return problem.solve(ahead=(goal - at.load) / at.last if at.last else 1.0, field=field)
 
 
 @dataclasses.dataclass

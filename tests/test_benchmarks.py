@@ -46,16 +46,17 @@ def test_times_are_medians_in_units_of_a_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_half_cylinder_runs(tmp_path: Path) -> None:
-    """The short benchmark ends well and every method finds the solution."""
-    command = [sys.executable, str(ROOT / "benchmarks" / "run.py"), "half_cylinder", "--short"]
+@pytest.mark.parametrize("name", ["half_cylinder", "ball"])
+def test_short_benchmark(name: str, tmp_path: Path) -> None:
+    """The short benchmark ends well, every method finds the solution, and plots are drawn."""
+    command = [sys.executable, str(ROOT / "benchmarks" / "run.py"), name, "--short"]
     command += ["--repeat", "1", "--output", str(tmp_path)]
     done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert (tmp_path / "README.md").is_file()
-    with open(tmp_path / "half_cylinder" / "half_cylinder.csv", newline="") as file:
+    assert f"![]({name}/{name}_dofs.png)" in (tmp_path / "README.md").read_text()
+    with open(tmp_path / name / f"{name}_sizes.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) > 3
+    assert len(rows) > 10
     assert all(float(row["seconds"]) > 0 and row["iterations"] != "none" for row in rows)
 
 

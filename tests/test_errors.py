@@ -108,7 +108,8 @@ def test_increments():
 @pytest.mark.parametrize("condensation", [None, False])
 def test_solver(condensation):
     """A residual left on purpose: what was left shows to 1 %, for a residual of 1e-3."""
-    options = {"petsc_options": {"snes_rtol": 1e-3}}
+    # Newton's method would end with the exact solution all the same.
+    options = {"petsc_options": {"snes_rtol": 1e-3}, "method": "lbfgs"}
     rough = Press(friction=0.0, condensation=condensation, **options)
     exact = Press(friction=0.0, condensation=condensation)
     rough.solved()

@@ -313,7 +313,7 @@ def test_pairs_do_not_outlive_an_increment():
     second run differs from the first by the pairs of L-BFGS alone, if any were kept. Residual norms
     of every iteration agree to 1e-9: round-off of a sum over ranks, grown over some iterations.
     """
-    made = rub(fc.Frictionless(k_n=1e3))
+    made = rub(fc.Frictionless(k_n=1e3), method="lbfgs")
     runs = []
     for number, (side, down) in enumerate([(0.0, 0.05), (0.01, 0.02), (0.0, 0.05)]):
         made.scene.u.x.array[:] = 0.0
@@ -1257,3 +1257,41 @@ def test_restore_drops_what_was_not_committed() -> None:
     made.problem.restore()
     assert identical(snapshot(made), before)
     assert np.array_equal(made.scene.u.x.array, u)
+
+
+@pytest.mark.parametrize("condensation", [None, False])
+def test_newton_after_an_increment_of_no_iterations(condensation):
+    """A first increment without load needs no tangent, and leaves none to start the next from."""
+    if condensation is None and COMM.size > 1:
+        pytest.skip("condensation takes one rank")
+    made = rub(method="newton", condensation=condensation)
+    made.move(0.0, 0.0)
+    made.scene.u.x.array[:] = 0.0
+    first = made.problem.solve()
+    made.problem.commit()
+    assert first.iterations == 0
+    walk(made, path=PATH[:2])
+
+
+@pytest.mark.parametrize("condensation", [None, False])
+def test_newton_starts_where_the_right_points_slip(condensation):
+    """Small increments along a path take fewer steps than without the start from the last tangent.
+
+    And lead to the same state: both solve to 1e-9 of the forces, 1e-7 over the path.
+    """
+    if condensation is None and COMM.size > 1:
+        pytest.skip("condensation takes one rank")
+    taken, states = [], []
+    for helped in (True, False):
+        made = rub(method="newton", condensation=condensation, mesh={"n": 12})
+        taken.append(0)
+        for i in range(1, 13):
+            made.move(0.004 * i, 0.05)
+            if not helped:
+                made.problem._predicts = False
+            taken[-1] += made.problem.solve().iterations
+            made.problem.commit()
+        assert made.contact.resultants().slip > 0
+        states.append(owned(made.scene.u).copy())
+    assert taken[0] < 0.8 * taken[1]
+    assert close(*states, 1e-7)
