@@ -206,8 +206,8 @@ class ContactProblem:
                 tangent), "continuation" (the same, from soft contact to stiff; alternating where
                 it is stuck), or "alternating" (minimum problems in turn, each by Newton's method
                 with a line search on the energy). By default "lbfgs" on all unknowns, where a
-                factorisation costs as much as dozens of iterations, and "newton" condensed, where
-                it costs as much as ten.
+                factorisation costs as much as dozens of iterations, and condensed, where it costs
+                as much as ten, "newton", with "continuation" for the first increment.
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
                 paper has 0; 1 needs a third of the iterations once a point sticks.
@@ -356,6 +356,7 @@ class ContactProblem:
         self._condensed = self._choose_condensation(named)
         self._whole.linear_kind = self._choose_linear_solver(named)
         self._set_space()
+        self._automatic = method is None
         self._method = method or ("newton" if self._condensed else "lbfgs")
         options.set(_COMMON | _METHODS[self._method], prefix)
         self._quasi_newton = options.get(prefix + "snes_type") == PETSc.SNES.Type.QN
@@ -930,7 +931,11 @@ class ContactProblem:
         try:
             starts = [self._space.part(start) / self._length for start in self._starts(ahead)]
             tries = [(start, self._method) for start in starts]
-            if self._may_climb():
+            climbs = self._may_climb()
+            if climbs and self._automatic and self._condensed and self._rate is None:
+                # From nothing, Newton's method on the stiff problem often gives up first.
+                tries = [(starts[0], _LAST_RESORT)]
+            elif climbs:
                 tries.append((starts[0], _LAST_RESORT))
             for start, method in tries:
                 self._solution.array[:] = start
