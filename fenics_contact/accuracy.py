@@ -26,9 +26,8 @@ PRESETS = {"draft": 5e-2, "standard": 1e-2, "fine": 1e-3}
 # multipliers are cheaper than stiffness. N increments leave 0.14/N of the half-cylinder's friction.
 _PENALTY_ERROR, _INCREMENT_ERROR = 0.5, 0.14
 _SOFTEST, _STIFFEST = 3.0, 10.0
-# The multipliers' share of the error wanted, and the solver's of the multipliers': where residuals
-# are as large as what the multipliers may miss, rounds leave the solution as it is, and do not end.
-_SHARE = 0.01
+# Shares of the error wanted: what multipliers leave of the penalty's, and the solver.
+_LEFT, _SHARE = 0.5, 0.01
 
 
 @dataclass(frozen=True)
@@ -71,13 +70,13 @@ class Accuracy:
             )
         needed = _PENALTY_ERROR / error
         soft = needed <= _STIFFEST * (1 + 1e-12)
-        tolerance = max(_SHARE * error, 1e-8)
+        left = _LEFT * error / (_PENALTY_ERROR / _STIFFEST)
         return cls(
             error=float(error),
             factor=max(_SOFTEST, needed) if soft else _STIFFEST,
             enforcement="penalty" if soft else "augmented",
-            tolerance=tolerance,
-            rtol=float(np.clip(_SHARE * tolerance, 1e-10, 1e-6)),
+            tolerance=float(np.clip(left, 1e-8, 0.1)),
+            rtol=float(np.clip(_SHARE * error, 1e-10, 1e-4)),
             increments=ceil(_INCREMENT_ERROR / error * (1 - 1e-12)),
         )
 

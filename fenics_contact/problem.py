@@ -348,7 +348,9 @@ class ContactProblem:
         options = self._options = Defaults()
         options.set(given, prefix)
         if self.accuracy is not None:
-            options.set({"snes_rtol": self.accuracy.rtol}, prefix)
+            # Residuals as large as what multipliers may miss would make rounds that change nothing.
+            least = [_INNER * c.tolerance for c in self.contacts if c.multipliers is not None]
+            options.set({"snes_rtol": min(self.accuracy.rtol, *least, 1.0)}, prefix)
             if self._comm.rank == 0:
                 logger.info("accuracy %s", self.accuracy)
         solvers = [part + name for part in ("", "tangent_") for name in _NAMES_A_SOLVER]
