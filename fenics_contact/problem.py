@@ -934,7 +934,8 @@ class ContactProblem:
             starts = [self._space.part(start) / self._length for start in self._starts(ahead)]
             tries = [(start, self._method) for start in starts]
             climbs = self._may_climb()
-            if climbs and self._automatic and self._condensed and self._rate is None:
+            cold = self._rate is None and ahead > 0.0  # and no later round of multipliers
+            if climbs and cold and self._automatic and self._condensed:
                 # From nothing, Newton's method on the stiff problem often gives up first.
                 tries = [(starts[0], _LAST_RESORT)]
             elif climbs:
