@@ -157,7 +157,7 @@ def main() -> None:
     for row in measure(1 if arguments.short else arguments.repeat):
         rows.append(row)
         print(*row.values(), sep="  ", flush=True)
-    title = "The three methods on three scenes with friction"
+    title = "Four methods on three scenes with friction"
     timing.write(arguments.output, "methods", title, rows)
 
 
