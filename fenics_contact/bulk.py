@@ -62,7 +62,8 @@ class Bulk:
         self.tangent_form = ufl.algorithms.expand_derivatives(derivative)
         self.linear = u not in self.tangent_form.coefficients()
         kinds = dict.fromkeys(integral.integral_type() for integral in form.integrals())
-        self._parts = [_Part(form, kind, u) for kind in kinds]
+        parts = (_Part(form, kind, u) for kind in kinds)
+        self._parts = [part for part in parts if not part.empty]
         self._compiled_tangent = compat.compile_form(self.tangent_form)
         self.stiffness: PETSc.Mat = fem.petsc.create_matrix(self._compiled_tangent)
         self.symmetric = True
@@ -184,6 +185,7 @@ class _Part:
     def __init__(self, form: ufl.Form, kind: str, u: fem.Function) -> None:
         """Compile. Collective."""
         mine = ufl.Form([i for i in form.integrals() if i.integral_type() == kind])
+        self.empty = ufl.algorithms.expand_derivatives(mine).empty()  # a load that is 0 in UFL
         still = ufl.replace(mine, {u: ufl.zero(u.ufl_shape)})
         self._vanishes = ufl.algorithms.expand_derivatives(still).empty()
         self._compiled = compat.compile_form(mine)

@@ -57,6 +57,23 @@ def test_the_good_scene_is_solved():
     assert step.contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
 
 
+def test_a_load_that_is_zero_in_ufl():
+    """Its integral is empty, and the only one over its kind of facets: no load, no error.
+
+    The top moves down by 1e-3 of a height of 1, held aside at x = 0 and free at the other side:
+    plane strain and a penalty of 1e4 in series, 1/(1/k_n + (1 - ν²)/E), to the solver's 1e-9.
+    """
+    scene = block("quadrilateral", 1, **MESH)
+    v = ufl.TestFunction(scene.u.function_space)
+    F = ufl.inner(stress(scene.u, scene.E, scene.nu), strain(v)) * ufl.dx
+    F -= 0 * v[0] * ufl.ds(scene.mesh, subdomain_data=scene.tags)(TOP)
+    bcs = [*scene.rollers(), scene.hold(TOP, 1, -1e-3)]
+    contact = scene.contact(fc.Frictionless(k_n=1e4))
+    step = fc.ContactProblem(F, scene.u, bcs=bcs, contacts=[contact]).solve()
+    exact = 1e-3 / (1e-4 + (1 - 0.3**2) / 1000)
+    assert step.contacts["contact"].normal_force == pytest.approx(exact, rel=1e-8)
+
+
 # ---- parameters of the law -----------------------------------------------------------------------
 
 BAD_NUMBERS = [
