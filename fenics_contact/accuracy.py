@@ -27,7 +27,7 @@ PRESETS = {"draft": 5e-2, "standard": 1e-2, "fine": 1e-3}
 _PENALTY_ERROR, _INCREMENT_ERROR = 0.5, 0.14
 _SOFTEST, _STIFFEST = 3.0, 10.0
 # Shares of the error wanted: what multipliers leave of the penalty's, and the solver.
-_LEFT, _SHARE = 0.5, 0.01
+_LEFT, _SHARE = 0.2, 0.01
 
 
 @dataclass(frozen=True)
