@@ -109,7 +109,11 @@ def test_two_bodies(cell, method):
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_units(method):
-    """The same iterations and digits in other units, 1e-9 of the field."""
+    """The same iterations and digits in other units, 1e-9 of the field.
+
+    On several ranks the iterations to a tenth: equal meshes may be distributed differently, and the
+    smoother is that of each rank.
+    """
     found = []
     for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1e9)]:
         made = rub(
@@ -124,7 +128,7 @@ def test_units(method):
         steps = walk(made, length, PATH[:2])
         found.append(([s.iterations for s in steps], nodal(made.scene.u) / length))
     for iterations, u in found[1:]:
-        assert iterations == found[0][0]
+        assert iterations == pytest.approx(found[0][0], rel=0.1 if COMM.size > 1 else 0.0)
         assert close(u, found[0][1], 1e-9)
 
 
