@@ -72,18 +72,11 @@ class Alternation:
         self._problem = weakref.proxy(problem)
         self._function: PETSc.Vec | None = None
         self._shares_solver = not solver
-        self.snes = self._make_snes(f"{problem.prefix}alternating_", OPTIONS | solver, defaults)
-        self._finish = self._make_snes(f"{problem.prefix}finishing_", _FINISH | solver, defaults)
+        comm, prefix = problem.u.function_space.mesh.comm, problem.prefix
+        self.snes = defaults.make_snes(comm, f"{prefix}alternating_", OPTIONS | solver)
+        self._finish = defaults.make_snes(comm, f"{prefix}finishing_", _FINISH | solver)
         self._callbacks = Callbacks()
         self._goal = 0.0
-
-    def _make_snes(self, prefix: str, options: dict[str, Any], defaults: Defaults) -> PETSc.SNES:
-        snes = PETSc.SNES().create(self._problem.u.function_space.mesh.comm)
-        snes.setOptionsPrefix(prefix)
-        defaults.set(options, prefix)
-        with defaults.present():
-            snes.setFromOptions()
-        return snes
 
     def _attach(self) -> None:
         """Take the vectors, matrices and solver of H₀ of the problem's present space."""

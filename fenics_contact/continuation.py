@@ -59,13 +59,9 @@ class Continuation:
         """
         self._problem = weakref.proxy(problem)
         self._function: PETSc.Vec | None = None
-        prefix = f"{problem.prefix}continuation_"
-        self.snes = PETSc.SNES().create(problem.u.function_space.mesh.comm)
-        self.snes.setOptionsPrefix(prefix)
+        comm, prefix = problem.u.function_space.mesh.comm, f"{problem.prefix}continuation_"
+        self.snes = defaults.make_snes(comm, prefix, OPTIONS | solver)
         self._shares_solver = not solver
-        defaults.set(OPTIONS | solver, prefix)
-        with defaults.present():
-            self.snes.setFromOptions()
         self._callbacks = Callbacks()
         self._coarse = 0.0
 

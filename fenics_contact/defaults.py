@@ -35,6 +35,15 @@ class Defaults:
         database = PETSc.Options()
         return database.getString(name) if database.hasName(name) else self._values.get(name)
 
+    def make_snes(self, comm: Any, prefix: str, options: Mapping[str, Any]) -> PETSc.SNES:
+        """A solver with a prefix and these options where nothing has set them. Collective."""
+        snes = PETSc.SNES().create(comm)
+        snes.setOptionsPrefix(prefix)
+        self.set(options, prefix)
+        with self.present():
+            snes.setFromOptions()
+        return snes
+
     @contextmanager
     def present(self) -> Iterator[None]:
         """Have the options in the database inside the block."""

@@ -222,20 +222,18 @@ class _Springs:
     """A contact's springs at the present state, linearised with their status as it is.
 
     Attributes:
-        traction: On the body, (n_points, gdim) (stress).
         stiffness: What the traction loses per displacement, (n_points, gdim, gdim).
         stretch: Displacement that is in the springs because their stiffness stands for none at
             all, as far as displacements of Γc can answer it, (n_points, gdim) (length).
     """
 
-    traction: Array
     stiffness: Array
     stretch: Array
 
     @classmethod
     def of(cls, contact: Contact) -> _Springs:
         law, values, status = contact.law, contact.values, contact.status
-        normal, traction = values["normal"], contact.traction
+        normal = values["normal"]
         tangential, pressure = contact.tangential_traction, contact.pressure
         closed = status != Status.OPEN
         d = normal.shape[1]
@@ -258,7 +256,7 @@ class _Springs:
             along = np.einsum("q,qi,qj->qij", values["parameter k_t"], normal, normal)
             side = borne - np.sum(borne * normal, axis=1)[:, None] * normal
             stretch -= np.linalg.solve(k_t + along, side[:, :, None])[:, :, 0]
-        return cls(traction, stiffness, stretch)
+        return cls(stiffness, stretch)
 
     def change(self, jump: Array) -> Array:
         """Of the traction, by a change of the relative displacement, (n_points, gdim)."""
@@ -272,18 +270,19 @@ def _linear_parts(
     contacts = problem.contacts
     springs = [_Springs.of(contact) for contact in contacts]
     found = {}
-    with problem.linearised([s.stiffness for s in springs]) as solve:
-        way = solve(None)
-        jumps = [contact.at_points(way) for contact in contacts]
+
+    def differences(way: Array, shifts: list[Array]) -> dict[str, float]:
+        jumps = [shift + c.at_points(way) for c, shift in zip(contacts, shifts, strict=True)]
         changes = [s.change(jump) for s, jump in zip(springs, jumps, strict=True)]
-        found["solver"] = _differences(problem, values, changes, way)
+        return _differences(problem, values, changes, way)
+
+    with problem.linearised([s.stiffness for s in springs]) as solve:
+        found["solver"] = differences(solve(None), [np.zeros_like(s.stretch) for s in springs])
         # The springs' rest lengths follow what they carry: a round of augmented enforcement.
         # It leaves 1/(1 + k_n h/E) of the error in the shortest waves and far less in the long ones
         # that forces are made of.
         way = solve([s.change(s.stretch) for s in springs])
-        jumps = [s.stretch + c.at_points(way) for c, s in zip(contacts, springs, strict=True)]
-        changes = [s.change(jump) for s, jump in zip(springs, jumps, strict=True)]
-    found["enforcement"] = _differences(problem, values, changes, way)
+        found["enforcement"] = differences(way, [s.stretch for s in springs])
     return found
 
 
@@ -295,8 +294,8 @@ def _differences(
     after: dict[str, float] = {}
     for contact, change in zip(problem.contacts, changes, strict=True):
         normal, measure = contact.values["normal"], contact.measure
-        pressure = contact.pressure - np.sum(change * normal, axis=1)
-        side = change - np.sum(change * normal, axis=1)[:, None] * normal
+        along = np.sum(change * normal, axis=1)
+        pressure, side = contact.pressure - along, change - along[:, None] * normal
         friction = np.linalg.norm(contact.tangential_traction + side, axis=1)
         if contact.law.has_friction:
             friction = np.minimum(friction, _limit(contact, pressure))
