@@ -1,72 +1,178 @@
 """What contact costs in units of one linear solve: the yardsticks, and the study of a scene.
 
 The yardsticks are what a user of DOLFINx writes: one linear solve, and a penalty form with Newton's
-method (SNES ``newtonls``, the consistent tangent, MUMPS' LU in every step).
+method (SNES ``newtonls``, the consistent tangent), every step by MUMPS' LU or by GMRES with GAMG.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any
 
 import dolfinx.fem.petsc  # noqa: F401
+import scenes
 import timing
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
+from fenics_contact import linear
+from fenics_contact.surface import PointEvaluator
 
 YARDSTICK = "one linear solve"
+PLAIN = {"direct": "plain DOLFINx, LU", "multigrid": "plain DOLFINx, GMRES + GAMG"}
+# What residuals may have of the forces, for all; the package's default.
+TOLERANCE = 1e-9
+# Runs that take longer are not repeated (s).
+ONCE = 30.0
 Row = timing.Row
 
+_FORWARD = (PETSc.InsertMode.INSERT, PETSc.ScatterMode.FORWARD)
+_REVERSE = (PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
 
-class Scene(Protocol):
-    """A body and its contact, of some size.
+
+@dataclass(frozen=True)
+class Case:
+    """A body of some size, and all that is done to it.
 
     Attributes:
-        n_dofs, n_contact_dofs: Unknowns, and those of Γc.
+        body: The body.
+        degree: Of the displacement.
+        stiffness: k_n = k_t in units of E/h.
+        errors: Makes the columns that tell the accuracy, of friction, number of increments and
+            the results "u", "peak" and "force"; nothing by default.
     """
 
-    n_dofs: int
-    n_contact_dofs: int
+    body: scenes.Body
+    degree: int
+    stiffness: float
+    errors: Callable[[float, int, Row], Row] = lambda friction, steps, results: {}
 
-    def linear(self) -> Row:
-        """One linear solve of the body, glued to what it touches."""
+    @cached_property
+    def _space(self) -> fem.FunctionSpace:
+        return scenes.parts(self.body, self.degree)[0].function_space
 
-    def plain(self, friction: float) -> Row:
-        """By a penalty form of one's own, the load in one increment."""
+    @property
+    def n_dofs(self) -> int:
+        """Unknowns."""
+        return scenes.count(self._space)
 
-    def package(self, friction: float, steps: int, field: str, **options: Any) -> Row:
-        """By `fenics_contact`."""
+    @property
+    def n_contact_dofs(self) -> int:
+        """Unknowns of Γc. Collective."""
+        return scenes.count_on(self._space, self.body.tags.find(self.body.surface))
+
+    def linear(self, kind: str = "direct") -> Row:
+        """One linear solve of the body; see `linear_solve`."""
+        return linear_solve(self.body, self.degree, kind)
+
+    def plain(self, friction: float, kind: str = "direct") -> Row:
+        """By a penalty form of one's own, the load in one increment; see `newton`."""
+        body = replace(self.body, friction=friction)
+        u, F, load, bcs = scenes.parts(body, self.degree)
+        load.value = body.end
+        pressure, traction = scenes.penalty(body, u, load, self.stiffness)
+        # The points that the package takes, so that results are the same to all digits.
+        points = {"quadrature_degree": 2 * self.degree}
+        ds = ufl.Measure("ds", body.mesh, subdomain_data=body.tags, metadata=points)(body.surface)
+        F -= ufl.dot(traction, ufl.TestFunction(u.function_space)) * ds
+        if body.push:
+            for i, value in enumerate(body.push):
+                u.x.array[i :: len(u)] = value
+        fem.set_bc(u.x.array, bcs)
+        row = newton(F, u, bcs, body.force / self.n_contact_dofs**0.5, kind)
+        if row["iterations"] == "none":
+            return row
+        force = fem.assemble_scalar(fem.form(pressure * ds))
+        results = {"u": body.displacement(u), "force": body.mesh.comm.allreduce(force)}
+        rule = fc.ContactSurface(body.mesh, body.tags, body.surface).quadrature(self.degree)
+        values = PointEvaluator(rule, {"pressure": pressure})()["pressure"]
+        results["peak"] = body.mesh.comm.allreduce(values.max(initial=0.0), op=MPI.MAX)
+        return row | results | self.errors(friction, 1, results)
+
+    def package(self, friction: float, steps: int = 1, field: str = "last", **options: Any) -> Row:
+        """By `fenics_contact`; ``options`` are those of its problem."""
+        body = replace(self.body, friction=friction)
+        problem, contact, u, load = scenes.problem(body, self.degree, self.stiffness, **options)
+        try:
+            made = list(
+                fc.increments(problem, load, 0.0, body.end, steps=steps, field=field, max_cuts=0)
+            )
+        except fc.NotConverged:
+            return {"iterations": "none", "factorisations": ""}
+        way = "condensed" if problem._condensed else problem._whole.linear_kind
+        found = contact.resultants()
+        results = {
+            "u": body.displacement(u),
+            "force": found.normal_force,
+            "peak": found.max_pressure,
+        }
+        row: Row = {
+            "way": f"{made[-1].method}, {way}",
+            "iterations": sum(step.iterations for step in made),
+            "factorisations": sum(step.factorisations for step in made),
+        }
+        return row | results | self.errors(friction, steps, results)
 
 
-def linear_solve(a: ufl.Form, L: ufl.Form, bcs: Sequence[fem.DirichletBC], u: fem.Function) -> Row:
-    """Assemble, factor, solve; by Cholesky's method, half of the work of LU."""
-    bilinear, linear = fem.form(a), fem.form(L)
+def linear_solve(body: scenes.Body, degree: int, kind: str = "direct") -> Row:
+    """The unit of time: a body with Γc held or pressed, assembled and solved. Collective.
+
+    Args:
+        body: The body.
+        degree: Of the displacement.
+        kind: "direct": MUMPS' Cholesky factorisation, half of the work of LU; "multigrid":
+            conjugate gradients with GAMG, to `TOLERANCE`.
+    """
+    u, residual, load, bcs = scenes.parts(body, degree)
+    load.value = body.end
+    if body.pressed:
+        residual -= body.pressed(ufl.TestFunction(u.function_space), body.ds)
+    bcs += [scenes.hold(u, body.tags, i, tag) for tag in body.glued for i in range(len(u))]
+    bilinear = fem.form(ufl.derivative(residual, u))
     matrix = fem.petsc.assemble_matrix(bilinear, bcs)
     matrix.assemble()
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-    b = fem.petsc.assemble_vector(linear)
-    fem.petsc.apply_lifting(b, [bilinear], [bcs])
-    b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+    b = fem.petsc.assemble_vector(fem.form(-residual))
+    b.ghostUpdate(*_REVERSE)
     fem.petsc.set_bc(b, bcs)
+    options = linear.options(kind, symmetric=True, accurate=True)
+    if kind == "multigrid":
+        matrix.setNearNullSpace(linear.near_nullspace(u.function_space))
+        options |= {"ksp_rtol": TOLERANCE}
     ksp = PETSc.KSP().create(matrix.comm)
     ksp.setOperators(matrix)
-    _direct(ksp, "cholesky")
+    _configure(ksp, "yardstick_", options)
     ksp.solve(b, u.x.petsc_vec)
-    return {"iterations": 1, "factorisations": 1}
+    reason, iterations = ksp.getConvergedReason(), ksp.getIterationNumber()
+    for made in (ksp, matrix, b):
+        made.destroy()
+    if reason <= 0:
+        raise RuntimeError(f"the linear solve did not converge: {reason}")
+    return {"iterations": iterations, "factorisations": int(kind == "direct")}
 
 
-def newton(F: ufl.Form, u: fem.Function, bcs: Sequence[fem.DirichletBC], size: float) -> Row:
-    """Newton's method on a form with contact in it, from the present u.
+def newton(
+    F: ufl.Form,
+    u: fem.Function,
+    bcs: Sequence[fem.DirichletBC],
+    size: float,
+    kind: str = "direct",
+) -> Row:
+    """Newton's method on a form with contact in it, from the present u. Collective.
 
     Args:
         F: Residual.
         u: Displacement.
         bcs: Conditions that u meets.
-        size: Of the forces; the residual gets 1e-9 of it, as in the package.
+        size: Of the forces; the residual gets `TOLERANCE` of it, as in the package.
+        kind: "direct": LU by MUMPS; "multigrid": GMRES with GAMG, told of the rigid motions, to
+            PETSc's default of 1e-5 of the residual.
     """
     residual = fem.form(F)
     tangent = fem.form(ufl.derivative(F, u, ufl.TrialFunction(u.function_space)))
@@ -74,9 +180,11 @@ def newton(F: ufl.Form, u: fem.Function, bcs: Sequence[fem.DirichletBC], size: f
 
     def assemble_residual(snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
         x.copy(u.x.petsc_vec)
+        u.x.petsc_vec.ghostUpdate(*_FORWARD)
         with f.localForm() as local:
             local.set(0.0)
         fem.petsc.assemble_vector(f, residual)
+        f.ghostUpdate(*_REVERSE)
         fem.petsc.set_bc(f, bcs, x, alpha=-1.0)
 
     def assemble_tangent(snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
@@ -88,83 +196,81 @@ def newton(F: ufl.Form, u: fem.Function, bcs: Sequence[fem.DirichletBC], size: f
     snes.setType("newtonls")
     snes.setFunction(assemble_residual, b)
     snes.setJacobian(assemble_tangent, matrix)
-    snes.setTolerances(rtol=0.0, atol=1e-9 * size, stol=0.0, max_it=60)
-    snes.setOptionsPrefix("plain_")
-    PETSc.Options().setValue("plain_snes_linesearch_type", "basic")  # `bt` often fails in contact
-    snes.setFromOptions()
-    _direct(snes.ksp, "lu")
+    snes.setTolerances(rtol=0.0, atol=TOLERANCE * size, stol=0.0, max_it=60)
+    options = {"snes_linesearch_type": "basic"}  # `bt` often fails in contact
+    if kind == "multigrid":
+        matrix.setNearNullSpace(linear.near_nullspace(u.function_space))
+        # The quickest of what was tried: smoothing by Jacobi needs twice the iterations, each
+        # half the work; tolerances that follow the residual do not converge with contact.
+        options |= {"ksp_type": "gmres", "pc_type": "gamg", "mg_levels_pc_type": "sor"}
+    else:
+        options |= {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
+    _configure(snes, "plain_", options)
     x = u.x.petsc_vec.copy()
     snes.solve(None, x)
-    if snes.getConvergedReason() <= 0:
-        return {"iterations": "none", "factorisations": snes.getIterationNumber()}
-    return {"iterations": snes.getIterationNumber(), "factorisations": snes.getIterationNumber()}
+    assemble_residual(snes, x, b)
+    iterations, linear_iterations = snes.getIterationNumber(), snes.getLinearSolveIterations()
+    done = snes.getConvergedReason() > 0
+    for made in (snes, matrix, b, x):
+        made.destroy()
+    row: Row = {"iterations": iterations if done else "none", "factorisations": iterations}
+    if kind == "multigrid":
+        row |= {"factorisations": 0, "linear iterations": linear_iterations}
+    return row
 
 
-def _direct(ksp: PETSc.KSP, kind: str) -> None:
-    ksp.setType("preonly")
-    ksp.pc.setType(kind)
-    ksp.pc.setFactorSolverType("mumps")
-
-
-def contact_dofs(space: fem.FunctionSpace, facets: Any) -> int:
-    """Number of dofs on facets, on one rank."""
-    tdim = space.mesh.topology.dim
-    found = fem.locate_dofs_topological(space, tdim - 1, facets)
-    return int(found.size * space.dofmap.bs)
-
-
-def increments(problem: fc.ContactProblem, load: Any, end: float, steps: int, field: str) -> Row:
-    """Lead the load to its end."""
-    try:
-        made = list(fc.increments(problem, load, 0.0, end, steps=steps, field=field, max_cuts=0))
-    except fc.NotConverged:
-        return {"iterations": "none", "factorisations": ""}
-    return {
-        "iterations": sum(step.iterations for step in made),
-        "factorisations": sum(step.factorisations for step in made),
-    }
+def _configure(solver: PETSc.KSP | PETSc.SNES, prefix: str, options: Mapping[str, Any]) -> None:
+    """Give a solver options, and whatever else the command line has under the prefix."""
+    database = PETSc.Options(prefix)
+    mine = {name: value for name, value in options.items() if not database.hasName(name)}
+    for name, value in mine.items():
+        database[name] = value
+    solver.setOptionsPrefix(prefix)
+    solver.setFromOptions()
+    if isinstance(solver, PETSc.KSP):
+        solver.setUp()
+    for name in mine:
+        database.delValue(name)
 
 
 def runs(
-    scene: Scene, frictions: Sequence[float], histories: Sequence[int], *, all_unknowns: bool
+    case: Case, frictions: Sequence[float], histories: Sequence[int], *, all_unknowns: bool
 ) -> dict[str, Callable[[], Row]]:
     """What to time, by name.
 
     Args:
-        scene: The scene.
+        case: The scene.
         frictions: Coefficients.
         histories: Numbers of increments, of the cases with friction.
         all_unknowns: Whether histories are done on all unknowns, too, which takes minutes.
     """
-    found: dict[str, Callable[[], Row]] = {YARDSTICK: scene.linear}
+    found: dict[str, Callable[[], Row]] = {YARDSTICK: case.linear}
     ways: dict[str, dict[str, Any]] = {
-        "condensed": {"condensation": True},
+        "by default": {},
         "condensed, L-BFGS": {"condensation": True, "method": "lbfgs"},
         "all unknowns, L-BFGS": {"condensation": False, "method": "lbfgs"},
     }
     for friction in frictions:
-        case = f"μ = {friction:g}"
-        found[f"{case}: plain DOLFINx"] = lambda f=friction: scene.plain(f)
+        name = f"μ = {friction:g}"
+        found[f"{name}: {PLAIN['direct']}"] = partial(case.plain, friction)
         for steps in histories if friction else [1]:
             for way, options in ways.items():
-                if steps > 1 and not options["condensation"] and not all_unknowns:
+                whole = not options.get("condensation", True)
+                if steps > 1 and whole and not all_unknowns:
                     continue
                 fields = ("last",) if steps == 1 or "method" in options else ("last", "every")
                 for field in fields:
-                    name = f"{case}, {steps} increments: {way}"
-                    if field == "every":
-                        name += ", every field"
-                    found[name] = lambda f=friction, s=steps, w=field, o=options: scene.package(
-                        f, s, w, **o
-                    )
+                    run = f"{name}, {steps} increments: {way}"
+                    run += ", every field" if field == "every" else ""
+                    found[run] = partial(case.package, friction, steps, field, **options)
     return found
 
 
 def study(
     name: str,
     title: str,
-    scenes: Mapping[str, Callable[[], Scene]],
-    choose: Callable[[Scene], dict[str, Callable[[], Row]]],
+    cases: Mapping[str, Callable[[], Case]],
+    choose: Callable[[Case], dict[str, Callable[[], Row]]],
     arguments: argparse.Namespace,
 ) -> None:
     """Time the runs of a scene in its sizes; write tables and plots.
@@ -172,25 +278,27 @@ def study(
     Args:
         name: Of the files.
         title: Of the tables.
-        scenes: Make the scene in its sizes, smallest first; by the name of the size. The table
+        cases: Make the scene in its sizes, smallest first; by the name of the size. The table
             is of the last.
         choose: The runs of a scene.
         arguments: Those of `timing.parser`.
     """
     everything: list[Row] = []
     waits: dict[str, float] = {}  # of the smallest scene, which compiles the forms
-    for size, make in scenes.items():
-        scene = make()
-        chosen = choose(scene)
-        rows = timing.measure(chosen, repeat=arguments.repeat, first=None if waits else chosen)
+    for size, make in cases.items():
+        case = make()
+        chosen = choose(case)
+        rows = timing.measure(
+            chosen, repeat=arguments.repeat, first=None if waits else chosen, once=ONCE
+        )
         waits = waits or {row["run"]: row.pop("first use [s]") for row in rows}
         rows = timing.in_units_of(rows, YARDSTICK, "linear solves")
-        if size == list(scenes)[-1]:
+        if size == list(cases)[-1]:
             rows = [row | {"first use [s]": waits[row["run"]]} for row in rows]
-            heading = f"{title}: {scene.n_dofs} dofs, {scene.n_contact_dofs} of the contact surface"
-            heading += f", medians of {arguments.repeat}"
+            heading = f"{title}: {case.n_dofs} dofs, {case.n_contact_dofs} of the contact surface"
+            heading += f", medians of {arguments.repeat} (of one, beyond {ONCE:g} s)"
             timing.write(arguments.output, name, heading, rows)
-        sizes = {"size": size, "dofs": scene.n_dofs, "contact dofs": scene.n_contact_dofs}
+        sizes = {"size": size, "dofs": case.n_dofs, "contact dofs": case.n_contact_dofs}
         everything += [sizes | row for row in rows]
     columns = ("dofs", "contact dofs", "run", "iterations", "seconds", "linear solves")
     short = [{column: row[column] for column in columns} for row in everything]

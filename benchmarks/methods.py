@@ -19,6 +19,8 @@ from pathlib import Path
 
 import dolfinx
 import numpy as np
+import scenes
+import timing
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
@@ -26,9 +28,7 @@ from mpi4py import MPI
 import fenics_contact as fc
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
-import hertz
 import ironing
-import timing
 
 METHODS = ("lbfgs", "newton", "continuation", "alternating")
 STIFFNESSES = (10.0, 1000.0)
@@ -37,23 +37,11 @@ Loading = tuple[fc.ContactProblem, Callable[[float], None], int]
 
 def half_cylinder(method: str, stiffness: float) -> Loading:
     """The paper's first example, quadratic triangles."""
-    mesh, tags = hertz.make_mesh(0.1, 1.3 * hertz.hertz(hertz.PAPER_LOAD)[0])
-    V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
-    u, v = fem.Function(V), ufl.TestFunction(V)
-    pressure = fem.Constant(mesh, 0.0)
-    ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
-    body = fc.elasticity.LinearElastic(u, hertz.E, hertz.NU, "plane strain")
-    F = body.residual(v) + pressure * v[1] * ds(hertz.TOP)
-    axis = fem.locate_dofs_topological(V.sub(0), 1, tags.find(hertz.AXIS))
-    bcs = [fem.dirichletbc(0.0, axis, V.sub(0))]
-    k = fc.Scaled(stiffness)
-    floor = fc.HalfSpace((0, 0), (0, 1))
-    surface = fc.ContactSurface(mesh, tags, hertz.CONTACT)
-    contact = fc.Contact(u, surface, floor, fc.Coulomb(0.2, k, k))
-    problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method=method, fallback=False)
+    body = scenes.half_cylinder(0.2, 0.1)
+    problem, _, _, pressure = scenes.problem(body, 2, stiffness, method=method, fallback=False)
 
     def load(t: float) -> None:
-        pressure.value = hertz.PAPER_LOAD * t
+        pressure.value = body.end * t
 
     return problem, load, 10
 
@@ -86,14 +74,8 @@ def dragged_ball(method: str, stiffness: float) -> Loading:
     mesh = dolfinx.mesh.create_box(
         MPI.COMM_WORLD, [[-1, -1, -1], [1, 1, 0]], (16, 16, 8), dolfinx.mesh.CellType.hexahedron
     )
-    parts = [
-        dolfinx.mesh.locate_entities_boundary(mesh, 2, lambda x, z=z: np.isclose(x[2], z))
-        for z in (-1.0, 0.0)
-    ]
-    facets = np.concatenate(parts)
-    values = np.repeat(np.array([1, 2], dtype=np.int32), [len(p) for p in parts])
-    order = np.argsort(facets)
-    tags = dolfinx.mesh.meshtags(mesh, 2, facets[order], values[order])
+    ends = {1: lambda x: np.isclose(x[2], -1), 2: lambda x: np.isclose(x[2], 0)}
+    tags = scenes.sides(mesh, ends)
     V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
     u, v = fem.Function(V), ufl.TestFunction(V)
     body = fc.elasticity.LinearElastic(u, 1000.0, 0.3, "3D")

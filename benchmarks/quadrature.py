@@ -14,21 +14,15 @@ Writes tables, CSV files, and plots of the pressure's error against h.
 
 from __future__ import annotations
 
-import sys
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import ufl
-from dolfinx import fem
+import scenes
+import timing
 from mpi4py import MPI
 
 import fenics_contact as fc
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
-import hertz
-import timing
 
 ENFORCEMENTS: dict[str, tuple[float, str]] = {
     "penalty 10": (10.0, "penalty"),
@@ -38,33 +32,14 @@ ENFORCEMENTS: dict[str, tuple[float, str]] = {
 MIDDLE = 0.85 * 2.127  # a of the independent solution
 
 
-@cache
-def make_mesh(h: float) -> Any:
-    """Fine where it touches."""
-    return hertz.make_mesh(h, 1.3 * hertz.hertz(hertz.PAPER_LOAD)[0])
-
-
 def solve(
     h: float, degree: int, stiffness: float, enforcement: str, **rule: Any
 ) -> tuple[fc.Contact, fc.Step]:
     """The half-cylinder under its whole load."""
-    mesh, tags = make_mesh(h)
-    V = fem.functionspace(mesh, ("Lagrange", degree, (2,)))
-    u, v = fem.Function(V), ufl.TestFunction(V)
-    ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
-    body = fc.elasticity.LinearElastic(u, hertz.E, hertz.NU, "plane strain")
-    F = body.residual(v) + hertz.PAPER_LOAD * v[1] * ds(hertz.TOP)
-    axis = fem.locate_dofs_topological(V.sub(0), 1, tags.find(hertz.AXIS))
-    contact = fc.Contact(
-        u,
-        fc.ContactSurface(mesh, tags, hertz.CONTACT, **rule),
-        fc.HalfSpace((0, 0), (0, 1)),
-        fc.Frictionless(fc.Scaled(stiffness)),
-        enforcement=enforcement,
-    )
-    problem = fc.ContactProblem(
-        F, u, bcs=[fem.dirichletbc(0.0, axis, V.sub(0))], contacts=[contact]
-    )
+    body = scenes.half_cylinder(0.0, h)
+    choices = {"enforcement": enforcement}
+    problem, contact, _, load = scenes.problem(body, degree, stiffness, choices=choices, rule=rule)
+    load.value = body.end
     return contact, problem.solve()
 
 

@@ -39,7 +39,9 @@ def parser(documentation: str | None, folder: str) -> argparse.ArgumentParser:
     return made
 
 
-def measure(runs: Runs, *, repeat: int = 3, first: Runs | None = None) -> list[Row]:
+def measure(
+    runs: Runs, *, repeat: int = 3, first: Runs | None = None, once: float = math.inf
+) -> list[Row]:
     """Time runs by name. Collective; times are those of the slowest rank.
 
     Args:
@@ -47,6 +49,7 @@ def measure(runs: Runs, *, repeat: int = 3, first: Runs | None = None) -> list[R
         repeat: How often.
         first: The same names with small problems, each run once before: what that takes is in
             "first use [s]", which is the compilation of the forms if no cache has them.
+        once: Runs that took longer than this are not repeated (s).
 
     Returns:
         One row a run: "run", what the last repetition returned, "seconds" (the median), "spread"
@@ -57,6 +60,8 @@ def measure(runs: Runs, *, repeat: int = 3, first: Runs | None = None) -> list[R
     found: dict[str, Row] = {}
     for _ in range(repeat):
         for name, run in runs.items():
+            if max(times[name], default=0.0) > once:
+                continue
             seconds, found[name] = _timed(run)
             times[name].append(seconds)
     rows = []
@@ -99,17 +104,33 @@ def write(folder: Path, name: str, title: str, rows: Iterable[Row], notes: str =
     if MPI.COMM_WORLD.rank:
         return
     rows = list(rows)
-    columns = list(dict.fromkeys(column for row in rows for column in row))
-    lines = [f"## {title}", "", "| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
-    lines += ["| " + " | ".join(_shown(row.get(c, "")) for c in columns) + " |" for row in rows]
-    text = "\n".join([*lines, *(["", notes] if notes else [])]) + "\n"
+    text = "\n".join([f"## {title}", "", *table(rows), *(["", notes] if notes else [])]) + "\n"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.md").write_text(text)
-    with open(folder / f"{name}.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=columns)
+    save(folder / f"{name}.csv", rows)
+    print(text, flush=True)
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """Lines of a table in Markdown; columns are all those of the rows."""
+    columns = list(dict.fromkeys(column for row in rows for column in row))
+    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
+    return lines + ["| " + " | ".join(_shown(r.get(c, "")) for c in columns) + " |" for r in rows]
+
+
+def save(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows as CSV, with all their digits."""
+    columns = list(dict.fromkeys(column for row in rows for column in row))
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    print(text, flush=True)
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV, as they are written there."""
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def _shown(value: Any) -> str:

@@ -21,33 +21,35 @@ from __future__ import annotations
 
 import csv
 import os
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import dolfinx
+import costs
 import numpy as np
-import ufl
-from dolfinx import fem
+import timing
 from mpi4py import MPI
 from petsc4py import PETSc
+from scenes import (
+    Body,
+    ball_on_half_space,
+    greco,
+    greco_block,
+    half_cylinder,
+    hertz,
+    parts,
+    rings,
+    shrink_fit,
+    sphere,
+)
 from tqdm import tqdm
 
 import fenics_contact as fc
-from fenics_contact import output, plotting
+from fenics_contact import plotting
 from fenics_contact.accuracy import PRESETS
-from fenics_contact.elasticity import LinearElastic
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
-import greco_block
-import hertz
-import shrink_fit
-import sphere
-import timing
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
@@ -110,128 +112,6 @@ COLUMNS = (
 )
 COLUMNS += (*QUANTITIES, *(f"{name}, error" for name in QUANTITIES), "error")
 COLUMNS += ("seconds", "linear solve [s]", "time")
-
-
-@dataclass(frozen=True)
-class Body:
-    """A mesh and what is done to it.
-
-    Attributes:
-        glued: Facets held in the linear solve that is the unit of time.
-        contact: Makes the support, and the gap if it is given apart from the geometry.
-        work: Virtual work of the loads (test function, load parameter, ds).
-        held: Components (component, tag) that do not move.
-        end: Of the load parameter.
-        displacement: The one to compare.
-        history: Whether the result depends on the increments of the load.
-    """
-
-    mesh: dolfinx.mesh.Mesh
-    tags: dolfinx.mesh.MeshTags
-    E: float
-    nu: float
-    kind: str
-    friction: float
-    glued: tuple[int, ...]
-    contact: Callable[[fem.Constant], dict[str, Any]]
-    work: Callable[[Any, fem.Constant, ufl.Measure], Any]
-    held: tuple[tuple[int, int], ...]
-    end: float
-    displacement: Callable[[fem.Function], float]
-    history: bool = False
-
-
-@cache
-def half_cylinder(friction: float, h: float) -> Body:
-    """The paper's; cells away from Γc shrink with those on it."""
-    mesh, tags = hertz.make_mesh(
-        h,
-        1.3 * hertz.hertz(hertz.PAPER_LOAD)[0],
-        grading=min(0.3, 2.5 * h),
-        coarsest=min(hertz.R / 4, 12.5 * h),
-    )
-    return Body(
-        mesh=mesh,
-        tags=tags,
-        E=hertz.E,
-        nu=hertz.NU,
-        kind="plane strain",
-        friction=friction,
-        glued=(hertz.CONTACT,),
-        contact=lambda load: {"support": fc.HalfSpace((0, 0), (0, 1))},
-        work=lambda v, load, ds: -load * v[1] * ds(hertz.TOP),
-        held=((0, hertz.AXIS),),
-        end=hertz.PAPER_LOAD,
-        displacement=lambda u: output.at_node(u, (0.0, hertz.R))[1],
-        history=friction > 0,
-    )
-
-
-@cache
-def block(h: float) -> Body:
-    """The GRECO block."""
-    g = greco_block
-    mesh, tags = g.make_mesh(round(g.SIZE / h))
-    return Body(
-        mesh=mesh,
-        tags=tags,
-        E=g.E,
-        nu=g.NU,
-        kind="plane strain",
-        friction=g.FRICTION,
-        glued=(g.BOTTOM,),
-        contact=lambda load: {"support": fc.HalfSpace((0, 0), (0, 1))},
-        work=lambda v, load, ds: (
-            load * (g.SIDE_PRESSURE * v[0] * ds(g.LEFT) - g.TOP_PRESSURE * v[1] * ds(g.TOP))
-        ),
-        held=((0, g.RIGHT),),
-        end=1.0,
-        displacement=lambda u: 1e3 * output.at_node(u, (0.0, 0.0))[0],
-    )
-
-
-@cache
-def ball_on_block(h: float) -> Body:
-    """A rigid ball moved into an elastic block; the displacement is that below its centre."""
-    depth = 4e-4
-    mesh, tags = sphere.make_mesh("block", np.sqrt(sphere.R * depth), round(1 / h))
-    return Body(
-        mesh=mesh,
-        tags=tags,
-        E=sphere.E,
-        nu=sphere.NU,
-        kind="3D",
-        friction=0.0,
-        glued=(sphere.CONTACT,),
-        contact=lambda load: {
-            "support": fc.Ball((0, 0, sphere.R), sphere.R, displacement=ufl.as_vector([0, 0, load]))
-        },
-        work=lambda v, load, ds: 0 * v[0] * ds(sphere.HELD),
-        held=((0, sphere.AT_X), (1, sphere.AT_Y), *((i, sphere.HELD) for i in range(3))),
-        end=-depth,
-        displacement=lambda u: output.at_node(u, (0.0, 0.0, 0.0))[2],
-    )
-
-
-@cache
-def rings(h: float) -> Body:
-    """The shrink fit, plane strain; the displacement is that of the bore."""
-    s = shrink_fit
-    mesh, tags = s.make_mesh(h)
-    return Body(
-        mesh=mesh,
-        tags=tags,
-        E=s.E,
-        nu=s.NU,
-        kind="plane strain",
-        friction=0.0,
-        glued=(s.SHAFT, s.HUB),
-        contact=lambda load: {"support": fc.DeformableBody(tags, s.HUB), "gap": load},
-        work=lambda v, load, ds: 0 * v[0] * ds(s.SHAFT),
-        held=((1, s.FLAT), (0, s.UPRIGHT)),
-        end=-s.OVERSIZE,
-        displacement=lambda u: output.at_node(u, (s.INNER, 0))[0],
-    )
 
 
 @dataclass(frozen=True)
@@ -299,7 +179,7 @@ def all_scenes() -> dict[str, Scene]:
     made = [
         scene(
             "half-cylinder",
-            partial(half_cylinder, 0.0),
+            partial(half_cylinder, 0.0, smooth=True),
             sizes,
             0.05,
             0.025,
@@ -308,7 +188,7 @@ def all_scenes() -> dict[str, Scene]:
         ),
         scene(
             "half-cylinder μ=0.2",
-            partial(half_cylinder, 0.2),
+            partial(half_cylinder, 0.2, smooth=True),
             sizes,
             0.05,
             0.025,
@@ -318,20 +198,20 @@ def all_scenes() -> dict[str, Scene]:
         ),
         scene(
             "GRECO block",
-            block,
+            lambda h: greco_block(round(greco.SIZE / h)),
             (5.0, 2.5, 1.25),
             1.25,
             40 / 96,
             {
                 "normal force": 2000.0,
-                "friction force": greco_block.SHEAR,
-                "displacement": greco_block.CONVERGED[0],
+                "friction force": greco.SHEAR,
+                "displacement": greco.CONVERGED[0],
             },
             independent,
         ),
         scene(
             "ball on block",
-            ball_on_block,
+            lambda h: ball_on_half_space(round(1 / h)),
             (1 / 3, 1 / 4, 1 / 6),
             1 / 4,
             1 / 9,
@@ -408,46 +288,6 @@ def sweep(one: Scene, short: bool) -> list[Setting]:
 # ---- one run -------------------------------------------------------------------------------------
 
 
-def parts(body: Body, degree: int) -> tuple[fem.Function, ufl.Form, fem.Constant, list[Any]]:
-    """Displacement, residual without contact, load parameter, Dirichlet conditions."""
-    mesh, tags = body.mesh, body.tags
-    V = fem.functionspace(mesh, ("Lagrange", degree, (mesh.geometry.dim,)))
-    u, v = fem.Function(V), ufl.TestFunction(V)
-    load = fem.Constant(mesh, PETSc.ScalarType(0.0))
-    ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
-    residual = LinearElastic(u, body.E, body.nu, body.kind).residual(v) - body.work(v, load, ds)
-    return u, residual, load, [hold(u, tags, i, tag) for i, tag in body.held]
-
-
-def hold(u: fem.Function, tags: dolfinx.mesh.MeshTags, component: int, tag: int) -> fem.DirichletBC:
-    """No displacement of one component on a side."""
-    part = u.function_space.sub(component)
-    dofs = fem.locate_dofs_topological(part, tags.dim, tags.find(tag))
-    return fem.dirichletbc(PETSc.ScalarType(0.0), dofs, part)
-
-
-def linear_solve(body: Body, degree: int) -> Row:
-    """The unit of time: the body with Γc held, assembled, factored and solved."""
-    u, residual, load, bcs = parts(body, degree)
-    load.value = body.end
-    bcs += [hold(u, body.tags, i, tag) for tag in body.glued for i in range(len(u))]
-    a = fem.form(ufl.derivative(residual, u))
-    matrix = fem.petsc.assemble_matrix(a, bcs)
-    matrix.assemble()
-    matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-    b = fem.petsc.assemble_vector(fem.form(-residual))
-    fem.petsc.set_bc(b, bcs)
-    ksp = PETSc.KSP().create(body.mesh.comm)
-    ksp.setOperators(matrix)
-    ksp.setType("preonly")
-    ksp.getPC().setType("cholesky")
-    ksp.getPC().setFactorSolverType("mumps")
-    ksp.solve(b, u.x.petsc_vec)
-    for made in (ksp, matrix, b):
-        made.destroy()
-    return {}
-
-
 def solve(body: Body, setting: Setting, limit: float = LIMIT) -> Row:
     """Make the contact problem and lead the load to its end: what its row has, but the time."""
     u, residual, load, bcs = parts(body, setting.degree)
@@ -477,7 +317,7 @@ def solve(body: Body, setting: Setting, limit: float = LIMIT) -> Row:
     try:
         contact = fc.Contact(
             u,
-            fc.ContactSurface(body.mesh, body.tags, body.glued[0], **rule),
+            fc.ContactSurface(body.mesh, body.tags, body.surface, **rule),
             law=law,
             **choices,
             **body.contact(load),
@@ -529,7 +369,7 @@ def timed(one: Scene, setting: Setting, repeat: int, limit: float = LIMIT) -> Ro
     """
     body = one.make(setting.h)
     runs = {
-        "linear": lambda: linear_solve(body, setting.degree),
+        "linear": lambda: costs.linear_solve(body, setting.degree),
         "contact": lambda: solve(body, setting, limit),
     }
     found = []
@@ -627,7 +467,7 @@ def study(scenes: dict[str, Scene], store: Store, repeat: int, short: bool) -> N
                 forms = (one.name, *(getattr(setting, name) for name in COMPILED))
                 if forms not in warm:
                     body = one.make(one.sizes[0])
-                    linear_solve(body, setting.degree)
+                    costs.linear_solve(body, setting.degree)
                     solve(body, replace(setting, increments=min(2, setting.increments)))
                     warm.add(forms)
                 row = timed(one, setting, repeat)

@@ -13,6 +13,10 @@ from running import ROOT, environment
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
+import large
+import parallel
+import run
+import targets
 import timing
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="of one process")
@@ -43,6 +47,107 @@ def test_times_are_medians_in_units_of_a_run(tmp_path: Path) -> None:
     with open(tmp_path / "table.csv", newline="") as file:
         assert [row["run"] for row in csv.DictReader(file)] == ["one", "other"]
     assert "| one |" in (tmp_path / "table.md").read_text()
+
+
+def test_long_runs_are_not_repeated() -> None:
+    """What takes longer than `once` is timed once."""
+    calls: list[str] = []
+    runs = {"long": lambda: calls.append("long") or {}, "other": lambda: calls.append("o") or {}}
+    timing.measure(runs, repeat=3, once=0.0)
+    assert calls == ["long", "o"]
+
+
+def made_up(folder: Path, slower: float) -> None:
+    """CSV files as the benchmarks leave them, with times times ``slower`` for the package's."""
+    cylinder = [
+        {"run": "one linear solve", "iterations": 1, "seconds": 1.0},
+        {"run": "μ = 0: plain DOLFINx, LU", "iterations": 9, "seconds": 9.0},
+        {"run": "μ = 0.2: plain DOLFINx, LU", "iterations": 10, "seconds": 12.0},
+        {"run": "μ = 0, 1 increments: by default", "iterations": 5, "seconds": 0.9 * slower},
+        {"run": "μ = 0.2, 1 increments: by default", "iterations": 6, "seconds": 1.2 * slower},
+        {"run": "μ = 0.2, 40 increments: by default", "iterations": 80, "seconds": 1.9 * slower},
+    ]
+    ball = [
+        {"run": "one linear solve", "iterations": 1, "seconds": 10.0},
+        {"run": "plain DOLFINx, LU", "iterations": 9, "seconds": 150.0},
+        {"run": "plain DOLFINx, GMRES + GAMG", "iterations": 9, "seconds": 48.0},
+        {"run": "by default", "iterations": 11, "seconds": 24.0 * slower, "error of peak [%]": 1.0},
+    ]
+    million = {"dofs": 1_029_000, "ranks": 1, "GiB": 5.4 * slower**2}
+    big = [
+        {"run": "linear, multigrid", "iterations": 30, "seconds": 60.0, **million},
+        {"run": "contact", "iterations": 67, "seconds": 300.0 * slower, **million},
+    ]
+    ranks = [
+        {"run": "contact, multigrid", "dofs": dofs, "ranks": p, "iterations": 50, "seconds": time}
+        for dofs in (46_875, 107_811, 331_776)
+        for p, time in ((1, 10.0), (2, 6.0 * slower))
+    ]
+    for name, rows in (("half_cylinder", cylinder), ("ball", ball), ("large", big)):
+        (folder / name).mkdir(exist_ok=True)
+        timing.save(folder / name / f"{name}.csv", rows)
+    (folder / "parallel").mkdir(exist_ok=True)
+    timing.save(folder / "parallel" / "parallel.csv", ranks)
+
+
+def test_targets(tmp_path: Path) -> None:
+    """All met by made-up times just below them, none by times and memory far above them."""
+    assert {row["met"] for row in targets.table(tmp_path)} == {targets.NOT_MEASURED}
+    made_up(tmp_path, 1.0)
+    rows = targets.table(tmp_path)
+    expected = [0.9, 0.1, 1.2, 0.1, 1.9, 2.4, 0.16, 0.5, 5.0, 5.4, 10 / 6, 10 / 6]
+    assert [row["measured"] for row in rows] == pytest.approx(expected)
+    assert {row["met"] for row in rows} == {"yes"}
+    assert "error of peak [%] 1" in next(r["with"] for r in rows if r["scene"].startswith("ball"))
+    made_up(tmp_path, 2.0)
+    assert {row["met"] for row in targets.table(tmp_path)} == {"no"}
+
+
+def test_failed_run_meets_no_target(tmp_path: Path) -> None:
+    """A method that did not converge is not quick."""
+    made_up(tmp_path, 1.0)
+    path = tmp_path / "ball" / "ball.csv"
+    path.write_text(path.read_text().replace("by default,11", "by default,none"))
+    rows = {row["target"]: row["met"] for row in targets.table(tmp_path)}
+    assert rows["time / one linear solve ≤ 2.5"] == "no"
+
+
+def test_page_keeps_parts_of_earlier_runs(tmp_path: Path) -> None:
+    """What has been run is joined, in order; what has not is left out, failures are told."""
+    stamp = '{"machine": "m", "threads": "1", "date": "d", "seconds": 3, "failed": %d}'
+    for name, failed in (("ball", 0), ("large", 1)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "stamp.json").write_text(stamp % failed)
+        (tmp_path / name / "table.md").write_text(f"the table of {name}\n")
+    (tmp_path / "ball" / "a.png").write_bytes(b"")
+    page = run.page(tmp_path, ["ball", "half_cylinder", "large"], tmp_path.parent)
+    assert "the table of ball" in page and "the table of large" not in page
+    assert "failed with exit code 1" in page and "# half_cylinder" not in page
+    assert f"![]({tmp_path.name}/ball/a.png)" in page
+    assert len(timing.read(tmp_path / "targets.csv")) == len(targets.TARGETS)
+
+
+def test_latency_and_bandwidth_are_fitted() -> None:
+    """Of times that obey the law, exactly (1e-9: conditioning of the least squares)."""
+    sizes = [8.0 * 4**k for k in range(10)]
+    found = parallel.fit_message(sizes, [2e-6 + s / 5e9 for s in sizes])
+    assert found == pytest.approx((2e-6, 5e9), rel=1e-9)
+
+
+def test_model_of_ranks() -> None:
+    """T = bus c n/p I + m α + s/β + r γ log₂ p of given counts; speed-up tends to p with n."""
+    machine = parallel.Machine(alpha=1e-6, beta=1e9, gamma=2e-6, bus=1.25)
+    one = {"run": "a", "dofs": 1000, "ranks": 1, "iterations": 10, "seconds": 0.05}
+    two = {"ranks": 2, "messages": 300.0, "MB sent": 2.0, "reductions": 40.0, "seconds": 0.04}
+    rows = [one, one | two]
+    c = parallel.fit_operations(rows)
+    assert c == pytest.approx(5e-6)
+    assert parallel.predicted(c, one, machine) == pytest.approx(0.05)
+    time = 1.25 * 0.025 + 300e-6 + 2e-3 + 40 * 2e-6
+    assert parallel.predicted(c, one | two, machine) == pytest.approx(time)
+    alone = parallel.Machine(1e-6, 1e9, 2e-6)
+    assert parallel.speed_up(c, rows, 1000, 2, alone) == pytest.approx(0.05 / (time - 0.00625))
+    assert parallel.speed_up(c, rows, 1e12, 64, alone) == pytest.approx(64, rel=0.01)
 
 
 @pytest.mark.slow
@@ -86,7 +191,7 @@ def test_enforcement_and_quadrature_run(tmp_path: Path) -> None:
 def test_large_runs(tmp_path: Path) -> None:
     """On a small block every run ends well, with one force to 1e-6: also the script by hand's."""
     command = [sys.executable, str(ROOT / "benchmarks" / "large.py"), "--cells", "8"]
-    command += ["--repeat", "1", "--output", str(tmp_path)]
+    command += ["--repeat", "1", "--output", str(tmp_path), "--runs", *large.RUNS]
     done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     with open(tmp_path / "large.csv", newline="") as file:
@@ -95,3 +200,17 @@ def test_large_runs(tmp_path: Path) -> None:
     forces = [float(row["force"]) for row in rows.values() if row["force"]]
     assert len(forces) == 6
     assert forces == pytest.approx(forces[:1] * 6, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_parallel_runs(tmp_path: Path) -> None:
+    """Small blocks on one rank and two: Newton's method takes the same number of iterations."""
+    command = [sys.executable, str(ROOT / "benchmarks" / "run.py"), "parallel", "--short"]
+    command += ["--repeat", "1", "--output", str(tmp_path)]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = timing.read(tmp_path / "parallel" / "parallel.csv")
+    newton = [row["iterations"] for row in rows if row["run"] == "contact, multigrid, Newton"]
+    assert newton[::2] == newton[1::2]
+    assert float(rows[1]["messages"]) > 0
+    assert "Where the time goes" in (tmp_path / "README.md").read_text()

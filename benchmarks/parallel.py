@@ -1,0 +1,349 @@
+r"""Two ranks against one, and a model of the cost fitted to them.
+
+The ball on a block of ``large.py`` in several sizes, solved by multigrid on one and on two ranks:
+one linear solve, and contact with friction in one increment by L-BFGS and by Newton's method. What
+a message, a reduction and a byte cost between two processes of this machine is measured apart, and
+so is what two ranks that copy at once leave each other of the memory's bandwidth. With them
+
+    T = c n/p + m (α + s/(m β)) + r γ log₂ p
+
+for each iteration, on p ranks and with n unknowns: c is fitted to one rank's times; m, s and r, the
+messages, bytes and reductions of a rank, are counted by PETSc. The table sets the model beside the
+measured times, and a picture draws it for more ranks.
+
+    OMP_NUM_THREADS=1 python benchmarks/parallel.py            # ten minutes
+    OMP_NUM_THREADS=1 python benchmarks/parallel.py --short
+
+Another table says where the time goes, operation by operation, and what limits two ranks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import large
+import numpy as np
+import timing
+from mpi4py import MPI
+
+from fenics_contact import plotting
+
+RUNS = ("linear, multigrid", "contact, multigrid", "contact, multigrid, Newton")
+CELLS = (24, 32, 47)
+# Neighbours of a part of a body that is cut into many.
+NEIGHBOURS = 6
+Row = timing.Row
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What ranks cost each other.
+
+    Attributes:
+        alpha: Time of an empty message (s).
+        beta: Bytes sent in a second.
+        gamma: Time of a reduction over two ranks (s).
+        bus: Time of a copy in memory while the other rank copies, over that alone.
+    """
+
+    alpha: float
+    beta: float
+    gamma: float
+    bus: float = 1.0
+
+
+# Beyond one machine, in round numbers, one rank to a memory bus.
+NETWORKS = {
+    "fast network": Machine(2e-6, 10e9, 4e-6),
+    "Ethernet": Machine(50e-6, 0.1e9, 100e-6),
+}
+
+
+# ---- the machine ---------------------------------------------------------------------------------
+
+
+def fit_message(sizes: Sequence[float], times: Sequence[float]) -> tuple[float, float]:
+    """α and β of T = α + s/β, by least squares of the relative differences.
+
+    Args:
+        sizes: Bytes.
+        times: Seconds.
+    """
+    t = np.asarray(times)
+    columns = np.column_stack([1 / t, np.asarray(sizes) / t])
+    (alpha, slope), *_ = np.linalg.lstsq(columns, np.ones_like(t), rcond=None)
+    return float(alpha), float(1 / slope)
+
+
+def measure_machine() -> Machine:
+    """On two ranks. Collective."""
+    comm = MPI.COMM_WORLD
+    other = 1 - comm.rank
+    sizes, times = [8 * 4**k for k in range(10)], []
+    for size in sizes:
+        buffer, rounds = np.zeros(size, dtype=np.uint8), []
+        for _ in range(200):
+            comm.Barrier()
+            start = time.perf_counter()
+            if comm.rank == 0:
+                comm.Send(buffer, other)
+                comm.Recv(buffer, other)
+            else:
+                comm.Recv(buffer, other)
+                comm.Send(buffer, other)
+            rounds.append((time.perf_counter() - start) / 2)
+        times.append(statistics.median(rounds))
+    alpha, beta = fit_message(sizes, times)
+    one, sums, waits = np.ones(1), np.empty(1), []
+    for _ in range(5000):
+        start = time.perf_counter()
+        comm.Allreduce(one, sums)
+        waits.append(time.perf_counter() - start)
+    # Copies alone, one rank after the other, and at once.
+    a, b = np.zeros(10_000_000), np.ones(10_000_000)
+    alone = together = 0.0
+    for turn in range(2):
+        comm.Barrier()
+        if comm.rank == turn:
+            alone = _copy(a, b)
+    comm.Barrier()
+    together = _copy(a, b)
+    bus = comm.allreduce(together / alone) / comm.size
+    return Machine(alpha, beta, statistics.median(waits), max(1.0, bus))
+
+
+def _copy(a: np.ndarray, b: np.ndarray) -> float:
+    times = []
+    for _ in range(15):
+        start = time.perf_counter()
+        a[:] = b
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+# ---- the model -----------------------------------------------------------------------------------
+
+
+def predicted(c: float, row: Row, machine: Machine) -> float:
+    """Time by the model, of what a row says of unknowns, iterations and counts.
+
+    Args:
+        c: Time for an unknown in an iteration (s).
+        row: "dofs", "ranks", "iterations"; "messages", "MB sent" and "reductions" of a rank.
+        machine: What ranks cost each other.
+    """
+    p = row["ranks"]
+    work = c * row["dofs"] / p * row["iterations"]
+    if p == 1:
+        return work
+    sent = row["messages"] * machine.alpha + row["MB sent"] * 1e6 / machine.beta
+    return work * machine.bus + sent + row["reductions"] * machine.gamma * np.log2(p)
+
+
+def fit_operations(rows: Sequence[Row]) -> float:
+    """Fit c to the rows on one rank: the geometric mean of time by unknown and iteration (s)."""
+    each = [r["seconds"] / r["dofs"] / r["iterations"] for r in rows if r["ranks"] == 1]
+    return float(np.exp(np.mean(np.log(each))))
+
+
+def on_many(rows: Sequence[Row], dofs: float, ranks: int) -> Row:
+    """Counts of an iteration on many ranks, from those of two.
+
+    On two ranks a body is cut once, through some n^(2/3) unknowns; on many every part has
+    `NEIGHBOURS` cuts through (n/p)^(2/3).
+    """
+    two = [r for r in rows if r["ranks"] == 2]
+    counts = {
+        name: statistics.median(r[name] / r["iterations"] for r in two)
+        for name in ("messages", "reductions")
+    }
+    sent = statistics.median(r["MB sent"] / r["iterations"] / r["dofs"] ** (2 / 3) for r in two)
+    cuts, through = (1, dofs) if ranks == 2 else (NEIGHBOURS, dofs / ranks)
+    return {
+        "dofs": dofs,
+        "ranks": ranks,
+        "iterations": 1,
+        "messages": counts["messages"] * cuts,
+        "MB sent": sent * cuts * through ** (2 / 3),
+        "reductions": counts["reductions"],
+    }
+
+
+def speed_up(c: float, rows: Sequence[Row], dofs: float, ranks: int, machine: Machine) -> float:
+    """By the model."""
+    return c * dofs / predicted(c, on_many(rows, dofs, ranks), machine)
+
+
+# ---- tables --------------------------------------------------------------------------------------
+
+
+def compared(rows: Sequence[Row], machine: Machine) -> list[Row]:
+    """Measured and by the model, two ranks beside one."""
+    found = []
+    for run in dict.fromkeys(row["run"] for row in rows):
+        mine = [row for row in rows if row["run"] == run]
+        c = fit_operations(mine)
+        for row in mine:
+            new: Row = {name: row[name] for name in ("run", "dofs", "ranks", "iterations")}
+            new["seconds"] = row["seconds"]
+            new["model [s]"] = predicted(c, row, machine)
+            if row["ranks"] > 1:
+                new["speed-up"] = row["speed-up"]
+                new["speed-up, model"] = c * row["dofs"] * row["iterations"] / new["model [s]"]
+                waiting = predicted(0.0, row, machine)
+                new["messages and reductions [s]"] = waiting
+            new["GiB per rank"] = row["GiB"] / row["ranks"]
+            new["kB per unknown"] = row["GiB"] * 2**20 / row["dofs"]
+            found.append(new)
+    return found
+
+
+def operations(rows: Sequence[Row]) -> list[Row]:
+    """Where the time of the largest problems goes, and what two ranks make of it."""
+    largest = max(row["dofs"] for row in rows)
+    found = []
+    for run in dict.fromkeys(row["run"] for row in rows):
+        by_ranks = {r["ranks"]: r for r in rows if r["run"] == run and r["dofs"] == largest}
+        if set(by_ranks) != {1, 2}:
+            continue
+        one, two = by_ranks[1], by_ranks[2]
+        times = {name: (one[f"{name} [s]"], two[f"{name} [s]"]) for name in large.EVENTS}
+        times["all"] = one["seconds"], two["seconds"]
+        for name, (t1, t2) in times.items():
+            row: Row = {"run": run, "dofs": largest, "part": name}
+            row |= {"1 rank [s]": t1, "2 ranks [s]": t2, "share": t2 / two["seconds"]}
+            found.append(row | {"speed-up": t1 / t2 if t1 and t2 else float("nan")})
+    return found
+
+
+def counts(rows: Sequence[Row]) -> list[Row]:
+    """What a rank of two does and sends in an iteration."""
+    return [
+        {
+            "run": row["run"],
+            "dofs": row["dofs"],
+            "operations per unknown": row["Gflop"] * 1e9 / row["iterations"] / row["dofs"] * 2,
+            "messages": row["messages"] / row["iterations"],
+            "MB sent": row["MB sent"] / row["iterations"],
+            "reductions": row["reductions"] / row["iterations"],
+        }
+        for row in rows
+        if row["ranks"] == 2
+    ]
+
+
+def beyond(c: float, rows: Sequence[Row], here: Machine) -> list[Row]:
+    """Speed-ups that the model gives on more ranks."""
+    found = []
+    for name, machine in NETWORKS.items():
+        for dofs in (1e6, 1e7):
+            row: Row = {"ranks on": name, "unknowns": f"{dofs:.0e}"}
+            for ranks in (8, 64, 512):
+                row[f"{ranks} ranks"] = speed_up(c, rows, dofs, ranks, machine)
+            found.append(row)
+    return found
+
+
+def draw(path: Path, rows: Sequence[Row], machine: Machine) -> None:
+    """Speed-up over ranks by the model, with what is measured."""
+    mine = [row for row in rows if row["run"] == RUNS[1]]
+    c = fit_operations(mine)
+    ranks = 2 ** np.arange(0, 11)
+    with plotting.figure(path, size=(7.5, 5.0)) as axes:
+        for number, dofs in enumerate((1e5, 1e6, 1e7)):
+            for style, (name, network) in zip("-:", NETWORKS.items(), strict=True):
+                values = [1.0] + [speed_up(c, mine, dofs, p, network) for p in ranks[1:]]
+                label = f"{dofs:.0e} unknowns, {name}"
+                axes.loglog(ranks, values, style, color=f"C{number}", label=label)
+        measured = [row["speed-up"] for row in mine if row["ranks"] == 2]
+        axes.loglog([2] * len(measured), measured, "ko", label="measured, one machine")
+        axes.loglog(ranks, ranks, color="0.7", linewidth=0.8, label="ideal")
+        axes.set(title="Contact by L-BFGS and multigrid, by the model", xlabel="ranks")
+        axes.set_ylabel("speed-up")
+        axes.grid(alpha=0.25, which="both")
+        axes.legend(fontsize=8)
+
+
+def launch_machine() -> Machine:
+    """`measure_machine` in two new processes."""
+    command = ["mpirun", "--oversubscribe", "-n", "2", sys.executable]
+    command += [str(Path(__file__).resolve()), "--machine"]
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
+    done = subprocess.run(command, env=kept, stdout=subprocess.PIPE, text=True, check=True)
+    return Machine(**json.loads(done.stdout.strip().splitlines()[-1]))
+
+
+def report(folder: Path, rows: list[Row], machine: Machine) -> None:
+    """Write the tables and the picture; pure functions of the rows."""
+    c = {run: fit_operations([r for r in rows if r["run"] == run]) for run in RUNS}
+    mine = [row for row in rows if row["run"] == RUNS[1]]
+    note = f"α = {machine.alpha * 1e6:.2g} µs, β = {machine.beta / 1e9:.3g} GB/s, "
+    note += f"γ = {machine.gamma * 1e6:.2g} µs between two ranks of this machine; a copy in memory "
+    note += f"takes {machine.bus:.2f} times as long while the other rank copies, too. c, the time "
+    note += "of an unknown in an iteration on one rank: "
+    note += ", ".join(f"{1e6 * value:.2g} µs ({run})" for run, value in c.items()) + "."
+    timing.write(folder, "parallel_1", "Two ranks against one", compared(rows, machine), note)
+    timing.write(
+        folder, "parallel_2", "Where the time goes", operations(rows),
+        "Seconds of the slowest rank in PETSc's operations, which lie partly within each other: "
+        "products and smoothing are also part of the set-up. What is in none of them is the "
+        "assembly of the matrix, the law on Γc and the set-up of forms.",
+    )  # fmt: skip
+    timing.write(
+        folder, "parallel_3", "What a rank does in an iteration, on two ranks", counts(rows)
+    )
+    title = "Speed-up on more ranks by the model, contact by L-BFGS and multigrid"
+    assumed = ", ".join(
+        f"{name}: α = {m.alpha * 1e6:g} µs, β = {m.beta / 1e9:g} GB/s, γ = {m.gamma * 1e6:g} µs"
+        for name, m in NETWORKS.items()
+    )
+    assumed = f"Assumed, {assumed}, one rank to a memory bus, {NEIGHBOURS} neighbours. Coarse "
+    assumed += "levels that leave ranks without work, and imbalance, are not in it."
+    timing.write(folder, "parallel_4", title, beyond(c[RUNS[1]], mine, machine), assumed)
+    draw(folder / "speed_up.png", rows, machine)
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = timing.parser(__doc__, "parallel")
+    parser.add_argument("--cells", type=int, nargs="*", default=list(CELLS))
+    parser.add_argument("--machine", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.machine:
+        machine = measure_machine()
+        if MPI.COMM_WORLD.rank == 0:
+            print(json.dumps(machine.__dict__), flush=True)
+        return
+    rows: list[Row] = []
+    for cells in (8, 10) if arguments.short else arguments.cells:
+        repeat = 1 if 3 * (cells + 1) ** 3 > large.MANY else arguments.repeat
+        some = []
+        for run in RUNS:
+            for ranks in (1, 2):
+                some.append(large.start(run, cells, ranks, repeat))
+                print(
+                    f"{cells} cells, {run}, {ranks} ranks: {some[-1]['seconds']:.3g} s", flush=True
+                )
+        rows += large.in_units(some)
+    failed = [row for row in rows if row["iterations"] in ("none", "failed")]
+    if failed:
+        sys.exit(f"failed: {failed}")
+    machine = launch_machine()
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    timing.save(arguments.output / "parallel.csv", rows)
+    (arguments.output / "machine.json").write_text(json.dumps(machine.__dict__, indent=1) + "\n")
+    report(arguments.output, rows, machine)
+
+
+if __name__ == "__main__":
+    np.seterr(all="ignore")
+    main()

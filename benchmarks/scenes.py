@@ -1,0 +1,385 @@
+"""What the benchmarks solve: bodies, what they touch and how they are loaded.
+
+A `Body` says it all apart from how it is solved: `parts` makes its displacement, residual and
+conditions, `contact` and `problem` what this package needs of it, `penalty` the boundary form that
+a user of DOLFINx would write by hand.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import dolfinx
+import numpy as np
+import scipy.optimize
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import fenics_contact as fc
+from fenics_contact import output
+from fenics_contact.elasticity import LinearElastic
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
+import greco_block as greco
+import hertz
+import shrink_fit
+import sphere
+
+Parts = tuple[fem.Function, ufl.Form, fem.Constant, list[fem.DirichletBC]]
+Sides = Mapping[int, Callable[[np.ndarray], np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Body:
+    """A mesh, what it may touch and what is done to it.
+
+    Attributes:
+        mesh, tags: The mesh and the tags of its facets.
+        E, nu, kind: Of `LinearElastic`.
+        friction: μ.
+        surface: Tag of Γc.
+        held: Components (component, tag) that do not move.
+        end: Of the load parameter.
+        work: Virtual work of the loads (test function, load parameter, ds).
+        contact: Makes the support, and the gap if it is given apart from the geometry, of the load
+            parameter: arguments of `fc.Contact`.
+        displacement: The one to compare.
+        glued: Facets held in a linear solve, the unit of time.
+        pressed: Virtual work of its loads (test function, ds), if not ``work`` at the end.
+        force: That of the contact, about, by which residuals are measured (force).
+        h: Height of the cells at Γc: k = stiffness E/h of forms by hand (length).
+        by_hand: For them, of the place x and the load parameter: normal from the body to the
+            support, gap, and the support's motion (UFL).
+        push: Start of Newton's method by hand, a displacement, where it needs contact to start.
+        history: Whether the result depends on the increments of the load.
+    """
+
+    mesh: dolfinx.mesh.Mesh
+    tags: dolfinx.mesh.MeshTags
+    E: float
+    nu: float
+    kind: str
+    friction: float
+    surface: int
+    held: tuple[tuple[int, int], ...]
+    end: float
+    work: Callable[[Any, Any, ufl.Measure], Any]
+    contact: Callable[[Any], dict[str, Any]]
+    displacement: Callable[[fem.Function], float]
+    glued: tuple[int, ...] = ()
+    pressed: Callable[[Any, ufl.Measure], Any] | None = None
+    force: float = 0.0
+    h: float = 0.0
+    by_hand: Callable[[Any, Any], tuple[Any, Any, Any]] | None = None
+    push: tuple[float, ...] = ()
+    history: bool = False
+
+    @property
+    def ds(self) -> ufl.Measure:
+        """Measure of the boundary, by tag."""
+        return ufl.Measure("ds", domain=self.mesh, subdomain_data=self.tags)
+
+
+# ---- what is made of a body ----------------------------------------------------------------------
+
+
+def parts(body: Body, degree: int) -> Parts:
+    """Displacement, residual without contact, load parameter (0), Dirichlet conditions."""
+    V = fem.functionspace(body.mesh, ("Lagrange", degree, (body.mesh.geometry.dim,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    load = fem.Constant(body.mesh, PETSc.ScalarType(0.0))
+    residual = LinearElastic(u, body.E, body.nu, body.kind).residual(v)
+    residual -= body.work(v, load, body.ds)
+    return u, residual, load, [hold(u, body.tags, i, tag) for i, tag in body.held]
+
+
+def hold(u: fem.Function, tags: dolfinx.mesh.MeshTags, component: int, tag: int) -> fem.DirichletBC:
+    """No displacement of one component on a side."""
+    part = u.function_space.sub(component)
+    dofs = fem.locate_dofs_topological(part, tags.dim, tags.find(tag))
+    return fem.dirichletbc(PETSc.ScalarType(0.0), dofs, part)
+
+
+def law(body: Body, stiffness: float) -> fc.Coulomb | fc.Frictionless:
+    """Coulomb's or none, k_n = k_t = ``stiffness`` E/h."""
+    k = fc.Scaled(stiffness)
+    return fc.Coulomb(body.friction, k_n=k, k_t=k) if body.friction else fc.Frictionless(k_n=k)
+
+
+def problem(
+    body: Body,
+    degree: int,
+    stiffness: float,
+    *,
+    choices: Mapping[str, Any] | None = None,
+    rule: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> tuple[fc.ContactProblem, fc.Contact, fem.Function, fem.Constant]:
+    """The contact problem of this package, its contact, displacement and load parameter (0).
+
+    Args:
+        body: The body.
+        degree: Of the displacement.
+        stiffness: k_n and k_t in units of E/h.
+        choices: More arguments of `fc.Contact`.
+        rule: Of `fc.ContactSurface`.
+        **options: Of `fc.ContactProblem`.
+    """
+    u, residual, load, bcs = parts(body, degree)
+    surface = fc.ContactSurface(body.mesh, body.tags, body.surface, **(rule or {}))
+    contact = fc.Contact(
+        u, surface, law=law(body, stiffness), **(choices or {}), **body.contact(load)
+    )
+    made = fc.ContactProblem(residual, u, bcs=bcs, contacts=[contact], **options)
+    return made, contact, u, load
+
+
+def penalty(body: Body, u: fem.Function, load: Any, stiffness: float) -> tuple[Any, Any]:
+    """Pressure and traction on Γc of a penalty form by hand, in one increment (UFL).
+
+    Args:
+        body: The body.
+        u: Its displacement.
+        load: The load parameter.
+        stiffness: k_n and k_t in units of E/h.
+    """
+    assert body.by_hand is not None
+    k = fem.Constant(body.mesh, stiffness * body.E / body.h)
+    n, gap, motion = body.by_hand(ufl.SpatialCoordinate(body.mesh), load)
+    pressure = k * ufl.max_value(ufl.dot(u, n) - gap, 0.0)
+    if not body.friction:
+        return pressure, -pressure * n
+    jump = u - motion
+    trial = -k * (jump - ufl.dot(jump, n) * n)
+    size = ufl.sqrt(ufl.dot(trial, trial) + 1e-30)
+    limit = fem.Constant(body.mesh, body.friction) * pressure
+    return pressure, -pressure * n + ufl.conditional(ufl.lt(size, limit), 1.0, limit / size) * trial
+
+
+def sides(mesh: dolfinx.mesh.Mesh, where: Sides) -> dolfinx.mesh.MeshTags:
+    """Tags of the facets of the boundary whose nodes lie where it is said. Collective."""
+    dim = mesh.topology.dim - 1
+    mesh.topology.create_entities(dim)
+    found = {t: dolfinx.mesh.locate_entities_boundary(mesh, dim, at) for t, at in where.items()}
+    facets = np.concatenate(list(found.values()))
+    values = np.repeat(np.array(list(found), dtype=np.int32), [len(f) for f in found.values()])
+    # A facet of several sides has the tag of the last.
+    facets, first = np.unique(facets[::-1], return_index=True)
+    return dolfinx.mesh.meshtags(mesh, dim, facets, values[::-1][first])
+
+
+def count(space: fem.FunctionSpace) -> int:
+    """Number of unknowns."""
+    return int(space.dofmap.index_map.size_global * space.dofmap.bs)
+
+
+def count_on(space: fem.FunctionSpace, facets: np.ndarray) -> int:
+    """Number of unknowns on facets. Collective."""
+    found = fem.locate_dofs_topological(space, space.mesh.topology.dim - 1, facets)
+    owned = np.count_nonzero(found < space.dofmap.index_map.size_local)
+    return int(space.mesh.comm.allreduce(owned) * space.dofmap.bs)
+
+
+# ---- in the plane --------------------------------------------------------------------------------
+
+
+@cache
+def half_cylinder(friction: float, h: float, *, smooth: bool = False) -> Body:
+    """The demo's half-cylinder on a plane; ``smooth``: cells away from Γc shrink with those on it.
+
+    Smooth meshes have an error below 1e-6 in the displacement of the top at h = 0.02.
+    """
+    growth = {"grading": min(0.3, 2.5 * h), "coarsest": min(hertz.R / 4, 12.5 * h)}
+    mesh, tags = hertz.make_mesh(
+        h, 1.3 * hertz.hertz(hertz.PAPER_LOAD)[0], **(growth if smooth else {})
+    )
+    return Body(
+        mesh=mesh,
+        tags=tags,
+        E=hertz.E,
+        nu=hertz.NU,
+        kind="plane strain",
+        friction=friction,
+        surface=hertz.CONTACT,
+        glued=(hertz.CONTACT,),
+        held=((0, hertz.AXIS),),
+        end=hertz.PAPER_LOAD,
+        work=lambda v, load, ds: -load * v[1] * ds(hertz.TOP),
+        contact=lambda load: {"support": fc.HalfSpace((0, 0), (0, 1))},
+        displacement=lambda u: float(output.at_node(u, (0.0, hertz.R))[1]),
+        force=hertz.R * hertz.PAPER_LOAD,
+        h=h,
+        by_hand=_plane,
+        # Nothing else holds it.
+        push=(0.0, -0.05),
+        history=friction > 0,
+    )
+
+
+@cache
+def greco_block(cells: int) -> Body:
+    """The demo's GRECO block; the displacement is u_x of the left bottom corner (µm)."""
+    mesh, tags = greco.make_mesh(cells)
+    return Body(
+        mesh=mesh,
+        tags=tags,
+        E=greco.E,
+        nu=greco.NU,
+        kind="plane strain",
+        friction=greco.FRICTION,
+        surface=greco.BOTTOM,
+        glued=(greco.BOTTOM,),
+        held=((0, greco.RIGHT),),
+        end=1.0,
+        work=lambda v, load, ds: (
+            load
+            * (
+                greco.SIDE_PRESSURE * v[0] * ds(greco.LEFT)
+                - greco.TOP_PRESSURE * v[1] * ds(greco.TOP)
+            )
+        ),
+        contact=lambda load: {"support": fc.HalfSpace((0, 0), (0, 1))},
+        displacement=lambda u: 1e3 * float(output.at_node(u, (0.0, 0.0))[0]),
+        force=greco.SIZE * greco.TOP_PRESSURE,
+        h=greco.SIZE / cells,
+        by_hand=_plane,
+        push=(0.0, -0.02),
+    )
+
+
+def _plane(x: Any, load: Any) -> tuple[Any, Any, Any]:
+    """The plane y = 0, at rest."""
+    return ufl.as_vector([0, -1]), x[1], ufl.as_vector([0, 0])
+
+
+@cache
+def rings(h: float) -> Body:
+    """The demo's shrink fit, plane strain; the displacement is that of the bore."""
+    s = shrink_fit
+    mesh, tags = s.make_mesh(h)
+    return Body(
+        mesh=mesh,
+        tags=tags,
+        E=s.E,
+        nu=s.NU,
+        kind="plane strain",
+        friction=0.0,
+        surface=s.SHAFT,
+        held=((1, s.FLAT), (0, s.UPRIGHT)),
+        end=-s.OVERSIZE,
+        work=lambda v, load, ds: 0 * v[0] * ds(s.SHAFT),
+        contact=lambda load: {"support": fc.DeformableBody(tags, s.HUB), "gap": load},
+        displacement=lambda u: float(output.at_node(u, (s.INNER, 0))[0]),
+        glued=(s.SHAFT, s.HUB),
+    )
+
+
+# ---- in space ------------------------------------------------------------------------------------
+
+
+@cache
+def ball_on_half_space(cells: int) -> Body:
+    """The demo's ball on a block of tetrahedra, ``cells`` a contact radius, without friction.
+
+    The displacement is that below the ball's centre.
+    """
+    depth = 4e-4
+    mesh, tags = sphere.make_mesh("block", np.sqrt(sphere.R * depth), cells)
+    return Body(
+        mesh=mesh,
+        tags=tags,
+        E=sphere.E,
+        nu=sphere.NU,
+        kind="3D",
+        friction=0.0,
+        surface=sphere.CONTACT,
+        glued=(sphere.CONTACT,),
+        held=((0, sphere.AT_X), (1, sphere.AT_Y), *((i, sphere.HELD) for i in range(3))),
+        end=-depth,
+        work=lambda v, load, ds: 0 * v[0] * ds(sphere.HELD),
+        contact=lambda load: _ball(sphere.R, load),
+        displacement=lambda u: float(output.at_node(u, (0.0, 0.0, 0.0))[2]),
+    )
+
+
+RADIUS, DEPTH = 8.0, 1.25e-3  # of the ball; a = √(R d) = 0.1, the block's edge is 1
+WIDTH = 0.15  # of Γc
+AT_X, AT_Y, AT_Z, FAR_X, FAR_Y, TOUCHING = range(1, 7)
+
+
+@cache
+def ball_on_block(cells: int, friction: float = 0.3) -> Body:
+    """A rigid ball pressed on a quarter of a block of hexahedra, ``cells`` along each edge.
+
+    Half of the cells of an edge lie on Γc, 1.5 contact radii wide, and are cubes. The far sides
+    are held. The displacement is u_z at the end of Γc on the x axis. Collective.
+    """
+    mesh = dolfinx.mesh.create_unit_cube(
+        MPI.COMM_WORLD, *(cells,) * 3, dolfinx.mesh.CellType.hexahedron
+    )
+    x = mesh.geometry.x
+    x[:] = np.interp(x, np.linspace(0, 1, cells + 1), graded(cells))
+    x[:, 2] *= -1
+    where: dict[int, Any] = {
+        tag: lambda x, i=i, at=at: np.isclose(x[i], at)
+        for tag, i, at in (
+            (AT_X, 0, 0.0),
+            (AT_Y, 1, 0.0),
+            (AT_Z, 2, -1.0),
+            (FAR_X, 0, 1.0),
+            (FAR_Y, 1, 1.0),
+        )
+    }
+    where[TOUCHING] = lambda x: np.isclose(x[2], 0) & (np.max(x[:2], axis=0) < WIDTH + 1e-9)
+    far = [(i, tag) for tag in (AT_Z, FAR_X, FAR_Y) for i in range(3)]
+    return Body(
+        mesh=mesh,
+        tags=sides(mesh, where),
+        E=1.0,
+        nu=0.3,
+        kind="3D",
+        friction=friction,
+        surface=TOUCHING,
+        held=((0, AT_X), (1, AT_Y), *far),
+        end=-DEPTH,
+        work=lambda v, load, ds: 0 * v[2] * ds(TOUCHING),
+        pressed=lambda v, ds: -v[2] * ds(TOUCHING),
+        contact=lambda load: _ball(RADIUS, load),
+        displacement=lambda u: float(output.at_node(u, (WIDTH, 0.0, 0.0))[2]),
+        force=hertz_force() / 4,
+        h=WIDTH / (cells // 2),
+        by_hand=_by_hand_ball,
+    )
+
+
+def hertz_force() -> float:
+    """Of the ball on a half-space like the block, without friction: F = 4/3 E* √R d^(3/2)."""
+    return 4 / 3 / (1 - 0.3**2) * np.sqrt(RADIUS) * DEPTH**1.5
+
+
+def graded(cells: int) -> np.ndarray:
+    """Places of the nodes on an edge: equal cells on Γc, then growing by a constant factor."""
+    near = cells // 2
+    h, away = WIDTH / near, np.arange(1, cells - near + 1)
+    growth = scipy.optimize.brentq(lambda q: h * np.sum(q**away) - (1 - WIDTH), 1.0, 3.0)
+    return np.concatenate([h * np.arange(near + 1), WIDTH + h * np.cumsum(growth**away)])
+
+
+def _ball(radius: float, load: Any) -> dict[str, Any]:
+    """A ball that touches z = 0 at the origin and moves by ``load``."""
+    moved = ufl.as_vector([0, 0, load])
+    return {"support": fc.Ball((0, 0, radius), radius, displacement=moved)}
+
+
+def _by_hand_ball(x: Any, load: Any) -> tuple[Any, Any, Any]:
+    """The same for forms by hand."""
+    arm = ufl.as_vector([0, 0, RADIUS + load]) - x
+    distance = ufl.sqrt(ufl.dot(arm, arm))
+    return arm / distance, distance - RADIUS, ufl.as_vector([0, 0, load])
