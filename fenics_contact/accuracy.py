@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import ceil
 
+import basix
 import dolfinx.fem.petsc
 import numpy as np
+import numpy.typing as npt
 import ufl
 from dolfinx import fem, la
 from petsc4py import PETSc
@@ -113,27 +115,22 @@ def cell_modulus(
     Returns:
         A function, one value per cell (stress).
     """
-    mesh = u.function_space.mesh
-    constants = fem.functionspace(mesh, ("DG", 0))
-    q = ufl.TestFunction(constants)
+    space = u.function_space
     cells = [i for i in bulk_tangent.integrals() if i.integral_type() == "cell"]
-    field = fem.Function(u.function_space)
     test, trial = bulk_tangent.arguments()
-    energy_form = compat.compile_form(ufl.replace(ufl.Form(cells), {test: q * field, trial: field}))
-    volume_form = compat.compile_form(weight * q * ufl.dx(mesh))
-
-    def energy(direction: int) -> np.ndarray:
-        field.interpolate(
-            lambda x: np.vstack(
-                [x[direction] if i == 1 else 0 * x[0] for i in range(mesh.geometry.dim)]
-            )
-        )
-        return _assemble(energy_form)
-
-    volume = _assemble(volume_form)
-    shear, stretch = energy(0) / volume, energy(1) / volume
+    # Both energies and the volume as the components of one form: compiled and assembled at once.
+    three = fem.functionspace(space.mesh, ("DG", 0, (3,)))
+    q = ufl.TestFunction(three)
+    form = weight * q[2] * ufl.dx(space.mesh)
+    x = space.tabulate_dof_coordinates()
+    for direction in range(2):
+        field = fem.Function(space)
+        field.x.array.reshape(len(x), -1)[:, 1] = x[:, direction]
+        form += ufl.replace(ufl.Form(cells), {test: q[direction] * field, trial: field})
+    shear, stretch, volume = _assemble(compat.compile_form(form)).reshape(-1, 3).T
+    shear, stretch = shear / volume, stretch / volume
     isotropic = stretch > 1.2 * shear  # λ > -0.8 G: else no isotropic solid, and E is the stretch's
-    modulus = fem.Function(constants, name="modulus")
+    modulus = fem.Function(fem.functionspace(space.mesh, ("DG", 0)), name="modulus")
     modulus.x.array[:] = stretch
     modulus.x.array[isotropic] = (shear * (3 * stretch - 4 * shear))[isotropic] / (stretch - shear)[
         isotropic
@@ -160,33 +157,45 @@ def modulus_over_height(surface: ContactSurface, modulus: fem.Function) -> fem.F
         ValueError: The modulus is not positive at some facet: the bulk form has no stiffness there.
     """
     mesh, submesh = surface.mesh, surface.submesh
-    cells = modulus.function_space
-    volume = _assemble(compat.compile_form(ufl.TestFunction(cells) * ufl.dx(mesh)))
+    behind = surface.cells_behind()
+    area = _sizes(submesh, np.arange(behind.size, dtype=np.int32))
     # A simplex of height h over a facet of area A has the volume A h / d, a brick A h.
     simplex = mesh.topology.cell_type in (
         dolfinx.mesh.CellType.triangle,
         dolfinx.mesh.CellType.tetrahedron,
     )
-    per_volume = fem.Function(cells)
-    per_volume.x.array[:] = modulus.x.array / ((mesh.topology.dim if simplex else 1) * volume)
-    facets = fem.functionspace(submesh, ("DG", 0))
-    q = ufl.TestFunction(facets)
-    ds = surface.measure(2)
-    # ∫ E/(d V) over the facet is E A/(d V) = E/h.
-    ratio = _assemble(compat.compile_form(per_volume * q * ds, surface.entity_maps))
-    area = _assemble(compat.compile_form(q * ds, surface.entity_maps))
+    height = (mesh.topology.dim if simplex else 1) * _sizes(mesh, behind) / area
+    ratio = modulus.x.array[modulus.function_space.dofmap.list[behind, 0]] / height
     smallest = global_min(mesh.comm, ratio, empty=1.0)
     if not smallest > 0.0:
         raise ValueError(
             f"Young's modulus next to Γc is not positive (smallest E/h: {smallest:g}): check the "
             "modulus, or the bulk form it was measured in; or give k_n and k_t in stress/length"
         )
+    facets = fem.functionspace(submesh, ("DG", 0))
     logarithm, length = fem.Function(facets), fem.Function(facets)
-    logarithm.x.array[:] = np.log(ratio)
-    length.x.array[:] = _SMOOTHING_FACETS * area ** (1 / (mesh.topology.dim - 1))
+    own = facets.dofmap.list[: behind.size, 0]
+    logarithm.x.array[own] = np.log(ratio)
+    length.x.array[own] = _SMOOTHING_FACETS * area ** (1 / submesh.topology.dim)
+    for function in (logarithm, length):
+        function.x.scatter_forward()
     result = _smooth(logarithm, length)
     result.x.array[:] = np.exp(result.x.array)
     return result
+
+
+def _sizes(mesh: dolfinx.mesh.Mesh, cells: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
+    """Area or volume of cells, that of their midpoints' Jacobian: exact for straight simplices."""
+    kind = basix.CellType[mesh.topology.cell_name()]
+    geometry = compat.coordinate_element(mesh)
+    variant = basix.LagrangeVariant(geometry.variant)
+    element = basix.create_element(basix.ElementFamily.P, kind, geometry.degree, variant)
+    corners = basix.geometry(kind)
+    slopes = element.tabulate(1, corners.mean(axis=0, keepdims=True))[1:, 0, :, 0]
+    x = mesh.geometry.x[compat.geometry_dofmap(mesh)[cells]][:, :, : mesh.geometry.dim]
+    jacobian = np.einsum("kn,cnd->ckd", slopes, x)
+    squared = np.linalg.det(jacobian @ jacobian.transpose(0, 2, 1))
+    return np.asarray(np.sqrt(squared) * basix.cell.volume(kind), dtype=np.float64)
 
 
 def _smooth(values: fem.Function, length: fem.Function) -> fem.Function:
@@ -195,10 +204,8 @@ def _smooth(values: fem.Function, length: fem.Function) -> fem.Function:
     space = fem.functionspace(mesh, ("Lagrange", 1))
     w, v = ufl.TrialFunction(space), ufl.TestFunction(space)
     dx = ufl.dx(mesh)
-    matrix = fem.petsc.create_matrix(
-        form := compat.compile_form(w * v * dx + length**2 * ufl.dot(ufl.grad(w), ufl.grad(v)) * dx)
-    )
-    fem.petsc.assemble_matrix(matrix, form)
+    form = w * v * dx + length**2 * ufl.dot(ufl.grad(w), ufl.grad(v)) * dx
+    matrix = fem.petsc.assemble_matrix(compat.compile_form(form))
     matrix.assemble()
     result = fem.Function(space, name="modulus_over_height")
     rhs = fem.Function(space)

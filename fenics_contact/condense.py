@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import ctypes
 import logging
-import weakref
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +21,7 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.contact import Contact
-from fenics_contact.dense import PartlyFactored
+from fenics_contact.dense import PartlyFactored, Sum
 from fenics_contact.energy import Forces
 from fenics_contact.spaces import Mask, WholeSpace
 from fenics_contact.unknowns import Selection, Unknowns
@@ -290,8 +289,6 @@ class CondensedSpace(WholeSpace):
         self.ready = False
         self.mark = object()
         self._fixed: Array | None = None  # the constant part of the matrices
-        self._factored: weakref.WeakValueDictionary[int, PartlyFactored]
-        self._factored = weakref.WeakValueDictionary()  # by the handles of the matrices
         self._places: Array | None = None
         self._whole, self._prefix = whole, prefix
         self._kept_dofs = unknowns.kept[: unknowns.n_dofs]
@@ -399,10 +396,10 @@ class CondensedSpace(WholeSpace):
             self._condensation.forget()
 
     def matrix(self, stiffness: PETSc.Mat, *, symmetric: bool) -> PETSc.Mat:
-        """A new dense matrix."""
+        """A new operator, S and contact side by side."""
         n = self.unknowns.n_local
-        matrix = PETSc.Mat().createDense((n, n), comm=self.unknowns.comm)
-        matrix.assemble()
+        matrix = PETSc.Mat().createPython((n, n), Sum(), comm=self.unknowns.comm)
+        matrix.setUp()
         return matrix
 
     def prepare(self, ksp: PETSc.KSP, matrix: PETSc.Mat) -> None:
@@ -414,8 +411,7 @@ class CondensedSpace(WholeSpace):
             self._places[: self.unknowns.n_dofs] = nodes[self._kept_dofs // gdim]
         ksp.setOperators(matrix)
         ksp.pc.setType("python")
-        solver = self._factored[matrix.handle] = PartlyFactored(self._places)
-        ksp.pc.setPythonContext(solver)
+        ksp.pc.setPythonContext(PartlyFactored(self._places))
 
     def fill(self, matrix: PETSc.Mat, stiffness: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
         """S plus contact, conditions applied, dimensionless; no sparse factorisation."""
@@ -428,19 +424,12 @@ class CondensedSpace(WholeSpace):
             fixed[held, held] = 1.0
             self._fixed = fixed
         rows, columns, values = _entries(list(contacts))
-        acts = (values != 0.0) & ~self.constrained[rows] & ~self.constrained[columns]
-        rows, columns, values = rows[acts], columns[acts], values[acts] / scale
-        array = matrix.getDenseArray()
-        solver = self._factored[matrix.handle]
-        if solver.fixed is fixed:
-            before = solver.added[:2]
-            array[before] = fixed[before]
-        else:
-            array[:] = fixed
-        array[rows, columns] += values
-        matrix.assemble()
-        solver.set_parts(fixed, rows, columns, values)
-        self.diagonal = scale * np.diag(array)
+        values = np.where(self.constrained[rows] | self.constrained[columns], 0.0, values / scale)
+        matrix.getPythonContext().set_parts(fixed, rows, columns, values)
+        matrix.assemble()  # says that it changed
+        on = rows == columns
+        added = np.bincount(rows[on], values[on], minlength=len(fixed))
+        self.diagonal = scale * (np.diag(fixed) + added)
         self._whole.diagonal[self.unknowns.kept] = self.diagonal  # for the round-off of contact
         return 0
 

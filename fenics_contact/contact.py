@@ -22,9 +22,10 @@ from fenics_contact.history import History
 from fenics_contact.laws import Kinematics, Law, Scaled, Springs
 from fenics_contact.pairing import DeformableBody, Opposite
 from fenics_contact.parallel import gather_rows, global_max, global_min, global_sum
+from fenics_contact.products import PointProduct
 from fenics_contact.supports import Motion, Placement, Support, nonzero_vector
 from fenics_contact.surface import ContactSurface, PointEvaluator, VertexAreas
-from fenics_contact.unknowns import Unknowns
+from fenics_contact.unknowns import Selection, Unknowns
 
 __all__ = ["Contact", "Resultants", "Status"]
 
@@ -228,6 +229,8 @@ class Contact:
         self._first_motion = 0
         self._felt_maps: weakref.WeakKeyDictionary[Unknowns, PETSc.Mat]
         self._felt_maps = weakref.WeakKeyDictionary({self._unknowns: self._map})
+        self._products: weakref.WeakKeyDictionary[Unknowns, PointProduct]
+        self._products = weakref.WeakKeyDictionary()
         self._jump = fem.Function(self.quadrature.space(gdim), name="jump")
         self._reaction = self._map.createVecLeft()
         kinematics = self._kinematics(self._jump)
@@ -548,6 +551,11 @@ class Contact:
 
     def _matrix(self, blocks: Array) -> PETSc.Mat:
         """Dᵀ C D with C block-diagonal, one block per point: (n_points, gdim, gdim)."""
+        if isinstance(self._unknowns, Selection):
+            product = self._products.get(self._unknowns)
+            if product is None:
+                product = self._products[self._unknowns] = PointProduct(self._felt_map, self._gdim)
+            return product(self.quadrature.weights[:, None, None] * blocks)
         matrix = self._block_diagonal(blocks)
         product = matrix.ptap(self._felt_map)
         matrix.destroy()
@@ -721,6 +729,7 @@ class Contact:
         mask.destroy()
         self._map = relative
         self._felt_maps.clear()
+        self._products.clear()
         self._felt_maps[self._unknowns] = self._make_felt_map()
         self.forget()
         self.n_unpaired = int(global_sum(mesh.comm, np.count_nonzero(~paired)))

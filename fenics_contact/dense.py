@@ -11,7 +11,7 @@ import scipy.linalg
 import scipy.spatial
 from petsc4py import PETSc
 
-__all__ = ["PartlyFactored"]
+__all__ = ["PartlyFactored", "Sum"]
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.integer[Any]]
@@ -19,23 +19,57 @@ Mask = npt.NDArray[np.bool_]
 
 # So many more unknowns than C acts on, the nearest ones, are factored with it, that a contact has
 # room to grow.
-_MARGIN = 0.2
+_MARGIN = 0.5
 # Share of all unknowns above which none are left out.
 _MOST = 0.9
+# Share of the unknowns of A up to which a change of C is a correction to the last factors.
+_CORRECTED = 0.25
+# Residual, relative, that a corrected solution may have before all is factored.
+_ACCURATE = 1e-11
 # Smallest pivot, relative to the largest, of the part that is factored once.
 _SINGULAR = 1e-9
 
 
-class PartlyFactored:
-    """Context of a PETSc PC, LU by blocks: what C does not act on is factored once.
-
-    With A the unknowns on which C acts and some around them, and O the others, S_AA + C_AA less
-    the constant S_AO S_OO⁻¹ S_OA is what remains to be factored for every C. It is as exact as
-    LU of the whole. Where contact is open C is zero.
+class Sum:
+    """Context of a PETSc Mat, S + C.
 
     Attributes:
         fixed: S, (n, n).
         added: Rows, columns and values of C's entries.
+    """
+
+    def __init__(self) -> None:
+        """Nothing yet; see `set_parts`."""
+        self.fixed: Array = np.zeros((0, 0))
+        nothing = np.zeros(0, dtype=np.intp)
+        self.added: tuple[Index, Index, Array] = nothing, nothing, np.zeros(0)
+
+    def set_parts(self, fixed: Array, rows: Index, columns: Index, values: Array) -> None:
+        """Say what the operator is; afterwards assemble the Mat, that its PC sees it.
+
+        Args:
+            fixed: S, (n, n): the same array as before as long as S is the same.
+            rows: Of C's entries, each place at most once.
+            columns: Likewise.
+            values: The entries.
+        """
+        self.fixed, self.added = fixed, (rows, columns, values)
+
+    def mult(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Multiply."""
+        rows, columns, values = self.added
+        state = x.array_r
+        added = np.bincount(rows, values * state[columns], minlength=state.size)
+        y.array[:] = self.fixed @ state + added
+
+
+class PartlyFactored:
+    """Context of the PC of a `Sum`, LU by blocks: what C does not act on is factored once.
+
+    With A the unknowns on which C acts and some around them, and O the others, S_AA + C_AA less
+    the constant S_AO S_OO⁻¹ S_OA is what remains to be factored for every C. It is as exact as
+    LU of the whole. Where contact is open C is zero. While C differs in few places from what was
+    factored last, the factors are corrected.
     """
 
     def __init__(self, places: Array) -> None:
@@ -44,51 +78,92 @@ class PartlyFactored:
         Args:
             places: Where the unknowns are, (n, gdim); NaN for those nowhere, which are always in A.
         """
-        self._places, self._nowhere = places, np.isnan(places).any(axis=1)
-        self.fixed: Array = np.zeros((0, 0))
-        self._acted: Mask = np.ones(len(places), dtype=np.bool_)
-        nothing = np.zeros(0, dtype=np.intp)
-        self.added: tuple[Index, Index, Array] = nothing, nothing, np.zeros(0)
+        self._places, self._nowhere = places, np.any(np.isnan(places), axis=1)
+        self._operator = Sum()
+        self._fixed = self._operator.fixed
+        self._pattern = self._operator.added[:2]
         self._forget()
 
     def _forget(self) -> None:
         self._in: Index = np.arange(len(self._places))
         self._out: Index = np.zeros(0, dtype=np.intp)
         self._position: Index = self._in  # of the unknowns in A
-        self._reduced = self.fixed
-
-    def set_parts(self, fixed: Array, rows: Index, columns: Index, values: Array) -> None:
-        """Say what the operator of the PC is, whenever it changes.
-
-        Args:
-            fixed: S, (n, n): the same array as before as long as S is the same.
-            rows: Of C's entries, each place at most once.
-            columns: Likewise.
-            values: The entries.
-        """
-        if fixed is not self.fixed:
-            self.fixed = fixed
-            self._forget()
-        self._acted[:] = self._nowhere
-        self._acted[rows] = self._acted[columns] = True
-        self.added = rows, columns, values
+        self._reduced = self._fixed
+        self._factored: Array | None = None  # the values of C in the last factors
 
     def setUp(self, pc: PETSc.PC) -> None:
-        """Factor."""
+        """Factor, or find out what the last factors lack."""
+        self._operator = pc.getOperators()[1].getPythonContext()
+        if self._operator.fixed is not self._fixed:
+            self._fixed = self._operator.fixed
+            self._forget()
+        rows, columns, values = self._operator.added
+        if not all(map(np.array_equal, (rows, columns), self._pattern)):
+            self._pattern, self._factored = (rows, columns), None
+        acts = values != 0.0
+        self._acted = self._nowhere.copy()
+        self._acted[rows[acts]] = self._acted[columns[acts]] = True
         n_acted, n = np.count_nonzero(self._acted), len(self._places)
         fits = not self._acted[self._out].any()
         roomy = self._in.size > (1 + _MARGIN) ** 2 * n_acted + 1
         if not fits or (roomy and n_acted < _MOST * n / (1 + _MARGIN)):
             self._divide()
+        regular = self._correct() or self._factor_anew()
+        reasons = PETSc.PC.FailedReason
+        pc.setFailedReason(reasons.NOERROR if regular else reasons.FACTOR_NUMERIC_ZEROPIVOT)
+
+    def _factor_anew(self) -> bool:
+        """Factor the block of A as it is now; whether it is regular."""
         block = self._reduced.copy(order="F")
-        rows, columns, values = self.added
-        block[self._position[rows], self._position[columns]] += values
+        rows, columns, values = self._present()
+        block[rows, columns] += values
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
             self._factor = scipy.linalg.lu_factor(block, overwrite_a=True, check_finite=False)
-        regular = np.all(np.diag(self._factor[0]))
-        reasons = PETSc.PC.FailedReason
-        pc.setFailedReason(reasons.NOERROR if regular else reasons.FACTOR_NUMERIC_ZEROPIVOT)
+        regular = bool(np.all(np.diag(self._factor[0])))
+        self._factored = self._operator.added[2] if regular else None
+        self._changed: Index = np.zeros(0, dtype=np.intp)
+        self._known: Index = self._changed
+        self._columns = np.zeros((self._in.size, 0))
+        return regular
+
+    def _present(self) -> tuple[Index, Index, Array]:
+        """C within A: rows, columns and values."""
+        rows, columns, values = self._operator.added
+        acts = values != 0.0
+        return self._position[rows[acts]], self._position[columns[acts]], values[acts]
+
+    def _correct(self) -> bool:
+        """Find the change since the last factorisation, if it is of few unknowns; whether it is.
+
+        From one iteration to the next a few points change between open, stick and slip. With E the
+        unknowns they reach and D the change of C there, the columns of A⁻¹ for E and a system as
+        large as E make the solutions of A + D (Woodbury's identity).
+        """
+        if self._factored is None:
+            return False
+        rows, columns, values = self._operator.added
+        change = values - self._factored
+        matters = change != 0.0
+        rows, columns = self._position[rows[matters]], self._position[columns[matters]]
+        reached = np.union1d(rows, columns)
+        new = np.setdiff1d(reached, self._known)
+        if self._known.size + new.size > _CORRECTED * self._in.size:
+            return False
+        unit = np.zeros((self._in.size, new.size), order="F")
+        unit[new, np.arange(new.size)] = 1.0
+        made = scipy.linalg.lu_solve(self._factor, unit, overwrite_b=True, check_finite=False)
+        self._columns = np.hstack([self._columns, made])
+        self._known = np.concatenate([self._known, new])
+        order = np.argsort(self._known)
+        among = order[np.searchsorted(self._known, reached, sorter=order)]
+        self._changed, self._answers = reached, self._columns[:, among]
+        self._change = np.zeros((reached.size, reached.size))
+        places = np.searchsorted(reached, rows), np.searchsorted(reached, columns)
+        self._change[places] = change[matters]
+        core = np.eye(reached.size) + self._answers[reached] @ self._change
+        self._core = scipy.linalg.lu_factor(core, overwrite_a=True, check_finite=False)
+        return bool(np.all(np.diag(self._core[0])))
 
     def _divide(self) -> None:
         """Choose A anew and eliminate O."""
@@ -105,16 +180,16 @@ class PartlyFactored:
         outside = np.setdiff1d(others, more)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
-            corner = self.fixed[np.ix_(outside, outside)]
+            corner = self._fixed[np.ix_(outside, outside)]
             factor = scipy.linalg.lu_factor(corner, check_finite=False)
         pivots = np.abs(np.diag(factor[0]))
         if not pivots.min() > _SINGULAR * pivots.max():
             return
         self._in, self._out, self._factor_out = inside, outside, factor
-        self._coupling = self.fixed[np.ix_(inside, outside)]
-        right = self.fixed[np.ix_(outside, inside)]
+        self._coupling = self._fixed[np.ix_(inside, outside)]
+        right = self._fixed[np.ix_(outside, inside)]
         self._extension = scipy.linalg.lu_solve(factor, right, check_finite=False)
-        self._reduced = self.fixed[np.ix_(inside, inside)] - self._coupling @ self._extension
+        self._reduced = self._fixed[np.ix_(inside, inside)] - self._coupling @ self._extension
         self._position = np.full(n, -1)
         self._position[inside] = np.arange(inside.size)
 
@@ -122,10 +197,25 @@ class PartlyFactored:
         """Solve."""
         right = x.array_r
         if not self._out.size:
-            y.array[:] = scipy.linalg.lu_solve(self._factor, right, check_finite=False)
+            y.array[:] = self._solve(right)
             return
         outside = scipy.linalg.lu_solve(self._factor_out, right[self._out], check_finite=False)
         rest = right[self._in] - self._coupling @ outside
-        inside = scipy.linalg.lu_solve(self._factor, rest, check_finite=False)
+        inside = self._solve(rest)
         y.array[self._in] = inside
         y.array[self._out] = outside - self._extension @ inside
+
+    def _solve(self, right: Array) -> Array:
+        """Solve with the block of A, and look whether a correction was good enough."""
+        solution = scipy.linalg.lu_solve(self._factor, right, check_finite=False)
+        if not self._changed.size:
+            return solution
+        at_changed = scipy.linalg.lu_solve(self._core, solution[self._changed], check_finite=False)
+        solution -= self._answers @ (self._change @ at_changed)
+        rows, columns, values = self._present()
+        added = np.bincount(rows, values * solution[columns], minlength=right.size)
+        left = right - self._reduced @ solution - added
+        if not np.linalg.norm(left) <= _ACCURATE * np.linalg.norm(right):
+            self._factor_anew()
+            return scipy.linalg.lu_solve(self._factor, right, check_finite=False)
+        return solution

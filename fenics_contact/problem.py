@@ -931,7 +931,7 @@ class ContactProblem:
         factored = self._predicts
         self._space.enter()
         try:
-            starts = [self._space.part(start) / self._length for start in self._starts(ahead)]
+            starts = [start / self._length for start in self._starts(ahead)]
             tries = [(start, self._method) for start in starts]
             climbs = self._may_climb()
             cold = self._rate is None and ahead > 0.0  # and no later round of multipliers
@@ -1019,7 +1019,7 @@ class ContactProblem:
             self.motions.check_balance(self._load, self.contacts)
 
     def _starts(self, ahead: float) -> list[Array]:
-        """Displacements to start from, the one nearest to equilibrium first. Collective.
+        """Unknowns of the space to start from, nearest to equilibrium first. Collective.
 
         The present state; that state moved on by as much as the last increment moved it: in
         proportional loading that is the solution; and that state with one step of Newton's method
@@ -1028,20 +1028,18 @@ class ContactProblem:
         them slip again, one after another from the edge of the contact inwards. The last start has
         the right ones slipping, and comes first unless it is far off.
         """
-        present = self._whole.state()
+        space = self._space
+        present = space.state()
         starts = [present]
         if self._rate is not None and ahead:
-            self._whole.set_state(present + ahead * self._rate)
-            for bc in self._bcs:
-                bc.set(self.u.x.array)
-            starts.append(self._whole.state())
+            starts.append(present + ahead * space.part(self._rate))
         predicts = self._predicts
         if predicts:
             starts.append(self._predicted(present))
         residuals = []
         self._start_residual = self.committed_start
         for guess in starts:
-            self._solution.array[:] = self._space.part(guess) / self._length
+            self._solution.array[:] = guess / self._length
             self._compute_residual(self._solution, self._function)
             residuals.append(self._norms["residual"])
         self._start_residual = max(self._start_residual, residuals[0])
@@ -1052,12 +1050,11 @@ class ContactProblem:
     def _predicted(self, present: Array) -> Array:
         """One Newton step from a state on the tangent factored last. Collective."""
         self._predicts = False
-        self._solution.array[:] = self._space.part(present) / self._length
+        self._solution.array[:] = present / self._length
         self._compute_residual(self._solution, self._function)
         step = self._solution.duplicate()
         self._solvers[True].solve(self._function, step)
-        moved = present.copy()
-        moved[self._space.unknowns.kept] -= self._length * step.array_r
+        moved = present - self._length * step.array_r
         step.destroy()
         return moved
 

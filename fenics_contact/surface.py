@@ -86,6 +86,15 @@ class ContactSurface:
         scheme = "vertex" if nodal and free else self.quadrature_scheme or "default"
         return SurfaceQuadrature(self, degree, scheme)
 
+    def cells_behind(self) -> npt.NDArray[np.int32]:
+        """The cell of the body behind each of this rank's own cells of the submesh."""
+        mesh, submesh = self.mesh, self.submesh
+        n_owned = submesh.topology.index_map(submesh.topology.dim).size_local
+        tdim = mesh.topology.dim
+        to_cell = mesh.topology.connectivity(tdim - 1, tdim)  # of an exterior facet, one
+        behind = [to_cell.links(facet)[0] for facet in self._parent_facets[:n_owned]]
+        return np.array(behind, dtype=np.int32)
+
     def measure(self, degree: int, scheme: str = "default") -> ufl.Measure:
         """The surface measure of Γc with a quadrature rule (all of Γc, nothing else)."""
         metadata = {"quadrature_degree": degree, "quadrature_rule": scheme}

@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from fenics_contact.dense import PartlyFactored
+from fenics_contact.dense import PartlyFactored, Sum
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="dense matrices of one rank")
 N = 40
@@ -22,44 +22,87 @@ def scene(symmetric, seed=1):
     fixed += 2 * np.eye(N)
     places = np.column_stack([np.arange(N) / N, np.zeros(N)])
     places[-1] = np.nan  # such as the motion of a support
-    matrix = PETSc.Mat().createDense((N, N), comm=PETSc.COMM_SELF)
-    matrix.assemble()
+    operator = Sum()
+    matrix = PETSc.Mat().createPython((N, N), operator, comm=PETSc.COMM_SELF)
+    matrix.setUp()
     ksp = PETSc.KSP().create(PETSc.COMM_SELF)
     ksp.setType("preonly")
     ksp.setOperators(matrix)
     ksp.pc.setType("python")
-    solver = PartlyFactored(places)
-    ksp.pc.setPythonContext(solver)
-    return rng, fixed, matrix, ksp, solver
+    ksp.pc.setPythonContext(PartlyFactored(places))
+    return rng, fixed, matrix, ksp, operator
 
 
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_solutions(symmetric):
     """A contact that grows, shrinks, leaves and covers all; then another S. 1e-12 by condition."""
-    rng, fixed, matrix, ksp, solver = scene(symmetric)
+    rng, fixed, matrix, ksp, operator = scene(symmetric)
     left_out = []
     for fixed_now in (fixed, fixed + 0.5 * np.eye(N)):
         for n in (3, 4, 9, 20, N - 2, 5, 0, 12):
-            operator = fixed_now.copy()
+            whole = fixed_now.copy()
             rows, columns = (a.ravel() for a in np.indices((n, n)))
             added = rng.normal(size=n * n) / N
-            operator[rows, columns] += added
+            whole[rows, columns] += added
+            operator.set_parts(fixed_now, rows, columns, added)
             matrix.assemble()  # says that it changed
-            solver.set_parts(fixed_now, rows, columns, added)
             right = rng.normal(size=N)
             b, x = (PETSc.Vec().createSeq(N) for _ in range(2))
             b.array[:] = right
             ksp.solve(b, x)
-            assert np.allclose(x.array, np.linalg.solve(operator, right), rtol=0, atol=1e-12)
-            left_out.append(solver._out.size)
+            assert np.allclose(x.array, np.linalg.solve(whole, right), rtol=0, atol=1e-12)
+            left_out.append(ksp.pc.getPythonContext()._out.size)
     assert max(left_out) > N / 2 and min(left_out) == 0
+
+
+@pytest.mark.parametrize("size", [1.0, 1e8])
+def test_few_changes_are_corrections(size, monkeypatch):
+    """Points that close and open one by one, soft and stiff, against LU of the whole to 1e-9.
+
+    Soft ones take no new factorisation while few unknowns have changed, and one where many have;
+    where stiff ones spoil the correction a look at the residual asks for one.
+    """
+    rng, fixed, matrix, ksp, operator = scene(True)
+    made = []
+    solver = ksp.pc.getPythonContext()
+    anew = solver._factor_anew
+    monkeypatch.setattr(solver, "_factor_anew", lambda: made.append(1) or anew())
+    diagonal = np.arange(N)
+    added = np.where(diagonal < 25, size, 0.0)
+    counts = []
+    for changed in ([], [3], [3, 4], [24], [1, 2, 5], [24], [], [23], range(12), [0]):
+        added[list(changed)] = size - added[list(changed)]
+        operator.set_parts(fixed, diagonal, diagonal, added.copy())
+        matrix.assemble()
+        right = rng.normal(size=N)
+        b, x = (PETSc.Vec().createSeq(N) for _ in range(2))
+        b.array[:] = right
+        ksp.solve(b, x)
+        assert np.allclose(x.array, np.linalg.solve(fixed + np.diag(added), right), 0, 1e-9)
+        counts.append(len(made))
+    if size == 1.0:
+        assert counts[0] == 1 and counts[5] <= 2
+        assert counts[-2] > counts[-3]
+
+
+def test_the_operator_multiplies():
+    """S x + C x, by numpy."""
+    rng, fixed, matrix, _, operator = scene(False)
+    values = rng.normal(size=3)
+    operator.set_parts(fixed, np.array([1, 1, 7]), np.array([2, 1, 0]), values)
+    x, y = (PETSc.Vec().createSeq(N) for _ in range(2))
+    x.array[:] = rng.normal(size=N)
+    matrix.mult(x, y)
+    whole = fixed.copy()
+    whole[[1, 1, 7], [2, 1, 0]] += values
+    assert np.allclose(y.array, whole @ x.array, rtol=0, atol=1e-13)
 
 
 def test_a_part_that_cannot_be_eliminated():
     """Where O alone is singular all is factored: the whole is regular."""
-    rng, fixed, _, ksp, solver = scene(True)
+    rng, fixed, _, ksp, operator = scene(True)
     fixed[30, 20:-1] = fixed[20:-1, 30] = 0.0  # held by the unknowns 0 to 19 alone
-    solver.set_parts(fixed, np.arange(5), np.arange(5), np.zeros(5))
+    operator.set_parts(fixed, np.arange(5), np.arange(5), np.zeros(5))
     b, x = (PETSc.Vec().createSeq(N) for _ in range(2))
     b.array[:] = right = rng.normal(size=N)
     ksp.solve(b, x)
@@ -68,15 +111,15 @@ def test_a_part_that_cannot_be_eliminated():
 
 def test_a_zero_pivot_is_said():
     """As a diverged solution, which SNES understands, and once only."""
-    _, fixed, matrix, ksp, solver = scene(True)
+    _, fixed, matrix, ksp, operator = scene(True)
     every = np.indices((N, N)).reshape(2, -1)
-    solver.set_parts(fixed, *every, -fixed.ravel())
+    operator.set_parts(fixed, *every, -fixed.ravel())
     b, x = (PETSc.Vec().createSeq(N) for _ in range(2))
     b.array[:] = 1.0
     ksp.solve(b, x)
     assert ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
+    operator.set_parts(fixed, *every, 0 * fixed.ravel())
     matrix.assemble()
-    solver.set_parts(fixed, *every, 0 * fixed.ravel())
     ksp.solve(b, x)
     assert ksp.getConvergedReason() > 0
     assert np.allclose(fixed @ x.array, 1.0, rtol=0, atol=1e-12)
