@@ -10,6 +10,7 @@ norm as estimated; beside it what the contact force and the peak pressure come t
 from __future__ import annotations
 
 import numpy as np
+import scenes
 import ufl
 from dolfinx import fem, mesh
 from dolfinx.mesh import GhostMode
@@ -28,14 +29,11 @@ def half_block(n: int) -> tuple[mesh.Mesh, mesh.MeshTags]:
     made = mesh.create_rectangle(
         MPI.COMM_WORLD, [(0, -1), (1, 0)], (n, n), ghost_mode=GhostMode.none
     )
-    found = {
-        tag: mesh.locate_entities_boundary(made, 1, lambda x, i=i, at=at: np.isclose(x[i], at))
+    where = {
+        tag: lambda x, i=i, at=at: np.isclose(x[i], at)
         for tag, i, at in ((BASE, 1, -1), (TOP, 1, 0), (AXIS, 0, 0))
     }
-    facets = np.concatenate(list(found.values()))
-    tags = np.repeat(np.array(list(found), dtype=np.int32), [len(f) for f in found.values()])
-    order = np.argsort(facets)
-    return made, mesh.meshtags(made, 1, facets[order], tags[order])
+    return made, scenes.sides(made, where)
 
 
 def press(made: mesh.Mesh, tags: mesh.MeshTags, friction: float) -> tuple:

@@ -197,10 +197,10 @@ def compared(rows: Sequence[Row], machine: Machine) -> list[Row]:
             new["seconds"] = row["seconds"]
             new["model [s]"] = predicted(c, row, machine)
             if row["ranks"] > 1:
-                new["speed-up"] = row["speed-up"]
-                new["speed-up, model"] = c * row["dofs"] * row["iterations"] / new["model [s]"]
-                waiting = predicted(0.0, row, machine)
-                new["messages and reductions [s]"] = waiting
+                one = next(r for r in mine if (r["dofs"], r["ranks"]) == (row["dofs"], 1))
+                new["speed-up"] = one["seconds"] / row["seconds"]
+                new["speed-up, model"] = predicted(c, one, machine) / new["model [s]"]
+                new["messages and reductions [s]"] = predicted(0.0, row, machine)
             new["GiB per rank"] = row["GiB"] / row["ranks"]
             new["kB per unknown"] = row["GiB"] * 2**20 / row["dofs"]
             found.append(new)
@@ -286,11 +286,14 @@ def report(folder: Path, rows: list[Row], machine: Machine) -> None:
     """Write the tables and the picture; pure functions of the rows."""
     c = {run: fit_operations([r for r in rows if r["run"] == run]) for run in RUNS}
     mine = [row for row in rows if row["run"] == RUNS[1]]
-    note = f"α = {machine.alpha * 1e6:.2g} µs, β = {machine.beta / 1e9:.3g} GB/s, "
-    note += f"γ = {machine.gamma * 1e6:.2g} µs between two ranks of this machine; a copy in memory "
-    note += f"takes {machine.bus:.2f} times as long while the other rank copies, too. c, the time "
-    note += "of an unknown in an iteration on one rank: "
-    note += ", ".join(f"{1e6 * value:.2g} µs ({run})" for run, value in c.items()) + "."
+    operations_take = ", ".join(f"{1e6 * value:.2g} µs ({run})" for run, value in c.items())
+    note = (
+        f"α = {machine.alpha * 1e6:.2g} µs, β = {machine.beta / 1e9:.3g} GB/s, "
+        f"γ = {machine.gamma * 1e6:.2g} µs between two ranks of this machine. A copy in memory "
+        f"takes {machine.bus:.2f} times as long while the other rank copies, too: two ranks make "
+        f"what memory limits {2 / machine.bus:.2f} times as quick. c, the time of an unknown in an "
+        f"iteration on one rank: {operations_take}."
+    )
     timing.write(folder, "parallel_1", "Two ranks against one", compared(rows, machine), note)
     timing.write(
         folder, "parallel_2", "Where the time goes", operations(rows),

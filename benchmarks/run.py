@@ -52,12 +52,14 @@ def page(folder: Path, names: list[str], root: Path) -> str:
         if not (here / STAMP).exists():
             continue
         stamp = json.loads((here / STAMP).read_text())
-        parts.append(f"# {name}\n")
-        parts.append("{machine}, OMP_NUM_THREADS {threads}, {date}; {seconds} s.\n".format(**stamp))
+        parts.append(f"## {name}\n")
+        told = "{machine}, OMP_NUM_THREADS {threads}, {date}, load {load:.1f}; {seconds} s in all"
+        parts.append(told.format(**stamp) + ".\n")
         if stamp["failed"]:
             parts.append(f"It failed with exit code {stamp['failed']}.\n")
             continue
-        parts += [path.read_text() for path in sorted(here.glob("*.md"))]
+        # The scripts' own headings are of the second level.
+        parts += [f"#{path.read_text()}" for path in sorted(here.glob("*.md"))]
         parts += [f"![]({path.relative_to(root)})\n" for path in sorted(here.glob("*.png"))]
     return "\n".join(parts)
 
@@ -100,13 +102,14 @@ def main() -> int:
             command = [sys.executable, str(HERE / f"{name}.py"), "--output", str(folder)]
             command += ["--repeat", str(arguments.repeat), *["--short"] * arguments.short]
             print(f"== {name}", flush=True)
-            start = time.perf_counter()
+            start, load = time.perf_counter(), os.getloadavg()[0]
             code = subprocess.run(command, env=os.environ | {"XDG_CACHE_HOME": cache}).returncode
             stamp = {
                 "machine": machine(),
                 "threads": os.environ.get("OMP_NUM_THREADS", "not set"),
                 "date": time.strftime("%Y-%m-%d"),
                 "seconds": round(time.perf_counter() - start),
+                "load": load,
                 "failed": code,
             }
             (folder / STAMP).write_text(json.dumps(stamp) + "\n")

@@ -114,15 +114,15 @@ def test_failed_run_meets_no_target(tmp_path: Path) -> None:
 
 def test_page_keeps_parts_of_earlier_runs(tmp_path: Path) -> None:
     """What has been run is joined, in order; what has not is left out, failures are told."""
-    stamp = '{"machine": "m", "threads": "1", "date": "d", "seconds": 3, "failed": %d}'
+    stamp = '{"machine": "m", "threads": "1", "date": "d", "seconds": 3, "load": 0.1, "failed": %d}'
     for name, failed in (("ball", 0), ("large", 1)):
         (tmp_path / name).mkdir()
         (tmp_path / name / "stamp.json").write_text(stamp % failed)
-        (tmp_path / name / "table.md").write_text(f"the table of {name}\n")
+        (tmp_path / name / "table.md").write_text(f"## the table of {name}\n")
     (tmp_path / "ball" / "a.png").write_bytes(b"")
     page = run.page(tmp_path, ["ball", "half_cylinder", "large"], tmp_path.parent)
-    assert "the table of ball" in page and "the table of large" not in page
-    assert "failed with exit code 1" in page and "# half_cylinder" not in page
+    assert "### the table of ball" in page and "the table of large" not in page
+    assert "failed with exit code 1" in page and "## half_cylinder" not in page
     assert f"![]({tmp_path.name}/ball/a.png)" in page
     assert len(timing.read(tmp_path / "targets.csv")) == len(targets.TARGETS)
 
