@@ -337,12 +337,12 @@ def main() -> None:
                     f"{cells} cells, {run}, {ranks} ranks: {some[-1]['seconds']:.3g} s", flush=True
                 )
         rows += large.in_units(some)
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    timing.save(arguments.output / "parallel.csv", rows)
     failed = [row for row in rows if row["iterations"] in ("none", "failed")]
     if failed:
         sys.exit(f"failed: {failed}")
     machine = launch_machine()
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    timing.save(arguments.output / "parallel.csv", rows)
     (arguments.output / "machine.json").write_text(json.dumps(machine.__dict__, indent=1) + "\n")
     report(arguments.output, rows, machine)
 
