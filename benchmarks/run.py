@@ -9,8 +9,8 @@ Every script of this folder takes ``--output``, ``--repeat`` and ``--short`` and
 (``.md``), numbers (``.csv``) and plots (``.png``) in its part of the output folder. The page there,
 `README.md`, joins the parts of this run and of earlier ones, below the table of targets. Forms are
 compiled anew, into a cache of this run, so that "first use" is what a new user waits. The exit code
-is 1 if a benchmark failed. ``trade.py`` takes a quarter of an hour, writes a page of its own
-(docs/trade.md), and is run when named or by its own command.
+is 1 if a benchmark failed. ``methods.py`` (five minutes) and ``trade.py`` (a quarter of an hour)
+have pages of their own in docs/ and are run when they are named, or by their own commands.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ import timing
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
 HELPERS = ("run", "timing", "costs", "scenes", "targets")
-BY_NAME_ONLY = ("trade",)
+# Long, and with pages of their own in docs/.
+BY_NAME_ONLY = ("methods", "trade")
 STAMP = "stamp.json"
 
 
