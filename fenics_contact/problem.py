@@ -1025,38 +1025,38 @@ class ContactProblem:
         proportional loading that is the solution; and that state with one step of Newton's method
         on the tangent in which the last increment ended. At the present state itself no point has
         slipped yet, and all closed ones stick: from there Newton's method takes ten steps to let
-        them slip again, one after another from the edge of the contact inwards. The last start has
-        the right ones slipping, and comes first unless it is far off.
+        them slip again, one after another from the edge of the contact inwards. The start by a step
+        has the right ones slipping, and comes first unless it is far off.
         """
-        space = self._space
-        present = space.state()
+        present = self._space.state()
         starts = [present]
-        if self._rate is not None and ahead:
-            starts.append(present + ahead * space.part(self._rate))
+        self._start_residual = self.committed_start
+        residuals = [self._residual_at(present)]
+        self._start_residual = max(self._start_residual, residuals[0])
         predicts = self._predicts
         if predicts:
             starts.append(self._predicted(present))
-        residuals = []
-        self._start_residual = self.committed_start
-        for guess in starts:
-            self._solution.array[:] = guess / self._length
-            self._compute_residual(self._solution, self._function)
-            residuals.append(self._norms["residual"])
-        self._start_residual = max(self._start_residual, residuals[0])
-        if predicts and residuals[-1] <= _FAR * min(residuals):
-            residuals[-1] = 0.0
+        if self._rate is not None and ahead:
+            starts.append(present + ahead * self._space.part(self._rate))
+        residuals += [self._residual_at(start) for start in starts[1:]]
+        if predicts and residuals[1] <= _FAR * min(residuals):
+            residuals[1] = 0.0
         return [starts[i] for i in np.argsort(residuals, kind="stable")]
 
-    def _predicted(self, present: Array) -> Array:
-        """One Newton step from a state on the tangent factored last. Collective."""
-        self._predicts = False
-        self._solution.array[:] = present / self._length
+    def _residual_at(self, state: Array) -> float:
+        """Norm of the residual at a state of the space, left in ``_function``. Collective."""
+        self._solution.array[:] = state / self._length
         self._compute_residual(self._solution, self._function)
+        return self._norms["residual"]
+
+    def _predicted(self, present: Array) -> Array:
+        """One Newton step on the tangent factored last; the residual is there. Collective."""
+        self._predicts = False
         step = self._solution.duplicate()
         self._solvers[True].solve(self._function, step)
         moved = present - self._length * step.array_r
         step.destroy()
-        return moved
+        return np.asarray(moved, dtype=np.float64)
 
     def _approach(self) -> None:
         """Move bodies that nothing holds yet to first touch, along their load. Collective."""

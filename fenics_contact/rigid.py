@@ -87,6 +87,8 @@ class RigidMotions:
         self.free = np.zeros((0, len(modes)))
         self._free_fields: Array = np.zeros((0, unknowns.n_local))
         self._balanced: list[Array] = []
+        # Counts of pairings, and masks of points that were found to hold all motions.
+        self._holding: tuple[list[int], list[npt.NDArray[np.bool_]]] = [], []
         self._jumps: weakref.WeakKeyDictionary[Contact, tuple[int, Array]]
         self._jumps = weakref.WeakKeyDictionary()
 
@@ -115,6 +117,7 @@ class RigidMotions:
         self.free = (free / np.abs(free).max(axis=0)).T if free.size else free.T
         self._free_fields = self.free @ self._modes
         self._balanced = []
+        self._holding = [], []
         for vector in (diagonal, work, image):
             vector.destroy()
 
@@ -144,7 +147,24 @@ class RigidMotions:
             contacts: Evaluated contacts.
             closed_only: Count the points that are closed now, not all of Γc.
         """
-        return not len(self.free) or not self._loose(contacts, closed_only).size
+        if not len(self.free):
+            return True
+        bearing, pairings = [], [c.pairings for c in contacts]
+        for contact in contacts:
+            closed = contact.status != Status.OPEN
+            bearing.append(closed)
+            if contact.law.has_tangential:
+                bearing.append(closed & (contact.values["grip"] > 0))
+        if closed_only:
+            # What holds a body still does with more of Γc closed: no need to look again.
+            known = self._holding[1] if self._holding[0] == pairings else []
+            lacks = [np.any(was & ~now) for was, now in zip(known, bearing, strict=bool(known))]
+            if self._comm.allreduce(not known or any(lacks)) == 0:
+                return True
+        held = not self._loose(contacts, closed_only).size
+        if held and closed_only:
+            self._holding = pairings, bearing
+        return held
 
     def check_held(self, contacts: Sequence[Contact]) -> None:
         """Refuse a free motion that no contact feels, even if all of Γc were closed. Collective.
