@@ -148,12 +148,15 @@ def solve(
             }
         )
         last = float(along.value)
-    info = {
+    info: dict[str, Any] = {
         "dofs": V.dofmap.index_map.size_global * 2,
         "facets_passed": float(WAY / HALF_WIDTH * arguments.cells),
         "iterations": iterations,
         "wall_seconds": time.perf_counter() - start,
     }
+    if arguments.errors:
+        budget = fc.estimate_errors(problem, body.stress, strain=body.strain(u))
+        info["errors"] = budget.numbers()
     return contact, body, path, info
 
 
@@ -233,6 +236,7 @@ def main() -> int:
     parser.add_argument("--increments", type=int, default=60, help="increments of the drag")
     parser.add_argument("--stiffness", type=float, default=40, help="k_n and k_t over E/h")
     parser.add_argument("--solver", default="newton", choices=("lbfgs", "newton", "alternating"))
+    parser.add_argument("--errors", action="store_true", help="estimate the errors, part by part")
     parser.add_argument("--output", type=Path, default=Path("output/ironing"), help="folder")
     arguments, _ = parser.parse_known_args()
     contact, body, path, info = solve(arguments)
@@ -242,6 +246,8 @@ def main() -> int:
     points = contact.gather()
     if comm.rank == 0:
         print(output.table(result["references"]))
+        if "errors" in result:
+            print(fc.ErrorBudget(**result["errors"]))
         draw(arguments.output, path, points)
     output.write_json(arguments.output / "result.json", result, comm)
     return 0 if all(entry["passed"] for entry in result["references"].values()) else 1

@@ -178,13 +178,18 @@ def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
     exact = (P, Q, A, C, PEAK, float(cattaneo(np.array(C))))
     allowed = (EQUILIBRIUM, EQUILIBRIUM, *(TOLERANCE,) * 4)
     references = dict(zip(values, zip(exact, allowed, strict=True), strict=True))
-    return scene, {
+    result = {
         "references": output.compare(values, references),
         "dofs": contact.u.function_space.dofmap.index_map.size_global * 2,
         "increments": arguments.increments,
         "iterations": [step.iterations for step in made],
         "wall_seconds": time.perf_counter() - start,
     }
+    if arguments.errors:
+        body = scene.body
+        budget = fc.estimate_errors(scene.problem, body.stress, strain=body.strain(body.u))
+        result["errors"] = budget.numbers()
+    return scene, result
 
 
 def draw(folder: Path, points: dict[str, np.ndarray]) -> None:
@@ -221,6 +226,7 @@ def main() -> int:
     parser.add_argument("--degree", type=int, default=2, help="degree of the displacement")
     parser.add_argument("--increments", type=int, default=5, help="increments of the shear")
     parser.add_argument("--stiffness", type=float, default=10, help="contact stiffness over E/h")
+    parser.add_argument("--errors", action="store_true", help="estimate the errors, part by part")
     parser.add_argument("--output", type=Path, default=Path("output/two_cylinders"), help="folder")
     arguments, _ = parser.parse_known_args()
     scene, result = solve(arguments)
@@ -236,6 +242,8 @@ def main() -> int:
         print(f"{result['dofs']} dofs, {len(its)} increments, {sum(its)} iterations, ", end="")
         print(f"{result['wall_seconds']:.2f} s")
         print(output.table(result["references"]))
+        if "errors" in result:
+            print(fc.ErrorBudget(**result["errors"]))
         draw(folder, points)
     return 0 if all(e["passed"] for e in result["references"].values()) else 1
 

@@ -96,12 +96,16 @@ class ErrorBudget:
 
     @property
     def total(self) -> dict[str, float]:
-        """Sum of all parts without their signs, relative to the quantities."""
-        total = dict.fromkeys(self.values, 0.0)
+        """All parts together, relative to the quantities: the root of the sum of their squares.
+
+        The parts have causes of their own, and whether two of them add up or cancel is chance where
+        the sign of one is not known: their sum without signs is too large, with signs too small.
+        """
+        squares = dict.fromkeys(self.values, 0.0)
         for part in self.parts:
             for name, error in self.relative(part).items():
-                total[name] += error
-        return total
+                squares[name] += error**2
+        return {name: float(np.sqrt(square)) for name, square in squares.items()}
 
     @property
     def dominant(self) -> str:
@@ -353,7 +357,8 @@ def _discretisation(
     """The potential energy is off by η²/2.
 
     Per elastic energy that is the relative error of what a prescribed displacement needs as force,
-    or of how far a force goes. The peak is compared with that of the smooth stress on Γc.
+    or of how far a force goes. Friction is told from its share in the normal force that the smooth
+    stress has on Γc, the peak from the pressure smoothed on Γc itself.
     """
     contacts, mesh = problem.contacts, problem.u.function_space.mesh
     state, twice, share = problem.present_state(), smooth.twice_energy, smooth.share
@@ -369,20 +374,51 @@ def _discretisation(
         normal = np.sum(traction * values_at["normal"], axis=1)
         side = np.linalg.norm(traction - normal[:, None] * values_at["normal"], axis=1)
         closed = contact.status != Status.OPEN
-        friction = float(global_sum(mesh.comm, (contact.measure * closed) @ side))
-        peak = global_max(mesh.comm, np.where(closed, -normal, 0.0))
+        measure = contact.measure * closed
+        smooth_normal, smooth_friction = global_sum(mesh.comm, [-measure @ normal, measure @ side])
         r = contact.resultants()
+        error = share * driven * r.normal_force
+        # Smoothing carries traction beyond the end of contact: normal and tangential alike, so that
+        # their ratio stays.
+        kept = (r.normal_force - error) / smooth_normal if smooth_normal > 0 else 1.0
+        friction = r.tangential_force - kept * smooth_friction
+        if contact.law.has_friction and not contact.law.has_potential and not r.stick:
+            # All of it is the law's share of the pressure.
+            friction = error * r.tangential_force / (r.normal_force or 1.0)
         found |= _named(
             problem,
             contact,
-            share * driven * r.normal_force,
-            r.tangential_force - friction,
-            r.max_pressure - peak,
+            error,
+            friction,
+            r.max_pressure - _smooth_peak(contact),
         )
     if not np.any(global_sum(mesh.comm, np.abs(problem.load).sum())):
         loaded = 0.0 if _largest_is_prescribed(problem, state) else 1.0
     found[DISPLACEMENT] = -share * loaded * values[DISPLACEMENT]
     return found
+
+
+def _smooth_peak(contact: Contact) -> float:
+    """Largest pressure when its means over the facets are smoothed. Collective.
+
+    Smooth stresses of the bulk would not do: at a boundary they are of less than the pressure's own
+    accuracy. Means and linear functions serve any degree and rule, for the pressure ends like a
+    square root and is nowhere of more than the order h² that they have.
+    """
+    quadrature, submesh = contact.quadrature, contact.surface.submesh
+    n_cells = submesh.topology.index_map(submesh.topology.dim).size_local
+    points = quadrature.space().dofmap.list[:n_cells]
+    weights, pressure = quadrature.weights[points], contact.pressure[points]
+    space = fem.functionspace(submesh, ("DG", 0))
+    mean, bears = fem.Function(space), fem.Function(space)
+    cells = space.dofmap.list[:n_cells, 0]
+    mean.x.array[cells] = np.sum(weights * pressure, axis=1) / np.sum(weights, axis=1)
+    bears.x.array[cells] = np.any(pressure > 0, axis=1)
+    for function in (mean, bears):
+        function.x.scatter_forward()
+    smooth = _projected(submesh, [mean], 1, bears, ufl.dx(submesh))
+    at_points = PointEvaluator(quadrature, {"pressure": smooth[0]})()["pressure"]
+    return global_max(submesh.comm, at_points)
 
 
 def _largest_is_prescribed(problem: ContactProblem, state: Array) -> bool:
@@ -397,30 +433,7 @@ def _smoothed(
 ) -> list[Any]:
     """L2 projections of symmetric tensors onto continuous functions of a degree. Collective."""
     pairs = [(t, i, j) for t in tensors for i in range(t.ufl_shape[0]) for j in range(i + 1)]
-    space = fem.functionspace(mesh, ("Lagrange", degree))
-    p, q = ufl.TrialFunction(space), ufl.TestFunction(space)
-    mass = fem.petsc.assemble_matrix(compat.compile_form(weight * p * q * dx))
-    mass.assemble()
-    all_at_once = fem.functionspace(mesh, ("Lagrange", degree, (len(pairs),)))
-    components = ufl.as_vector([t[i, j] for t, i, j in pairs])
-    right = fem.Function(all_at_once)
-    form = weight * ufl.dot(components, ufl.TestFunction(all_at_once)) * dx
-    fem.assemble_vector(right.x.array, compat.compile_form(form))
-    right.x.scatter_reverse(la.InsertMode.add)
-    ksp = PETSc.KSP().create(mesh.comm)
-    ksp.setOperators(mass)
-    ksp.setType(PETSc.KSP.Type.CG)
-    ksp.getPC().setType(PETSc.PC.Type.JACOBI)
-    ksp.setTolerances(rtol=1e-8)
-    known, found = fem.Function(space), fem.Function(all_at_once)
-    for c in range(len(pairs)):
-        known.x.array[:] = right.x.array[c :: len(pairs)]
-        solution = fem.Function(space)
-        ksp.solve(known.x.petsc_vec, solution.x.petsc_vec)
-        solution.x.scatter_forward()
-        found.x.array[c :: len(pairs)] = solution.x.array
-    ksp.destroy()
-    mass.destroy()
+    found = _projected(mesh, [t[i, j] for t, i, j in pairs], degree, weight, dx)
     place = {(id(t), i, j): c for c, (t, i, j) in enumerate(pairs)}
     return [
         ufl.as_tensor(
@@ -431,3 +444,36 @@ def _smoothed(
         )
         for t in tensors
     ]
+
+
+def _projected(
+    mesh: dolfinx.mesh.Mesh, scalars: list[Any], degree: int, weight: Any, dx: ufl.Measure
+) -> fem.Function:
+    """L2 projections onto continuous functions of a degree, as one vector. Collective.
+
+    They vanish at nodes around which the weight is zero.
+    """
+    space = fem.functionspace(mesh, ("Lagrange", degree))
+    p, q = ufl.TrialFunction(space), ufl.TestFunction(space)
+    mass = fem.petsc.assemble_matrix(compat.compile_form(weight * p * q * dx))
+    mass.assemble()
+    all_at_once = fem.functionspace(mesh, ("Lagrange", degree, (len(scalars),)))
+    right = fem.Function(all_at_once)
+    form = weight * ufl.dot(ufl.as_vector(scalars), ufl.TestFunction(all_at_once)) * dx
+    fem.assemble_vector(right.x.array, compat.compile_form(form))
+    right.x.scatter_reverse(la.InsertMode.add)
+    ksp = PETSc.KSP().create(mesh.comm)
+    ksp.setOperators(mass)
+    ksp.setType(PETSc.KSP.Type.CG)
+    ksp.getPC().setType(PETSc.PC.Type.JACOBI)
+    ksp.setTolerances(rtol=1e-8)
+    known, found = fem.Function(space), fem.Function(all_at_once)
+    for c in range(len(scalars)):
+        known.x.array[:] = right.x.array[c :: len(scalars)]
+        solution = fem.Function(space)
+        ksp.solve(known.x.petsc_vec, solution.x.petsc_vec)
+        solution.x.scatter_forward()
+        found.x.array[c :: len(scalars)] = solution.x.array
+    ksp.destroy()
+    mass.destroy()
+    return found

@@ -11,10 +11,11 @@ from running import ROOT
 
 sys.path.insert(0, str(ROOT / "verification"))
 
+import effectivity
 import half_planes  # noqa: F401
 import run
 import solids  # noqa: F401
-import statics  # noqa: F401
+import statics
 from cases import CASES, Case, Outcome, Row
 
 pytestmark = pytest.mark.mpi
@@ -85,3 +86,24 @@ def test_the_page_has_all_cases():
     titles = [line.removeprefix("## ") for line in page.splitlines() if line.startswith("## ")]
     assert titles == [case.name for case in [*run.DEMOS, *run.CASES]]
     assert "MISSED" not in page and "FAILED" not in page
+
+
+def test_estimates_of_a_case():
+    """The patch test's only error is that of enforcement; one round of it leaves its square."""
+    found = list(statics.patch().estimates())
+    assert len(found) == 6
+    for e in found:
+        assert abs(e.estimated + e.true) <= 1.1 * e.true**2 + 1e-9, e
+
+
+@ONE_PROCESS
+def test_the_page_of_estimates_has_all_cases():
+    """Every case has a row or a reason; the demos' rows begin with the demo's name."""
+    page = effectivity.PAGE.read_text()
+    rows = [line for line in page.splitlines() if line.startswith("| ")]
+    for case in CASES:
+        assert any(row.startswith(f"| {case.name} | {case.budget}") for row in rows), case.name
+    for case in run.DEMOS:
+        assert not case.budget or f"| {case.name} | {case.budget} |" in rows, case.name
+    for name, *_ in effectivity.WHOLES:
+        assert any(row.startswith(f"| {name} ") for row in rows), name

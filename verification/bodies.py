@@ -110,6 +110,7 @@ class Bodies:
         mesh, tags: As given.
         u: Displacement.
         v: Test function.
+        stress: σ(u) (UFL).
         F: Residual without loads, to be added to.
         bcs: Conditions made by `hold`.
     """
@@ -132,8 +133,8 @@ class Bodies:
         ratio = fem.Constant(self.mesh, float(nu))
         strain = ufl.sym(ufl.grad(self.u))
         lame = E * ratio / ((1 + ratio) * (1 - 2 * ratio))
-        stress = E / (1 + ratio) * strain + lame * ufl.tr(strain) * ufl.Identity(d)
-        self.F = ufl.inner(stress, ufl.sym(ufl.grad(self.v))) * ufl.dx(self.mesh)
+        self.stress = E / (1 + ratio) * strain + lame * ufl.tr(strain) * ufl.Identity(d)
+        self.F = ufl.inner(self.stress, ufl.sym(ufl.grad(self.v))) * ufl.dx(self.mesh)
         self.bcs: list[fem.DirichletBC] = []
 
     @property

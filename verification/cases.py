@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-__all__ = ["CASES", "Case", "Outcome", "Row", "case"]
+import fenics_contact as fc
+
+__all__ = ["CASES", "Case", "Estimate", "Outcome", "Row", "case"]
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,34 @@ class Row:
 
 
 @dataclass(frozen=True)
+class Estimate:
+    """What an error budget says of a quantity whose exact value is known.
+
+    Attributes:
+        quantity: Its name in the budget.
+        budget: The budget.
+        exact: What the quantity should be, of the contact that is modelled.
+        known: How far that can be off, relative.
+    """
+
+    quantity: str
+    budget: fc.ErrorBudget
+    exact: float
+    known: float = 1e-9
+
+    @property
+    def true(self) -> float:
+        """The error, relative to the value that was computed."""
+        value = self.budget.values[self.quantity]
+        return (value - self.exact) / value
+
+    @property
+    def estimated(self) -> float:
+        """All parts together, relative."""
+        return self.budget.total[self.quantity]
+
+
+@dataclass(frozen=True)
 class Outcome:
     """What a case gives.
 
@@ -47,12 +78,15 @@ class Outcome:
         mesh: The cells, in words.
         dofs: Unknown displacements of the largest run.
         seconds: Wall time of all of it.
+        estimates: Estimates the errors of the last state; collective. None if there is nothing to
+            estimate, see `Case.budget`.
     """
 
     rows: tuple[Row, ...]
     mesh: str
     dofs: int
     seconds: float = 0.0
+    estimates: Callable[[], Iterator[Estimate]] | None = None
 
     @property
     def passed(self) -> bool:
@@ -69,28 +103,32 @@ class Case:
         reason: Why the tolerance is what it is.
         compute: The computation; collective.
         slow: Takes more than some seconds.
+        budget: Why there is no error that estimates could be compared with.
     """
 
     name: str
     reason: str
     compute: Callable[[], Outcome]
     slow: bool = False
+    budget: str = ""
 
     def run(self) -> Outcome:
         """Compute and take the time. Collective."""
         start = time.perf_counter()
         made = self.compute()
-        return Outcome(made.rows, made.mesh, made.dofs, time.perf_counter() - start)
+        return dataclasses.replace(made, seconds=time.perf_counter() - start)
 
 
 CASES: list[Case] = []
 
 
-def case(name: str, reason: str, *, slow: bool = False) -> Callable[..., Callable[[], Outcome]]:
+def case(
+    name: str, reason: str, *, slow: bool = False, budget: str = ""
+) -> Callable[..., Callable[[], Outcome]]:
     """Put a computation on the list."""
 
     def enter(compute: Callable[[], Outcome]) -> Callable[[], Outcome]:
-        CASES.append(Case(name, reason, compute, slow))
+        CASES.append(Case(name, reason, compute, slow, budget))
         return compute
 
     return enter

@@ -45,7 +45,13 @@ def runs(result: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def demo(
-    title: str, reason: str, name: str, *options: str, source: Mapping[str, str], label: str = ""
+    title: str,
+    reason: str,
+    name: str,
+    *options: str,
+    source: Mapping[str, str],
+    label: str = "",
+    budget: str = "",
 ) -> Case:
     """A demo that puts value, reference and relative tolerance under "references".
 
@@ -56,6 +62,7 @@ def demo(
         options: Of its command line.
         source: Of its references: of those whose name has the word, the first that fits.
         label: Key of what tells its runs apart.
+        budget: As a `Case` has it.
     """
 
     def compute() -> Outcome:
@@ -74,7 +81,7 @@ def demo(
         dofs = max(one.get("dofs", 0) for one in made)
         return Outcome(tuple(rows), " ".join([f"demos/{name}.py", *options]), dofs)
 
-    return Case(title, reason, compute, slow=True)
+    return Case(title, reason, compute, slow=True, budget=budget)
 
 
 EXACT = "exact complementarity, converged"
@@ -180,6 +187,7 @@ DEMOS = [
         "1 % as for 80 increments, 2 % for the largest shear; the zone to the spacing of points",
         half_cylinder_at_once,
         slow=True,
+        budget="one increment is what is computed here, no error; the table has two",
     ),
     Case(
         "Half-cylinder on a plane, a/R = 0.048",
@@ -217,6 +225,8 @@ DEMOS = [
         "1 % for energies, 3 % for the shear that is left: a difference of two curves",
         "fretting",
         source={"gap": "closed loop", "": "Mindlin, Deresiewicz"},
+        budget="energies and the shear at a point are not among the budget's quantities; the "
+        "contact is that of the two cylinders",
     ),
     demo(
         "Shrink fit",
@@ -243,11 +253,13 @@ DEMOS = [
         "1e-7: equilibrium to the solver's tolerance; 1e-8 for homogeneity",
         "fitting",
         source={"difference": "homogeneity", "": "statics"},
+        budget="forces follow from statics and are met to round-off",
     ),
     demo(
         "Block on a rigid incline; wedge",
         "1e-4, to which the limit is searched; 1e-6 for the wedge: statics",
         "incline",
         source={"F/G": "NAFEMS CGS-4: (tan α + μ)/(1 - μ tan α)", "": "statics: tan α = μ"},
+        budget="forces follow from statics and are met to round-off",
     ),
 ]

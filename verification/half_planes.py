@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import dolfinx
 import gmsh
 import numpy as np
 import ufl
 from bodies import COMM, Bodies, boxes, graded
-from cases import Outcome, Row, case
+from cases import Estimate, Outcome, Row, case
 from dolfinx import fem
 from statics import near
 
@@ -21,6 +23,8 @@ GROUND, LOAD, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
     "Rigid flat punch on a half-plane",
     "0.5 %: the half-plane ends at 50 a, and next to the corner the singular pressure is smeared "
     "over two of the cells, 1/160 of a",
+    budget="the force is given, the largest pressure infinite, and so is the displacement of a "
+    "half-plane",
 )
 def flat_punch() -> Outcome:
     """Half of it, driven by a force: the pressure inside |x| ≤ 0.9 a, and the load inside x."""
@@ -72,9 +76,12 @@ def flat_punch() -> Outcome:
     "1 %: 256 cells over half a wave leave half a cell, 0.6 %, in a/λ = 1/6; a smooth pressure is "
     "far better, but the stiffness of 10 E/h lowers the wave by some 0.1 %",
 )
-def wavy() -> Outcome:
-    """An elastic half-plane pressed on a rigid wave by p*/4, p*/2, 3p*/4; period by symmetry."""
-    wave, height, n = 1.0, 1.5, 256
+def wavy(n: int = 256) -> Outcome:
+    """An elastic half-plane pressed on a rigid wave by p*/4, p*/2, 3p*/4; period by symmetry.
+
+    ``n`` cells over half a wave.
+    """
+    wave, height = 1.0, 1.5
     modulus, nu, amplitude = 1000.0, 0.3, 1e-3
     full = np.pi * modulus / (1 - nu**2) * amplitude / wave
     y = graded(8 * wave / 2 / n, 8, height, 1.2)
@@ -112,7 +119,14 @@ def wavy() -> Outcome:
         exact = 2 * mean * np.cos(np.pi * x / wave) / s**2 * np.sqrt(np.maximum(s**2 - sx**2, 0))
         rms = np.sqrt(points["measure"] @ (p - exact) ** 2 / (points["measure"] @ exact**2))
         rows.append(Row(f"error of p(x), rms, at {share:g} p*", float(rms), 0.0, source, 0.01))
-    return Outcome(tuple(rows), f"{n} × {len(y) - 1} quadrilaterals", body.dofs)
+
+    def estimates() -> Iterator[Estimate]:
+        # A half-plane of 1.5 waves' depth ends where the wave has decayed by exp(-3π).
+        budget = fc.estimate_errors(problem, body.stress)
+        yield Estimate("peak pressure", budget, peak * mean, np.exp(-3 * np.pi))
+
+    made = f"{n} × {len(y) - 1} quadrilaterals"
+    return Outcome(tuple(rows), made, body.dofs, estimates=estimates)
 
 
 def cylinder_on_block(h: float):
@@ -175,9 +189,12 @@ def cylinder_on_block(h: float):
     "Cylinder on block, two bodies, NAFEMS R0094-1",
     "1.5 %, that is (a/R)²: Hertz takes the cylinder for a parabola and the normals for parallel",
 )
-def cylinder() -> Outcome:
-    """35 kN/mm on a steel cylinder, on a block of 70 GPa, small displacements, no friction."""
-    made = cylinder_on_block(0.25)
+def cylinder(h: float = 0.25, stiffness: float = 10.0) -> Outcome:
+    """35 kN/mm on a steel cylinder, on a block of 70 GPa, small displacements, no friction.
+
+    Cells of size ``h``, a stiffness of so many E/h.
+    """
+    made = cylinder_on_block(h)
     body = Bodies(made, _moduli(made[0], 210e3, 70e3), 0.3, degree=2)
     body.hold(GROUND, 0, 1)
     body.hold(AXIS, 0)
@@ -190,7 +207,7 @@ def cylinder() -> Outcome:
         body.u,
         fc.ContactSurface(body.mesh, body.tags, SURFACE),
         fc.DeformableBody(body.tags, OPPOSITE),
-        fc.Frictionless(),
+        fc.Frictionless(fc.Scaled(stiffness)),
     )
     problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
     list(fc.increments(problem, load, 0.0, total / 2, steps=2))
@@ -200,8 +217,14 @@ def cylinder() -> Outcome:
         Row("half-width a [mm]", _half_width(points), 6.2146, "Hertz", 0.015),
         Row("peak pressure p₀ [MPa]", r.max_pressure, 3585.4, "Hertz", 0.015),
     )
+
+    def estimates() -> Iterator[Estimate]:
+        budget = fc.estimate_errors(problem, body.stress)
+        yield Estimate("peak pressure", budget, 3585.4, (6.2146 / 50) ** 2)
+
     n = body.mesh.topology.index_map(2).size_global
-    return Outcome(rows, f"2 bodies, {n} curved triangles, h = a/25, degree 2", body.dofs)
+    words = f"2 bodies, {n} curved triangles, h = a/{6.2146 / h:.0f}, degree 2"
+    return Outcome(rows, words, body.dofs, estimates=estimates)
 
 
 def _moduli(mesh: dolfinx.mesh.Mesh, upper: float, lower: float) -> fem.Function:

@@ -17,6 +17,7 @@ GROUND, TOP, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
     "2 %: a zone ends between points of quadratic cells of a/5, a/15 apart, and the half-spaces "
     "end at 6 a",
     slow=True,
+    budget="Hertz is known to some 1 % where the half-spaces end at 6 a, more than the error",
 )
 def spheres() -> Outcome:
     """Two blocks of one material stand for the spheres: the gap between them is r²/2R.
