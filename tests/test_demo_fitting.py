@@ -49,6 +49,7 @@ def test_another_geometry(tmp_path: Path) -> None:
     assert result["flank_angle_degrees"] == pytest.approx(math.degrees(math.atan2(22, 60)))
 
 
+@pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
     """The same on two ranks, to 1e-6: the solver stops at 1e-12 of the forces."""
     serial = run_demo("fitting", tmp_path / "1", "--h", "2")

@@ -39,6 +39,7 @@ def test_sliding(tmp_path: Path) -> None:
     assert (tmp_path / "ironing.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
     """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
     options = ("--cells", "5", "--increments", "4")

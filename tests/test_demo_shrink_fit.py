@@ -40,6 +40,7 @@ def test_lame(tmp_path: Path) -> None:
             assert (folder / f"{name}.pvd").exists()
 
 
+@pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
     """The same on two ranks, to 1e-6 (the unevenness, a difference, to 1e-8 of the pressure)."""
     options = ("--kinds", "plane strain")
