@@ -134,7 +134,7 @@ class Alternation:
                 pressure = pressure + relaxation * (self._pressure() - pressure)
             return iterations, int(reasons.DIVERGED_MAX_IT)
         finally:
-            problem.drop_h0()
+            problem._rounds.forget()
             for contact in problem.contacts:
                 contact.thaw()
 

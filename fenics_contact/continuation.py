@@ -118,7 +118,7 @@ class Continuation:
                 share = min(1.0, factor * solved)
         finally:
             self._soften(1.0)
-            problem.drop_h0()
+            problem._rounds.forget()
 
     def _soften(self, share: float) -> None:
         """Let the contacts have a share of their stiffness."""

@@ -27,6 +27,7 @@ from fenics_contact.continuation import Continuation
 from fenics_contact.defaults import Defaults
 from fenics_contact.energy import Energy, EnergyState, Forces
 from fenics_contact.parallel import global_max, global_min, global_sum
+from fenics_contact.quasi_newton import QuasiNewton
 from fenics_contact.rigid import RigidMotions
 from fenics_contact.spaces import WholeSpace
 from fenics_contact.unknowns import Selection, Unknowns
@@ -40,12 +41,6 @@ logger = logging.getLogger("fenics_contact")
 # An open point keeps this share of its stiffness in H₀: enough that a body held by contact alone
 # stays held when its whole surface is open, too little to be felt as a wrong tangent.
 _OPEN_SHARE = 1e-3
-# Rounds in a row that do not lower the residual before the increment is given up: the potential may
-# fall for long before the residual does.
-_MAX_STALLS = 10
-# A round that ends with more than this times the lowest residual, or none, has gone astray: the
-# next one starts where that was.
-_ASTRAY = 1e3
 # Round-off in K u excuses a residual up to this share of the forces (or of the largest residual an
 # increment began with), not more: a displacement grown without bounds would excuse anything.
 _MAX_FLOOR = 1e-5
@@ -369,6 +364,7 @@ class ContactProblem:
         snes.setOptionsPrefix(prefix)
         snes.setSolution(self._solution)
         self._callbacks = Callbacks()
+        self._rounds = QuasiNewton(self)
         self._solvers: dict[bool, PETSc.KSP] = {}
         for consistent in (False, True):
             # Tolerances that follow the residual are for a solver that SNES has made.
@@ -504,7 +500,8 @@ class ContactProblem:
         self._matrices: dict[bool, PETSc.Mat] = {}
         for ksp in self._solvers.values():
             ksp.reset()
-        self._has_h0 = self._predicts = False
+        self._rounds.forget()
+        self._predicts = False
 
     def _matrix(self, consistent: bool) -> PETSc.Mat:
         """The matrix of H₀ or of the consistent tangent, made when first needed. Collective."""
@@ -645,36 +642,6 @@ class ContactProblem:
                 normal = np.where(contact.status != Status.OPEN, 1.0, _OPEN_SHARE)
                 tangential = np.where(contact.status == Status.STICK, 1.0, _OPEN_SHARE)
             yield contact.stiffness_matrix(self._alpha * normal, self._phi * tangential)
-
-    # ---- H₀ --------------------------------------------------------------------------------------
-
-    def _start_h0(self) -> None:
-        """H₀ = (K + αK_n + φK_t)⁻¹, all of Γc closed and sticking (section 5). Collective."""
-        self._clear_pairs(consistent=False)
-        self._assemble_matrix(self._matrix(False), self._stiffnesses(everywhere=True))
-
-    def drop_h0(self) -> None:
-        """Say that the matrix of H₀ was used for something else."""
-        self._has_h0 = False
-
-    def _refresh_h0(self) -> bool:
-        """Make H₀ anew from the status that the last round reached; False if none. Collective.
-
-        With Coulomb friction it is the consistent tangent: what L-BFGS cannot build from pairs is
-        the unsymmetric coupling of slip to pressure, and without it the residual wanders.
-        """
-        self._set_u(self._solution)
-        self._update_bulk()
-        if not np.isfinite(self.bulk.scale):
-            return False
-        for contact in self.contacts:
-            contact.evaluate()
-        self._watch.note(self._norms["residual"])
-        consistent = not self.has_potential and self.motions.held(self.contacts, closed_only=True)
-        parts = self._tangents() if consistent else self._stiffnesses(everywhere=False)
-        self._clear_pairs(consistent=consistent)
-        self._assemble_matrix(self._matrix(consistent), parts)
-        return True
 
     def _clear_pairs(self, *, consistent: bool | None = None) -> None:
         """Forget the pairs of L-BFGS and keep the factorisation, which reset() would drop too."""
@@ -964,7 +931,7 @@ class ContactProblem:
         if method == "continuation":
             return self._continuation.solve()
         if self._quasi_newton:
-            return self._solve_quasi_newton(stiffness_changed)
+            return self._rounds.solve(stiffness_changed)
         return self._callbacks.solve(self.snes, self._solution)
 
     def _recover(self) -> None:
@@ -1068,45 +1035,6 @@ class ContactProblem:
         way = self.motions.approach(self._load, self.contacts)
         if way is not None:
             self._whole.set_state(self._whole.state() + way)
-
-    def _solve_quasi_newton(self, stiffness_changed: bool) -> tuple[int, int]:
-        """L-BFGS in rounds, H₀ made anew between them from the status reached. Collective.
-
-        Returns:
-            Iterations and reason, the latter after a look at the residual itself.
-        """
-        snes, reasons = self.snes, _REASONS
-        if not self._has_h0 or stiffness_changed:
-            self._start_h0()
-            self._has_h0 = True
-        else:
-            self._clear_pairs()
-        iterations = stalls = 0
-        best, kept = np.inf, self._solution.copy()
-        while True:
-            snes.setTolerances(
-                max_it=min(self._space.iterations_per_round, self._max_it - iterations)
-            )
-            iterations += self._callbacks.solve(snes, self._solution)[0]
-            self._compute_residual(self._solution, self._function)
-            residual = self._norms["residual"]
-            if residual <= self._tolerance():
-                return iterations, int(reasons.CONVERGED_FNORM_RELATIVE)
-            if iterations >= self._max_it:
-                return iterations, int(reasons.DIVERGED_MAX_IT)
-            if residual < best:
-                stalls, best = 0, residual
-                self._solution.copy(kept)
-            else:
-                stalls += 1
-                if not residual <= _ASTRAY * best:
-                    kept.copy(self._solution)
-            if stalls >= _MAX_STALLS:
-                lost = not np.isfinite(residual)
-                failure = reasons.DIVERGED_FNORM_NAN if lost else reasons.DIVERGED_LINE_SEARCH
-                return iterations, int(failure)
-            if not self._refresh_h0():
-                return iterations, int(reasons.DIVERGED_FNORM_NAN)
 
     def _judge_all(self) -> Verdict:
         """Complete u and judge by assembly, past SNES and its residual. Collective."""
