@@ -47,8 +47,8 @@ _SHARE = 0.5
 # From this many unknowns on multigrid is quicker, in three dimensions. In two MUMPS always is.
 _MANY = 30_000
 # One factorisation for a whole load history pays longer: condensed onto Γc, it takes as long as two
-# increments by multigrid at 108,000 unknowns, and as long as four at this many.
-_MANY_CONDENSED = 200_000
+# increments by multigrid at 108,000 unknowns, and as long as four at 200,000.
+_MANY_PER_INCREMENT = 50_000
 
 _MULTIGRID: dict[str, Any] = {
     "pc_type": "gamg",
@@ -125,9 +125,16 @@ def too_large(n_bytes: float, comm: MPI.Comm) -> str | None:
     )
 
 
-def quicker(n: int, dimension: int, *, condensed: bool) -> bool:
-    """Whether multigrid is quicker than a factorisation, by measured cost."""
-    return dimension == 3 and n > (_MANY_CONDENSED if condensed else _MANY)
+def quicker(n: int, dimension: int, *, condensed_for: int = 0) -> bool:
+    """Whether multigrid is quicker than factorisations, by measured cost.
+
+    Args:
+        n: Number of unknowns.
+        dimension: Of the mesh.
+        condensed_for: The increments that one factorisation serves; 0: it serves none alone.
+    """
+    many = max(_MANY, condensed_for * _MANY_PER_INCREMENT)
+    return dimension == 3 and n > many
 
 
 def near_nullspace(space: fem.FunctionSpace) -> PETSc.NullSpace:

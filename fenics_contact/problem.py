@@ -55,6 +55,8 @@ _FIRST_ROUND, _INNER, _NEARLY = 1e-4, 1e-2, 10.0
 _FAR = 100.0
 # Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
 _TOUCHING = 1e-12
+# Increments expected where nothing is said.
+_EXPECTED = 4
 # Iterations of Newton's method without a lower residual after which another method takes over.
 _PATIENCE = 20
 
@@ -283,7 +285,10 @@ class ContactProblem:
         self._round_rtol = 0.0
         self._condensation, self._linear_solver = condensation, linear_solver
         self.prefix, self._fallback = prefix, fallback
-        self._configure(method, dict(petsc_options or {}), prefix)
+        self._expected = _EXPECTED
+        self._fresh = True  # nothing was solved yet
+        self._given = method, dict(petsc_options or {})
+        self._configure()
 
     # ---- construction ----------------------------------------------------------------------------
 
@@ -338,8 +343,9 @@ class ContactProblem:
                     )
         return worst
 
-    def _configure(self, method: str | None, given: dict[str, Any], prefix: str) -> None:
+    def _configure(self) -> None:
         """Set up SNES and its two linear solvers: for H₀, and for the consistent tangent."""
+        (method, given), prefix = self._given, self.prefix
         options = self._options = Defaults()
         options.set(given, prefix)
         if self.accuracy is not None:
@@ -350,6 +356,7 @@ class ContactProblem:
                 logger.info("accuracy %s", self.accuracy)
         solvers = [part + name for part in ("", "tangent_") for name in _NAMES_A_SOLVER]
         named = [name for name in solvers if options.get(prefix + name) is not None]
+        self._named_solvers = named
         self._condensed = self._choose_condensation(named)
         self._whole.linear_kind = self._choose_linear_solver(named)
         self._set_space()
@@ -396,6 +403,27 @@ class ContactProblem:
         self._rtol = snes.getTolerances()[0]
         self._max_it = snes.getTolerances()[3]
 
+    def expect(self, increments: int) -> None:
+        """Say how many increments will be solved: the choice of the solver needs it. Collective.
+
+        `increments` does. It matters before the first solution, in three dimensions: a few are
+        solved by multigrid sooner than all unknowns but those of Γc are eliminated for many. Where
+        nothing is said, four are expected.
+
+        Args:
+            increments: Their number, at least 1.
+
+        Raises:
+            ValueError: It is less.
+        """
+        if increments < 1:
+            raise ValueError(f"increments is {increments}; expect at least 1")
+        before, self._expected = self._expected, increments
+        if self._fresh and before != increments:
+            chosen = self._choose_condensation(self._named_solvers)
+            if chosen != self._condensed:
+                self._configure()
+
     def _symmetric(self, consistent: bool) -> bool:
         return self.bulk.symmetric and (not consistent or self.has_potential)
 
@@ -429,7 +457,7 @@ class ContactProblem:
             elif not self.unknowns.n_motions and self._linear_solver is None:
                 n_bytes = linear.factor_bytes(n, len(self.u), symmetric=self.bulk.symmetric)
                 obstacle = linear.too_large(n_bytes, self._comm)
-                if not obstacle and linear.quicker(n, len(self.u), condensed=True):
+                if not obstacle and linear.quicker(n, len(self.u), condensed_for=self._expected):
                     obstacle = f"multigrid is quicker for {n} unknowns"
         if obstacle and self._comm.rank == 0:
             logger.info("iterating on all unknowns: %s", obstacle)
@@ -448,7 +476,7 @@ class ContactProblem:
             if not self._symmetric(True):  # L-BFGS keeps the factors of both
                 n_bytes += linear.factor_bytes(n, len(self.u), symmetric=False)
             reason = linear.too_large(n_bytes, self._comm) or ""
-            if not reason and linear.quicker(n, len(self.u), condensed=False):
+            if not reason and linear.quicker(n, len(self.u)):
                 reason = "it is quicker for as many"
             kind = "multigrid" if reason and not self._condensed and not solvers else "direct"
         if kind == "multigrid" and self.unknowns.n_motions:
@@ -755,6 +783,7 @@ class ContactProblem:
                 can balance.
         """
         start = time.perf_counter()
+        self._fresh = False
         saved = self._whole.state(), self._load, self._behind
         try:
             with self._options.present():
@@ -1164,6 +1193,7 @@ class ContactProblem:
         self._committed, self._rate = state.copy(), rate.copy()
         self._committed_lag = None, self._load
         self.committed_force, self.committed_start, self.increment = force, start, increment
+        self._fresh = False
         self.restore()
         self.restart_solver()
 

@@ -79,6 +79,7 @@ def increments(
         raise ValueError(f'field is {field!r}; it must be "every", "last", or a number from 1')
     comm = problem.u.function_space.mesh.comm
     set_load = _setter(load)
+    problem.expect(len(ends) * (3 if estimate else 1))
 
     def apply(value: float) -> None:
         with collective_errors(comm):

@@ -202,11 +202,38 @@ def test_chosen_where_factors_do_not_fit(caplog, monkeypatch):
 
 def test_chosen_where_it_is_quicker():
     """In three dimensions, for many unknowns; for more if one factorisation serves a history."""
-    assert not linear.quicker(10_000, 3, condensed=False)
-    assert linear.quicker(100_000, 3, condensed=False)
-    assert not linear.quicker(100_000, 3, condensed=True)
-    assert linear.quicker(1_000_000, 3, condensed=True)
-    assert not linear.quicker(1_000_000, 2, condensed=False)
+    assert not linear.quicker(10_000, 3)
+    assert linear.quicker(100_000, 3)
+    assert linear.quicker(100_000, 3, condensed_for=1)
+    assert not linear.quicker(100_000, 3, condensed_for=4)
+    assert linear.quicker(1_000_000, 3, condensed_for=4)
+    assert not linear.quicker(1_000_000, 2)
+
+
+@pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="condensation takes one rank")
+def test_chosen_by_the_number_of_increments(monkeypatch):
+    """Multigrid for few increments, condensed for many; settled with the first solution."""
+    scene = block("hexahedron", n=2)
+    problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
+    monkeypatch.setattr(linear, "_MANY", 0)
+    monkeypatch.setattr(linear, "_MANY_PER_INCREMENT", problem.unknowns.n_local / 2.5)
+    assert problem._condensed
+    problem.expect(2)
+    assert not problem._condensed and problem._whole.linear_kind == "multigrid"
+    with pytest.raises(ValueError, match="at least 1"):
+        problem.expect(0)
+    few = problem.solve().contacts["contact"].normal_force
+    problem.expect(40)
+    assert not problem._condensed
+    problem, _ = scene.problem(fc.Frictionless(), scene.rollers(), condensation=True)
+    problem.expect(2)
+    assert problem._condensed
+    assert problem.solve().contacts["contact"].normal_force == pytest.approx(few, rel=1e-8)
+    # `increments` knows the number.
+    for steps, condensed in ((1, False), (3, True)):
+        problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
+        list(fc.increments(problem, lambda share: None, steps=steps))
+        assert problem._condensed == condensed
 
 
 def test_a_support_that_moves_freely(caplog):
