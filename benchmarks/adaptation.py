@@ -10,7 +10,7 @@ norm as estimated; beside it what the contact force and the peak pressure come t
 from __future__ import annotations
 
 import numpy as np
-import scenes
+import problems
 import ufl
 from dolfinx import fem, mesh
 from dolfinx.mesh import GhostMode
@@ -33,7 +33,7 @@ def half_block(n: int) -> tuple[mesh.Mesh, mesh.MeshTags]:
         tag: lambda x, i=i, at=at: np.isclose(x[i], at)
         for tag, i, at in ((BASE, 1, -1), (TOP, 1, 0), (AXIS, 0, 0))
     }
-    return made, scenes.sides(made, where)
+    return made, problems.sides(made, where)
 
 
 def press(made: mesh.Mesh, tags: mesh.MeshTags, friction: float) -> tuple:

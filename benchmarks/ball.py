@@ -20,7 +20,7 @@ from functools import partial
 
 import costs
 import numpy as np
-import scenes
+import problems
 import timing
 from mpi4py import MPI
 
@@ -55,7 +55,7 @@ def main() -> None:
     sizes, finer = arguments.cells, arguments.reference
     if arguments.short:
         sizes, finer = [6, 8, 11], 14
-    finest = costs.Case(scenes.ball_on_block(finer), 1, 3 * arguments.stiffness)
+    finest = costs.Case(problems.ball_on_block(finer), 1, 3 * arguments.stiffness)
     exact = finest.package(arguments.friction, linear_solver="multigrid")
 
     def errors(friction: float, steps: int, results: costs.Row) -> costs.Row:
@@ -66,7 +66,7 @@ def main() -> None:
         }
 
     def make(cells: int) -> costs.Case:
-        return costs.Case(scenes.ball_on_block(cells), 1, arguments.stiffness, errors)
+        return costs.Case(problems.ball_on_block(cells), 1, arguments.stiffness, errors)
 
     def choose(case: costs.Case) -> dict[str, Callable[[], costs.Row]]:
         found = runs(case, arguments.friction)

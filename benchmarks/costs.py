@@ -13,7 +13,7 @@ from functools import cached_property, partial
 from typing import Any
 
 import dolfinx.fem.petsc  # noqa: F401
-import scenes
+import problems
 import timing
 import ufl
 from dolfinx import fem
@@ -48,24 +48,24 @@ class Case:
             the results "u", "peak" and "force"; nothing by default.
     """
 
-    body: scenes.Body
+    body: problems.Body
     degree: int
     stiffness: float
     errors: Callable[[float, int, Row], Row] = lambda friction, steps, results: {}
 
     @cached_property
     def _space(self) -> fem.FunctionSpace:
-        return scenes.parts(self.body, self.degree)[0].function_space
+        return problems.parts(self.body, self.degree)[0].function_space
 
     @property
     def n_dofs(self) -> int:
         """Unknowns."""
-        return scenes.count(self._space)
+        return problems.count(self._space)
 
     @property
     def n_contact_dofs(self) -> int:
         """Unknowns of Γc. Collective."""
-        return scenes.count_on(self._space, self.body.tags.find(self.body.surface))
+        return problems.count_on(self._space, self.body.tags.find(self.body.surface))
 
     def linear(self, kind: str = "direct") -> Row:
         """One linear solve of the body; see `linear_solve`."""
@@ -74,9 +74,9 @@ class Case:
     def plain(self, friction: float, kind: str = "direct") -> Row:
         """By a penalty form of one's own, the load in one increment; see `newton`."""
         body = replace(self.body, friction=friction)
-        u, F, load, bcs = scenes.parts(body, self.degree)
+        u, F, load, bcs = problems.parts(body, self.degree)
         load.value = body.end
-        pressure, traction = scenes.penalty(body, u, load, self.stiffness)
+        pressure, traction = problems.penalty(body, u, load, self.stiffness)
         # The points that the package takes, so that results are the same to all digits.
         points = {"quadrature_degree": 2 * self.degree}
         ds = ufl.Measure("ds", body.mesh, subdomain_data=body.tags, metadata=points)(body.surface)
@@ -98,7 +98,7 @@ class Case:
     def package(self, friction: float, steps: int = 1, field: str = "last", **options: Any) -> Row:
         """By `fenics_contact`; ``options`` are those of its problem."""
         body = replace(self.body, friction=friction)
-        problem, contact, u, load = scenes.problem(body, self.degree, self.stiffness, **options)
+        problem, contact, u, load = problems.problem(body, self.degree, self.stiffness, **options)
         try:
             made = list(
                 fc.increments(problem, load, 0.0, body.end, steps=steps, field=field, max_cuts=0)
@@ -120,7 +120,7 @@ class Case:
         return row | results | self.errors(friction, steps, results)
 
 
-def linear_solve(body: scenes.Body, degree: int, kind: str = "direct") -> Row:
+def linear_solve(body: problems.Body, degree: int, kind: str = "direct") -> Row:
     """The unit of time: a body with Γc held or pressed, assembled and solved. Collective.
 
     Args:
@@ -129,11 +129,11 @@ def linear_solve(body: scenes.Body, degree: int, kind: str = "direct") -> Row:
         kind: "direct": MUMPS' Cholesky factorisation, half of the work of LU; "multigrid":
             conjugate gradients with GAMG, to `TOLERANCE`.
     """
-    u, residual, load, bcs = scenes.parts(body, degree)
+    u, residual, load, bcs = problems.parts(body, degree)
     load.value = body.end
     if body.pressed:
         residual -= body.pressed(ufl.TestFunction(u.function_space), body.ds)
-    bcs += [scenes.hold(u, body.tags, i, tag) for tag in body.glued for i in range(len(u))]
+    bcs += [problems.hold(u, body.tags, i, tag) for tag in body.glued for i in range(len(u))]
     bilinear = fem.form(ufl.derivative(residual, u))
     matrix = fem.petsc.assemble_matrix(bilinear, bcs)
     matrix.assemble()

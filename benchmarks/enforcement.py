@@ -23,13 +23,13 @@ from typing import Any
 
 import dolfinx.fem.petsc  # noqa: F401
 import numpy as np
-import scenes
+import problems
 import timing
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from scenes import Body
+from problems import Body
 
 import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic
@@ -78,7 +78,7 @@ class Found:
 def by_package(body: Body, stiffness: float, enforcement: str, tolerance: float = 1e-5) -> Found:
     """Penalty or multipliers."""
     choices = {"enforcement": enforcement, "tolerance": tolerance}
-    problem, contact, u, load = scenes.problem(body, 2, stiffness, choices=choices)
+    problem, contact, u, load = problems.problem(body, 2, stiffness, choices=choices)
     load.value = body.end
     step = problem.solve()
     shear = contact.tangential_traction[:, 0]
@@ -103,7 +103,7 @@ def by_nitsche(body: Body, factor: float, share: float) -> Found:
     ∫ σ(u):ε(v) - θ ∫ σ(u)n·σ(v)n/γ + ∫ P(σ(u)n - γ jump)·(θ σ(v)n/γ - v) over Γc, P the projection
     onto pressures and tractions within the cone; θ = ``share``, 1: symmetric without friction.
     """
-    u, F, load, bcs = scenes.parts(body, 2)
+    u, F, load, bcs = problems.parts(body, 2)
     load.value = body.end
     V = u.function_space
     v = ufl.TestFunction(V)
@@ -201,7 +201,7 @@ def compare(
     make(size)
     rows = timing.measure(runs, repeat=repeat, first=first, once=ONCE)
     rows = timing.in_units_of(rows, YARDSTICK, "time / penalty 10")
-    dofs = scenes.count(scenes.parts(make(size), 2)[0].function_space)
+    dofs = problems.count(problems.parts(make(size), 2)[0].function_space)
     note = f"Reference: displacement {reference.displacement:.9g}, peak pressure "
     note += f"{reference.pressure.max():.7g}, shear {reference.shear:.7g}."
     stem = name.lower().replace(" ", "_").replace("=", "").replace("μ", "mu").replace(".", "")
@@ -229,9 +229,11 @@ def main() -> None:
     h, cells = (0.1, 16) if arguments.short else (arguments.h, arguments.cells)
     for friction in (0.0, 0.2):
         name = f"Half-cylinder μ = {friction:g}"
-        cylinder = partial(scenes.half_cylinder, friction, smooth=True)
+        cylinder = partial(problems.half_cylinder, friction, smooth=True)
         compare(name, cylinder, h, h / 2, arguments.output, arguments.repeat)
-    compare("GRECO block", scenes.greco_block, cells, 2 * cells, arguments.output, arguments.repeat)
+    compare(
+        "GRECO block", problems.greco_block, cells, 2 * cells, arguments.output, arguments.repeat
+    )
 
 
 if __name__ == "__main__":

@@ -19,10 +19,10 @@ from typing import Any
 
 import costs
 import numpy as np
-import scenes
+import problems
 import timing
 from mpi4py import MPI
-from scenes import hertz
+from problems import hertz
 
 # The fewest increments whose solution is that of the reference's history.
 MANY = 40
@@ -31,9 +31,9 @@ MANY = 40
 @cache
 def one_increment(friction: float, h: float) -> dict[str, float]:
     """The solution of one increment: multipliers, quadratic cells of size h."""
-    body = scenes.half_cylinder(friction, h)
+    body = problems.half_cylinder(friction, h)
     choices = {"enforcement": "augmented", "tolerance": 1e-7}
-    problem, contact, u, load = scenes.problem(body, 2, 10.0, choices=choices)
+    problem, contact, u, load = problems.problem(body, 2, 10.0, choices=choices)
     load.value = body.end
     problem.solve()
     return {"u": body.displacement(u), "peak": contact.resultants().max_pressure}
@@ -80,7 +80,7 @@ def main() -> None:
             one_increment(friction, finer)
 
     def make(h: float) -> costs.Case:
-        body = scenes.half_cylinder(0.0, h)
+        body = problems.half_cylinder(0.0, h)
         return costs.Case(body, arguments.degree, arguments.stiffness, partial(errors, finer))
 
     def choose(case: costs.Case) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from typing import Any
 
 import costs
 import numpy as np
-import scenes
+import problems
 import timing
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -91,9 +91,9 @@ def child(run: str, cells: int, repeat: int) -> None:
     """One run in this process; its row as JSON, the last line that rank 0 prints. Collective."""
     PETSc.Log.begin()
     start = time.perf_counter()
-    RUNS[run](costs.Case(scenes.ball_on_block(6), 1, FACTOR))
+    RUNS[run](costs.Case(problems.ball_on_block(6), 1, FACTOR))
     first = time.perf_counter() - start
-    case = costs.Case(scenes.ball_on_block(cells), 1, FACTOR)
+    case = costs.Case(problems.ball_on_block(cells), 1, FACTOR)
     times, before, spent = [], counted(), events()
     for _ in range(repeat):
         COMM.Barrier()
@@ -192,7 +192,7 @@ def main() -> None:
         if "force" in row:
             # The force is that on a quarter.
             row["force/finest - 1"] = row["force"] / finest[-1] - 1
-            row["force/Hertz - 1"] = 4 * row["force"] / scenes.hertz_force() - 1
+            row["force/Hertz - 1"] = 4 * row["force"] / problems.hertz_force() - 1
     title = f"Ball on a block, hexahedra, μ = {FRICTION:g}, k h/E = {FACTOR:g}"
     timing.write(arguments.output, "large", title, rows)
     series: dict[str, tuple[list[float], list[float]]] = {}

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import dolfinx
 import numpy as np
-import scenes
+import problems
 import timing
 import ufl
 from dolfinx import fem
@@ -40,8 +40,8 @@ Loading = tuple[fc.ContactProblem, Callable[[float], None], int]
 
 def half_cylinder(method: str, stiffness: float) -> Loading:
     """The paper's first example, quadratic triangles."""
-    body = scenes.half_cylinder(0.2, 0.1)
-    problem, _, _, pressure = scenes.problem(body, 2, stiffness, method=method, fallback=False)
+    body = problems.half_cylinder(0.2, 0.1)
+    problem, _, _, pressure = problems.problem(body, 2, stiffness, method=method, fallback=False)
 
     def load(t: float) -> None:
         pressure.value = body.end * t
@@ -78,7 +78,7 @@ def dragged_ball(method: str, stiffness: float) -> Loading:
         MPI.COMM_WORLD, [[-1, -1, -1], [1, 1, 0]], (16, 16, 8), dolfinx.mesh.CellType.hexahedron
     )
     ends = {1: lambda x: np.isclose(x[2], -1), 2: lambda x: np.isclose(x[2], 0)}
-    tags = scenes.sides(mesh, ends)
+    tags = problems.sides(mesh, ends)
     V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
     u, v = fem.Function(V), ufl.TestFunction(V)
     body = fc.elasticity.LinearElastic(u, 1000.0, 0.3, "3D")

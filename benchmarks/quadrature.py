@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scenes
+import problems
 import timing
 from mpi4py import MPI
 
@@ -36,9 +36,11 @@ def solve(
     h: float, degree: int, stiffness: float, enforcement: str, **rule: Any
 ) -> tuple[fc.Contact, fc.Step]:
     """The half-cylinder under its whole load."""
-    body = scenes.half_cylinder(0.0, h)
+    body = problems.half_cylinder(0.0, h)
     choices = {"enforcement": enforcement}
-    problem, contact, _, load = scenes.problem(body, degree, stiffness, choices=choices, rule=rule)
+    problem, contact, _, load = problems.problem(
+        body, degree, stiffness, choices=choices, rule=rule
+    )
     load.value = body.end
     return contact, problem.solve()
 

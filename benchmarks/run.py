@@ -30,7 +30,7 @@ import timing
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
-HELPERS = ("run", "timing", "costs", "scenes", "targets")
+HELPERS = ("run", "timing", "costs", "problems", "targets")
 # Long, and with pages of their own in docs/.
 BY_NAME_ONLY = ("methods", "trade")
 STAMP = "stamp.json"

@@ -33,7 +33,7 @@ import numpy as np
 import timing
 from mpi4py import MPI
 from petsc4py import PETSc
-from scenes import (
+from problems import (
     Body,
     ball_on_half_space,
     greco,
