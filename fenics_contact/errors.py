@@ -39,6 +39,10 @@ _REMEDIES = {
 }
 
 
+# Facets in a row under pressure from which on discretisation is estimated reliably.
+_FEW = 5
+
+
 @dataclass(frozen=True)
 class ErrorBudget:
     """Estimated errors of a solution, the same on every rank.
@@ -53,6 +57,9 @@ class ErrorBudget:
             could not be told has no entry.
         wanted: The relative error that the contacts' ``accuracy`` stands for, if it was said.
         h: Mean size of the facets of the contacts that bear pressure (length).
+        across: How many of these facets there are in a row, about: their number in two dimensions,
+            its root in three; 0 where none bears. Fewer than five make the estimate of
+            discretisation unreliable.
         degree: Of the displacement.
         energy: Error of discretisation in the energy norm, relative.
         cells: Squares of that error, of every cell that this rank owns (force times length).
@@ -62,13 +69,14 @@ class ErrorBudget:
     parts: dict[str, dict[str, float]]
     wanted: float | None = None
     h: float = 0.0
+    across: float = 0.0
     degree: int = 1
     energy: float = 0.0
     cells: Array | None = field(default=None, repr=False, compare=False)
 
     def numbers(self) -> dict[str, Any]:
         """All but the cells, for files; ``ErrorBudget(**numbers)`` has them again."""
-        names = ("values", "parts", "wanted", "h", "degree", "energy")
+        names = ("values", "parts", "wanted", "h", "across", "degree", "energy")
         return {name: getattr(self, name) for name in names}
 
     @property
@@ -122,6 +130,11 @@ class ErrorBudget:
             cells = [f"{100 * found[n]:.2g}" if n in found else "not told" for n in names]
             lines.append(f"{part:<16}" + "".join(f"{cell:>{width}}" for cell in cells))
         lines.append(f"{self.dominant} dominates: {_REMEDIES[self.dominant]} would help most")
+        if 0 < self.across < _FEW:
+            lines.append(
+                f"only some {self.across:.0f} facets in a row bear pressure: discretisation is not "
+                f"told reliably by fewer than {_FEW}"
+            )
         if self.wanted is not None:
             size = f"facets of {self.h_wanted:.2g} at the contact, now {self.h:.2g}"
             enough = "the mesh is fine enough" if self.h_wanted >= self.h else f"it takes {size}"
@@ -174,29 +187,34 @@ def estimate_errors(
     parts["discretisation"] = _discretisation(problem, smooth, values)
     if increments is not None:
         parts["increments"] = dict(increments)
+    h, across = _bearing_facets(problem)
     return ErrorBudget(
         values,
         {name: parts[name] for name in _REMEDIES if name in parts},
         wanted=problem.accuracy.error if problem.accuracy else None,
-        h=_facet_size(problem),
+        h=h,
+        across=across,
         degree=u.function_space.ufl_element().degree,
         energy=float(np.sqrt(smooth.share)),
         cells=smooth.squares,
     )
 
 
-def _facet_size(problem: ContactProblem) -> float:
-    """Mean of the sizes of the facets under pressure, area^(1/(d-1)) (length). Collective."""
+def _bearing_facets(problem: ContactProblem) -> tuple[float, float]:
+    """Mean size area^(1/(d-1)) of the facets under pressure, and how many are in a row. Collective.
+
+    Of all contacts together; size (length).
+    """
+    d = problem.u.function_space.mesh.geometry.dim
     sums = np.zeros(2)
     for contact in problem.contacts:
         quadrature = contact.quadrature
         rows = quadrature.point_rows()
         area = quadrature.weights[rows].sum(axis=1)
         bears = np.any(contact.pressure[rows] > 0, axis=1)
-        d = problem.u.function_space.mesh.geometry.dim
         sums += [np.sum(bears * area ** (1 / (d - 1))), np.count_nonzero(bears)]
     size, count = global_sum(problem.u.function_space.mesh.comm, sums)
-    return float(size / count) if count else 0.0
+    return (float(size / count), float(count ** (1 / (d - 1)))) if count else (0.0, 0.0)
 
 
 def _named(

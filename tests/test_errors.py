@@ -190,6 +190,17 @@ def test_the_table():
     } | {"displacement"}
 
 
+@pytest.mark.parametrize(("cell", "n"), [("triangle", 3), ("triangle", 8), ("hexahedron", 2)])
+def test_few_facets_are_told(cell, n):
+    """All n, or n², facets of a block bear pressure: the table warns below five in a row."""
+    scene = block(cell, 1, n=n, up=-1.0)
+    problem, _ = scene.problem(fc.Frictionless(k_n=1e3), scene.rollers())
+    problem.solve()
+    found = budget(scene, problem)
+    assert close(found.across, n, 1e-12)
+    assert ("not told reliably" in str(found)) == (n < 5)
+
+
 def test_physical_springs_are_no_error():
     """The stiffness of a foundation is meant: no part of the displacement is due to it."""
     scene = block("quadrilateral", 1, n=2, up=-1.0)
