@@ -75,7 +75,7 @@ class Alternation:
         comm, prefix = problem.u.function_space.mesh.comm, problem.prefix
         self.snes = defaults.make_snes(comm, f"{prefix}alternating_", OPTIONS | solver)
         self._finish = defaults.make_snes(comm, f"{prefix}finishing_", _FINISH | solver)
-        self._callbacks = Callbacks()
+        self._callbacks = Callbacks(comm)
         self._goal = 0.0
 
     def _attach(self) -> None:

@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact import compat
+from fenics_contact.parallel import fail_together
 
 __all__ = ["Callbacks"]
 
@@ -22,8 +24,13 @@ __all__ = ["Callbacks"]
 class Callbacks:
     """The callbacks of one SNES, which is no part of it: SNES keeps them, and would keep itself."""
 
-    def __init__(self) -> None:
-        """No error yet."""
+    def __init__(self, comm: MPI.Comm) -> None:
+        """No error yet.
+
+        Args:
+            comm: The ranks of the SNES.
+        """
+        self._comm = comm
         self._error: BaseException | None = None
         # Where the residual was computed last, and it.
         self._last: tuple[npt.NDArray[np.float64], ...] = ()
@@ -89,7 +96,7 @@ class Callbacks:
             if error is not None:
                 raise error
         reason = snes.getConvergedReason()
-        if reason <= 0 and compat.refused_memory(snes.getKSP().getPC()):
+        if reason <= 0 and self._comm.allreduce(compat.refused_memory(snes.getKSP().getPC())):
             raise MemoryError(
                 "the factorisation was refused its memory: use more ranks, an iterative solver, or "
                 "a coarser mesh; if options limit MUMPS, raise the limit (mat_mumps_icntl_14, "
@@ -110,5 +117,6 @@ class Callbacks:
             try:
                 return function(*arguments)
             except BaseException as error:
+                fail_together(self._comm, error)
                 self._error = error
         return otherwise

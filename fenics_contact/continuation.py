@@ -62,7 +62,7 @@ class Continuation:
         comm, prefix = problem.u.function_space.mesh.comm, f"{problem.prefix}continuation_"
         self.snes = defaults.make_snes(comm, prefix, OPTIONS | solver)
         self._shares_solver = not solver
-        self._callbacks = Callbacks()
+        self._callbacks = Callbacks(comm)
         self._coarse = 0.0
 
     def _attach(self) -> None:

@@ -22,7 +22,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from fenics_contact.parallel import global_max, global_min, global_sum
+from fenics_contact.parallel import agreed, global_max, global_min, global_sum
 from fenics_contact.rigid import rigid_motions
 
 __all__ = [
@@ -149,7 +149,8 @@ def near_nullspace(space: fem.FunctionSpace) -> PETSc.NullSpace:
     high = np.array([global_max(comm, column) for column in x.T])
     motions = rigid_motions(x - (low + high) / 2, float(np.linalg.norm(high - low)))
     modes = np.array([motion.ravel() for motion in motions.values()])
-    modes = np.linalg.solve(np.linalg.cholesky(global_sum(comm, modes @ modes.T)), modes)
+    factor = agreed(comm, np.linalg.cholesky(global_sum(comm, modes @ modes.T)))
+    modes = np.linalg.solve(factor, modes)
     vectors = []
     for mode in modes:
         vector = PETSc.Vec().createMPI((mode.size, None), bsize=gdim, comm=comm)

@@ -25,7 +25,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.facets import FacetSet, tabulate
-from fenics_contact.parallel import gather_rows
+from fenics_contact.parallel import collective_errors, gather_rows
 from fenics_contact.supports import Support
 from fenics_contact.surface import SurfaceQuadrature, tagged_facets
 
@@ -180,13 +180,14 @@ class Opposite:
         at_points = tabulate(basis, 0, place)[0, :, :, 0]
         at_pieces = tabulate(basis, 0, places)[0, :, :, 0]
         lines, columns, values = [], [], []
-        for f in np.flatnonzero(good):
-            own = order[bounds[f] : bounds[f + 1]]
-            weighted = weights[own, None] * at_pieces[own]
-            block = at_points[rows[f]] @ np.linalg.solve(at_pieces[own].T @ weighted, weighted.T)
-            lines.append(np.repeat(rows[f], len(own)))
-            columns.append(np.tile(own, rows.shape[1]))
-            values.append(block.ravel())
+        with collective_errors(self._comm):  # a facet's matrix may be singular
+            for f in np.flatnonzero(good):
+                own = order[bounds[f] : bounds[f + 1]]
+                weighted = weights[own, None] * at_pieces[own]
+                inverse = np.linalg.solve(at_pieces[own].T @ weighted, weighted.T)
+                lines.append(np.repeat(rows[f], len(own)))
+                columns.append(np.tile(own, rows.shape[1]))
+                values.append((at_points[rows[f]] @ inverse).ravel())
         n, m = self._quadrature.n_points, len(places)
         empty = np.zeros(0, dtype=np.int64)
         local = scipy.sparse.csr_matrix(

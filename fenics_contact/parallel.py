@@ -2,14 +2,58 @@
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-__all__ = ["collective_errors", "gather_rows", "global_max", "global_min", "global_sum"]
+__all__ = [
+    "agreed",
+    "collective_errors",
+    "fail_together",
+    "gather_rows",
+    "global_max",
+    "global_min",
+    "global_sum",
+]
+
+
+logger = logging.getLogger("fenics_contact")
+
+# How long ranks that fail together may be apart (seconds), and the tag of their messages.
+PATIENCE = 10.0
+_TAG = 7351
+
+
+def fail_together(comm: MPI.Comm, error: BaseException) -> None:
+    """Come back where all ranks have failed; end all of them where this one is alone.
+
+    A rank that fails where others do not is waited for by them in some collective call, for ever:
+    no rank can go on, nor take back what was begun. The failures are told to one another by
+    messages, which are not taken for a part of that call.
+
+    Args:
+        comm: The ranks.
+        error: What this rank is about to raise.
+    """
+    others = [rank for rank in range(comm.size) if rank != comm.rank]
+    requests = [comm.Isend(b"", rank, _TAG) for rank in others]
+    requests += [comm.Irecv(bytearray(1), rank, _TAG) for rank in others]
+    end = time.monotonic() + PATIENCE
+    while not MPI.Request.Testall(requests):
+        if time.monotonic() > end:
+            logger.critical(
+                "rank %d failed alone, and the others wait for it: all are ended",
+                comm.rank,
+                exc_info=error,
+            )
+            comm.Abort(1)
+        time.sleep(1e-4)
 
 
 @contextmanager
@@ -19,18 +63,20 @@ def collective_errors(comm: MPI.Comm) -> Iterator[None]:
     The block must not communicate: a rank that raises leaves it early, and the others would wait.
 
     Raises:
-        Exception: The error of this rank, or else the same type and text as on the first rank
+        BaseException: The error of this rank, or else the same type and text as on the first rank
             that raised (types that cannot be rebuilt from their text become RuntimeError).
     """
     if comm.size == 1:
         yield
         return
-    error: Exception | None = None
+    error: BaseException | None = None
     try:
         yield
-    except Exception as caught:
+    except BaseException as caught:  # an interrupt on one rank, too
         error = caught
-    reports = comm.allgather(None if error is None else (type(error), str(error)))
+    reports = comm.allgather(
+        None if error is None else (type(error), str(error) or type(error).__name__)
+    )
     first = next((report for report in reports if report is not None), None)
     if first is None:
         return
@@ -38,6 +84,16 @@ def collective_errors(comm: MPI.Comm) -> Iterator[None]:
         raise error
     kind, text = first
     raise (kind(text) if kind in (ValueError, TypeError) else RuntimeError(text))
+
+
+def agreed(comm: MPI.Comm, value: Any) -> Any:
+    """The first rank's value, on all ranks. Collective.
+
+    For what every rank computes of the same numbers and then decides by: factorisations of equal
+    matrices may differ in the last digits, between machines or by where in memory they are, and
+    with them the basis of a null space, or the side of a threshold.
+    """
+    return comm.bcast(value) if comm.size > 1 else value
 
 
 def global_sum(comm: MPI.Comm, values: npt.ArrayLike) -> npt.NDArray[np.float64]:

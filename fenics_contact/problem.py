@@ -26,7 +26,7 @@ from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.continuation import Continuation
 from fenics_contact.defaults import Defaults
 from fenics_contact.energy import Energy, EnergyState, Forces
-from fenics_contact.parallel import global_max, global_min, global_sum
+from fenics_contact.parallel import fail_together, global_max, global_min, global_sum
 from fenics_contact.quasi_newton import QuasiNewton
 from fenics_contact.rigid import RigidMotions
 from fenics_contact.spaces import WholeSpace
@@ -370,7 +370,7 @@ class ContactProblem:
         snes = self.snes = PETSc.SNES().create(self._comm)
         snes.setOptionsPrefix(prefix)
         snes.setSolution(self._solution)
-        self._callbacks = Callbacks()
+        self._callbacks = Callbacks(self._comm)
         self._rounds = QuasiNewton(self)
         self._solvers: dict[bool, PETSc.KSP] = {}
         for consistent in (False, True):
@@ -572,19 +572,16 @@ class ContactProblem:
 
     def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         self._set_u(x)
-        # A trial of the line search may overflow; the convergence test sees it.
-        with np.errstate(all="ignore"):
-            contact = self._space.contact_force()
-            total = self._space.bulk_force() + contact
-            self._measure_norms(self._space, total, contact)
-            total[self._space.constrained] = 0.0
-            f.array[:] = total / (self.bulk.scale * self._length)
+        contact = self._space.contact_force()
+        total = self._space.bulk_force() + contact
+        self._measure_norms(self._space, total, contact)
+        total[self._space.constrained] = 0.0
+        f.array[:] = total / (self.bulk.scale * self._length)
 
     def _energy_at(self, x: PETSc.Vec) -> float:
         """Potential of a linear bulk and contacts, dimensionless as SNES sees it. Collective."""
         self._set_u(x)
-        with np.errstate(all="ignore"):
-            energy = self._space.bulk_energy() + sum(c.energy() for c in self.contacts)
+        energy = self._space.bulk_energy() + sum(c.energy() for c in self.contacts)
         total = float(global_sum(self._comm, energy))
         return total / (self.bulk.scale * self._length**2)
 
@@ -786,9 +783,12 @@ class ContactProblem:
         self._fresh = False
         saved = self._whole.state(), self._load, self._behind
         try:
-            with self._options.present():
+            # A trial of a line search may overflow, and the convergence test and the verdict see
+            # it: a warning, on the rank that has the point, must not become an error there alone.
+            with self._options.present(), np.errstate(all="ignore"):
                 step = self._solve(start, ahead, field)
         except BaseException as error:
+            fail_together(self._comm, error)
             state, self._load, self._behind = saved
             self._whole.set_state(state)
             for contact in self.contacts:
@@ -1153,7 +1153,8 @@ class ContactProblem:
         try:
             for contact in self.contacts:
                 contact.commit()
-        except BaseException:
+        except BaseException as error:
+            fail_together(self._comm, error)
             for contact, values in zip(self.contacts, before, strict=True):
                 contact.history.function.x.array[:] = values
             self.restore()

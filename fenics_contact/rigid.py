@@ -19,7 +19,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact.contact import Contact, Status
-from fenics_contact.parallel import gather_rows, global_min, global_sum
+from fenics_contact.parallel import agreed, gather_rows, global_min, global_sum
 from fenics_contact.unknowns import Unknowns
 
 __all__ = ["RigidMotions", "rigid_motions"]
@@ -112,7 +112,7 @@ class RigidMotions:
         energy, mass = global_sum(self._comm, gram)
         scale = 1 / np.sqrt(np.diag(mass))
         values, vectors = np.linalg.eigh((energy + energy.T) / 2 * np.outer(scale, scale))
-        free = (vectors * scale[:, None])[:, values < _FREE]
+        free = agreed(self._comm, (vectors * scale[:, None])[:, values < _FREE])
         self._jumps.clear()
         self.free = (free / np.abs(free).max(axis=0)).T if free.size else free.T
         self._free_fields = self.free @ self._modes
@@ -200,7 +200,7 @@ class RigidMotions:
                 gram += np.einsum("mqd,q,nqd->mn", across, grip, across)
         mean = global_sum(self._comm, gram) / max(float(global_sum(self._comm, area)), 1e-300)
         sizes, vectors = np.linalg.eigh(mean)
-        return vectors[:, sizes < _FELT].T @ self.free
+        return agreed(self._comm, vectors[:, sizes < _FELT].T @ self.free)
 
     def approach(self, load: Array, contacts: Sequence[Contact]) -> Array | None:
         """Rigid motion to first touch, where the load sets free bodies moving. Collective.
@@ -219,7 +219,7 @@ class RigidMotions:
         mass = global_sum(self._comm, free @ free.T)
         if not np.abs(drive).max() > 0:
             return None
-        coefficients = np.linalg.solve(mass, drive)
+        coefficients = agreed(self._comm, np.linalg.solve(mass, drive))
         coefficients /= np.abs(coefficients).max()
         way = np.inf
         for contact in contacts:
@@ -274,7 +274,7 @@ class RigidMotions:
         rays = rays[felt] / length[felt, None]
         rest = np.abs(resultant).max()
         if len(rays):
-            rest *= _unbalanced(rays.T, -resultant / rest)
+            rest *= agreed(self._comm, _unbalanced(rays.T, -resultant / rest))
         if rest > _BALANCED * max(size, np.abs(resultant).max()):
             worst = int(np.argmax(np.abs(resultant)))
             raise ValueError(

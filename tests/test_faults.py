@@ -8,6 +8,8 @@ tolerance of 1e-9).
 import json
 import os
 import resource
+import subprocess
+import sys
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,6 +18,7 @@ import pytest
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
+from running import ROOT, environment
 from scenes import close, nodal, raised_everywhere
 from test_solver import PATH, identical, rub, snapshot, walk
 
@@ -156,6 +159,32 @@ def test_memory_refused(method, condensation, prefix):
     finally:
         del options[key]
     assert made.problem.solve().verdict.failures == []
+
+
+ALONE = """
+import sys
+sys.path.insert(0, "tests")
+from test_solver import PATH, rub
+from fenics_contact import parallel
+parallel.PATIENCE = 0.2
+made = rub()
+made.move(*PATH[0])
+name, rank = "{name}", made.problem.u.function_space.mesh.comm.rank
+kept = getattr(made.problem, name)
+setattr(made.problem, name, lambda: kept() if rank == 0 else 1 / 0)
+made.problem.solve()
+"""
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="starts ranks of its own")
+@pytest.mark.parametrize("name", ["_check_before", "_test_convergence"])
+def test_one_rank_fails_alone(name):
+    """Where nothing tells the other ranks, which wait: all are ended, with the error shown."""
+    script = ["mpirun", "--oversubscribe", "-n", "2", sys.executable, "-c", ALONE.format(name=name)]
+    done = subprocess.run(script, env=environment(), cwd=ROOT, capture_output=True, timeout=60)
+    said = done.stderr.decode(errors="replace")
+    assert done.returncode != 0
+    assert "rank 1 failed alone" in said and "ZeroDivisionError" in said
 
 
 def test_a_load_fails_on_one_rank():
