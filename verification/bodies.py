@@ -41,6 +41,7 @@ def boxes(
     simplex: bool = False,
     bend: Callable[[Array], Array] | None = None,
     degree: int = 1,
+    partitioner: Any = None,
 ) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
     """Boxes that share no node, each cut along its coordinates. Collective.
 
@@ -51,6 +52,7 @@ def boxes(
         simplex: Triangles (in the plane) instead of quadrilaterals and hexahedra.
         bend: Moves the nodes, (n, d).
         degree: Of the cells' geometry.
+        partitioner: DOLFINx's, of the cells, all of which the first rank has.
     """
     d = len(axes[0])
     corners, cells, first = [], [], 0
@@ -81,7 +83,7 @@ def boxes(
     if COMM.rank:
         x, quads = x[:0], quads[:0]
     element = ufl.Mesh(basix.ufl.element("Lagrange", kind, degree, shape=(d,)))
-    mesh = dolfinx.mesh.create_mesh(COMM, cells=quads, x=x, e=element)
+    mesh = dolfinx.mesh.create_mesh(COMM, cells=quads, x=x, e=element, partitioner=partitioner)
     tags = _tagged(mesh, sides)
     if bend is not None:
         mesh.geometry.x[:, :d] = bend(mesh.geometry.x[:, :d])

@@ -3,10 +3,10 @@
 python verification/extremes.py
 python verification/extremes.py --only stiffness --output /tmp/extremes.md
 
-A block is pressed on a floor, or on a round cushion and dragged along it, cold, in one increment
-where nothing else is said, by both direct methods with all that takes over where they fail. Writes
-docs/extremes.md and a CSV. The exit code is 1 if anything is wrong: an error above its tolerance, a
-number that is none, or an end that is neither a verified solution nor an error that says why.
+The scenes are those of ``extreme_scenes.py``, by both direct methods with all that takes over
+where they fail. Writes docs/extremes.md and a CSV. The exit code is 1 if anything is wrong: an
+error above its tolerance, a number that is none, or an end that is neither a verified solution nor
+an error that says why.
 """
 
 from __future__ import annotations
@@ -15,112 +15,34 @@ import argparse
 import csv
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import dolfinx
 import numpy as np
-import ufl
-from dolfinx import fem
-from mpi4py import MPI
+from extreme_scenes import (
+    E,
+    Solve,
+    cycle,
+    dragged,
+    dragged_pair,
+    graded_to,
+    hertz,
+    in_units,
+    loaded,
+    on_one_rank,
+    pair_in_units,
+    poisson,
+    pressed,
+    pressed_pair,
+    proportional,
+)
 
 import fenics_contact as fc
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "extremes.md"
 METHODS = ("lbfgs", "newton")
-BOTTOM, TOP, LEFT = 1, 2, 3
-E, NU, PRESSURE = 1000.0, 0.3, 1.0
-Array = np.ndarray
-
-
-class Block:
-    """A rectangle (0, a) × (0, b), its bottom Γc, plane strain."""
-
-    def __init__(
-        self,
-        degree: int = 1,
-        *,
-        n: tuple[int, int] = (8, 8),
-        size: tuple[float, float] = (1.0, 1.0),
-        modulus: float = E,
-        nu: float = NU,
-        place: Callable[[Array], Array] | None = None,
-        cell: str = "quadrilateral",
-    ) -> None:
-        """Mesh it; ``place`` moves the nodes (2, n) of the unit square before they are scaled."""
-        kind = dolfinx.mesh.CellType[cell]
-        self.mesh = mesh = dolfinx.mesh.create_unit_square(MPI.COMM_WORLD, *n, kind)
-        if place is not None:
-            mesh.geometry.x[:, :2] = place(mesh.geometry.x[:, :2].T).T
-        sides = ((BOTTOM, 1, 0.0), (TOP, 1, 1.0), (LEFT, 0, 0.0))
-        found = [
-            dolfinx.mesh.locate_entities_boundary(
-                mesh, 1, lambda x, i=i, at=at: np.abs(x[i] - at) < 1e-12
-            )
-            for _, i, at in sides
-        ]
-        facets = np.concatenate(found)
-        values = np.repeat(np.array([s[0] for s in sides], np.int32), [len(f) for f in found])
-        order = np.argsort(facets)
-        self.tags = dolfinx.mesh.meshtags(mesh, 1, facets[order], values[order])
-        mesh.geometry.x[:, :2] *= size
-        self.size, self.modulus, self.nu = size, modulus, nu
-        self.V = fem.functionspace(mesh, ("Lagrange", degree, (2,)))
-        self.u, v = fem.Function(self.V), ufl.TestFunction(self.V)
-        self.traction = fem.Constant(mesh, np.zeros(2))
-        body = fc.elasticity.LinearElastic(self.u, modulus, nu, "plane strain")
-        ds = ufl.ds(mesh, subdomain_data=self.tags)
-        self.F = body.residual(v) - ufl.dot(self.traction, v) * ds(TOP)
-        self.surface = fc.ContactSurface(mesh, self.tags, BOTTOM)
-
-    def hold(self, tag: int, component: int, value: Any = 0.0) -> fem.DirichletBC:
-        """Prescribe a component on a side."""
-        if not isinstance(value, fem.Constant):
-            value = fem.Constant(self.mesh, float(value))
-        space = self.V.sub(component)
-        dofs = fem.locate_dofs_topological(space, 1, self.tags.find(tag))
-        return fem.dirichletbc(value, dofs, space)
-
-    def problem(
-        self, law: Any, support: Any, bcs: list[fem.DirichletBC], **options: Any
-    ) -> fc.ContactProblem:
-        """The problem with one contact."""
-        self.contact = fc.Contact(self.u, self.surface, support, law)
-        return fc.ContactProblem(self.F, self.u, bcs=bcs, contacts=[self.contact], **options)
-
-    def floor(self, gap: float = 0.0) -> fc.HalfSpace:
-        """A floor below the bottom."""
-        return fc.HalfSpace((0.0, -gap), (0.0, 1.0))
-
-    def cushion(self) -> fc.Cylinder:
-        """A cylinder of twice the block's width that touches the middle of its bottom."""
-        a = self.size[0]
-        return fc.Cylinder((0.5 * a, -2.0 * a), 2.0 * a)
-
-    def compressed(self, k_n: float, gap: float = 0.0, pressure: float = PRESSURE) -> float:
-        """Error of the displacement under a uniform pressure, sides free, relative to its size.
-
-        σ_y = -p alone, u_y = -gap - p/k_n - (1 - ν²) p y/E, u_x = ν (1 + ν) p x/E.
-        """
-        exact = fem.Function(self.V)
-        p, nu = pressure / self.modulus, self.nu
-        exact.interpolate(
-            lambda x: np.vstack(
-                [nu * (1 + nu) * p * x[0], -gap - pressure / k_n - (1 - nu**2) * p * x[1]]
-            )
-        )
-        return difference(self.u, exact)
-
-
-def difference(f: fem.Function, g: fem.Function) -> float:
-    """Largest difference of two functions, relative to the second. Collective."""
-    comm = f.function_space.mesh.comm
-    n = f.function_space.dofmap.index_map.size_local * f.function_space.dofmap.bs
-    both = [float(np.abs(x).max(initial=0.0)) for x in ((f.x.array - g.x.array)[:n], g.x.array[:n])]
-    error, size = comm.allreduce(np.array(both), op=MPI.MAX)
-    return error / size if size else error
 
 
 @dataclass
@@ -157,9 +79,6 @@ class Row:
         if self.outcome == "verified":
             return bool(self.reference) and not self.error <= self.tolerance
         return not self.outcome.startswith("refused: ")
-
-
-Solve = Callable[[str], tuple[list[fc.problem.Step], float | None]]
 
 
 @dataclass
@@ -208,183 +127,6 @@ class Trial:
                 self.tolerance,
                 seconds,
             )
-
-
-# ---- scenes --------------------------------------------------------------------------------------
-
-
-def friction_law(mu: float, k_n: Any, k_t: Any = None) -> Any:
-    """Coulomb's law, or none without friction."""
-    return fc.Coulomb(mu, k_n, k_n if k_t is None else k_t) if mu else fc.Frictionless(k_n)
-
-
-def pressed(
-    kappa: float,
-    mu: float = 0.0,
-    *,
-    gap: float = 0.0,
-    held: bool = True,
-    load: float = 1.0,
-    history: int = 1,
-    **block: Any,
-) -> Solve:
-    """A block pressed on a floor by a uniform load; held aside unless by friction alone."""
-
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
-        body = Block(**block)
-        h = body.size[1] / block.get("n", (8, 8))[1]
-        k_n = kappa * body.modulus / h
-        # A load in proportion to the modulus strains the block alike in all units.
-        p = PRESSURE * load * body.modulus / E
-        bcs = [body.hold(LEFT, 0)] if held else []
-        problem = body.problem(friction_law(mu, k_n), body.floor(gap), bcs, method=method)
-
-        def apply(t: float) -> None:
-            body.traction.value[1] = -p * t
-
-        steps = list(fc.increments(problem, apply, steps=history))
-        return steps, body.compressed(k_n, gap, p) if mu == 0.0 else abs(
-            steps[-1].contacts["contact"].normal_force / (p * body.size[0]) - 1
-        )
-
-    return solve
-
-
-def dragged(
-    kappa: float,
-    mu: float,
-    *,
-    ratio: float = 1.0,
-    down: float = 0.03,
-    aside: float = 0.02,
-    against: str = "alternating",
-    **block: Any,
-) -> Solve:
-    """The block's top moved down on the cushion and aside; error of u against another method's."""
-
-    def state(method: str, **options: Any) -> tuple[list[fc.problem.Step], Block]:
-        body = Block(**block)
-        length = body.size[0]
-        bcs = [body.hold(TOP, 0, aside * length), body.hold(TOP, 1, -down * length)]
-        law = friction_law(mu, fc.Scaled(kappa), fc.Scaled(kappa * ratio))
-        problem = body.problem(law, body.cushion(), bcs, method=method, **options)
-        return [problem.solve()], body
-
-    def solve(method: str) -> tuple[list[fc.problem.Step], float | None]:
-        steps, body = state(method)
-        try:
-            _, other = state(against, fallback=False)
-        except fc.NotConverged:
-            return steps, None
-        return steps, difference(body.u, other.u)
-
-    return solve
-
-
-def in_units(modulus: float, length: float) -> Solve:
-    """The dragged block in other units: the iterations and digits of the first ones."""
-
-    def state(method: str, modulus: float, length: float) -> tuple[fc.problem.Step, Array]:
-        body = Block(modulus=modulus, size=(length, length))
-        bcs = [body.hold(TOP, 0, 0.02 * length), body.hold(TOP, 1, -0.03 * length)]
-        problem = body.problem(fc.Coulomb(0.3), body.cushion(), bcs, method=method)
-        return problem.solve(), body.u.x.array / length
-
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
-        step, u = state(method, modulus, length)
-        first, v = state(method, E, 1.0)
-        same = step.iterations == first.iterations
-        return [step], float(np.abs(u - v).max() / np.abs(v).max()) if same else np.inf
-
-    return solve
-
-
-def poisson(nu: float, degree: int) -> Solve:
-    """The force of the pressed cushion against that of cubic elements on a mesh twice as fine."""
-
-    def force(method: str, degree: int, n: int) -> fc.problem.Step:
-        body = Block(degree, n=(n, n), nu=nu, cell="triangle")
-        bcs = [body.hold(TOP, 0), body.hold(TOP, 1, -0.03)]
-        return body.problem(fc.Frictionless(), body.cushion(), bcs, method=method).solve()
-
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
-        step, fine = force(method, degree, 16), force("newton", 3, 32)
-        ours, theirs = (s.contacts["contact"].normal_force for s in (step, fine))
-        return [step], abs(ours / theirs - 1)
-
-    return solve
-
-
-def proportional(steps: int) -> Solve:
-    """Load aside and down in proportion, no gap: any number of increments has one state."""
-
-    def state(method: str, steps: int) -> tuple[list[fc.problem.Step], Block]:
-        body = Block(n=(4, 4))
-        problem = body.problem(fc.Coulomb(0.5), body.floor(), [], method=method)
-
-        def load(t: float) -> None:
-            body.traction.value[:] = 0.2 * t, -1.0 * t
-
-        return list(fc.increments(problem, load, steps=steps)), body
-
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
-        made, body = state(method, steps)
-        _, once = state(method, 1)
-        return made, difference(body.u, once.u)
-
-    return solve
-
-
-def cycle(path: list[tuple[float, float]], mu: float = 0.3) -> Solve:
-    """The top led along (aside, down), and back down to the first place, without friction's trace.
-
-    Reference: the force at the first place, found again after the last.
-    """
-
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
-        body = Block()
-        move = [fem.Constant(body.mesh, 0.0) for _ in range(2)]
-        bcs = [body.hold(TOP, i, c) for i, c in enumerate(move)]
-        problem = body.problem(friction_law(mu, fc.Scaled(10)), body.floor(), bcs, method=method)
-        steps = []
-        for aside, down in [path[0], *path, path[0]]:
-            move[0].value, move[1].value = aside, -down
-            steps.append(problem.solve())
-            problem.commit()
-        forces = [step.contacts["contact"].normal_force for step in (steps[0], steps[-1])]
-        opened = [s for s, (_, down) in zip(steps[1:], path, strict=False) if down < 0]
-        if any(s.contacts["contact"].normal_force != 0.0 for s in opened):
-            return steps, float("inf")
-        return steps, abs(forces[1] / forces[0] - 1) if forces[0] else abs(forces[1])
-
-    return solve
-
-
-def loaded(side: float, up: float, mu: float, bcs: str) -> Solve:
-    """A load on a block on its floor, with what holds it; the force is that of the load."""
-
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
-        body = Block()
-        held = {"free": [], "sides": [body.hold(LEFT, 0)]}[bcs]
-        problem = body.problem(friction_law(mu, fc.Scaled(10)), body.floor(), held, method=method)
-        body.traction.value[:] = side, up
-        step = problem.solve()
-        force = step.contacts["contact"].force - [0.0 if bcs == "sides" else -side, -up]
-        return [step], float(np.abs(force).max() / max(abs(up), abs(side), 1e-300) if up else 0.0)
-
-    return solve
-
-
-def graded(ratio: float) -> Callable[[Array], Array]:
-    """Cells along x whose widths grow by ``ratio`` from the middle of Γc to its ends."""
-
-    def place(x: Array) -> Array:
-        s = 2 * x[0] - 1
-        growth = np.log(ratio)
-        moved = np.sign(s) * np.expm1(growth * np.abs(s)) / np.expm1(growth)
-        return np.vstack([0.5 + 0.5 * moved, x[1]])
-
-    return place
 
 
 def trials() -> Iterator[Trial]:
@@ -436,7 +178,7 @@ def trials() -> Iterator[Trial]:
     yield Trial("free bodies", "pushed beyond friction", loaded(0.5, -1.0, 0.3, "free"))
     yield Trial("free bodies", "no friction", loaded(0.0, -1.0, 0.0, "free"))
     for ratio in (1e1, 1e2, 1e4):
-        meshes = {"place": graded(ratio), "n": (32, 8)}
+        meshes = {"place": graded_to(ratio), "n": (32, 8)}
         yield Trial("mesh size ratio", f"{ratio:g}, patch", pressed(10, **meshes), patch)
         yield Trial(
             "mesh size ratio", f"{ratio:g}, cushion", dragged(10, 0.3, **meshes), other, 1e-5
@@ -452,6 +194,86 @@ def trials() -> Iterator[Trial]:
         yield Trial("degree", f"{case}, cushion", dragged(10, 0.3, degree=degree), other, 1e-5)
     yield Trial("Γc all closed", "μ = 0.3", pressed(10, 0.3), "the load")
     yield Trial("Γc all open", "nothing in reach", cycle([up, up]), back)
+    yield from in_space()
+    yield from two_bodies()
+    yield from against_hertz()
+    for ranks in (2, 3):
+        for kind, k, mu in (("cushion", 10.0, 0.3), ("pair", 1e5, 0.0)):
+            case = f"{ranks} ranks, {kind}, k_n h/E = {k:g}, μ = {mu:g}"
+            yield Trial(
+                "Γc on one rank only",
+                case,
+                on_one_rank(ranks, kind, k, mu),
+                "the same on one rank",
+                1e-5,
+                METHODS if kind == "cushion" else ("newton",),  # L-BFGS takes hundreds of steps
+            )
+
+
+def in_space() -> Iterator[Trial]:
+    """Blocks of bricks on floors and on a ball."""
+    few, some = (2, 2, 2), (4, 4, 4)
+    for k in (1e-3, 1.0, 1e3, 1e6, 1e8):
+        name = "3D, stiffness k_n h/E, patch"
+        yield Trial(name, f"{k:.0e}", pressed(k, n=few), "uniform compression, exact")
+    other = "the alternation's solution"
+    for mu in (0.0, 0.3):
+        for k in (1e-3, 1e-1, 1e1, 1e2, 1e3, 1e4, 1e6, 1e8):
+            name = f"3D, stiffness k_n h/E, ball, μ = {mu:g}"
+            # Stiffer friction is beyond the alternation; the state changes by some 1e-6.
+            kept = 1e6 if mu and k > 1e6 else k
+            reference = other if kept == k else f"{other} for {kept:.0e}"
+            yield Trial(name, f"{k:.0e}", dragged(k, mu, known=kept, n=some), reference, 1e-5)
+    for mu in (0.01, 1.0, 10.0):
+        yield Trial("3D, friction μ", f"{mu:g}", dragged(10, mu, n=some), other, 1e-5)
+    for nu, degree in ((0.4999, 1), (0.3, 2), (0.499, 2), (0.4999, 2)):
+        fine = "force of bricks of half the size, degree 2"
+        tolerance = np.inf if degree == 1 else 0.05
+        name, case = "3D, Poisson's ratio ν", f"{nu:g}, degree {degree}"
+        yield Trial(name, case, poisson(nu, degree, 3), fine, tolerance)
+    same = "units N–mm; same iterations"
+    for modulus in (1e-6, 1e15):
+        yield Trial("3D, units", f"E {modulus:.0e}", in_units(modulus, 1.0, some), same, 1e-9)
+    for length in (1e-9, 1e6):
+        yield Trial("3D, units", f"length {length:.0e}", in_units(E, length, some), same, 1e-9)
+    free = loaded(0.1, -1.0, 0.3, "free", some)
+    yield Trial("3D, free bodies", "held by friction", free, "the load")
+    yield Trial("3D, free bodies", "pushed beyond friction", loaded(0.5, -1.0, 0.3, "free", some))
+
+
+def two_bodies() -> Iterator[Trial]:
+    """One block on another, both elastic."""
+    exact, other = "uniform compression, exact", "the alternation's solution"
+    for k in (1e-3, 1.0, 1e3, 1e6, 1e8):
+        yield Trial("two bodies, stiffness k_n h/E, patch", f"{k:.0e}", pressed_pair(k), exact)
+    for mu in (0.0, 0.3):
+        for k in (1e-3, 1e-1, 1e1, 1e2, 1e3, 1e4, 1e6, 1e8):
+            name = f"two bodies, stiffness k_n h/E, round, μ = {mu:g}"
+            yield Trial(name, f"{k:.0e}", dragged_pair(k, mu), other, 1e-5)
+    for contrast in (1e-6, 1e-3, 1e3, 1e6):
+        name, case = "two bodies, stiffness of one over that of the other", f"{contrast:.0e}"
+        yield Trial(name, f"{case}, patch", pressed_pair(10, contrast=contrast), exact)
+        round_ = dragged_pair(10, 0.3, contrast=contrast)
+        yield Trial(name, f"{case}, round", round_, other, 1e-5)
+    for gap in (1e-9, 1e-3, 1.0, 10.0, 1000.0):
+        name = "two bodies, gap, in body lengths"
+        yield Trial(name, f"{gap:g}", pressed_pair(10, gap=gap), exact)
+    same = "units N–mm; same iterations"
+    for modulus, length in ((1e-6, 1.0), (1e15, 1.0), (E, 1e-9), (E, 1e6)):
+        case = f"E {modulus:.0e}" if modulus != E else f"length {length:.0e}"
+        units = in_units(modulus, length, scene=pair_in_units)
+        yield Trial("two bodies, units", case, units, same, 1e-9)
+
+
+def against_hertz() -> Iterator[Trial]:
+    """A roller on a half-plane: to 1 % for the mesh, and to what the springs predict."""
+    name = "peak pressure of a roller, k_n h/E"
+    for k in [10.0**i for i in range(-3, 9)]:
+        solve, share = hertz(k)
+        peak = "Hertz, 1 % + ε" if k > 0.1 else "springs alone, 1 % + 1/ε"
+        yield Trial(name, f"{k:.0e}", solve, peak, 0.01 + share)
+    solve, _ = hertz(10.0, enforcement="augmented")
+    yield Trial(name, "1e+01, multipliers", solve, "Hertz, 1 %", 0.01)
 
 
 # ---- the page ------------------------------------------------------------------------------------
@@ -464,8 +286,9 @@ def page(rows: list[Row]) -> str:
     lines = [
         "# The extremes",
         "",
-        "Written by `python verification/extremes.py`: a block on a floor or a round cushion, "
-        "E = 1000, cold, in one increment where nothing else is said. A solution is *verified* "
+        "Written by `python verification/extremes.py`: a block on a floor or a round cushion, in "
+        "the plane or in space, one block on another, a roller on a half-plane; E = 1000, cold, in "
+        "one increment where nothing else is said. A solution is *verified* "
         "when it passed the package's own checks; its error is that of the displacement (or force) "
         "against the reference, relative. Behind every rung its iterations; “cut” is a halved "
         "increment.",

@@ -1,0 +1,620 @@
+"""The scenes of the extremes: blocks on floors and cushions, one block on another, a roller.
+
+Cold, in one increment where nothing else is said. A scene is a function of the method that returns
+the steps made and the error against its reference, relative.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import dolfinx
+import numpy as np
+import ufl
+from bodies import Bodies, boxes, graded
+from dolfinx import fem
+from mpi4py import MPI
+from statics import near
+
+import fenics_contact as fc
+
+BOTTOM, TOP, LEFT, FRONT, OPPOSITE = 1, 2, 3, 4, 5
+E, NU, PRESSURE = 1000.0, 0.3, 1.0
+Array = np.ndarray
+Solve = Callable[[str], tuple[list[fc.problem.Step], float | None]]
+
+
+class Block:
+    """A rectangle or box from the origin, its bottom Γc; the last coordinate is the height."""
+
+    def __init__(
+        self,
+        degree: int = 1,
+        *,
+        n: Sequence[int] = (8, 8),
+        size: Sequence[float] | None = None,
+        modulus: float = E,
+        nu: float = NU,
+        place: Callable[[Array], Array] | None = None,
+        cell: str = "quadrilateral",
+    ) -> None:
+        """Mesh it; ``place`` moves the nodes (2, n) of the unit square before they are scaled."""
+        self.d = d = len(n)
+        size = (1.0,) * d if size is None else size
+        kind = dolfinx.mesh.CellType[cell if d == 2 or cell != "quadrilateral" else "hexahedron"]
+        make = dolfinx.mesh.create_unit_square if d == 2 else dolfinx.mesh.create_unit_cube
+        self.mesh = mesh = make(MPI.COMM_WORLD, *n, kind)
+        if place is not None:
+            mesh.geometry.x[:, :2] = place(mesh.geometry.x[:, :2].T).T
+        sides = [(BOTTOM, d - 1, 0.0), (TOP, d - 1, 1.0), (LEFT, 0, 0.0)]
+        sides += [(FRONT, 1, 0.0)] if d == 3 else []
+        found = [
+            dolfinx.mesh.locate_entities_boundary(
+                mesh, d - 1, lambda x, i=i, at=at: np.abs(x[i] - at) < 1e-12
+            )
+            for _, i, at in sides
+        ]
+        facets = np.concatenate(found)
+        values = np.repeat(np.array([s[0] for s in sides], np.int32), [len(f) for f in found])
+        order = np.argsort(facets)
+        self.tags = dolfinx.mesh.meshtags(mesh, d - 1, facets[order], values[order])
+        mesh.geometry.x[:, :d] *= size
+        self.size, self.modulus, self.nu = size, modulus, nu
+        self.V = fem.functionspace(mesh, ("Lagrange", degree, (d,)))
+        self.u, v = fem.Function(self.V), ufl.TestFunction(self.V)
+        self.traction = fem.Constant(mesh, np.zeros(d))
+        body = fc.elasticity.LinearElastic(self.u, modulus, nu, "plane strain" if d == 2 else "3D")
+        ds = ufl.ds(mesh, subdomain_data=self.tags)
+        self.F = body.residual(v) - ufl.dot(self.traction, v) * ds(TOP)
+        self.surface = fc.ContactSurface(mesh, self.tags, BOTTOM)
+
+    def hold(self, tag: int, component: int, value: Any = 0.0) -> fem.DirichletBC:
+        """Prescribe a component on a side."""
+        if not isinstance(value, fem.Constant):
+            value = fem.Constant(self.mesh, float(value))
+        space = self.V.sub(component)
+        dofs = fem.locate_dofs_topological(space, self.d - 1, self.tags.find(tag))
+        return fem.dirichletbc(value, dofs, space)
+
+    def rollers(self) -> list[fem.DirichletBC]:
+        """No displacement across the planes x = 0 and, in space, y = 0."""
+        return [self.hold(LEFT, 0)] + ([self.hold(FRONT, 1)] if self.d == 3 else [])
+
+    def moved(self, aside: float, down: float) -> list[fem.DirichletBC]:
+        """The top moved along x and down."""
+        across = [self.hold(TOP, 1)] if self.d == 3 else []
+        return [self.hold(TOP, 0, aside), *across, self.hold(TOP, self.d - 1, -down)]
+
+    def problem(
+        self, law: Any, support: Any, bcs: list[fem.DirichletBC], **options: Any
+    ) -> fc.ContactProblem:
+        """The problem with one contact."""
+        self.contact = fc.Contact(self.u, self.surface, support, law)
+        return fc.ContactProblem(self.F, self.u, bcs=bcs, contacts=[self.contact], **options)
+
+    def floor(self, gap: float = 0.0) -> fc.HalfSpace:
+        """A floor below the bottom."""
+        up = np.eye(self.d)[-1]
+        return fc.HalfSpace(-gap * up, up)
+
+    def cushion(self) -> fc.Ball:
+        """A ball (a disc) twice as wide as the block, that touches the middle of its bottom."""
+        a = self.size[0]
+        return fc.Ball([0.5 * a] * (self.d - 1) + [-2.0 * a], 2.0 * a)
+
+    def compressed(self, k_n: float, gap: float = 0.0, pressure: float = PRESSURE) -> float:
+        """Error of the displacement under a uniform pressure, sides free, relative to its size.
+
+        σ = -p along the height alone; in plane strain u_y = -gap - p/k_n - (1 - ν²) p y/E and
+        u_x = ν (1 + ν) p x/E; in space u_z = -gap - p/k_n - p z/E, u_x = ν p x/E, u_y = ν p y/E.
+        """
+        exact = fem.Function(self.V)
+        along, across = strains(pressure / self.modulus, self.nu, self.d)
+        exact.interpolate(
+            lambda x: np.vstack(
+                [*(across * x[: self.d - 1]), -gap - pressure / k_n - along * x[self.d - 1]]
+            )
+        )
+        return difference(self.u, exact)
+
+
+def strains(load: float, nu: float, d: int) -> tuple[float, float]:
+    """Compression along the load p/E and extension across it, plane strain or in space."""
+    return ((1 - nu**2) * load, nu * (1 + nu) * load) if d == 2 else (load, nu * load)
+
+
+def difference(f: fem.Function, g: fem.Function) -> float:
+    """Largest difference of two functions, relative to the second. Collective."""
+    comm = f.function_space.mesh.comm
+    n = f.function_space.dofmap.index_map.size_local * f.function_space.dofmap.bs
+    both = [float(np.abs(x).max(initial=0.0)) for x in ((f.x.array - g.x.array)[:n], g.x.array[:n])]
+    error, size = comm.allreduce(np.array(both), op=MPI.MAX)
+    return error / size if size else error
+
+
+# ---- a block on a rigid support ------------------------------------------------------------------
+
+
+def friction_law(mu: float, k_n: Any, k_t: Any = None) -> Any:
+    """Coulomb's law, or none without friction."""
+    return fc.Coulomb(mu, k_n, k_n if k_t is None else k_t) if mu else fc.Frictionless(k_n)
+
+
+def pressed(
+    kappa: float,
+    mu: float = 0.0,
+    *,
+    gap: float = 0.0,
+    held: bool = True,
+    load: float = 1.0,
+    history: int = 1,
+    **block: Any,
+) -> Solve:
+    """A block pressed on a floor by a uniform load; held aside unless by friction alone."""
+
+    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+        body = Block(**block)
+        h = body.size[-1] / block.get("n", (8, 8))[-1]
+        k_n = kappa * body.modulus / h
+        # A load in proportion to the modulus strains the block alike in all units.
+        p = PRESSURE * load * body.modulus / E
+        bcs = body.rollers() if held else []
+        problem = body.problem(friction_law(mu, k_n), body.floor(gap), bcs, method=method)
+
+        def apply(t: float) -> None:
+            body.traction.value[-1] = -p * t
+
+        steps = list(fc.increments(problem, apply, steps=history))
+        if mu == 0.0:
+            return steps, body.compressed(k_n, gap, p)
+        force = p * float(np.prod(body.size[:-1]))
+        return steps, abs(steps[-1].contacts["contact"].normal_force / force - 1)
+
+    return solve
+
+
+def dragged(
+    kappa: float,
+    mu: float,
+    *,
+    ratio: float = 1.0,
+    down: float = 0.03,
+    aside: float = 0.02,
+    against: str = "alternating",
+    known: float | None = None,
+    **block: Any,
+) -> Solve:
+    """The block's top moved down on the cushion and aside; error of u against another method's.
+
+    The latter for the stiffness ``known``, by default the same.
+    """
+
+    def state(
+        method: str, kappa: float = kappa, **options: Any
+    ) -> tuple[list[fc.problem.Step], Block]:
+        body = Block(**block)
+        length = body.size[0]
+        bcs = body.moved(aside * length, down * length)
+        law = friction_law(mu, fc.Scaled(kappa), fc.Scaled(kappa * ratio))
+        problem = body.problem(law, body.cushion(), bcs, method=method, **options)
+        return [problem.solve()], body
+
+    @functools.cache
+    def other() -> fem.Function | None:
+        try:
+            return state(against, known or kappa, fallback=False)[1].u
+        except fc.NotConverged:
+            return None
+
+    def solve(method: str) -> tuple[list[fc.problem.Step], float | None]:
+        steps, body = state(method)
+        reference = other()
+        return steps, None if reference is None else difference(body.u, reference)
+
+    return solve
+
+
+State = tuple[fc.problem.Step, Array]
+
+
+def block_in_units(method: str, modulus: float, length: float, n: Sequence[int]) -> State:
+    """The dragged block and its displacements over its length."""
+    body = Block(modulus=modulus, size=(length,) * len(n), n=n)
+    bcs = body.moved(0.02 * length, 0.03 * length)
+    problem = body.problem(fc.Coulomb(0.3), body.cushion(), bcs, method=method)
+    return problem.solve(), body.u.x.array / length
+
+
+def in_units(
+    modulus: float, length: float, n: Sequence[int] = (8, 8), scene: Any = block_in_units
+) -> Solve:
+    """A scene in other units: the iterations and digits of the first ones."""
+
+    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+        step, u = scene(method, modulus, length, n)
+        first, v = scene(method, E, 1.0, n)
+        same = step.iterations == first.iterations
+        return [step], float(np.abs(u - v).max() / np.abs(v).max()) if same else np.inf
+
+    return solve
+
+
+def poisson(nu: float, degree: int, d: int = 2) -> Solve:
+    """The force of the pressed cushion against that of a mesh twice as fine, in the plane cubic."""
+    n, cell, best = (16, "triangle", 3) if d == 2 else (3, "hexahedron", 2)
+
+    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+        step = _force(method, nu, degree, (n,) * d, cell)
+        fine = _force("newton", nu, best, (2 * n,) * d, cell)
+        ours, theirs = (s.contacts["contact"].normal_force for s in (step, fine))
+        return [step], abs(ours / theirs - 1)
+
+    return solve
+
+
+@functools.lru_cache(maxsize=64)
+def _force(method: str, nu: float, degree: int, n: tuple[int, ...], cell: str) -> fc.problem.Step:
+    body = Block(degree, n=n, nu=nu, cell=cell)
+    problem = body.problem(fc.Frictionless(), body.cushion(), body.moved(0.0, 0.03), method=method)
+    return problem.solve()
+
+
+def proportional(steps: int) -> Solve:
+    """Load aside and down in proportion, no gap: any number of increments has one state."""
+
+    def state(method: str, steps: int) -> tuple[list[fc.problem.Step], Block]:
+        body = Block(n=(4, 4))
+        problem = body.problem(fc.Coulomb(0.5), body.floor(), [], method=method)
+
+        def load(t: float) -> None:
+            body.traction.value[:] = 0.2 * t, -1.0 * t
+
+        return list(fc.increments(problem, load, steps=steps)), body
+
+    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+        made, body = state(method, steps)
+        _, once = state(method, 1)
+        return made, difference(body.u, once.u)
+
+    return solve
+
+
+def cycle(path: list[tuple[float, float]], mu: float = 0.3) -> Solve:
+    """The top led along (aside, down), and back down to the first place, without friction's trace.
+
+    Reference: the force at the first place, found again after the last.
+    """
+
+    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+        body = Block()
+        move = [fem.Constant(body.mesh, 0.0) for _ in range(2)]
+        bcs = [body.hold(TOP, i, c) for i, c in enumerate(move)]
+        problem = body.problem(friction_law(mu, fc.Scaled(10)), body.floor(), bcs, method=method)
+        steps = []
+        for aside, down in [path[0], *path, path[0]]:
+            move[0].value, move[1].value = aside, -down
+            steps.append(problem.solve())
+            problem.commit()
+        forces = [step.contacts["contact"].normal_force for step in (steps[0], steps[-1])]
+        opened = [s for s, (_, down) in zip(steps[1:], path, strict=False) if down < 0]
+        if any(s.contacts["contact"].normal_force != 0.0 for s in opened):
+            return steps, float("inf")
+        return steps, abs(forces[1] / forces[0] - 1) if forces[0] else abs(forces[1])
+
+    return solve
+
+
+def loaded(side: float, up: float, mu: float, bcs: str, n: Sequence[int] = (8, 8)) -> Solve:
+    """A load on a block on its floor, with what holds it; the force is that of the load."""
+
+    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+        body = Block(n=n)
+        held = {"free": [], "sides": body.rollers()}[bcs]
+        problem = body.problem(friction_law(mu, fc.Scaled(10)), body.floor(), held, method=method)
+        body.traction.value[0], body.traction.value[-1] = side, up
+        step = problem.solve()
+        wanted = -body.traction.value
+        if bcs == "sides":
+            wanted[:-1] = 0.0
+        force = step.contacts["contact"].force - wanted
+        return [step], float(np.abs(force).max() / max(abs(up), abs(side), 1e-300) if up else 0.0)
+
+    return solve
+
+
+def graded_to(ratio: float) -> Callable[[Array], Array]:
+    """Cells along x whose widths grow by ``ratio`` from the middle of Γc to its ends."""
+
+    def place(x: Array) -> Array:
+        s = 2 * x[0] - 1
+        growth = np.log(ratio)
+        moved = np.sign(s) * np.expm1(growth * np.abs(s)) / np.expm1(growth)
+        return np.vstack([0.5 + 0.5 * moved, x[1]])
+
+    return place
+
+
+# ---- one block on another ----------------------------------------------------------------------
+
+APART = 0.25  # of the blocks when they are meshed, so that sides are told apart
+
+
+class Pair:
+    """Two blocks of height 1/2 and width 1, of meshes that do not match, one above the other.
+
+    Attributes:
+        moduli: Of the lower and of the upper block.
+        gap: Between them (length).
+        traction: On the top (force/length).
+    """
+
+    def __init__(
+        self,
+        *,
+        modulus: float = E,
+        contrast: float = 1.0,
+        length: float = 1.0,
+        gap: float = 0.0,
+        n: tuple[int, int] = (6, 8),
+        partitioner: Any = None,
+    ) -> None:
+        """Mesh them; the upper one is ``contrast`` times as stiff, ``gap`` is over ``length``."""
+        self.moduli, self.length, self.gap = (modulus, contrast * modulus), length, gap * length
+        lines = [
+            [np.linspace(0, 1, m + 1), low + np.linspace(0, 0.5, m // 2 + 1)]
+            for m, low in zip(n, (0.0, 0.5 + APART), strict=True)
+        ]
+        sides = {
+            BOTTOM: near(1, 0.0),
+            TOP: near(1, 1.0 + APART),
+            LEFT: near(0, 0.0),
+            FRONT: near(1, 0.5),
+            OPPOSITE: near(1, 0.5 + APART),
+        }
+
+        def bend(x: Array) -> Array:
+            upper = x[:, 1] > 0.5 + 0.5 * APART
+            down = np.where(upper, gap - APART, 0.0)
+            return length * np.column_stack([x[:, 0], x[:, 1] + down])
+
+        made = boxes(lines, sides, bend=bend, partitioner=partitioner)
+        mesh = made[0]
+        n_cells = mesh.topology.index_map(2).size_local + mesh.topology.index_map(2).num_ghosts
+        cells = np.arange(n_cells, dtype=np.int32)
+        # The middles of cells, where the lower block ends at 1/2.
+        height = dolfinx.mesh.compute_midpoints(mesh, 2, cells).reshape(-1, 3)[:, 1]
+        upper = height > 0.5 * length
+        self.cells = cells[~upper], cells[upper]
+        stiffness = fem.Function(fem.functionspace(mesh, ("DG", 0)))
+        stiffness.x.array[:] = np.where(upper, self.moduli[1], self.moduli[0])
+        self.body = body = Bodies(made, stiffness, NU)
+        self.u = body.u
+        self.traction = body.constant(np.zeros(2))
+        body.F = body.F - ufl.dot(self.traction, body.v) * body.ds(TOP)
+        self.surface = fc.ContactSurface(mesh, made[1], FRONT)
+
+    def problem(self, law: Any, *, curved: bool = False, **options: Any) -> fc.ContactProblem:
+        """The problem with the contact of the lower block's top with the upper one's bottom.
+
+        Args:
+            law: Of contact.
+            curved: Let them touch in the middle alone, as if rounded by twice their width.
+            options: Of the problem.
+        """
+        a, x = self.length, self.body.x
+        support = fc.DeformableBody(self.body.tags, OPPOSITE)
+        gap = (x[0] - 0.5 * a) ** 2 / (4.0 * a) if curved else None
+        contact = fc.Contact(self.u, self.surface, support, law, gap=gap)
+        return fc.ContactProblem(
+            self.body.F, self.u, bcs=self.body.bcs, contacts=[contact], **options
+        )
+
+    def press(self) -> float:
+        """Rollers below and at the left, a pressure on the top that strains the softer by 1e-3."""
+        self.body.hold(BOTTOM, 1)
+        self.body.hold(LEFT, 0)
+        pressure = PRESSURE / E * min(self.moduli)
+        self.traction.value[1] = -pressure
+        return pressure
+
+    def drag(self, down: float = 0.03, aside: float = 0.02) -> None:
+        """The lower one clamped below, the top of the upper one moved down and aside."""
+        self.body.hold(BOTTOM, 0, 1)
+        self.body.hold(TOP, 0, value=aside * self.length)
+        self.body.hold(TOP, 1, value=-down * self.length)
+
+    def compressed(self, k_n: float, pressure: float) -> float:
+        """Error under a uniform pressure, relative to the displacement's size; see `Block`."""
+        exact = fem.Function(self.u.function_space)
+        half = 0.5 * self.length
+        lower, upper = (strains(pressure / modulus, NU, 2) for modulus in self.moduli)
+        sunk = lower[0] * half + self.gap + pressure / k_n
+
+        def below(x: Array) -> Array:
+            return np.vstack([lower[1] * x[0], -lower[0] * x[1]])
+
+        def above(x: Array) -> Array:
+            return np.vstack([upper[1] * x[0], -sunk - upper[0] * (x[1] - half - self.gap)])
+
+        for values, cells in zip((below, above), self.cells, strict=True):
+            exact.interpolate(values, cells)
+        exact.x.scatter_forward()
+        return difference(self.u, exact)
+
+
+def pressed_pair(kappa: float, **pair: Any) -> Solve:
+    """One block pressed on the other by a uniform load; k_n is that of the softer one."""
+
+    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+        both = Pair(**pair)
+        k_n = kappa * min(both.moduli) * 6 / both.length
+        pressure = both.press()
+        step = both.problem(fc.Frictionless(k_n), method=method).solve()
+        return [step], both.compressed(k_n, pressure)
+
+    return solve
+
+
+def dragged_pair(kappa: float, mu: float, **pair: Any) -> Solve:
+    """One rounded block pressed on the other and dragged; against the alternation's solution."""
+
+    def state(method: str, **options: Any) -> tuple[list[fc.problem.Step], Pair]:
+        both = Pair(**pair)
+        both.drag()
+        k = kappa * min(both.moduli) * 6 / both.length
+        problem = both.problem(friction_law(mu, k), curved=True, method=method, **options)
+        return [problem.solve()], both
+
+    @functools.cache
+    def other() -> fem.Function | None:
+        try:
+            return state("alternating", fallback=False)[1].u
+        except fc.NotConverged:
+            return None
+
+    def solve(method: str) -> tuple[list[fc.problem.Step], float | None]:
+        steps, both = state(method)
+        reference = other()
+        return steps, None if reference is None else difference(both.u, reference)
+
+    return solve
+
+
+def pair_in_units(method: str, modulus: float, length: float, _: Any) -> State:
+    """The dragged pair and its displacements over its length."""
+    both = Pair(modulus=modulus, length=length)
+    both.drag()
+    step = both.problem(fc.Coulomb(0.3), curved=True, method=method).solve()
+    return step, both.u.x.array / length
+
+
+# ---- Hertz ---------------------------------------------------------------------------------------
+
+
+def hertz(kappa: float, *, enforcement: str = "penalty") -> tuple[Solve, float]:
+    """A rigid roller on a half-plane: error of the peak pressure p₀, and what the springs predict.
+
+    Springs of stiffness k_n on the surface give way by p/k_n: over the parabola's a²/2R, by which
+    the half-plane gives way, that is ε = E*/(k_n a), since p₀ = E* a/2R. Hertz's peak is missed by
+    no more than ε. Where ε > 1 it is rather the springs alone that bear the roller, with
+    P = 2/3 k_n a³/R and p₀ = k_n a²/2R; these are missed by no more than 1/ε, of their own a.
+    """
+    star, radius, a = E / (1 - NU**2), 8.0, 0.1
+    force = np.pi * a**2 * star / (4 * radius)
+    peak, cells, far = star * a / (2 * radius), 10, 40.0
+    h = a / cells
+    k_n = kappa * E / h
+    share = star / (k_n * a)
+    if share > 1 and enforcement == "penalty":
+        a = (1.5 * force * radius / k_n) ** (1 / 3)
+        peak, share = k_n * a**2 / (2 * radius), k_n * a / star
+    if enforcement != "penalty":
+        share = 0.0
+
+    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+        x = graded(0.15, 15, far * 0.1, 1.3)
+        y = -graded(0.15, 15, far * 0.1, 1.3)[::-1]
+        sides = {BOTTOM: near(1, y[0]), LEFT: near(0, 0.0), FRONT: near(1, 0.0)}
+        body = Bodies(boxes([[x, y]], sides), E, NU, degree=2)
+        body.hold(BOTTOM, 0, 1)
+        body.hold(LEFT, 0)
+        roller = fc.Motion(force=(None, -force / 2))
+        gap = body.x[0] ** 2 / (2 * radius)
+        support = fc.Obstacle(gap, (0.0, 1.0), displacement=roller)
+        law = fc.Frictionless(k_n)
+        surface = fc.ContactSurface(body.mesh, body.tags, FRONT)
+        contact = fc.Contact(body.u, surface, support, law, enforcement=enforcement)
+        problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact], method=method)
+        step = problem.solve()
+        return [step], abs(step.contacts["contact"].max_pressure / peak - 1)
+
+    return solve, share
+
+
+# ---- several ranks -------------------------------------------------------------------------------
+
+
+def lower_block_apart(comm: MPI.Comm, n_parts: int, cell_types: Any, cells: Any) -> Any:
+    """A partitioner of `Pair`: the lower block on the last rank, the upper one on the others."""
+    n_cells = cells[0].size // 4
+    n_lower = 6 * 3
+    upper = np.arange(max(n_cells - n_lower, 0)) * (n_parts - 1) // max(n_cells - n_lower, 1)
+    destination = np.concatenate([np.full(min(n_lower, n_cells), n_parts - 1), upper])
+    offsets = np.arange(n_cells + 1, dtype=np.int32)
+    adjacency = dolfinx.graph.adjacencylist(destination.astype(np.int32), offsets)
+    return getattr(adjacency, "_cpp_object", adjacency)
+
+
+def ranked(
+    kind: str, kappa: float, mu: float, method: str, *, apart: bool = True
+) -> tuple[fc.problem.Step, Array, list[int]]:
+    """One block dragged on the other or, alone, on a cushion; nodes' places with displacements.
+
+    On several ranks all of Γc is on the last one, if ``apart``. Collective.
+
+    Returns:
+        The step; (n_nodes, 4) in the order of the places; and the facets of Γc on every rank.
+    """
+    comm = MPI.COMM_WORLD
+    both = Pair(gap=1e-3, partitioner=lower_block_apart if apart and comm.size > 1 else None)
+    both.drag()
+    law = friction_law(mu, kappa * 6 * E)
+    if kind == "pair":
+        problem = both.problem(law, method=method)
+    else:  # the upper block is pressed by nothing: it is held and stays
+        both.body.bcs.clear()
+        both.body.hold(OPPOSITE, 0, 1)
+        both.body.hold(BOTTOM, 0, value=0.02)
+        both.body.hold(BOTTOM, 1, value=0.03)
+        support = fc.Ball((0.5, 2.5), 2.0)
+        contact = fc.Contact(both.u, both.surface, support, law)
+        problem = fc.ContactProblem(
+            both.body.F, both.u, bcs=both.body.bcs, contacts=[contact], method=method
+        )
+    step = problem.solve()
+    space = both.u.function_space
+    n = space.dofmap.index_map.size_local
+    x, u = space.tabulate_dof_coordinates()[:n, :2], both.u.x.array.reshape(-1, 2)[:n]
+    rows = np.concatenate(comm.allgather(np.column_stack([x, u])))
+    order = np.lexsort(np.round(rows[:, :2], 9).T)
+    return step, rows[order], comm.allgather(len(both.surface.facets))
+
+
+def on_one_rank(ranks: int, kind: str, kappa: float, mu: float) -> Solve:
+    """`ranked` in processes of its own, against the same on one rank."""
+
+    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "state"
+            command = ["mpirun", "--oversubscribe", "-n", str(ranks), sys.executable, __file__]
+            command += [kind, str(kappa), str(mu), method, str(path)]
+            done = subprocess.run(command, env=environment(), capture_output=True, timeout=120)
+            if done.returncode:
+                raise RuntimeError(done.stderr.decode(errors="replace")[-300:])
+            step, rows, n_facets = pickle.loads(path.read_bytes())
+        if np.count_nonzero(n_facets) != 1:
+            raise RuntimeError(f"Γc is not on one rank alone: {n_facets} facets")
+        _, alone, _ = ranked(kind, kappa, mu, method)
+        return [step], float(np.abs(rows - alone).max() / np.abs(alone[:, 2:]).max())
+
+    return solve
+
+
+def environment() -> dict[str, str]:
+    """What new ranks get: what mpirun left here would make another mpirun join it."""
+    return {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
+
+
+if __name__ == "__main__":
+    kind, kappa, mu, method, path = sys.argv[1:]
+    found = ranked(kind, float(kappa), float(mu), method)
+    if MPI.COMM_WORLD.rank == 0:
+        Path(path).write_bytes(pickle.dumps(found))
