@@ -13,7 +13,7 @@ sys.path.insert(0, str(ROOT / "verification"))
 
 import effectivity
 import half_planes  # noqa: F401
-import run
+import report
 import solids  # noqa: F401
 import statics
 from cases import CASES, Case, Outcome, Row
@@ -59,11 +59,11 @@ def test_misses_and_failures_are_shown(tmp_path, monkeypatch, capsys):
         Case(name, "none", lambda row=row: Outcome((row,), "a mesh", 7))
         for name, row in rows.items()
     ]
-    monkeypatch.setattr(run, "DEMOS", [])
-    monkeypatch.setattr(run, "CASES", cases)
-    monkeypatch.setattr(run, "PAGE", tmp_path / "page.md")
+    monkeypatch.setattr(report, "DEMOS", [])
+    monkeypatch.setattr(report, "CASES", cases)
+    monkeypatch.setattr(report, "PAGE", tmp_path / "page.md")
     monkeypatch.setattr(sys, "argv", ["run.py"])
-    assert run.main() == 1
+    assert report.main() == 1
     page = (tmp_path / "page.md").read_text()
     assert page == page.rstrip() + "\n"
     for text in (
@@ -74,17 +74,17 @@ def test_misses_and_failures_are_shown(tmp_path, monkeypatch, capsys):
     ):
         assert text in page
     assert page.count("| **MISSED** |") == 1 and page.count("| met |") == 1
-    monkeypatch.setattr(run, "CASES", cases[1:2])
-    assert run.main() == 0
+    monkeypatch.setattr(report, "CASES", cases[1:2])
+    assert report.main() == 0
     assert "MISSED" not in (tmp_path / "page.md").read_text()
 
 
 @ONE_PROCESS
 def test_the_page_has_all_cases():
     """The page that is kept is of these cases, and nothing on it is missed."""
-    page = run.PAGE.read_text()
+    page = report.PAGE.read_text()
     titles = [line.removeprefix("## ") for line in page.splitlines() if line.startswith("## ")]
-    assert titles == [case.name for case in [*run.DEMOS, *run.CASES]]
+    assert titles == [case.name for case in [*report.DEMOS, *report.CASES]]
     assert "MISSED" not in page and "FAILED" not in page
 
 
@@ -103,7 +103,7 @@ def test_the_page_of_estimates_has_all_cases():
     rows = [line for line in page.splitlines() if line.startswith("| ")]
     for case in CASES:
         assert any(row.startswith(f"| {case.name} | {case.budget}") for row in rows), case.name
-    for case in run.DEMOS:
+    for case in report.DEMOS:
         assert not case.budget or f"| {case.name} | {case.budget} |" in rows, case.name
     for name, *_ in effectivity.WHOLES:
         assert any(row.startswith(f"| {name} ") for row in rows), name
