@@ -26,7 +26,7 @@ __all__ = [
 logger = logging.getLogger("fenics_contact")
 
 # How long ranks that fail together may be apart (seconds), and the tag of their messages.
-PATIENCE = 10.0
+PATIENCE = 30.0
 _TAG = 7351
 
 
