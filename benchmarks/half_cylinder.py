@@ -61,7 +61,7 @@ def main() -> None:
         "--h",
         type=float,
         nargs="+",
-        default=[0.25, 0.12, 0.06, 0.03, 0.0165],
+        default=[0.25, 0.12, 0.06, 0.03, 0.0165, 0.0115],
         help="cell sizes on Γc; the table is of the last",
     )
     parser.add_argument("--degree", type=int, default=2)
