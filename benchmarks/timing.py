@@ -152,14 +152,16 @@ def draw(path: Path, title: str, x: str, y: str, series: Series) -> None:
     if MPI.COMM_WORLD.rank:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    with plotting.figure(path, size=(7.5, 5.0)) as axes:
-        for name, (at, values) in series.items():
-            (points,) = axes.loglog(at, values, "o", markersize=4, label=name)
+    with plotting.figure(path, size=(10.0, 5.0)) as axes:
+        for number, (name, (at, values)) in enumerate(series.items()):
+            marker = "osv"[number // 10 % 3]  # colours are ten
+            (points,) = axes.loglog(at, values, marker, markersize=4, label=name)
             if len(set(at)) > 2:
                 factor, exponent = fit(at, values)
                 ends = np.array([min(at), max(at)], dtype=np.float64)
-                axes.loglog(ends, factor * ends**exponent, "-", color=points.get_color())
+                line = ("-", "--", ":")[number // 10 % 3]
+                axes.loglog(ends, factor * ends**exponent, line, color=points.get_color())
                 points.set_label(f"{name}: exponent {exponent:.2f}")
         axes.set(title=title, xlabel=x, ylabel=y)
         axes.grid(alpha=0.25, which="both")
-        axes.legend(fontsize=8)
+        axes.figure.legend(fontsize=8, loc="outside right upper")
