@@ -9,7 +9,7 @@ Every script of this folder takes ``--output``, ``--repeat`` and ``--short`` and
 (``.md``), numbers (``.csv``) and plots (``.png``) in its part of the output folder. The page there,
 `README.md`, joins the parts of this run and of earlier ones, below the table of targets. Forms are
 compiled anew, into a cache of this run, so that "first use" is what a new user waits. The exit code
-is 1 if a benchmark failed. ``methods.py`` (five minutes) and ``trade.py`` (a quarter of an hour)
+is 1 if a benchmark failed. ``methods.py`` (five minutes) and ``trade.py`` (ten minutes)
 have pages of their own in docs/ and are run when they are named, or by their own commands.
 """
 

@@ -10,7 +10,7 @@ units of one linear solve of the same mesh and degree (assembly, factorisation, 
 made in turn with the runs, the quickest of ``--repeat`` and for the unit of all; meshing and the
 compiling of forms, done before, are not counted.
 
-    OMP_NUM_THREADS=1 python benchmarks/trade.py            # a quarter of an hour; writes docs/
+    OMP_NUM_THREADS=1 python benchmarks/trade.py            # ten minutes; writes docs/
     OMP_NUM_THREADS=1 python benchmarks/trade.py --short    # a minute; writes to --output only
 
 Rows are kept in ``trade.csv`` of the output folder as they are done: a run that was killed goes on
