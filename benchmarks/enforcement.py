@@ -215,7 +215,8 @@ def compare(
         )
         for kind in kinds
     }
-    timing.draw(folder / f"{stem}.png", name, "seconds", "error of the displacement", series)
+    label = "error of the displacement"
+    timing.draw(folder / f"{stem}.png", name, "seconds", label, series, fitted=False)
 
 
 def main() -> None:

@@ -139,8 +139,8 @@ def _shown(value: Any) -> str:
     return "–" if math.isnan(value) else f"{value:.4g}"
 
 
-def draw(path: Path, title: str, x: str, y: str, series: Series) -> None:
-    """Plot series over logarithmic axes with their fitted power laws. On rank 0.
+def draw(path: Path, title: str, x: str, y: str, series: Series, *, fitted: bool = True) -> None:
+    """Plot series over logarithmic axes, by default with their fitted power laws. On rank 0.
 
     Args:
         path: The picture.
@@ -148,6 +148,7 @@ def draw(path: Path, title: str, x: str, y: str, series: Series) -> None:
         x: Name of the abscissa.
         y: Name of the ordinate.
         series: Values (x, y) by name; the law fitted to them stands in the legend.
+        fitted: Whether the values follow a law.
     """
     if MPI.COMM_WORLD.rank:
         return
@@ -156,7 +157,7 @@ def draw(path: Path, title: str, x: str, y: str, series: Series) -> None:
         for number, (name, (at, values)) in enumerate(series.items()):
             marker = "osv"[number // 10 % 3]  # colours are ten
             (points,) = axes.loglog(at, values, marker, markersize=4, label=name)
-            if len(set(at)) > 2:
+            if fitted and len(set(at)) > 2:
                 factor, exponent = fit(at, values)
                 ends = np.array([min(at), max(at)], dtype=np.float64)
                 line = ("-", "--", ":")[number // 10 % 3]

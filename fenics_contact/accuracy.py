@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import ceil
+from typing import Any
 
 import basix
 import dolfinx.fem.petsc
@@ -14,6 +15,7 @@ from dolfinx import fem, la
 from petsc4py import PETSc
 
 from fenics_contact import compat
+from fenics_contact.facets import facet_cells
 from fenics_contact.parallel import global_min
 from fenics_contact.surface import ContactSurface
 
@@ -157,7 +159,7 @@ def modulus_over_height(surface: ContactSurface, modulus: fem.Function) -> fem.F
         ValueError: The modulus is not positive at some facet: the bulk form has no stiffness there.
     """
     mesh, submesh = surface.mesh, surface.submesh
-    behind = surface.cells_behind()
+    behind = facet_cells(mesh, surface.parent_facets())
     area = _sizes(submesh, np.arange(behind.size, dtype=np.int32))
     # A simplex of height h over a facet of area A has the volume A h / d, a brick A h.
     simplex = mesh.topology.cell_type in (
@@ -184,14 +186,11 @@ def modulus_over_height(surface: ContactSurface, modulus: fem.Function) -> fem.F
     return result
 
 
-def _sizes(mesh: dolfinx.mesh.Mesh, cells: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
+def _sizes(mesh: dolfinx.mesh.Mesh, cells: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.float64]:
     """Area or volume of cells, that of their midpoints' Jacobian: exact for straight simplices."""
     kind = basix.CellType[mesh.topology.cell_name()]
-    geometry = compat.coordinate_element(mesh)
-    variant = basix.LagrangeVariant(geometry.variant)
-    element = basix.create_element(basix.ElementFamily.P, kind, geometry.degree, variant)
-    corners = basix.geometry(kind)
-    slopes = element.tabulate(1, corners.mean(axis=0, keepdims=True))[1:, 0, :, 0]
+    middle = basix.geometry(kind).mean(axis=0, keepdims=True)
+    slopes = compat.geometry_element(mesh).tabulate(1, middle)[1:, 0, :, 0]
     x = mesh.geometry.x[compat.geometry_dofmap(mesh)[cells]][:, :, : mesh.geometry.dim]
     jacobian = np.einsum("kn,cnd->ckd", slopes, x)
     squared = np.linalg.det(jacobian @ jacobian.transpose(0, 2, 1))

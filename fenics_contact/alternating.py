@@ -172,7 +172,7 @@ class Alternation:
         for contact in problem.contacts:
             contact.evaluate()
         problem._watch.note(problem._norms["residual"])
-        if not problem.motions.held(problem.contacts, closed_only=True):
+        if not problem.motions.held(problem.contacts):
             problem._assemble_matrix(matrix, problem._stiffnesses(everywhere=True))
             return
         # Where all slips, what nothing but friction holds would be loose.

@@ -110,7 +110,7 @@ class Callbacks:
         The line search `cp` asks for it once more at the step that it takes, half of all times.
         """
         same = bool(self._last) and np.array_equal(x.array_r, self._last[0])
-        return bool(x.comm.tompi4py().allreduce(not same) == 0)
+        return bool(self._comm.allreduce(not same) == 0)
 
     def _run(self, function: Callable[..., Any], *arguments: Any, otherwise: Any = None) -> Any:
         if self._error is None:

@@ -21,6 +21,7 @@ from mpi4py import MPI
 
 from fenics_contact import files
 from fenics_contact.contact import Contact
+from fenics_contact.facets import facet_cells
 from fenics_contact.parallel import collective_errors, gather_rows
 from fenics_contact.problem import ContactProblem
 
@@ -166,10 +167,7 @@ def _node_places(space: fem.FunctionSpace) -> Array:
 def _point_places(contact: Contact) -> Array:
     """Coordinates of the owned points and middle of their cell, (n, 2 gdim). Collective."""
     surface, rows = contact.surface, contact.quadrature.point_rows()
-    tdim = surface.mesh.topology.dim
-    surface.mesh.topology.create_connectivity(tdim - 1, tdim)
-    to_cell = surface.mesh.topology.connectivity(tdim - 1, tdim)
-    cells = np.array([to_cell.links(f)[0] for f in surface.facets], dtype=np.int64)
+    cells = facet_cells(surface.mesh, surface.facets)
     middles = np.empty_like(contact.points)
     middles[rows] = _middles(surface.mesh)[cells][:, None]
     return np.hstack([contact.points, middles])

@@ -7,6 +7,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import basix
 import dolfinx
 import numpy as np
 import numpy.typing as npt
@@ -80,10 +81,12 @@ def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:
     return fem.form(form, entity_maps=entity_maps or None)
 
 
-def coordinate_element(mesh: dolfinx.mesh.Mesh) -> Any:
-    """The coordinate element, with ``degree`` and ``variant``."""
+def geometry_element(mesh: dolfinx.mesh.Mesh) -> Any:
+    """The scalar Basix element of the geometry, over the nodes of `geometry_dofmap`."""
     geometry = mesh.geometry
-    return geometry.cmaps[0] if hasattr(geometry, "cmaps") else geometry.cmap
+    cmap = geometry.cmaps[0] if hasattr(geometry, "cmaps") else geometry.cmap
+    kind, variant = basix.CellType[mesh.topology.cell_name()], basix.LagrangeVariant(cmap.variant)
+    return basix.create_element(basix.ElementFamily.P, kind, cmap.degree, variant)
 
 
 def geometry_dofmap(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:

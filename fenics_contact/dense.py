@@ -117,9 +117,7 @@ class PartlyFactored:
         block = self._reduced.copy(order="F")
         rows, columns, values = self._present()
         block[rows, columns] += values
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
-            self._factor = scipy.linalg.lu_factor(block, overwrite_a=True, check_finite=False)
+        self._factor = _factors(block)
         regular = bool(np.all(np.diag(self._factor[0])))
         self._factored = self._operator.added[2] if regular else None
         self._changed: Index = np.zeros(0, dtype=np.intp)
@@ -161,8 +159,7 @@ class PartlyFactored:
         self._change = np.zeros((reached.size, reached.size))
         places = np.searchsorted(reached, rows), np.searchsorted(reached, columns)
         self._change[places] = change[matters]
-        core = np.eye(reached.size) + self._answers[reached] @ self._change
-        self._core = scipy.linalg.lu_factor(core, overwrite_a=True, check_finite=False)
+        self._core = _factors(np.eye(reached.size) + self._answers[reached] @ self._change)
         return bool(np.all(np.diag(self._core[0])))
 
     def _divide(self) -> None:
@@ -178,10 +175,7 @@ class PartlyFactored:
         more = others[np.argsort(distance, kind="stable")[: wanted - acted.size]]
         inside = np.sort(np.concatenate([acted, more]))
         outside = np.setdiff1d(others, more)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
-            corner = self._fixed[np.ix_(outside, outside)]
-            factor = scipy.linalg.lu_factor(corner, check_finite=False)
+        factor = _factors(self._fixed[np.ix_(outside, outside)])
         pivots = np.abs(np.diag(factor[0]))
         if not pivots.min() > _SINGULAR * pivots.max():
             return
@@ -219,3 +213,10 @@ class PartlyFactored:
             self._factor_anew()
             return scipy.linalg.lu_solve(self._factor, right, check_finite=False)
         return solution
+
+
+def _factors(matrix: Array) -> tuple[Array, Index]:
+    """LU of a matrix, which is used up; a zero pivot is looked for by the caller."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
+        return scipy.linalg.lu_factor(matrix, overwrite_a=True, check_finite=False)

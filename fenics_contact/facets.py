@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import basix
+import dolfinx
 import numpy as np
 import numpy.typing as npt
 import scipy.spatial
@@ -27,6 +28,23 @@ _NEWTON_STEPS = 25
 _CHUNK = 2_000_000
 
 
+def facet_cells(mesh: dolfinx.mesh.Mesh, facets: Index) -> Index:
+    """The cell of every exterior facet of this rank, (n_facets,)."""
+    d = mesh.topology.dim
+    mesh.topology.create_connectivity(d - 1, d)
+    to_cell = mesh.topology.connectivity(d - 1, d)
+    return np.array([to_cell.links(facet)[0] for facet in facets], dtype=np.int32)
+
+
+def local_facets(mesh: dolfinx.mesh.Mesh, facets: Index) -> list[int]:
+    """The number of every exterior facet of this rank in its cell."""
+    d = mesh.topology.dim
+    mesh.topology.create_connectivity(d, d - 1)
+    to_facet = mesh.topology.connectivity(d, d - 1)
+    pairs = zip(facet_cells(mesh, facets), facets, strict=True)
+    return [int(np.flatnonzero(to_facet.links(cell) == facet)[0]) for cell, facet in pairs]
+
+
 class FacetSet:
     """Facets of this rank, with reference coordinates of their own, of dimension d - 1.
 
@@ -45,15 +63,8 @@ class FacetSet:
         mesh = space.mesh
         self.space, self._x, self._d = space, mesh.geometry.x, mesh.topology.dim
         d = self._d
-        mesh.topology.create_connectivity(d - 1, d)
-        mesh.topology.create_connectivity(d, d - 1)
-        to_cell = mesh.topology.connectivity(d - 1, d)
-        to_facet = mesh.topology.connectivity(d, d - 1)
-        self.cells = np.array([to_cell.links(f)[0] for f in facets], dtype=np.int32)
-        local = [
-            int(np.flatnonzero(to_facet.links(c) == f)[0])
-            for c, f in zip(self.cells, facets, strict=True)
-        ]
+        self.cells = facet_cells(mesh, facets)
+        local = local_facets(mesh, facets)
         cell_type = basix.CellType[mesh.topology.cell_name()]
         geometry, topology = basix.geometry(cell_type), basix.topology(cell_type)
         corners = np.array([geometry[vertices] for vertices in topology[d - 1]])
@@ -61,10 +72,7 @@ class FacetSet:
         edges = np.swapaxes(corners[:, 1:d] - corners[:, :1], 1, 2)
         self._origin, self._edges = origins[local], edges[local]
         self.simplex = cell_type in (basix.CellType.triangle, basix.CellType.tetrahedron)
-        cmap = compat.coordinate_element(mesh)
-        self._geometry_basis = basix.create_element(
-            basix.ElementFamily.P, cell_type, cmap.degree, basix.LagrangeVariant(cmap.variant)
-        )
+        self._geometry_basis = compat.geometry_element(mesh)
         self._basis = space.element.basix_element
         self._nodes = compat.geometry_dofmap(mesh)[self.cells]
         self._dofs = space.dofmap.list[self.cells]

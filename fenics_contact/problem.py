@@ -26,6 +26,7 @@ from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.continuation import Continuation
 from fenics_contact.defaults import Defaults
 from fenics_contact.energy import Energy, EnergyState, Forces
+from fenics_contact.facets import facet_cells, local_facets
 from fenics_contact.parallel import fail_together, global_max, global_min, global_sum
 from fenics_contact.quasi_newton import QuasiNewton
 from fenics_contact.rigid import RigidMotions
@@ -637,7 +638,7 @@ class ContactProblem:
         self._watch.note(residual)
         # Until enough points are closed to hold the body its tangent is singular: take H₀ of the
         # whole surface, as for the start of the quasi-Newton iteration.
-        if self.motions.held(self.contacts, closed_only=True):
+        if self.motions.held(self.contacts):
             self._assemble_matrix(J, self._tangents())
         else:
             self._assemble_matrix(J, self._stiffnesses(everywhere=True))
@@ -1220,16 +1221,10 @@ def _facets_held(contact: Contact, constrained: Array) -> int:
     """Number of this rank's facets of Γc all of whose displacements are prescribed."""
     space = contact.u.function_space
     mesh, dofmap = space.mesh, space.dofmap
-    tdim = mesh.topology.dim
-    mesh.topology.create_connectivity(tdim - 1, tdim)
-    mesh.topology.create_connectivity(tdim, tdim - 1)
-    to_cell = mesh.topology.connectivity(tdim - 1, tdim)
-    to_facet = mesh.topology.connectivity(tdim, tdim - 1)
+    facets = contact.surface.facets
     held: npt.NDArray[np.bool_] = np.all(constrained.reshape(-1, dofmap.bs), axis=1)
     count = 0
-    for facet in contact.surface.facets:
-        cell = to_cell.links(facet)[0]
-        local = int(np.flatnonzero(to_facet.links(cell) == facet)[0])
-        closure = dofmap.dof_layout.entity_closure_dofs(tdim - 1, local)
+    for cell, local in zip(facet_cells(mesh, facets), local_facets(mesh, facets), strict=True):
+        closure = dofmap.dof_layout.entity_closure_dofs(mesh.topology.dim - 1, local)
         count += bool(held[dofmap.cell_dofs(cell)[closure]].all())
     return count

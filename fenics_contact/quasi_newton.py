@@ -96,9 +96,7 @@ class QuasiNewton:
         for contact in problem.contacts:
             contact.evaluate()
         problem._watch.note(problem._norms["residual"])
-        consistent = not problem.has_potential and problem.motions.held(
-            problem.contacts, closed_only=True
-        )
+        consistent = not problem.has_potential and problem.motions.held(problem.contacts)
         parts = problem._tangents() if consistent else problem._stiffnesses(everywhere=False)
         problem._clear_pairs(consistent=consistent)
         problem._assemble_matrix(problem._matrix(consistent), parts)

@@ -140,12 +140,11 @@ class RigidMotions:
         ]
         return " with ".join(terms)
 
-    def held(self, contacts: Sequence[Contact], *, closed_only: bool) -> bool:
-        """Whether contact holds every free motion. Collective.
+    def held(self, contacts: Sequence[Contact]) -> bool:
+        """Whether the points that are closed now hold every free motion. Collective.
 
         Args:
             contacts: Evaluated contacts.
-            closed_only: Count the points that are closed now, not all of Γc.
         """
         if not len(self.free):
             return True
@@ -155,14 +154,13 @@ class RigidMotions:
             bearing.append(closed)
             if contact.law.has_tangential:
                 bearing.append(closed & (contact.values["grip"] > 0))
-        if closed_only:
-            # What holds a body still does with more of Γc closed: no need to look again.
-            known = self._holding[1] if self._holding[0] == pairings else []
-            lacks = [np.any(was & ~now) for was, now in zip(known, bearing, strict=bool(known))]
-            if self._comm.allreduce(not known or any(lacks)) == 0:
-                return True
-        held = not self._loose(contacts, closed_only).size
-        if held and closed_only:
+        # What holds a body still does with more of Γc closed: no need to look again.
+        known = self._holding[1] if self._holding[0] == pairings else []
+        lacks = [np.any(was & ~now) for was, now in zip(known, bearing, strict=bool(known))]
+        if self._comm.allreduce(not known or any(lacks)) == 0:
+            return True
+        held = not self._loose(contacts, closed_only=True).size
+        if held:
             self._holding = pairings, bearing
         return held
 

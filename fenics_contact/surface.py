@@ -86,14 +86,10 @@ class ContactSurface:
         scheme = "vertex" if nodal and free else self.quadrature_scheme or "default"
         return SurfaceQuadrature(self, degree, scheme)
 
-    def cells_behind(self) -> npt.NDArray[np.int32]:
-        """The cell of the body behind each of this rank's own cells of the submesh."""
-        mesh, submesh = self.mesh, self.submesh
-        n_owned = submesh.topology.index_map(submesh.topology.dim).size_local
-        tdim = mesh.topology.dim
-        to_cell = mesh.topology.connectivity(tdim - 1, tdim)  # of an exterior facet, one
-        behind = [to_cell.links(facet)[0] for facet in self._parent_facets[:n_owned]]
-        return np.array(behind, dtype=np.int32)
+    def parent_facets(self) -> npt.NDArray[np.int32]:
+        """The facet of the body that each of this rank's own cells of the submesh is."""
+        topology = self.submesh.topology
+        return self._parent_facets[: topology.index_map(topology.dim).size_local]
 
     def measure(self, degree: int, scheme: str = "default") -> ufl.Measure:
         """The surface measure of Γc with a quadrature rule (all of Γc, nothing else)."""
@@ -203,10 +199,8 @@ class SurfaceQuadrature:
 
         Row i is that of ``surface.facets[i]``.
         """
-        submesh = self.surface.submesh
-        n_cells = submesh.topology.index_map(submesh.topology.dim).size_local
-        rows = self.space().dofmap.list[:n_cells]
-        return rows[np.argsort(self.surface._parent_facets[:n_cells])]
+        parents = self.surface.parent_facets()
+        return self.space().dofmap.list[: parents.size][np.argsort(parents)]
 
     def interpolation_matrix(self, space: fem.FunctionSpace) -> PETSc.Mat:
         """Sparse matrix from the dofs of a function to its values at the points. Collective.

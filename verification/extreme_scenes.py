@@ -181,6 +181,26 @@ def pressed(
     return solve
 
 
+def compared(
+    state: Callable[[str], tuple[list[fc.problem.Step], Any]],
+    reference: Callable[[], tuple[list[fc.problem.Step], Any]],
+) -> Solve:
+    """Solve by a method; error of the body's u against the reference, found once, if it is."""
+
+    @functools.cache
+    def other() -> fem.Function | None:
+        try:
+            return reference()[1].u
+        except fc.NotConverged:
+            return None
+
+    def solve(method: str) -> tuple[list[fc.problem.Step], float | None]:
+        steps, body = state(method)
+        return steps, None if other() is None else difference(body.u, other())
+
+    return solve
+
+
 def dragged(
     kappa: float,
     mu: float,
@@ -207,19 +227,7 @@ def dragged(
         problem = body.problem(law, body.cushion(), bcs, method=method, **options)
         return [problem.solve()], body
 
-    @functools.cache
-    def other() -> fem.Function | None:
-        try:
-            return state(against, known or kappa, fallback=False)[1].u
-        except fc.NotConverged:
-            return None
-
-    def solve(method: str) -> tuple[list[fc.problem.Step], float | None]:
-        steps, body = state(method)
-        reference = other()
-        return steps, None if reference is None else difference(body.u, reference)
-
-    return solve
+    return compared(state, lambda: state(against, known or kappa, fallback=False))
 
 
 State = tuple[fc.problem.Step, Array]
@@ -473,19 +481,7 @@ def dragged_pair(kappa: float, mu: float, **pair: Any) -> Solve:
         problem = both.problem(friction_law(mu, k), curved=True, method=method, **options)
         return [problem.solve()], both
 
-    @functools.cache
-    def other() -> fem.Function | None:
-        try:
-            return state("alternating", fallback=False)[1].u
-        except fc.NotConverged:
-            return None
-
-    def solve(method: str) -> tuple[list[fc.problem.Step], float | None]:
-        steps, both = state(method)
-        reference = other()
-        return steps, None if reference is None else difference(both.u, reference)
-
-    return solve
+    return compared(state, lambda: state("alternating", fallback=False))
 
 
 def pair_in_units(method: str, modulus: float, length: float, _: Any) -> State:
