@@ -9,15 +9,14 @@ from __future__ import annotations
 import weakref
 from collections.abc import Sequence
 
-import basix
 import numpy as np
 import numpy.typing as npt
 import scipy.optimize
-import scipy.sparse.csgraph
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from fenics_contact.bodies import connected_bodies
 from fenics_contact.contact import Contact, Status
 from fenics_contact.parallel import agreed, gather_rows, global_min, global_sum
 from fenics_contact.unknowns import Unknowns
@@ -62,7 +61,8 @@ class RigidMotions:
         gdim = space.mesh.geometry.dim
         n_owned = space.dofmap.index_map.size_local
         x = space.tabulate_dof_coordinates()[:n_owned, :gdim]
-        n_bodies, body = _bodies(space)
+        n_bodies, body = connected_bodies(space)
+        body = body[:n_owned]
         low, high = np.full((n_bodies, gdim), np.inf), np.full((n_bodies, gdim), -np.inf)
         for b in np.unique(body):
             mine = x[body == b] if n_bodies > 1 else x
@@ -351,50 +351,6 @@ def rigid_motions(arm: Array, size: float) -> dict[str, Array]:
             turn[:, j], turn[:, k] = -arm[:, k] / size, arm[:, j] / size
             motions[f"rotation about {axis}"] = turn
     return motions
-
-
-def _bodies(space: fem.FunctionSpace) -> tuple[int, npt.NDArray[np.intp]]:
-    """Number of connected parts of the mesh, and the part of every owned node. Collective."""
-    comm, dofmap = space.mesh.comm, space.dofmap
-    n_owned = dofmap.index_map.size_local
-    n_nodes = n_owned + dofmap.index_map.num_ghosts
-    # Cells that share a node share a vertex.
-    n_vertices = len(basix.topology(basix.CellType[space.mesh.topology.cell_name()])[0])
-    vertices = [dofmap.dof_layout.entity_dofs(0, i)[0] for i in range(n_vertices)]
-    cells = dofmap.list[:, vertices]
-    is_vertex = np.zeros(n_nodes, dtype=np.bool_)
-    is_vertex[cells] = True
-    number = np.cumsum(is_vertex) - 1
-    n = int(np.count_nonzero(is_vertex))
-    first = np.repeat(number[cells[:, 0]], n_vertices - 1)
-    links = scipy.sparse.coo_matrix(
-        (np.ones(first.size, dtype=np.int8), (first, number[cells[:, 1:]].ravel())), (n, n)
-    )
-    n_parts, of_vertex = scipy.sparse.csgraph.connected_components(links, directed=False)
-    part = np.full(n_nodes, -1, dtype=np.int64)
-    part[dofmap.list] = of_vertex[number[cells[:, :1]]]
-    # Nodes that no cell here has, all of them ghosts, are parts of their own.
-    alone = part < 0
-    part[alone] = n_parts + np.arange(np.count_nonzero(alone))
-    n_parts += int(np.count_nonzero(alone))
-    offset = comm.scan(n_parts) - n_parts
-    # A ghost belongs to a part here and to one on its owner: the two are one body.
-    label = fem.Function(space)
-    label.x.array.reshape(n_nodes, dofmap.bs)[:, 0] = offset + part
-    label.x.scatter_forward()
-    owner = label.x.array.reshape(n_nodes, dofmap.bs)[n_owned:, 0].astype(np.int64)
-    pairs = np.unique(np.column_stack([owner, offset + part[n_owned:]]), axis=0)
-    pairs = np.concatenate(comm.allgather(pairs))
-    total = comm.allreduce(n_parts)
-    graph = scipy.sparse.coo_matrix((np.ones(len(pairs)), pairs.T), (total, total))
-    _, merged = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    used = np.zeros(total, dtype=np.int64)
-    np.add.at(used, offset + part[:n_owned], 1)
-    comm.Allreduce(MPI.IN_PLACE, used, op=MPI.SUM)
-    bodies, numbered = np.unique(merged[used > 0], return_inverse=True)
-    of_part = np.zeros(total, dtype=np.intp)
-    of_part[used > 0] = numbered
-    return len(bodies), of_part[offset + part[:n_owned]]
 
 
 def _around(normal: Array) -> list[Array]:
