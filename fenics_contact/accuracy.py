@@ -134,9 +134,8 @@ def cell_modulus(
     isotropic = stretch > 1.2 * shear  # λ > -0.8 G: else no isotropic solid, and E is the stretch's
     modulus = fem.Function(fem.functionspace(space.mesh, ("DG", 0)), name="modulus")
     modulus.x.array[:] = stretch
-    modulus.x.array[isotropic] = (shear * (3 * stretch - 4 * shear))[isotropic] / (stretch - shear)[
-        isotropic
-    ]
+    G, M = shear[isotropic], stretch[isotropic]
+    modulus.x.array[isotropic] = G * ((3 * M - 4 * G) / (M - G))
     return modulus
 
 

@@ -41,8 +41,10 @@ OPTIONS = {
 }
 # Newton steps without line search finish where the energy has no digits left.
 _FINISH = OPTIONS | {"snes_max_it": 5, "snes_linesearch_type": "basic"}
-# Cycles before it is given up, and cycles in a row that may pass without a lower residual.
+# Cycles, and Newton iterations in all, before it is given up; and cycles in a row that may pass
+# without a lower residual.
 _MAX_CYCLES = 200
+_MAX_ITERATIONS = 1000
 _MAX_STALLS = 20
 # Cycles without a lower residual after which only half of the change of the limit is taken, and the
 # least share: two cycles may undo one another.
@@ -119,16 +121,18 @@ class Alternation:
                 for contact, part in zip(problem.contacts, np.split(pressure, ends), strict=True):
                     contact.freeze(part)
                 share = 0.0 if problem.has_potential else _INNER
-                self._goal = max(problem._tolerance(), share * residual)
+                self._goal = share * residual
                 iterations += self._minimise(solution)
                 residual = self._residual(solution)
-                if residual <= problem._tolerance():
+                if problem._norms.within(problem.rtol):
                     logger.debug("%d cycles, %d Newton iterations", cycle + 1, iterations)
                     return iterations, int(reasons.CONVERGED_FNORM_RELATIVE)
                 stalls = 0 if residual < best else stalls + 1
                 best = min(best, residual)
                 if not np.isfinite(residual) or stalls > _MAX_STALLS or problem.has_potential:
                     return iterations, int(reasons.DIVERGED_LINE_SEARCH)
+                if iterations > _MAX_ITERATIONS:
+                    return iterations, int(reasons.DIVERGED_MAX_IT)
                 if stalls and stalls % _PATIENCE == 0:
                     relaxation = max(relaxation / 2, _LEAST)
                 pressure = pressure + relaxation * (self._pressure() - pressure)
@@ -150,7 +154,7 @@ class Alternation:
         for contact in self._problem.contacts:
             contact.thaw()
         self._problem._compute_residual(solution, self._function)
-        return float(self._problem._norms["residual"])
+        return float(self._problem._norms.total)
 
     def _minimise(self, solution: PETSc.Vec) -> int:
         """Newton's method with the line search on the energy, then without any."""
@@ -162,7 +166,8 @@ class Alternation:
 
     def _test(self) -> int:
         reasons = PETSc.SNES.ConvergedReason
-        converged = self._problem._norms["residual"] <= self._goal
+        norms = self._problem._norms
+        converged = norms.total <= self._goal or norms.within(self._problem.rtol)
         return int(reasons.CONVERGED_FNORM_RELATIVE if converged else reasons.ITERATING)
 
     def _assemble(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
@@ -171,7 +176,7 @@ class Alternation:
         problem._update_bulk()
         for contact in problem.contacts:
             contact.evaluate()
-        problem._watch.note(problem._norms["residual"])
+        problem._watch.note(problem._norms.total)
         if not problem.motions.held(problem.contacts):
             problem._assemble_matrix(matrix, problem._stiffnesses(everywhere=True))
             return

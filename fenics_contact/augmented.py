@@ -18,7 +18,7 @@ falls with the mesh as the rest of the error does.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,9 @@ from fenics_contact.surface import SurfaceQuadrature
 __all__ = ["Multipliers", "TraceProjection"]
 
 Array = npt.NDArray[np.float64]
+
+# Of the projection of tractions, relative.
+_ROUND_OFF = 1e-12
 
 
 class TraceProjection:
@@ -113,16 +116,18 @@ class Multipliers:
     def error(self, values: Mapping[str, Array], history: History) -> float:
         """Largest change that `update` would make, see `Contact.enforcement_error`. Collective."""
         found = self._next(values)
-        # With the committed tractions: a body that is unloaded ends with none of its own.
         names = [n for n in ("normal_traction", "traction") if n in history]
-        scale = max(
-            global_max(self._comm, np.abs(v[n]))
-            for n in names
-            for v in (values, {n: history.values(n)})
-        )
-        changes = (np.abs(found[n] - self.fields.values(n)) for n in found)
-        change = max(global_max(self._comm, c) for c in changes)
-        return change / scale if change > 0 else change
+
+        def largest(of: Callable[[str], Array], names: Iterable[str]) -> float:
+            return max(global_max(self._comm, np.abs(of(n))) for n in names)
+
+        change = largest(lambda n: found[n] - self.fields.values(n), found)
+        # By the tractions of this increment: those before it leave round-off and no more.
+        scale = largest(lambda n: values[n], names)
+        before = largest(history.values, names)
+        if change <= _ROUND_OFF * max(scale, before):
+            return 0.0
+        return change / scale if scale > 0 else np.inf
 
     def update(self, values: Mapping[str, Array]) -> None:
         """Make the tractions of an evaluated contact the multipliers. Collective."""

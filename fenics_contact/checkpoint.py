@@ -59,9 +59,7 @@ def save(problem: ContactProblem, path: str | Path, numbers: Sequence[float] = (
     comm = problem.u.function_space.mesh.comm
     state, rate = problem.committed_state()
     arrays = {
-        "numbers": np.array(
-            [problem.increment, problem.committed_force, problem.committed_start, *numbers]
-        ),
+        "numbers": np.array([problem.increment, *numbers]),
         "motions": np.stack([problem.unknowns.motions(v) for v in (state, rate)]),
         "nodes": _gather(problem, _node_places(problem.u.function_space), [state, rate]),
     }
@@ -109,8 +107,8 @@ def load(problem: ContactProblem, path: str | Path) -> list[float]:
         stored = arrays[f"contact {contact.name}"]
         rows = _find(comm, stored, _point_places(contact), size, path)
         contact.history.set_rows(rows)
-    increment, force, start, *numbers = (float(value) for value in arrays["numbers"])
-    problem.set_committed(state, rate, int(increment), force, start)
+    increment, *numbers = (float(value) for value in arrays["numbers"])
+    problem.set_committed(state, rate, int(increment))
     return numbers
 
 

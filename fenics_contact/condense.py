@@ -285,7 +285,9 @@ class CondensedSpace(WholeSpace):
         self.prescribed: Array = np.zeros(int(self.constrained.sum()))
         self.load: Array = np.zeros(unknowns.n_local)
         self.diagonal: Array = np.zeros(unknowns.n_local)
-        self.outside = np.zeros(2)
+        self.label, self.n_bodies = whole.label[unknowns.kept], whole.n_bodies
+        self.outside = np.zeros((2, self.n_bodies))
+        self._parts = None
         self.ready = False
         self.mark = object()
         self._fixed: Array | None = None  # the constant part of the matrices
@@ -343,9 +345,12 @@ class CondensedSpace(WholeSpace):
         self.condensation.set_load(load, state)
         self.load = load[self.unknowns.kept]
         self.prescribed = self.state()[self.constrained]
-        kept = self.unknowns.kept
-        squares = [v @ v - v[kept] @ v[kept] for v in (load, self._whole.diagonal * state)]
-        self.outside[:] = np.clip(squares, 0.0, None)
+        for norms, vector in zip(self.outside, (load, self._whole.diagonal * state), strict=True):
+            apart = vector.copy()
+            apart[self.unknowns.kept] = 0.0
+            size = np.abs(apart).max(initial=0.0) or 1.0
+            squares = np.bincount(self._whole.label, (apart / size) ** 2, self.n_bodies)
+            norms[:] = size * np.sqrt(squares)
 
     def extended(self, change: Array) -> Array:
         """See `WholeSpace.extended`: one back-substitution."""

@@ -71,6 +71,19 @@ class Resultants:
     max_penetration: float
 
 
+@dataclass(frozen=True)
+class Found:
+    """A solved state of a contact, which a commit makes its history.
+
+    Attributes:
+        points: All fields at this rank's points, by name.
+        history: Those of them that become history, as it has them.
+    """
+
+    points: Mapping[str, Array]
+    history: Mapping[str, Array]
+
+
 class Contact:
     """Frictional contact of Γc with a support, as a boundary form and a committed history.
 
@@ -419,9 +432,18 @@ class Contact:
         return felt
 
     def felt_unknowns(self) -> npt.NDArray[np.int32]:
-        """Numbers of the unknowns that contact feels or acts on, ascending. One rank only."""
-        _, columns, values = self._felt_map.getValuesCSR()
-        return np.unique(columns[values != 0.0])
+        """This rank's unknowns that contact feels or acts on, ascending. Collective."""
+        felt = self._felt_map
+        pointers, columns, values = felt.getValuesCSR()
+        csr = (pointers, columns, (values != 0.0).astype(np.float64))
+        marks = PETSc.Mat().createAIJ(felt.getSizes(), csr=csr, comm=felt.comm)
+        points, counts = marks.createVecLeft(), marks.createVecRight()
+        points.set(1.0)
+        marks.multTranspose(points, counts)
+        found = np.flatnonzero(counts.array_r > 0.0).astype(np.int32)
+        for item in (marks, points, counts):
+            item.destroy()
+        return found
 
     def _motion_map(self) -> PETSc.Mat:
         """The map from the unknowns to the free displacement of the support. Collective."""
@@ -777,9 +799,10 @@ class Contact:
     def enforcement_error(self) -> float:
         """What the springs bear at the last evaluated state, relative: 0 if exact. Collective.
 
-        The largest |Π p - λ_n| and |Π τ - λ_t| over the points, by the largest pressure or traction
-        now or at the last commit: what another round would change. k_n times the penetration is
-        that, and k_t times the elastic slip, as far as displacements of Γc can undo them.
+        The largest |Π p - λ_n| and |Π τ - λ_t| over the points, by the largest pressure or
+        traction: what another round would change. k_n times the penetration is that, and k_t times
+        the elastic slip, as far as displacements of Γc can undo them. Infinite where nothing is
+        borne any more and multipliers are left.
 
         Raises:
             ValueError: There are no multipliers.
@@ -860,9 +883,8 @@ class Contact:
                     "follows the surface"
                 )
 
-    def commit(self) -> None:
-        """Make the state at the present ``u`` the history of the next increment. Collective."""
-        self.evaluate()
+    def found(self) -> Found:
+        """The state as evaluated, for `commit`: nothing that changes later changes it."""
         points = self._values
         values = {n: points[n] for n in ("opening", "penetration", "normal_traction")}
         if self.law.has_friction:
@@ -873,8 +895,20 @@ class Contact:
             }
         if self.multipliers is not None:
             values |= self.multipliers.committed(points)
+        return Found(points, values)
+
+    def commit(self, found: Found | None = None) -> None:
+        """Make a state the history of the next increment. Collective.
+
+        Args:
+            found: What `found` gave; by default the state at the present ``u``.
+        """
+        if found is None:
+            self.evaluate()
+            found = self.found()
+        points, values = found.points, dict(found.history)
         self.history.commit(values)
-        self.committed_jump = points["jump"]
+        self._points, self.committed_jump = dict(points), points["jump"]
         if self.pairs_anew:
             # The traction stays with the points of Γc; what they slip over has moved on.
             self.pair(self.u)
@@ -882,7 +916,7 @@ class Contact:
             if self.law.has_friction:
                 moved = values["jump"] + self.committed_jump - points["jump"]
                 self.history.commit(values | {"jump": moved})
-            self._points = points  # results stay those of the solution
+            self._points = dict(points)  # results stay those of the solution
         if self.multipliers is not None:
             self.multipliers.restore(self.history)
 

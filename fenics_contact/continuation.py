@@ -38,6 +38,8 @@ OPTIONS = {
 # Factor of the stiffness from one problem to the next, and the least that is tried.
 _FACTOR = 10.0
 _LEAST_FACTOR = 1.2
+# Newton iterations in all before it is given up; what it solves takes 600 at most.
+_MAX_ITERATIONS = 1000
 # Residual of the softer problems, as a share of the forces: they are starts, not results.
 _COARSE = 1e-3
 
@@ -112,6 +114,8 @@ class Continuation:
                     logger.debug("alternated at %.3g of the stiffness: reason %d", share, reason)
                 if reason <= 0 or share == 1.0:
                     return iterations, reason
+                if iterations > _MAX_ITERATIONS:
+                    return iterations, int(PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT)
                 logger.debug("%.3g of the stiffness, %d iterations so far", share, iterations)
                 solved = share
                 problem._solution.copy(kept)
@@ -133,6 +137,5 @@ class Continuation:
 
     def _test(self) -> int:
         problem, reasons = self._problem, PETSc.SNES.ConvergedReason
-        goal = max(problem._tolerance(), self._coarse * problem._norms["force"])
-        converged = problem._norms["residual"] <= goal
+        converged = problem._norms.within(max(problem.rtol, self._coarse))
         return int(reasons.CONVERGED_FNORM_RELATIVE if converged else reasons.ITERATING)

@@ -18,11 +18,12 @@ from petsc4py import PETSc
 
 from fenics_contact import accuracy, compat, linear
 from fenics_contact.alternating import Alternation
+from fenics_contact.balance import Norms
 from fenics_contact.bulk import Bulk
 from fenics_contact.callbacks import Callbacks
 from fenics_contact.chattering import StatusWatch
 from fenics_contact.condense import CondensedSpace, touched, worthwhile
-from fenics_contact.contact import Contact, Resultants, Status
+from fenics_contact.contact import Contact, Found, Resultants, Status
 from fenics_contact.continuation import Continuation
 from fenics_contact.defaults import Defaults
 from fenics_contact.energy import Energy, EnergyState, Forces
@@ -32,7 +33,7 @@ from fenics_contact.quasi_newton import QuasiNewton
 from fenics_contact.rigid import RigidMotions
 from fenics_contact.spaces import WholeSpace
 from fenics_contact.unknowns import Selection, Unknowns
-from fenics_contact.verdict import NotConverged, Rung, Verdict, check_laws
+from fenics_contact.verdict import Balance, NotConverged, Rung, Verdict, check_laws
 
 __all__ = ["ContactProblem", "Step"]
 
@@ -42,9 +43,6 @@ logger = logging.getLogger("fenics_contact")
 # An open point keeps this share of its stiffness in H₀: enough that a body held by contact alone
 # stays held when its whole surface is open, too little to be felt as a wrong tangent.
 _OPEN_SHARE = 1e-3
-# Round-off in K u excuses a residual up to this share of the forces (or of the largest residual an
-# increment began with), not more: a displacement grown without bounds would excuse anything.
-_MAX_FLOOR = 1e-5
 # An unknown with less than this share of the bulk's stiffness has none.
 _FELT = 1e-12
 # Rounds with multipliers before it is given up.
@@ -56,6 +54,8 @@ _FIRST_ROUND, _INNER, _NEARLY = 1e-4, 1e-2, 10.0
 _FAR = 100.0
 # Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
 _TOUCHING = 1e-12
+# Contact that bears less than this share of the load bears nothing yet.
+_IDLE = 1e-3
 # Increments expected where nothing is said.
 _EXPECTED = 4
 # Iterations of Newton's method without a lower residual after which another method takes over.
@@ -146,13 +146,26 @@ class Step:
         if self.load is not None:
             parts.append(f"load {self.load:.6g}")
         parts.append(f"{self.iterations} iterations, reason {self.reason}")
-        parts.append(f"residual {self.verdict.residual / self.verdict.force:.1e}")
+        parts.append(f"residual {self.verdict.relative_residual:.1e}")
         for name, r in self.contacts.items():
             parts.append(
                 f"{name}: force {r.normal_force:.6g}, friction {r.tangential_force:.6g}, area "
                 f"{r.area:.4g}, {r.stick} stick {r.slip} slip {r.open} open"
             )
         return "; ".join(parts)
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """What `ContactProblem.solve` found, until it is committed or dropped.
+
+    Attributes:
+        state: This rank's unknowns; where u is behind, those that are not.
+        contacts: The state of every contact.
+    """
+
+    state: Array
+    contacts: list[Found]
 
 
 class ContactProblem:
@@ -170,9 +183,6 @@ class ContactProblem:
         snes: The PETSc solver.
         accuracy: That of the contact that wants most, None if not every contact says one.
         increment: Number of committed increments.
-        committed_force: Size of the forces at the last commit (force).
-        committed_start: Largest residual that a committed increment began with (force): what moved
-            the body, where no force is left.
         initial_penetration: Largest penetration of the undeformed body (length), 0 if none; an
             interference by a prescribed gap is none.
     """
@@ -271,9 +281,10 @@ class ContactProblem:
         self._length = self.motions.size
         self._load: Array = np.zeros(self.unknowns.n_local)
         self._factorisations = 0
-        self._norms = {"residual": 0.0, "force": 0.0, "floor": 0.0}
-        self.committed_force = self.committed_start = self._start_residual = 0.0
-        self._committed = self._whole.state()
+        nothing: Array = np.zeros(self._whole.n_bodies)
+        self._norms = Norms(nothing, nothing, nothing, nothing.size)
+        self._start_product = nothing
+        self._committed = self._rest = self._whole.state()
         for contact in self.contacts:
             contact.evaluate()
         forces: dict[object, Forces] = {self._whole.mark: Forces.none(self._committed)}
@@ -282,6 +293,8 @@ class ContactProblem:
         self._behind: Array | None = None
         self._committed_lag: tuple[Array | None, Array] = None, self._load
         self._rate: Array | None = None
+        self._solved: _Solved | None = None
+        self._cold = True
         self._watch = StatusWatch(self.contacts)
         self._round_rtol = 0.0
         self._condensation, self._linear_solver = condensation, linear_solver
@@ -573,9 +586,9 @@ class ContactProblem:
 
     def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         self._set_u(x)
-        contact = self._space.contact_force()
-        total = self._space.bulk_force() + contact
-        self._measure_norms(self._space, total, contact)
+        contacts = self._space.contact_forces()
+        total = sum(contacts, self._space.bulk_force())
+        self._measure_norms(self._space, total, contacts)
         total[self._space.constrained] = 0.0
         f.array[:] = total / (self.bulk.scale * self._length)
 
@@ -586,39 +599,26 @@ class ContactProblem:
         total = float(global_sum(self._comm, energy))
         return total / (self.bulk.scale * self._length**2)
 
-    def _measure_norms(self, space: WholeSpace, total: Array, contact: Array) -> None:
-        """Norms in force: the free residual, the forces it is compared with, and round-off."""
-        reaction = total[space.constrained]
-        free = total[~space.constrained]
-        stiff: Array = space.diagonal * space.state()
-        squares = global_sum(
-            self._comm,
-            [
-                free @ free,
-                reaction @ reaction,
-                contact @ contact,
-                space.load @ space.load + space.outside[0],
-                stiff @ stiff + space.outside[1],
-            ],
+    def _measure_norms(self, space: WholeSpace, total: Array, contacts: Sequence[Array]) -> None:
+        """Norms of residual and forces at the present state of the space entered. Collective."""
+        self._norms = space.parts.norms(
+            total,
+            contacts,
+            space.load,
+            space.diagonal * space.state(),
+            space.constrained,
+            space.outside,
+            self._start_product,
         )
-        residual, *forces, product = np.sqrt(squares)
-        # With the committed forces: a body that is unloaded ends with none of its own.
-        force = float(max(*forces, self.committed_force))
-        # Rounding of the product K u, which no iteration can undercut.
-        floor = float(10 * np.finfo(float).eps * product)
-        self._norms = {
-            "residual": float(residual),
-            "force": force,
-            "floor": min(floor, _MAX_FLOOR * max(force, self._start_residual)),
-        }
 
-    def _tolerance(self) -> float:
-        rtol = max(self._rtol, self._round_rtol)
-        return max(rtol * self._norms["force"], self._norms["floor"])
+    @property
+    def rtol(self) -> float:
+        """Residual that ends the present iteration, as a share of the forces."""
+        return max(self._rtol, self._round_rtol)
 
     def _test_convergence(self) -> int:
         reasons = PETSc.SNES.ConvergedReason
-        if self._norms["residual"] <= self._tolerance():
+        if self._norms.within(self.rtol):
             return int(reasons.CONVERGED_FNORM_RELATIVE)
         if self._watch.idle > _PATIENCE and self._may_climb():
             return int(reasons.DIVERGED_LINE_SEARCH)
@@ -630,7 +630,7 @@ class ContactProblem:
 
     def _assemble_tangent(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
         """The consistent tangent of bulk and contact. Collective."""
-        residual = self._norms["residual"]  # SNES has just computed it at x
+        residual = self._norms.total  # SNES has just computed it at x
         self._set_u(x)
         self._update_bulk()
         for contact in self.contacts:
@@ -782,7 +782,7 @@ class ContactProblem:
         """
         start = time.perf_counter()
         self._fresh = False
-        saved = self._whole.state(), self._load, self._behind
+        saved = self._whole.state(), self._load, self._behind, self._energy
         try:
             # A trial of a line search may overflow, and the convergence test and the verdict see
             # it: a warning, on the rank that has the point, must not become an error there alone.
@@ -790,7 +790,7 @@ class ContactProblem:
                 step = self._solve(start, ahead, field)
         except BaseException as error:
             fail_together(self._comm, error)
-            state, self._load, self._behind = saved
+            state, self._load, self._behind, self._energy = saved
             self._whole.set_state(state)
             for contact in self.contacts:
                 contact.restore()
@@ -817,6 +817,7 @@ class ContactProblem:
         verdict = self._judge_kept() if lags else self._judge_all()
         if reason <= 0 or verdict.failures:
             raise NotConverged(self.increment + 1, reason, verdict, rungs)
+        self._solved = _Solved(self._whole.state(), [c.found() for c in self.contacts])
         return Step(
             increment=self.increment + 1,
             reason=reason,
@@ -870,6 +871,8 @@ class ContactProblem:
         if committed:
             self._committed = self._whole.state()
             self._committed_lag = None, self._load
+        elif self._solved is not None:
+            self._solved = replace(self._solved, state=self._whole.state())
         for vector in (state, image):
             vector.destroy()
         if verdict.failures:
@@ -910,7 +913,8 @@ class ContactProblem:
                     break
                 ahead, stiffness_changed = 0.0, False
                 exact = worst <= _NEARLY
-                self._round_rtol = 0.0 if exact else min(_FIRST_ROUND, _INNER * min(errors))
+                left = min((e for e in errors if e > 0), default=0.0)
+                self._round_rtol = 0.0 if exact else min(_FIRST_ROUND, _INNER * left)
                 if number < _MAX_ROUNDS and worst > 1.0:
                     for contact in augmented:
                         contact.augment()
@@ -931,7 +935,7 @@ class ContactProblem:
             starts = [start / self._length for start in self._starts(ahead)]
             tries = [(start, self._method) for start in starts]
             climbs = self._may_climb()
-            cold = self._rate is None and ahead > 0.0  # and no later round of multipliers
+            cold = self._cold and ahead > 0.0  # and no later round of multipliers
             if climbs and cold and self._automatic and self._condensed:
                 # From nothing, Newton's method on the stiff problem often gives up first.
                 tries = [(starts[0], _LAST_RESORT)]
@@ -1025,15 +1029,19 @@ class ContactProblem:
         them slip again, one after another from the edge of the contact inwards. The start by a step
         has the right ones slipping, and comes first unless it is far off.
         """
-        present = self._space.state()
+        present: Array = self._space.state()
         starts = [present]
-        self._start_residual = self.committed_start
+        # What a step from here takes away leaves the round-off of what was there.
+        terms: Array = self._space.parts.by_body(self._space.diagonal * present)[0]
+        terms = np.asarray(np.hypot(terms, self._space.outside[1]), dtype=np.float64)
+        # The last matrix may be that of a step that overflowed.
+        self._start_product = np.where(np.isfinite(terms), terms, 0.0)
         residuals = [self._residual_at(present)]
-        self._start_residual = max(self._start_residual, residuals[0])
-        predicts = self._predicts
+        # Where nothing was borne yet the last increment tells nothing of this one.
+        predicts = self._predicts and not self._cold
         if predicts:
             starts.append(self._predicted(present))
-        if self._rate is not None and ahead:
+        if self._rate is not None and ahead and not self._cold:
             starts.append(present + ahead * self._space.part(self._rate))
         residuals += [self._residual_at(start) for start in starts[1:]]
         if predicts and residuals[1] <= _FAR * min(residuals):
@@ -1044,7 +1052,7 @@ class ContactProblem:
         """Norm of the residual at a state of the space, left in ``_function``. Collective."""
         self._solution.array[:] = state / self._length
         self._compute_residual(self._solution, self._function)
-        return self._norms["residual"]
+        return self._norms.total
 
     def _predicted(self, present: Array) -> Array:
         """One Newton step on the tangent factored last; the residual is there. Collective."""
@@ -1056,11 +1064,23 @@ class ContactProblem:
         return np.asarray(moved, dtype=np.float64)
 
     def _approach(self) -> None:
-        """Move bodies that nothing holds yet to first touch, along their load. Collective."""
+        """Move bodies that nothing holds yet to first touch, along their load. Collective.
+
+        One that was released before rests wherever that ended, turned perhaps by more than the load
+        will press it together: it starts again from where it began.
+        """
+        self._cold = self.increment == 0
+        if not len(self.motions.free):
+            return
+        forces = [np.zeros(1), *self._whole.contact_forces()]
+        borne = global_max(self._comm, np.abs(np.concatenate(forces)))
+        if borne < _IDLE * global_max(self._comm, np.abs(self._load)):
+            self._cold = True
+            self._whole.set_state(np.where(self._constrained, self._whole.state(), self._rest))
         for contact in self.contacts:
             contact.evaluate()
         touching = [bool(np.any(c.status != Status.OPEN)) for c in self.contacts]
-        if not len(self.motions.free) or self._comm.allreduce(any(touching)):
+        if self._comm.allreduce(any(touching)):
             return
         way = self.motions.approach(self._load, self.contacts)
         if way is not None:
@@ -1113,47 +1133,70 @@ class ContactProblem:
         Returns:
             The verdict, and the reactions at the unknowns.
         """
-        contact = space.contact_force()
-        total = bulk + contact
-        self._measure_norms(space, total, contact)
-        components, gdim = space.components, len(self.u)
+        contacts = space.contact_forces()
+        total = sum(contacts, bulk)
+        self._measure_norms(space, total, contacts)
+        norms = self._norms
+        names, tolerance = space.parts.names, norms.tolerance(self.rtol)
         reaction = np.where(space.constrained, total, 0.0)
-        by_component = np.stack(
-            [
-                np.bincount(components, vector[: components.size], minlength=gdim)
-                for vector in (bulk, reaction)
-            ]
-        )
-        bulk_sum, reaction_sum = global_sum(self._comm, by_component)
-        # ∑F(u) - ∫ (r_n n + τ) = reactions, the middle one by quadrature, not by assembly.
-        imbalance = bulk_sum - reaction_sum
-        for c in self.contacts:
-            if c.rigid:  # between two bodies of the mesh contact forces are internal
-                imbalance = imbalance - c.resultants().force
-        absolute = float(global_sum(self._comm, np.abs(bulk).sum() + np.abs(contact).sum()))
-        n_dofs = float(global_sum(self._comm, components.size))
+        imbalance, sizes = self._force_sums(space, bulk - reaction, [bulk, *contacts])
+        allowed = np.sqrt(sizes[0]) * 2 * tolerance[: len(imbalance)] + 1e-12 * sizes[1]
         augmented = [c for c in self.contacts if c.multipliers is not None and laws]
+        equations = zip(names, norms.residual, norms.force, tolerance, strict=True)
+        sums = zip(names, np.abs(imbalance).max(axis=1), sizes[1], allowed, strict=False)
         verdict = Verdict(
-            residual=self._norms["residual"],
-            force=self._norms["force"],
-            tolerance=self._tolerance(),
-            imbalance=float(np.abs(imbalance).max()),
-            imbalance_tolerance=np.sqrt(n_dofs) * 2 * self._tolerance() + 1e-12 * absolute,
+            equations={name: Balance(*map(float, row)) for name, *row in equations},
+            sums={name: Balance(*map(float, row)) for name, *row in sums},
             laws={c.name: check_laws(c) for c in self.contacts} if laws else {},
             enforcement={c.name: c.enforcement_error() for c in augmented},
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
         )
         return verdict, reaction
 
+    def _force_sums(
+        self, space: WholeSpace, internal: Array, forces: Sequence[Array]
+    ) -> tuple[Array, Array]:
+        """Forces on every body that do not cancel: ∑F(u) - reactions - ∫ (r_n n + τ). Collective.
+
+        The last is the contacts' own sum over their points, not that of their nodal forces.
+
+        Args:
+            space: The unknowns, entered.
+            internal: Residual of the bulk without reactions, (n_local,).
+            forces: What tells how large all forces are, (n_local,) each.
+
+        Returns:
+            The sums, (n_bodies, gdim) (force); of every body the number of its unknowns, and the
+            sum of the absolute forces, (2, n_bodies).
+        """
+        components, gdim = space.components, len(self.u)
+        label = space.label[: components.size]
+        n = self._whole.n_bodies - self.unknowns.n_motions
+        place = label * gdim + components
+        flat = np.bincount(place, internal[: components.size], minlength=n * gdim)
+        count = np.bincount(label, minlength=n)
+        sizes = [np.bincount(label, np.abs(f[: components.size]), minlength=n) for f in forces]
+        total = np.asarray(flat.reshape(n, gdim), dtype=np.float64)
+        for contact in self.contacts:
+            force = contact.measure[:, None] * contact.traction
+            total = total - self._whole.shares(contact).T @ force
+        sums = global_sum(self._comm, np.stack([*total.T, count, np.sum(sizes, axis=0)]))
+        return sums[:gdim].T, sums[gdim:]
+
     def commit(self) -> None:
         """Make the solved state the start of the next increment, history included. Collective.
 
-        If it fails, the history is as before.
+        It is what `solve` found, whatever has changed since: constants, or u. Where nothing was
+        solved since the last commit nothing happens. If it fails, the history is as before.
         """
+        solved, self._solved = self._solved, None
+        if solved is None:
+            return
         before = [c.history.function.x.array.copy() for c in self.contacts]
         try:
-            for contact in self.contacts:
-                contact.commit()
+            self._whole.set_state(solved.state)
+            for contact, found in zip(self.contacts, solved.contacts, strict=True):
+                contact.commit(found)
         except BaseException as error:
             fail_together(self._comm, error)
             for contact, values in zip(self.contacts, before, strict=True):
@@ -1165,8 +1208,6 @@ class ContactProblem:
         self._committed = state
         self._committed_lag = self._behind, self._load
         self._committed_energy = self._energy.between([c.committed_jump for c in self.contacts])
-        self.committed_force = self._norms["force"]
-        self.committed_start = self._start_residual
         self.increment += 1
 
     def restore(self) -> None:
@@ -1174,6 +1215,7 @@ class ContactProblem:
 
         The history needs no restoring: it changes at `commit` alone. Collective.
         """
+        self._solved = None
         self._whole.set_state(self._committed)
         self._behind, self._load = self._committed_lag
         for contact in self.contacts:
@@ -1188,13 +1230,11 @@ class ContactProblem:
         rate = np.zeros_like(self._committed) if self._rate is None else self._rate
         return self._committed.copy(), rate.copy()
 
-    def set_committed(
-        self, state: Array, rate: Array, increment: int, force: float, start: float
-    ) -> None:
+    def set_committed(self, state: Array, rate: Array, increment: int) -> None:
         """Take up a history where another run left it; the contacts' are set apart. Collective."""
         self._committed, self._rate = state.copy(), rate.copy()
         self._committed_lag = None, self._load
-        self.committed_force, self.committed_start, self.increment = force, start, increment
+        self.increment = increment
         self._fresh = False
         self.restore()
         self.restart_solver()

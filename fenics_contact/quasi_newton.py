@@ -13,6 +13,9 @@ __all__ = ["QuasiNewton"]
 # Rounds in a row that do not lower the residual before the increment is given up: the potential may
 # fall for long before the residual does.
 _MAX_STALLS = 10
+# Contact that bears less than this share of the residual an increment begins with tells nothing of
+# which points will be closed.
+_IDLE = 1e-3
 # A round that ends with more than this times the lowest residual, or none, has gone astray: the
 # next one starts where that was.
 _ASTRAY = 1e3
@@ -45,7 +48,10 @@ class QuasiNewton:
         """
         problem, reasons = self._problem, PETSc.SNES.ConvergedReason
         snes, solution = problem.snes, problem._solution
-        if not self._has_h0 or stiffness_changed:
+        problem._compute_residual(solution, problem._function)
+        norms = problem._norms
+        borne = norms.force[norms.n_bodies :].max(initial=0.0)
+        if not self._has_h0 or stiffness_changed or borne < _IDLE * norms.total:
             self._start()
             self._has_h0 = True
         else:
@@ -57,8 +63,8 @@ class QuasiNewton:
             snes.setTolerances(max_it=min(problem._space.iterations_per_round, left))
             iterations += problem._callbacks.solve(snes, solution)[0]
             problem._compute_residual(solution, problem._function)
-            residual = problem._norms["residual"]
-            if residual <= problem._tolerance():
+            residual = problem._norms.total
+            if problem._norms.within(problem.rtol):
                 return iterations, int(reasons.CONVERGED_FNORM_RELATIVE)
             if iterations >= problem._max_it:
                 return iterations, int(reasons.DIVERGED_MAX_IT)
@@ -95,7 +101,7 @@ class QuasiNewton:
             return False
         for contact in problem.contacts:
             contact.evaluate()
-        problem._watch.note(problem._norms["residual"])
+        problem._watch.note(problem._norms.total)
         consistent = not problem.has_potential and problem.motions.held(problem.contacts)
         parts = problem._tangents() if consistent else problem._stiffnesses(everywhere=False)
         problem._clear_pairs(consistent=consistent)

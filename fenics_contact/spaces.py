@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -11,9 +12,12 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact import linear
+from fenics_contact.balance import Parts
+from fenics_contact.bodies import connected_bodies
 from fenics_contact.bulk import Bulk
 from fenics_contact.contact import Contact
 from fenics_contact.energy import Forces
+from fenics_contact.facets import facet_cells
 from fenics_contact.unknowns import Unknowns
 
 __all__ = ["WholeSpace"]
@@ -31,7 +35,10 @@ class WholeSpace:
         prescribed: Values at them, in the present increment.
         load: External forces at them (force).
         diagonal: Diagonal of the matrix assembled last (force/length).
-        outside: Squares of load and of diagonal times state at unknowns outside of the space.
+        outside: Norms of load and of diagonal times state at unknowns outside of the space, by
+            body, (2, n_bodies).
+        label: Body or free support of every unknown of this rank, (n_local,).
+        n_bodies: Their number.
         iterations_per_round: Iterations of L-BFGS after which H₀ is made anew from the status: one
             costs 1/15 to 1/35 of a factorisation, and pairs taken across changes of status are
             worth little.
@@ -58,7 +65,9 @@ class WholeSpace:
         self.prescribed: Array = np.zeros(int(constrained.sum()))
         self.load = np.zeros(unknowns.n_local)
         self.diagonal = np.zeros(unknowns.n_local)
-        self.outside = np.zeros(2)
+        self._label_unknowns()
+        self.outside = np.zeros((2, self.n_bodies))
+        self._parts: tuple[list[int], Parts] | None = None
         self.ready = True
         self._near_nullspace: PETSc.NullSpace | None = None
         self.mark: object = WholeSpace
@@ -71,6 +80,59 @@ class WholeSpace:
         for contact in self.contacts:
             contact.set_unknowns(self.unknowns, first)
             first += len(contact.free_motion)
+
+    def _label_unknowns(self) -> None:
+        """Tell bodies and free supports apart. Collective."""
+        n, self._body = connected_bodies(self.u.function_space)
+        self._shares: weakref.WeakKeyDictionary[Contact, tuple[int, Array]]
+        self._shares = weakref.WeakKeyDictionary()
+        dofs = np.repeat(self._body, len(self.u))[: self.unknowns.n_dofs]
+        motions = n + np.arange(len(self.motions))
+        label = self.unknowns.joined(dofs.astype(np.float64), motions.astype(np.float64))
+        self.label = label.astype(np.intp)
+        self.n_bodies = n + len(self.motions)
+
+    @property
+    def parts(self) -> Parts:
+        """What has to be in balance, for the present pairs; the space is entered. Collective."""
+        pairings = [c.pairings for c in self.contacts]
+        if self._parts is None or self._parts[0] != pairings:
+            moving = [(n, i) for n, c in enumerate(self.contacts) for i in c.free_motion]
+            n = self.n_bodies - len(moving)
+            bodies = [f"body {b + 1}" if n > 1 else "the body" for b in range(n)]
+            bodies += [f"support of {self.contacts[c].name} along {'xyz'[i]}" for c, i in moving]
+            touched = [c.felt_unknowns() for c in self.contacts]
+            names = [c.name for c in self.contacts]
+            parts = Parts(
+                self.unknowns.comm, self.label, bodies, names, touched, [c for c, _ in moving]
+            )
+            self._parts = pairings, parts
+        return self._parts[1]
+
+    def shares(self, contact: Contact) -> Array:
+        """Share of the traction at each point that acts on each body, (n_points, n_bodies).
+
+        1 for the body that the point is of, and in sum -1 for those opposite. Collective.
+        """
+        pairings, shares = self._shares.get(contact, (-1, np.zeros((0, 0))))
+        if pairings != contact.pairings:
+            n = self.n_bodies - len(self.motions)
+            shares = np.zeros((contact.quadrature.n_points, n))
+            rows = contact.quadrature.point_rows()
+            space = self.u.function_space
+            cells = facet_cells(space.mesh, contact.surface.facets)
+            own = self._body[space.dofmap.list[cells, 0]]
+            shares[rows.ravel(), np.repeat(own, rows.shape[1])] = 1.0
+            if not contact.rigid:
+                # What of the bodies a point feels is what its traction acts on.
+                for b in range(n):
+                    push = np.zeros(self.unknowns.n_local)
+                    push[: self.unknowns.n_dofs : len(self.u)] = (
+                        self.label[: self.unknowns.n_dofs : len(self.u)] == b
+                    )
+                    shares[:, b] = contact.at_points(push)[:, 0]
+            self._shares[contact] = contact.pairings, shares
+        return shares
 
     def vector(self) -> PETSc.Vec:
         """A new vector over the unknowns. Collective."""
@@ -141,12 +203,18 @@ class WholeSpace:
     def forget(self) -> None:
         """Drop what was kept of earlier increments and could show in the digits of the next."""
 
-    def contact_force(self) -> Array:
-        """Contact part of the residual at the present state, this rank's unknowns. Collective."""
-        self._contact_vector.set(0.0)
+    def contact_forces(self) -> list[Array]:
+        """Parts of the residual at the present state by contact, (n_local,) each. Collective."""
+        forces = []
         for contact in self.contacts:
+            self._contact_vector.set(0.0)
             contact.add_force(self._contact_vector)
-        return self._contact_vector.array_r.copy()
+            forces.append(self._contact_vector.array_r.copy())
+        return forces
+
+    def contact_force(self) -> Array:
+        """Their sum, (n_local,). Collective."""
+        return sum(self.contact_forces(), np.zeros(self.unknowns.n_local))
 
     def bulk_force(self) -> Array:
         """The rest of the residual: the bulk's, and the forces on free supports. Collective."""

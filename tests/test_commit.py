@@ -1,0 +1,115 @@
+"""What is committed is what was solved: no constant, no field and no second call changes it.
+
+The reference is the same history with nothing in between, to the last digit on one rank; on several
+MUMPS adds in the order in which messages come: 1e-10.
+"""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from scenes import at_points, block, close, nodal
+from test_pairs import FLOOR, LOWER, ROOF, UPPER, stack
+
+import fenics_contact as fc
+
+COMM = MPI.COMM_WORLD
+EXACT = 0.0 if COMM.size == 1 else 1e-10
+
+pytestmark = pytest.mark.mpi
+
+
+def slid(between, *, enforcement="penalty", field=True):
+    """A block pressed on a floor that is drawn along, three increments; forces and field."""
+    scene = block("quadrilateral", n=4, up=-10.0)
+    contact = {"displacement": np.zeros(2), "enforcement": enforcement}
+    problem, contact = scene.problem(fc.Coulomb(0.3), scene.rollers(), contact=contact)
+    motion = contact.parameters["displacement"]
+    forces = []
+    for way in (0.0, 1e-3, 2e-3):
+        motion.value[:] = way, 0.0
+        problem.solve(field=field)
+        between(problem, contact)
+        problem.commit()
+        problem.complete()
+        forces.append(contact.resultants().force)
+    return np.array(forces), nodal(scene.u), at_points(contact, contact.history.rows())
+
+
+def nothing(problem, contact):
+    pass
+
+
+def changed(problem, contact):
+    """Parameters of law and support, which the next solve is to see and this commit is not."""
+    kept = {name: c.value.copy() for name, c in contact.parameters.items()}
+    contact.parameters["friction"].value = 0.01
+    contact.parameters["displacement"].value[:] = 0.5, 0.1
+    contact.evaluate()
+    problem.commit()
+    for name, value in kept.items():
+        contact.parameters[name].value = value
+
+
+def moved(problem, contact):
+    """The displacement itself, set by hand."""
+    problem.u.x.array[:] += 1.0
+    contact.forget()
+
+
+def twice(problem, contact):
+    problem.commit()
+
+
+def failed(problem, contact):
+    """An increment that is tried before the commit, and has no solution."""
+    kept = contact.parameters["displacement"].value.copy()
+    contact.parameters["displacement"].value[:] = np.nan
+    with pytest.raises((fc.NotConverged, ValueError)):
+        problem.solve()
+    contact.parameters["displacement"].value[:] = kept
+
+
+@pytest.mark.parametrize("field", [True, False])
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+@pytest.mark.parametrize("between", [changed, moved, twice, failed])
+def test_commit_keeps_what_solve_found(between, enforcement, field):
+    options = {"enforcement": enforcement, "field": field}
+    expected, found = slid(nothing, **options), slid(between, **options)
+    for a, b in zip(found, expected, strict=True):
+        assert close(a, b, EXACT)
+    assert abs(expected[0][-1, 0]) > 0.1  # there is friction to go wrong
+
+
+def test_a_second_commit_finds_no_other_pairs():
+    """With pairs found anew at commits, a commit that has nothing to commit changes nothing."""
+    body = stack("quadrilateral", (3, 4), (0.5, 0.5), widths=[1.5, 1.0])
+    body.hold(FLOOR, 0, 1)
+    slide = body.constant()
+    body.hold(ROOF, 0, value=slide)
+    body.F += 1e4 * body.v[1] * body.ds(ROOF)
+    surface = fc.ContactSurface(body.mesh, body.tags, 10 + UPPER)
+    support = fc.DeformableBody(body.tags, 10 + LOWER, update="increment")
+    contact = fc.Contact(body.u, surface, support, fc.Coulomb(0.3))
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    for way in (0.0, 0.1):
+        slide.value = way
+        problem.solve()
+        problem.commit()
+    pairings, rows = contact.pairings, contact.history.rows()
+    before = contact.resultants()
+    slide.value = 0.2
+    problem.commit()
+    assert (contact.pairings, problem.increment) == (pairings, 2)
+    assert close(contact.history.rows(), rows, 0.0)
+    assert close(contact.resultants().force, before.force, 0.0)
+    step = problem.solve()
+    assert close(step.contacts["contact"].normal_force, 1e4, 1e-8)
+
+
+def test_a_commit_before_any_solution_changes_nothing():
+    scene = block("quadrilateral", up=-1.0)
+    problem, contact = scene.problem(fc.Frictionless(), scene.rollers())
+    before = contact.history.rows()
+    problem.commit()
+    assert problem.increment == 0
+    assert close(contact.history.rows(), before, 0.0)
