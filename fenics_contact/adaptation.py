@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from fenics_contact import compat
 from fenics_contact.errors import ErrorBudget, estimate_errors
 from fenics_contact.parallel import gather_rows
 from fenics_contact.problem import ContactProblem
@@ -72,10 +73,11 @@ def adapt(
         ValueError: Cells that cannot be split, or arguments without sense.
         NotConverged: As ``solve`` does.
     """
-    if mesh.topology.cell_type not in _SIMPLICES or mesh.geometry.cmap.degree != 1:
+    degree = compat.geometry_element(mesh).degree
+    if mesh.topology.cell_type not in _SIMPLICES or degree != 1:
         raise ValueError(
             f"the mesh has cells {mesh.topology.cell_type.name} of degree "
-            f"{mesh.geometry.cmap.degree}; only triangles and tetrahedra with straight edges "
+            f"{degree}; only triangles and tetrahedra with straight edges "
             "can be split: take such a mesh, and snap= for curved sides"
         )
     if mesh.comm.allreduce(mesh.topology.index_map(mesh.topology.dim).num_ghosts):

@@ -56,7 +56,7 @@ class Callbacks:
         """
 
         def test(_: Any, iteration: int, norms: tuple[float, float, float]) -> int:
-            lost = int(PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN)
+            lost = compat.NOT_FINITE
             return int(self._run(reason, otherwise=lost)) if np.isfinite(norms[2]) else lost
 
         def compute(_: Any, x: PETSc.Vec, f: PETSc.Vec) -> None:

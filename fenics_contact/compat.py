@@ -20,6 +20,16 @@ __all__ = ["compile_form", "create_facet_submesh", "interpolation_points", "mode
 # PETSc's line search for the least residual, renamed in 3.24; bound to Python since 3.23.
 _line_searches = getattr(getattr(PETSc, "SNESLineSearch", None), "Type", None)
 LEAST_RESIDUAL = getattr(_line_searches, "SECANT", "l2")
+# The longest step of a line search, renamed in the same release.
+_RENAMED = hasattr(_line_searches, "SECANT")
+LONGEST_STEP = "snes_linesearch_maxlambda" if _RENAMED else "snes_linesearch_maxstep"
+# The reason of SNES where the residual is not finite, renamed in 3.25 (the number is the same).
+_reasons = PETSc.SNES.ConvergedReason
+NOT_FINITE = int(
+    _reasons.DIVERGED_FUNCTION_NANORINF
+    if hasattr(_reasons, "DIVERGED_FUNCTION_NANORINF")
+    else _reasons.DIVERGED_FNORM_NAN
+)
 # MUMPS' errors INFOG(1) for workspace that is too small, or memory that was not to be had.
 _NO_MEMORY = (-5, -7, -8, -9, -11, -13, -14, -15, -17, -18, -19, -20)
 
@@ -74,6 +84,14 @@ def warn_of_slow_blas() -> None:
             "the reference BLAS is in use: factorisations take up to eight times longer than with "
             "OpenBLAS (Debian: apt install libopenblas0-pthread)"
         )
+
+
+def cell_partitioner(ghost_mode: dolfinx.mesh.GhostMode) -> Any:
+    """What ``dolfinx.mesh.create_mesh`` distributes cells by: a facet has up to two of them."""
+    try:
+        return dolfinx.mesh.create_cell_partitioner(ghost_mode, 2)
+    except TypeError:  # DOLFINx < 0.11
+        return dolfinx.mesh.create_cell_partitioner(ghost_mode)
 
 
 def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:

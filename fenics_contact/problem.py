@@ -64,7 +64,7 @@ _PATIENCE = 20
 _REASONS = PETSc.SNES.ConvergedReason
 _OUTCOMES = {
     int(_REASONS.DIVERGED_LINEAR_SOLVE): "the matrix is singular",
-    int(_REASONS.DIVERGED_FNORM_NAN): "the residual is not finite",
+    compat.NOT_FINITE: "the residual is not finite",
     int(_REASONS.DIVERGED_MAX_IT): "iterations used up",
     int(_REASONS.DIVERGED_LINE_SEARCH): "no progress",
     int(_REASONS.DIVERGED_DTOL): "no progress",
@@ -79,7 +79,7 @@ _COMMON = {
     "snes_linesearch_rtol": 0.1,
     "snes_linesearch_max_it": 20,
     # Bodies without contact are led to it before: no step of the iteration needs to be long.
-    "snes_linesearch_maxstep": 100.0,
+    compat.LONGEST_STEP: 100.0,
     # `cp` takes |F·y| below this for convergence of the whole; the residual itself is tested here.
     "snes_linesearch_atol": 1e-300,
 }

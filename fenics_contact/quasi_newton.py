@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
+from fenics_contact import compat
+
 __all__ = ["QuasiNewton"]
 
 # Rounds in a row that do not lower the residual before the increment is given up: the potential may
@@ -77,10 +79,10 @@ class QuasiNewton:
                     kept.copy(solution)
             if stalls >= _MAX_STALLS:
                 lost = not np.isfinite(residual)
-                failure = reasons.DIVERGED_FNORM_NAN if lost else reasons.DIVERGED_LINE_SEARCH
-                return iterations, int(failure)
+                failure = compat.NOT_FINITE if lost else int(reasons.DIVERGED_LINE_SEARCH)
+                return iterations, failure
             if not self._refresh():
-                return iterations, int(reasons.DIVERGED_FNORM_NAN)
+                return iterations, compat.NOT_FINITE
 
     def _start(self) -> None:
         """H₀ = (K + αK_n + φK_t)⁻¹, all of Γc closed and sticking (section 5). Collective."""

@@ -58,6 +58,8 @@ class Unknowns:
     def widened(self, matrix: PETSc.Mat, *, rows: bool = False) -> PETSc.Mat:
         """A matrix over the dofs as one over the unknowns, zero at the motions. Collective.
 
+        Rows of motions have their diagonal entry: PETSc sets conditions in no others.
+
         Args:
             matrix: Its columns, and with ``rows`` its rows too, are dofs. Returned itself where
                 there are no motions.
@@ -69,7 +71,10 @@ class Unknowns:
         n_rows = matrix.getLocalSize()[0]
         if rows:
             added = self.n_local - self.n_dofs
-            pointers = np.append(pointers, np.full(added, pointers[-1], dtype=pointers.dtype))
+            more = np.arange(added, dtype=columns.dtype)
+            pointers = np.append(pointers, pointers[-1] + 1 + more)
+            columns = np.append(columns, self.first_motion + more)
+            values = np.append(values, np.zeros(added))
             n_rows += added
         return PETSc.Mat().createAIJ(
             ((n_rows, None), (self.n_local, None)),

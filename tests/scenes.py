@@ -62,7 +62,7 @@ def block_mesh(
     else:
         serial = dolfinx.mesh.create_unit_cube(MPI.COMM_SELF, *n, kind)
     x = serial.geometry.x[:, :d].copy()
-    cells = serial.geometry.dofmap.astype(np.int64)
+    cells = compat.geometry_dofmap(serial).astype(np.int64)
     if shuffled:
         x, cells = _shuffle(x, cells, cell)
     if bend is not None:
@@ -73,7 +73,7 @@ def block_mesh(
     if comm.rank:
         x, cells = x[:0], cells[:0]
     if partitioner is None:
-        partitioner = dolfinx.mesh.create_cell_partitioner(ghost_mode)
+        partitioner = compat.cell_partitioner(ghost_mode)
     mesh = dolfinx.mesh.create_mesh(
         comm, cells=cells, x=x * size, e=ufl.Mesh(element), partitioner=partitioner
     )

@@ -41,7 +41,7 @@ def two_blocks(
         if low > 0 and shift > 0:
             x[-1][:, 0] += shift
             x[-1][:, 1 : d - 1] += (widths[0] - width) / 2
-        cells.append(block.geometry.dofmap.astype(np.int64) + offset)
+        cells.append(compat.geometry_dofmap(block).astype(np.int64) + offset)
         offset += len(x[-1])
     x, cells = np.concatenate(x), np.concatenate(cells)
     if COMM.rank:
