@@ -2,12 +2,15 @@
 
 PETSc carries no exception of Python: what leaves a callback comes out as an error code of PETSc's
 own, and leaves vectors locked behind it. So SNES is told that the residual is not a number, which
-ends it in good order, and then the error is raised.
+ends it in good order, and then the error is raised. An interrupt waits for the next callback.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -15,10 +18,51 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from fenics_contact import compat
+from fenics_contact import compat, dense
 from fenics_contact.parallel import fail_together
 
-__all__ = ["Callbacks"]
+__all__ = ["Callbacks", "interrupts_held", "release_interrupt"]
+
+
+class _Interrupt:
+    """An interrupt that waits, and what it was to do; there is one Ctrl-C for all problems."""
+
+    handler: Any = None  # of Python, while interrupts are held back
+    arguments: tuple[Any, ...] = ()
+
+
+@contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Hold back Ctrl-C inside the block: Python would raise where PETSc has just called it.
+
+    Nor must it tear apart what belongs together. `release_interrupt` lets it through.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    main = threading.current_thread() is threading.main_thread()
+    if _Interrupt.handler is not None or not callable(handler) or not main:
+        yield
+        return
+
+    def keep(*arguments: Any) -> None:
+        _Interrupt.arguments = arguments
+
+    _Interrupt.handler = handler
+    signal.signal(signal.SIGINT, keep)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        try:
+            release_interrupt()
+        finally:
+            _Interrupt.handler = None
+
+
+def release_interrupt() -> None:
+    """Do what an interrupt that waits was to do, usually raise KeyboardInterrupt."""
+    arguments, _Interrupt.arguments = _Interrupt.arguments, ()
+    if arguments:
+        _Interrupt.handler(*arguments)
 
 
 class Callbacks:
@@ -89,12 +133,14 @@ class Callbacks:
             MemoryError: The factorisation did not get its memory.
         """
         try:
-            snes.solve(None, x)
+            with interrupts_held():
+                snes.solve(None, x)
         finally:
             self._last = ()  # another solution may be of other equations
             error, self._error = self._error, None
             if error is not None:
                 raise error
+        dense.raise_kept(snes.getKSP())
         reason = snes.getConvergedReason()
         if reason <= 0 and self._comm.allreduce(compat.refused_memory(snes.getKSP().getPC())):
             raise MemoryError(
@@ -115,6 +161,7 @@ class Callbacks:
     def _run(self, function: Callable[..., Any], *arguments: Any, otherwise: Any = None) -> Any:
         if self._error is None:
             try:
+                release_interrupt()
                 return function(*arguments)
             except BaseException as error:
                 fail_together(self._comm, error)

@@ -11,7 +11,7 @@ import scipy.linalg
 import scipy.spatial
 from petsc4py import PETSc
 
-__all__ = ["PartlyFactored", "Sum"]
+__all__ = ["PartlyFactored", "Sum", "raise_kept"]
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.integer[Any]]
@@ -36,7 +36,10 @@ class Sum:
     Attributes:
         fixed: S, (n, n).
         added: Rows, columns and values of C's entries.
+        error: What `mult` ran into: PETSc carries no exception; see `raise_kept`.
     """
+
+    error: BaseException | None = None
 
     def __init__(self) -> None:
         """Nothing yet; see `set_parts`."""
@@ -56,11 +59,17 @@ class Sum:
         self.fixed, self.added = fixed, (rows, columns, values)
 
     def mult(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Multiply."""
+        """Multiply; into what is no number if that fails."""
+        try:
+            y.array[:] = self._product(x.array_r)
+        except BaseException as error:
+            self.error = self.error or error
+            y.set(np.nan)
+
+    def _product(self, state: Array) -> Array:
         rows, columns, values = self.added
-        state = x.array_r
         added = np.bincount(rows, values * state[columns], minlength=state.size)
-        y.array[:] = self.fixed @ state + added
+        return np.asarray(self.fixed @ state + added)
 
 
 class PartlyFactored:
@@ -70,7 +79,12 @@ class PartlyFactored:
     the constant S_AO S_OO⁻¹ S_OA is what remains to be factored for every C. It is as exact as
     LU of the whole. Where contact is open C is zero. While C differs in few places from what was
     factored last, the factors are corrected.
+
+    Attributes:
+        error: As of `Sum`.
     """
+
+    error: BaseException | None = None
 
     def __init__(self, places: Array) -> None:
         """Nothing is factored yet.
@@ -93,7 +107,17 @@ class PartlyFactored:
 
     def setUp(self, pc: PETSc.PC) -> None:
         """Factor, or find out what the last factors lack."""
+        reasons = PETSc.PC.FailedReason
         self._operator = pc.getOperators()[1].getPythonContext()
+        try:
+            regular = self._set_up()
+        except BaseException as error:
+            self.error, regular = self.error or error, False
+            self._factored = None
+        pc.setFailedReason(reasons.NOERROR if regular else reasons.FACTOR_NUMERIC_ZEROPIVOT)
+
+    def _set_up(self) -> bool:
+        """Do so for the present operator; whether it is regular."""
         if self._operator.fixed is not self._fixed:
             self._fixed = self._operator.fixed
             self._forget()
@@ -108,9 +132,7 @@ class PartlyFactored:
         roomy = self._in.size > (1 + _MARGIN) ** 2 * n_acted + 1
         if not fits or (roomy and n_acted < _MOST * n / (1 + _MARGIN)):
             self._divide()
-        regular = self._correct() or self._factor_anew()
-        reasons = PETSc.PC.FailedReason
-        pc.setFailedReason(reasons.NOERROR if regular else reasons.FACTOR_NUMERIC_ZEROPIVOT)
+        return self._correct() or self._factor_anew()
 
     def _factor_anew(self) -> bool:
         """Factor the block of A as it is now; whether it is regular."""
@@ -188,16 +210,22 @@ class PartlyFactored:
         self._position[inside] = np.arange(inside.size)
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Solve."""
-        right = x.array_r
+        """Solve; with what is no number if that fails."""
+        try:
+            self._apply(x.array_r, y.array)
+        except BaseException as error:
+            self.error = self.error or error  # PETSc may go on for a while
+            y.set(np.nan)
+
+    def _apply(self, right: Array, solution: Array) -> None:
         if not self._out.size:
-            y.array[:] = self._solve(right)
+            solution[:] = self._solve(right)
             return
         outside = scipy.linalg.lu_solve(self._factor_out, right[self._out], check_finite=False)
         rest = right[self._in] - self._coupling @ outside
         inside = self._solve(rest)
-        y.array[self._in] = inside
-        y.array[self._out] = outside - self._extension @ inside
+        solution[self._in] = inside
+        solution[self._out] = outside - self._extension @ inside
 
     def _solve(self, right: Array) -> Array:
         """Solve with the block of A, and look whether a correction was good enough."""
@@ -220,3 +248,13 @@ def _factors(matrix: Array) -> tuple[Array, Index]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
         return scipy.linalg.lu_factor(matrix, overwrite_a=True, check_finite=False)
+
+
+def raise_kept(ksp: PETSc.KSP) -> None:
+    """Raise what the contexts of a solver ran into when PETSc called them last, if it has any."""
+    context = ksp.getPC().getPythonContext() if ksp.getPC().getType() == "python" else None
+    if isinstance(context, PartlyFactored):
+        for part in (context, context._operator):
+            error, part.error = part.error, None
+            if error is not None:
+                raise error

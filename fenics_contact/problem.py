@@ -16,11 +16,11 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact import accuracy, compat, linear
+from fenics_contact import accuracy, compat, dense, linear
 from fenics_contact.alternating import Alternation
 from fenics_contact.balance import Norms
 from fenics_contact.bulk import Bulk
-from fenics_contact.callbacks import Callbacks
+from fenics_contact.callbacks import Callbacks, interrupts_held, release_interrupt
 from fenics_contact.chattering import StatusWatch
 from fenics_contact.condense import CondensedSpace, touched, worthwhile
 from fenics_contact.contact import Contact, Found, Resultants, Status
@@ -739,7 +739,9 @@ class ContactProblem:
                     contact.add_force(right, traction)
             right.array[space.constrained] = 0.0
             right.scale(-1.0 / self.bulk.scale)
-            ksp.solve(right, left)
+            with interrupts_held():
+                ksp.solve(right, left)
+            dense.raise_kept(ksp)
             return space.extended(left.array_r.copy())
 
         try:
@@ -759,6 +761,7 @@ class ContactProblem:
 
     # ---- solving ---------------------------------------------------------------------------------
 
+    @interrupts_held()
     def solve(self, *, ahead: float = 1.0, field: bool = True) -> Step:
         """Solve the next increment with the loads and conditions as they are now. Collective.
 
@@ -788,6 +791,7 @@ class ContactProblem:
             # it: a warning, on the rank that has the point, must not become an error there alone.
             with self._options.present(), np.errstate(all="ignore"):
                 step = self._solve(start, ahead, field)
+                release_interrupt()
         except BaseException as error:
             fail_together(self._comm, error)
             state, self._load, self._behind, self._energy = saved
@@ -1059,6 +1063,7 @@ class ContactProblem:
         self._predicts = False
         step = self._solution.duplicate()
         self._solvers[True].solve(self._function, step)
+        dense.raise_kept(self._solvers[True])
         moved = present - self._length * step.array_r
         step.destroy()
         return np.asarray(moved, dtype=np.float64)
@@ -1183,6 +1188,7 @@ class ContactProblem:
         sums = global_sum(self._comm, np.stack([*total.T, count, np.sum(sizes, axis=0)]))
         return sums[:gdim].T, sums[gdim:]
 
+    @interrupts_held()
     def commit(self) -> None:
         """Make the solved state the start of the next increment, history included. Collective.
 

@@ -8,8 +8,10 @@ tolerance of 1e-9).
 import json
 import os
 import resource
+import signal
 import subprocess
 import sys
+import time
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,11 +21,11 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 from running import ROOT, environment
-from scenes import close, nodal, raised_everywhere
+from scenes import close, nodal, raised_everywhere, stress
 from test_solver import PATH, identical, rub, snapshot, walk
 
 import fenics_contact as fc
-from fenics_contact import output, parallel, plotting, surface
+from fenics_contact import dense, output, parallel, plotting, surface
 
 COMM = MPI.COMM_WORLD
 LAST = COMM.size - 1
@@ -132,6 +134,77 @@ def test_snes_is_stopped(method):
         made.problem.solve()
     assert identical(snapshot(made), before)
     made.problem._test_convergence = kept
+    goes_on(made, twin)
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="condensation is for one rank")
+@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        (dense.PartlyFactored, "_factor_anew"),
+        (dense.PartlyFactored, "_solve"),
+    ],
+)
+def test_an_exception_in_a_dense_solve(kind, name, method, error, monkeypatch):
+    """It comes out as it is from the matrix and the solver that PETSc calls, at whichever call."""
+    made, twin = pair(method)
+    for after in (0, 1, 2, 5):
+        with monkeypatch.context() as patch:
+            broken = failing(getattr(kind, name), after, error)
+            patch.setattr(kind, name, broken)
+            before = snapshot(made)
+            try:
+                made.problem.solve()
+            except error:
+                assert identical(snapshot(made), before)
+            else:  # there were fewer calls
+                made.problem.restore()
+    goes_on(made, twin)
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="a signal to one rank")
+@pytest.mark.parametrize("condensation", [True, False])
+@pytest.mark.parametrize("method", METHODS)
+def test_an_interrupt_at_any_time(method, condensation):
+    """Ctrl-C while PETSc runs or calls back: KeyboardInterrupt and no trace of the increment.
+
+    The signal comes earlier or later by parts of the time that a solution takes.
+    """
+    made, twin = pair(method, condensation=condensation)
+    start = time.perf_counter()
+    made.problem.solve()
+    seconds = time.perf_counter() - start
+    made.problem.restore()
+    before, handler = snapshot(made), signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+    for share in np.linspace(0.02, 0.9, 12):
+        signal.setitimer(signal.ITIMER_REAL, share * seconds)
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                while True:  # a machine that is quick for once is interrupted in the next solution
+                    made.problem.solve()
+                    made.problem.restore()
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+        assert identical(snapshot(made), before)
+        assert signal.getsignal(signal.SIGINT) is handler
+    goes_on(made, twin)
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="condensation is for one rank")
+@pytest.mark.parametrize("name", ["_product", "_solve"])
+def test_an_exception_in_a_linearised_solve(name, monkeypatch):
+    """In the products and solutions of the error estimate: it comes out, and none comes after."""
+    made, twin = pair("newton")
+    made.problem.solve()
+    kind = dense.Sum if name == "_product" else dense.PartlyFactored
+    with monkeypatch.context() as patch:
+        patch.setattr(kind, name, failing(getattr(kind, name), 0))
+        with pytest.raises(Fault, match="on purpose"):
+            fc.estimate_errors(made.problem, stress(made.scene.u, made.scene.E, made.scene.nu))
+    made.problem.restore()
     goes_on(made, twin)
 
 
