@@ -141,16 +141,19 @@ class Step:
     complete: bool = True
 
     def summary(self) -> str:
-        """One line for people."""
+        """One line for people; friction is ∫|τ| over the points, not the size of its resultant."""
         parts = [f"increment {self.increment}"]
         if self.load is not None:
             parts.append(f"load {self.load:.6g}")
-        parts.append(f"{self.iterations} iterations, reason {self.reason}")
-        parts.append(f"residual {self.verdict.relative_residual:.1e}")
+        made = f"{self.iterations} iterations" if self.iterations else "solved by its first guess"
+        parts.append(f"{self.method}: {made}")
+        residual, force = self.verdict.relative_residual, self.verdict.force
+        parts.append(f"residual {residual:.1e} of the forces" if force > 0 else "no forces")
         for name, r in self.contacts.items():
             parts.append(
-                f"{name}: force {r.normal_force:.6g}, friction {r.tangential_force:.6g}, area "
-                f"{r.area:.4g}, {r.stick} stick {r.slip} slip {r.open} open"
+                f"{name}: force {r.normal_force:.6g}, friction ∫|τ| "
+                f"{r.tangential_force:.6g}, area {r.area:.4g}, {r.stick} stick {r.slip} slip "
+                f"{r.open} open"
             )
         return "; ".join(parts)
 
@@ -301,6 +304,7 @@ class ContactProblem:
         self.prefix, self._fallback = prefix, fallback
         self._expected = _EXPECTED
         self._fresh = True  # nothing was solved yet
+        self._obstacle: str | None = None  # to condensation, as last said
         self._given = method, dict(petsc_options or {})
         self._configure()
 
@@ -473,8 +477,9 @@ class ContactProblem:
                 obstacle = linear.too_large(n_bytes, self._comm)
                 if not obstacle and linear.quicker(n, len(self.u), condensed_for=self._expected):
                     obstacle = f"multigrid is quicker for {n} unknowns"
-        if obstacle and self._comm.rank == 0:
+        if obstacle and obstacle != self._obstacle and self._comm.rank == 0:
             logger.info("iterating on all unknowns: %s", obstacle)
+        self._obstacle = obstacle
         return obstacle is None
 
     def _choose_linear_solver(self, solvers: Sequence[str]) -> str:

@@ -459,3 +459,32 @@ def test_no_multipliers_under_penalty() -> None:
     contact = scene.contact(fc.Frictionless(k_n=1e3))
     raised_everywhere(contact.augment, ValueError, "augmented")
     assert contact.multipliers is None
+
+
+def test_a_contact_that_only_the_first_round_touches() -> None:
+    """A ledge that the top reaches while the springs below still give, and then no more.
+
+    Reference: the load of 1, all of it on the floor, to the solver's tolerance of 1e-9; the block
+    gives way by 0.91e-3, the first springs by 1e-2, and the ledge is 5e-3 away.
+    """
+    scene = block("quadrilateral", up=-1.0)
+    floor = scene.contact(fc.Frictionless(100.0), name="floor", **AUGMENTED)
+    top = fc.ContactSurface(scene.mesh, scene.tags, TOP)
+    support = fc.Obstacle(5e-3, (0.0, -1.0))
+    ledge = fc.Contact(
+        scene.u, top, support, fc.Frictionless(100.0), name="ledge", enforcement="augmented"
+    )
+    errors = []
+    kept = ledge.enforcement_error
+
+    def noted() -> float:
+        errors.append(kept())
+        return errors[-1]
+
+    ledge.enforcement_error = noted
+    problem = fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=[floor, ledge])
+    step = problem.solve()
+    assert errors[0] > 0.0  # it did touch
+    assert step.contacts["floor"].normal_force == pytest.approx(1.0, rel=1e-8)
+    assert step.contacts["ledge"].normal_force == 0.0
+    assert step.verdict.enforcement["ledge"] == 0.0 and not step.verdict.failures

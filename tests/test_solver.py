@@ -296,6 +296,32 @@ def test_increments_lead_the_load():
     assert "increment 4" in steps[-1].summary() and "-0.02" in steps[-1].summary()
 
 
+@pytest.mark.parametrize("lift", [0.0, 1e-3])
+def test_summary_without_forces(lift):
+    """Before anything touches there is no force that the residual could be a share of."""
+    scene = block("quadrilateral")
+    problem, _ = scene.problem(
+        fc.Coulomb(0.3, 1e4, 1e4),
+        [*scene.rollers(), scene.hold(TOP, scene.dim - 1, lift)],
+        contact={"gap": 0.1},
+    )
+    step = problem.solve()
+    assert "friction ∫|τ| 0," in step.summary()
+    assert ("no forces" in step.summary()) == (step.verdict.force == 0.0)
+    assert "reason" not in step.summary()
+    problem.commit()
+    assert "solved by its first guess" in problem.solve().summary()
+
+
+def test_why_all_unknowns_is_said_once(caplog):
+    """`increments` asks again whether to condense; the log has no news to tell."""
+    with caplog.at_level("INFO", logger="fenics_contact"):
+        made = rub(condensation=False)
+        list(fc.increments(made.problem, made.push[1], 0.0, -0.01, steps=2))
+    said = [r.message for r in caplog.records if "iterating on all unknowns" in r.message]
+    assert len(said) == (COMM.rank == 0)
+
+
 # ---- pairs and factorisations --------------------------------------------------------------------
 
 
