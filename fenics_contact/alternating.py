@@ -75,8 +75,8 @@ class Alternation:
         self._function: PETSc.Vec | None = None
         self._shares_solver = not solver
         comm, prefix = problem.u.function_space.mesh.comm, problem.prefix
-        self.snes = defaults.make_snes(comm, f"{prefix}alternating_", OPTIONS | solver)
-        self._finish = defaults.make_snes(comm, f"{prefix}finishing_", _FINISH | solver)
+        self.snes = defaults.make_snes(comm, prefix, "alternating_", OPTIONS | solver)
+        self._finish = defaults.make_snes(comm, prefix, "finishing_", _FINISH | solver)
         self._callbacks = Callbacks(comm)
         self._goal = 0.0
 

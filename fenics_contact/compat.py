@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import logging
 from pathlib import Path
@@ -70,6 +71,17 @@ def create_facet_submesh(
         return submesh, {submesh: parent_to_sub}, parents
     local = np.arange(n_cells, dtype=np.int32)
     return submesh, [facet_map], facet_map.sub_topology_to_topology(local, False)
+
+
+def option_was_read(name: str) -> bool:
+    """Whether anything has asked PETSc's database for an option, given without dash."""
+    options = PETSc.Options()
+    if hasattr(options, "used"):  # petsc4py >= 3.23
+        return bool(options.used(name))
+    read = ctypes.c_int(0)
+    library = ctypes.CDLL(PETSc.__file__)
+    library.PetscOptionsUsed(None, name.encode(), ctypes.byref(read))
+    return bool(read.value)
 
 
 @functools.cache

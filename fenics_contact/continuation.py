@@ -61,8 +61,8 @@ class Continuation:
         """
         self._problem = weakref.proxy(problem)
         self._function: PETSc.Vec | None = None
-        comm, prefix = problem.u.function_space.mesh.comm, f"{problem.prefix}continuation_"
-        self.snes = defaults.make_snes(comm, prefix, OPTIONS | solver)
+        comm = problem.u.function_space.mesh.comm
+        self.snes = defaults.make_snes(comm, problem.prefix, "continuation_", OPTIONS | solver)
         self._shares_solver = not solver
         self._callbacks = Callbacks(comm)
         self._coarse = 0.0

@@ -1,14 +1,69 @@
-"""PETSc options that hold where the caller and the command line say nothing."""
+"""PETSc options: the command line's, and those that hold where nobody says anything."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import logging
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
-__all__ = ["Defaults"]
+from fenics_contact import compat
+
+__all__ = ["Defaults", "take_command_line"]
+
+logger = logging.getLogger("fenics_contact")
+
+# What shows how a solver fares; under the problem's own prefix it is for those inside, too.
+_MONITORS = ("snes_monitor", "snes_linesearch_monitor", "snes_converged_reason", "ksp_monitor")
+# Read when something is factored, set up or done; in the first solve that may not be.
+_READ_LATE = re.compile("view|converged_reason|mat_|mg_|gamg|interior_")
+
+
+def take_command_line(prefix: str, comm: MPI.Comm) -> None:
+    """Put options of the command line into PETSc's database, with their values. Collective.
+
+    PETSc looks there itself only if it is initialised with ``sys.argv``, which no script need do.
+    What the database has already stays.
+
+    Args:
+        prefix: What their names begin with; without one there are none.
+        comm: The ranks; the first one's command line is taken.
+    """
+    database = PETSc.Options()
+    arguments = comm.bcast(getattr(sys, "argv", [])[1:])
+    for name, value in _options(arguments).items():
+        mine = prefix and name.startswith(prefix) and name != prefix
+        if mine and not database.hasName(name):
+            database.setValue(name, value)
+
+
+def _options(arguments: Sequence[str]) -> dict[str, str | None]:
+    """Options without dashes and their values, told apart as PETSc does; of equals the last."""
+    found: dict[str, str | None] = {}
+    name = None
+    for argument in arguments:
+        if _is_option(argument):
+            name = argument.removeprefix("-").removeprefix("-")
+            found[name] = None
+        elif name is not None:
+            found[name] = argument
+            name = None
+    return found
+
+
+def _is_option(argument: str) -> bool:
+    if not re.match("--?[A-Za-z]", argument):
+        return False
+    try:
+        float(argument)
+    except ValueError:
+        return True
+    return False  # -inf
 
 
 class Defaults:
@@ -21,6 +76,8 @@ class Defaults:
     def __init__(self) -> None:
         """None yet."""
         self._values: dict[str, Any] = {}
+        self._given: set[str] = set()
+        self._told = False
 
     def set(self, options: Mapping[str, Any], prefix: str) -> None:
         """Add options, given without prefix, that nothing has set; those added before win."""
@@ -30,16 +87,50 @@ class Defaults:
             if key not in self._values and not database.hasName(key):
                 self._values[key] = value
 
+    def give(self, options: Mapping[str, Any], prefix: str) -> None:
+        """`set` what the caller says, who is told if nothing reads it."""
+        self.set(options, prefix)
+        self._given |= {prefix + name for name in options}
+
+    def warn_of_unread(self, prefix: str) -> None:
+        """Name, once, the options that the caller or the database has and no solver has read."""
+        if self._told or not prefix:
+            return
+        self._told = True
+        unread = set(self._given)
+        for name in PETSc.Options().getAll():
+            if name.startswith(prefix):
+                unread.discard(name)
+                if not compat.option_was_read(name):
+                    unread.add(name)
+        names = [f"-{name}" for name in sorted(unread) if not _READ_LATE.search(name, len(prefix))]
+        if names:
+            logger.warning(
+                "no solver has read %s: misspelt, or of a solver that is not in use",
+                ", ".join(names),
+            )
+
     def get(self, name: str) -> Any:
         """The value that holds for a name with prefix; None if there is none."""
         database = PETSc.Options()
         return database.getString(name) if database.hasName(name) else self._values.get(name)
 
-    def make_snes(self, comm: Any, prefix: str, options: Mapping[str, Any]) -> PETSc.SNES:
-        """A solver with a prefix and these options where nothing has set them. Collective."""
+    def make_snes(
+        self, comm: Any, prefix: str, part: str, options: Mapping[str, Any]
+    ) -> PETSc.SNES:
+        """A solver inside another one, with options where nothing has set them. Collective.
+
+        Args:
+            comm: The ranks.
+            prefix: That of the other solver, whose monitors are this one's, too.
+            part: What follows it in the prefix of this one.
+            options: Without prefix.
+        """
         snes = PETSc.SNES().create(comm)
-        snes.setOptionsPrefix(prefix)
-        self.set(options, prefix)
+        snes.setOptionsPrefix(prefix + part)
+        self.set(options, prefix + part)
+        monitors = {name: self.get(prefix + name) for name in _MONITORS}
+        self.set({k: v for k, v in monitors.items() if v is not None}, prefix + part)
         with self.present():
             snes.setFromOptions()
         return snes
@@ -55,4 +146,6 @@ class Defaults:
             yield
         finally:
             for key in added:
+                if key in self._given and compat.option_was_read(key):
+                    self._given.remove(key)
                 database.delValue(key)

@@ -25,7 +25,7 @@ from fenics_contact.chattering import StatusWatch
 from fenics_contact.condense import CondensedSpace, touched, worthwhile
 from fenics_contact.contact import Contact, Found, Resultants, Status
 from fenics_contact.continuation import Continuation
-from fenics_contact.defaults import Defaults
+from fenics_contact.defaults import Defaults, take_command_line
 from fenics_contact.energy import Energy, EnergyState, Forces
 from fenics_contact.facets import facet_cells, local_facets
 from fenics_contact.parallel import fail_together, global_max, global_min, global_sum
@@ -306,6 +306,7 @@ class ContactProblem:
         self._fresh = True  # nothing was solved yet
         self._obstacle: str | None = None  # to condensation, as last said
         self._given = method, dict(petsc_options or {})
+        take_command_line(prefix, self._comm)
         self._configure()
 
     # ---- construction ----------------------------------------------------------------------------
@@ -365,7 +366,7 @@ class ContactProblem:
         """Set up SNES and its two linear solvers: for H₀, and for the consistent tangent."""
         (method, given), prefix = self._given, self.prefix
         options = self._options = Defaults()
-        options.set(given, prefix)
+        options.give(given, prefix)
         if self.accuracy is not None:
             # Residuals as large as what multipliers may miss would make rounds that change nothing.
             least = [_INNER * c.tolerance for c in self.contacts if c.multipliers is not None]
@@ -806,6 +807,9 @@ class ContactProblem:
             if not isinstance(error, NotConverged | ValueError):
                 self._recover()
             raise
+        finally:
+            if self._comm.rank == 0:
+                self._options.warn_of_unread(self.prefix)
         return step
 
     def _solve(self, start: float, ahead: float, field: bool) -> Step:

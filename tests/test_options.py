@@ -1,0 +1,129 @@
+"""Options of the command line: they reach PETSc without a line of the script's own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+from running import ROOT, environment
+from test_solver import rub, walk
+
+COMM = MPI.COMM_WORLD
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+
+SCRIPT = """
+import sys
+sys.path.insert(0, "tests")
+from test_solver import PATH, rub
+made = rub({arguments})
+made.move(*PATH[0])
+made.problem.solve()
+if made.problem.u.function_space.mesh.comm.rank == 0:
+    print("at most", made.problem._max_it)
+"""
+
+
+@pytest.fixture
+def command_line(monkeypatch):
+    """Sets the command line; what it leaves in the database goes with the test."""
+    before = PETSc.Options().getAll()
+
+    def say(*arguments: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["script.py", *arguments])
+
+    yield say
+    for name in set(PETSc.Options().getAll()) - set(before):
+        PETSc.Options().delValue(name)
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="starts ranks of its own")
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("arguments", ["", "condensation=False"])
+def test_a_script_with_options(ranks: int, arguments: str) -> None:
+    """Monitors print, whichever method solves the first increment, and values are taken."""
+    command = [sys.executable, "-c", SCRIPT.format(arguments=arguments), "mesh.msh", "-n", "3"]
+    command += ["-contact_snes_monitor", "-contact_snes_max_it", "737"]
+    if ranks > 1:
+        command = ["mpirun", "--oversubscribe", "-n", str(ranks), *command]
+    done = subprocess.run(command, env=environment(), cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "SNES Function norm" in done.stdout
+    assert "at most 737" in done.stdout
+    assert "no solver has read" not in done.stderr
+
+
+def test_values_of_options(command_line) -> None:
+    """A value is what follows, be it negative or of several words; the last of two holds."""
+    command_line(
+        *("-x", "--tb", "short", "-mine_snes_max_it", "7", "--mine_snes_max_it", "8", "mesh.msh"),
+        *("-mine_number", "-1e-3", "-mine_snes_monitor", "-mine_own", "two words", "-mine_"),
+    )
+    made = rub(prefix="mine_")
+    options = PETSc.Options()
+    taken = {n: options.getString(n) for n in options.getAll() if n.startswith("mine_")}
+    assert taken == {
+        "mine_snes_max_it": "8",
+        "mine_number": "-1e-3",
+        "mine_snes_monitor": "",
+        "mine_own": "two words",
+    }
+    assert not {"x", "tb"} & set(options.getAll())
+    assert made.problem.snes.getTolerances()[3] == 8
+
+
+def test_who_wins(command_line) -> None:
+    """The command line over ``petsc_options``; what the script has put into the database over it.
+
+    And only options of the problem's own prefix are taken, none without a prefix.
+    """
+    command_line("-mine_snes_max_it", "7", "-mine_snes_type", "qn", "-snes_max_it", "9")
+    PETSc.Options().setValue("mine_snes_type", "newtonls")
+    made = rub(prefix="mine_", petsc_options={"snes_max_it": 8, "snes_type": "ngmres"})
+    assert made.problem.snes.getTolerances()[3] == 7
+    assert made.problem.snes.getType() == "newtonls"
+    usual = rub(prefix="").problem.snes.getTolerances()[3]
+    assert usual == rub().problem.snes.getTolerances()[3] != 9
+
+
+def test_one_command_line_for_all_ranks(command_line) -> None:
+    """Where the ranks were started with different ones it is the first rank's."""
+    command_line("-mine_snes_max_it", str(7 + COMM.rank))
+    made = rub(prefix="mine_")
+    assert set(COMM.allgather(made.problem.snes.getTolerances()[3])) == {7}
+
+
+GOOD = {
+    "snes_monitor_cancel": None,
+    "snes_converged_reason": "ascii:/dev/null",
+    "snes_view": "ascii:/dev/null",
+    "snes_linesearch_order": 2,
+    "snes_linesearch_damping": 1.0,
+    "snes_max_it": 500,
+    "ksp_error_if_not_converged": False,
+    "continuation_snes_max_it": 20,
+    "alternating_snes_max_it": 150,
+    "interior_mat_mumps_icntl_14": 300,
+    "tangent_mat_mumps_icntl_14": 50,
+}
+
+
+@pytest.mark.parametrize("method", [None, "newton", "continuation"])
+@pytest.mark.parametrize("condensation", [None, False])
+def test_options_that_nothing_reads(command_line, method, condensation, caplog) -> None:
+    """Misspelt ones are named, once, wherever they come from; all others are not."""
+    line = ["-mine_snes_monitr", "-mine_ksp_typ", "cg", "-yours_snes_type", "qn"]
+    for name, value in GOOD.items():
+        line += [f"-mine_{name}", *([] if value is None else [str(value).lower()])]
+    command_line(*line)
+    given = {"snes_maxit": 3, "snes_force_iteration": False}
+    made = rub(prefix="mine_", method=method, condensation=condensation, petsc_options=given)
+    with caplog.at_level("WARNING", logger="fenics_contact"):
+        walk(made)
+    said = [r.message for r in caplog.records if "no solver has read" in r.message]
+    assert len(said) == (COMM.rank == 0)
+    if said:
+        (said,) = said
+        assert "-mine_ksp_typ, -mine_snes_maxit, -mine_snes_monitr:" in said
