@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
 from typing import Any
@@ -19,15 +19,15 @@ from petsc4py import PETSc
 from fenics_contact.accuracy import DEFAULT_FACTOR, Accuracy, modulus_over_height
 from fenics_contact.augmented import Multipliers, TraceProjection
 from fenics_contact.history import History
-from fenics_contact.laws import Kinematics, Law, Scaled, Springs
-from fenics_contact.pairing import DeformableBody, Opposite
-from fenics_contact.parallel import gather_rows, global_max, global_min, global_sum
+from fenics_contact.laws import Kinematics, Law, Response, Scaled, Springs
+from fenics_contact.pairing import REASONS, DeformableBody, LookBack, Opposite
+from fenics_contact.parallel import gather_rows, global_max, global_min, global_sum, warn
 from fenics_contact.products import PointProduct
 from fenics_contact.supports import Motion, Placement, Support, nonzero_vector
 from fenics_contact.surface import ContactSurface, PointEvaluator, VertexAreas
 from fenics_contact.unknowns import Selection, Unknowns
 
-__all__ = ["Contact", "Resultants", "Status"]
+__all__ = ["Contact", "Resultants", "Status", "passing"]
 
 Array = npt.NDArray[np.float64]
 
@@ -36,6 +36,8 @@ _ENFORCEMENTS = ("penalty", "augmented")
 _TOLERANCE = 1e-5
 # A direction with no more than this share across the normal counts as parallel to it.
 _PARALLEL = 1e-6
+# Share of the approach of two bodies that is no penetration between the points yet.
+_UNSEEN = 0.01
 
 
 class Status(IntEnum):
@@ -54,7 +56,7 @@ class Resultants:
         force: Contact force on the body, ∫ (r_n n + τ), shape (gdim,) (2D: per thickness).
         normal_force: ∫ -r_n, tension counted negative.
         tangential_force: ∫ |τ|.
-        area: Measure of the closed part; all of Γc where the law bears tension.
+        area: Measure of the closed part; all that has a support where the law bears tension.
         open, stick, slip: Numbers of quadrature points.
         max_pressure: Largest -r_n at a point (stress).
         max_penetration: Largest δ₋ (length).
@@ -104,7 +106,9 @@ class Contact:
         applied_force: The forces on it, likewise (force).
         softening: Factor of k_n and k_t, 1 but for the while in which stiffness is led up to it.
         gap_prescribed: Whether the gap was given apart from the geometry.
-        n_unpaired: Points whose normal meets no opposite surface (deformable support).
+        paired: Which of this rank's points have an opposite, (n_points,); all of them on a rigid
+            support. The others bear nothing and are open.
+        n_unpaired: Points without, on all ranks.
         pairings: How often opposites were found: the couplings change with each.
         committed_jump: Displacement relative to the support at the last commit, (n_points, gdim),
             between the places that are opposite each other from then on.
@@ -211,9 +215,11 @@ class Contact:
                 )
         x = ufl.SpatialCoordinate(mesh)
         self._opposite: Opposite | None = None
+        self.paired = np.ones(self.quadrature.n_points, dtype=np.bool_)
         if isinstance(support, DeformableBody):
             self._opposite = Opposite(support, self.quadrature, u.function_space)
             self._distance = fem.Function(self.quadrature.space(), name="distance")
+            self._acts = fem.Function(self.quadrature.space(), name="paired")
             placement = Placement(self._distance, ufl.FacetNormal(mesh))
         else:
             placement = support.place(x, shift, lambda v: self._to_ufl("support", v))
@@ -247,7 +253,7 @@ class Contact:
         self._jump = fem.Function(self.quadrature.space(gdim), name="jump")
         self._reaction = self._map.createVecLeft()
         kinematics = self._kinematics(self._jump)
-        response = law.response(kinematics, parameters)
+        response = self._response(law, kinematics, parameters)
         expressions = {
             "x": x,
             "normal": self._normal,
@@ -260,7 +266,7 @@ class Contact:
             "normal_traction": response.normal_traction,
             "jump": self._relative(self._jump),
             "shift": self._prescribed_shift(),
-            "stored": law.stored(kinematics, response, parameters),
+            "stored": self._acting_there(law.stored(kinematics, response, parameters)),
         } | {f"parameter {n}": v for n, v in parameters.items()}
         if law.has_tangential:
             stiffness = law.tangential_stiffness(kinematics, parameters)
@@ -273,7 +279,7 @@ class Contact:
                 "increment": kinematics.tangential_increment,
                 "old_traction": kinematics.traction,
                 "limit": response.limit,
-                "dissipated": law.dissipated(kinematics, response, parameters),
+                "dissipated": self._acting_there(law.dissipated(kinematics, response, parameters)),
                 "slip_increment": ufl.as_vector(response.slip),
             }
         if self.multipliers is not None:
@@ -288,6 +294,8 @@ class Contact:
         self._frozen: _Reactions | None = None
         self._evaluate_yield: PointEvaluator | None = None
         self._points: dict[str, Array] | None = None
+        self._paired_at: fem.Function | None = None
+        self._looking_back: LookBack | None = None
         self.n_unpaired = 0
         self.pairings = 0
         if self._opposite is not None:
@@ -358,6 +366,28 @@ class Contact:
         u_n = ufl.dot(jump, normal)
         return Kinematics(self._gap, u_n, normal, total, increment, traction, multiplier)
 
+    def _acting_there(self, value: Any) -> Any:
+        """A value at points with an opposite, 0 at the others (UFL)."""
+        return value if self._opposite is None else self._acts * value
+
+    def _response(
+        self, law: Law, kinematics: Kinematics, parameters: Mapping[str, Any]
+    ) -> Response:
+        """What a law makes of the kinematics, nothing at points without an opposite (UFL)."""
+        response = law.response(kinematics, parameters)
+        if self._opposite is None:
+            return response
+        there = self._acting_there
+        return replace(
+            response,
+            normal_traction=there(response.normal_traction),
+            opening=there(response.opening),
+            penetration=there(response.penetration),
+            traction=None if response.traction is None else there(response.traction),
+            limit=None if response.limit is None else there(response.limit),
+            slip=tuple(there(mode) for mode in response.slip),
+        )
+
     # ---- forms -----------------------------------------------------------------------------------
 
     def form(self, v: ufl.Argument) -> ufl.Form:
@@ -394,7 +424,9 @@ class Contact:
         Raises:
             ValueError: The law has none (Coulomb; a foundation with k_t and without tension).
         """
-        density = self.law.potential(self._kinematics(self.u), self._law_parameters)
+        density = self._acting_there(
+            self.law.potential(self._kinematics(self.u), self._law_parameters)
+        )
         return self.weight * density * self.quadrature.ds
 
     def tangent(self, v: ufl.Argument, du: ufl.Argument) -> ufl.Form:
@@ -732,19 +764,27 @@ class Contact:
         Args:
             u: Displacement of the bodies in which to find them; none: the undeformed bodies.
 
-        Points that find none are open, whatever they do, and counted in ``n_unpaired``.
+        Points that find none are open, whatever they do, and counted in ``n_unpaired``. A warning
+        says why, if they are more than half of all.
         """
         assert self._opposite is not None
         mesh, d = self.surface.mesh, self._gdim
         points = self._evaluate_points()
-        opposite, distance = self._opposite.pair(points["x"], points["normal"], u)
-        paired = ~np.isnan(distance)
-        extent = global_max(mesh.comm, mesh.geometry.x) - global_min(mesh.comm, mesh.geometry.x)
-        self._distance.x.array[: len(paired)] = np.where(paired, distance, 10 * extent)
-        self._distance.x.scatter_forward()
+        n = self.quadrature.n_points
+        penetration = np.zeros(n) if u is None else self._geometric_penetration(points)
+        opposite, distance, why = self._opposite.pair(points["x"], points["normal"], u, penetration)
+        self._forget_look_back()
+        self._paired_at = None if u is None else u.copy()
+        self.paired = ~np.isnan(distance)
+        for function, values in (
+            (self._distance, np.nan_to_num(distance)),
+            (self._acts, self.paired),
+        ):
+            function.x.array[:n] = values
+            function.x.scatter_forward()
         relative = self._own_map.copy()
         mask = relative.createVecLeft()
-        mask.array[:] = np.repeat(paired, d)
+        mask.array[:] = np.repeat(self.paired, d)
         relative.diagonalScale(mask, None)
         relative.axpy(-1.0, opposite, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         opposite.destroy()
@@ -754,8 +794,95 @@ class Contact:
         self._products.clear()
         self._felt_maps[self._unknowns] = self._make_felt_map()
         self.forget()
-        self.n_unpaired = int(global_sum(mesh.comm, np.count_nonzero(~paired)))
         self.pairings += 1
+        lost = [np.count_nonzero(~self.paired & (why == reason)) for reason in REASONS]
+        *counts, total = (int(number) for number in global_sum(mesh.comm, [*lost, n]))
+        self.n_unpaired = sum(counts)
+        if 2 * self.n_unpaired > total:
+            told = [f"{k}: {text}" for k, text in zip(counts, REASONS.values(), strict=True) if k]
+            warn(
+                mesh.comm,
+                f"{self.name}: {self.n_unpaired} of the {total} points of Γc have no opposite and "
+                f"bear nothing ({'; '.join(told)}). Check the tags of Γc and of the opposite "
+                "surface, reach and release of the DeformableBody",
+            )
+
+    def _geometric_penetration(self, points: Mapping[str, Array]) -> Array:
+        """Depth of evaluated points in the opposite, whatever gap is prescribed: (n_points,)."""
+        depth = points["normal_displacement"] - self._distance.x.array[: self.quadrature.n_points]
+        return np.where(self.paired, np.maximum(depth, 0.0), 0.0)
+
+    def true_gap(self) -> tuple[Array, Array]:
+        """Distances to the opposite in the bodies as they are displaced now, by a search anew.
+
+        To compare with the linearised ones, `gap`. The pairs stay as they are. Collective.
+
+        Returns:
+            Distance along the true normal of the displaced Γc, (n_points,) (length), NaN where
+            there is no opposite; and these unit normals, (n_points, gdim).
+
+        Raises:
+            ValueError: The support is rigid.
+        """
+        if self._opposite is None:
+            raise ValueError(f"{self.name}: the support is no DeformableBody; see `gap`")
+        points = self._values
+        depth = self._geometric_penetration(points)
+        return self._opposite.true_gap(points["x"], points["normal"], self.u, depth)
+
+    def _forget_look_back(self) -> None:
+        if self._looking_back is not None:
+            self._looking_back.approach.destroy()
+        self._looking_back = None
+
+    def unseen_penetration(self, others: Sequence[Contact] = ()) -> tuple[float, Array]:
+        """How deep the opposite passes through Γc between the points of Γc. Collective.
+
+        Corners and middles of the opposite's facets are followed back to Γc, with the pairs as they
+        are and at the last evaluated state. Where one lies deeper than any point of the contacts,
+        while no point of the facet that it passes through nor of its neighbours is closed, nothing
+        holds it up. Facets of curved surfaces may overlap by what they differ from these.
+
+        Args:
+            others: Further contacts, whose points see the opposite where it is their Γc.
+
+        Returns:
+            The largest such depth (length), 0 if there is none or the support is rigid, and the
+            place in the undeformed body, (gdim,).
+        """
+        comm, opposite = self.surface.mesh.comm, self._opposite
+        nowhere = 0.0, np.zeros(self._gdim)
+        if opposite is None:
+            return nowhere
+        points = self._values
+        if self._looking_back is None:
+            deepest = global_max(comm, self._geometric_penetration(points))
+            self._looking_back = opposite.look_back(self._paired_at, deepest)
+        back = self._looking_back
+        product = back.approach.createVecLeft()
+        back.approach.mult(self.u.x.petsc_vec, product)
+        approach = product.array_r.copy()
+        product.destroy()
+        distance = back.distance
+        if self.gap_prescribed:
+            distance = opposite.largest(points["gap"])[back.facet]
+        own = [c._values["penetration"] for c in (self, *others)]
+        allowed = max(global_max(comm, depth) for depth in own)
+        allowed = max(allowed, _UNSEEN * global_max(comm, np.abs(approach)))
+        depth = approach - distance - back.slack - allowed
+        if not global_max(comm, depth, empty=-1.0) > 0:
+            return nowhere
+        for contact in (self, *others):  # what has points of its own that look back
+            if contact._opposite is not None:
+                mutual = opposite.facets_among(contact._opposite)[back.facet]
+                depth[mutual & np.isin(back.source, contact.surface.facets)] = -1.0
+        depth[opposite.facets_near(self.status != Status.OPEN)[back.facet]] = -1.0
+        rows = np.column_stack([approach - distance, back.place])[depth > 0]
+        rows = gather_rows(comm, rows)
+        if not len(rows):
+            return nowhere
+        worst = rows[np.argmax(rows[:, 0])]
+        return float(worst[0]), worst[1:]
 
     # ---- state -----------------------------------------------------------------------------------
 
@@ -772,7 +899,7 @@ class Contact:
         """
         if self._evaluate_yield is None:
             kinematics = self._kinematics(self._jump)
-            response = self.law.response(kinematics, self._law_parameters)
+            response = self._response(self.law, kinematics, self._law_parameters)
             traction = ufl.variable(response.traction)
             functions = self.law.yield_functions(
                 kinematics, traction, response.limit, self._law_parameters
@@ -941,8 +1068,12 @@ class Contact:
 
     @property
     def gap(self) -> Array:
-        """Open distance s - u_n = δ₊ - δ₋ (eq. 6), shape (n_points,), in length."""
-        return self._values["opening"] - self._values["penetration"]
+        """Open distance s - u_n = δ₊ - δ₋ (eq. 6), shape (n_points,), in length.
+
+        NaN at points without an opposite.
+        """
+        gap = self._values["opening"] - self._values["penetration"]
+        return gap if self._opposite is None else np.where(self.paired, gap, np.nan)
 
     @property
     def pressure(self) -> Array:
@@ -998,9 +1129,9 @@ class Contact:
         """`Status` in the last evaluated increment, shape (n_points,).
 
         Without tangential tractions a closed point counts as slip: nothing holds it. Where the law
-        bears tension no point is open.
+        bears tension no point with an opposite is open; one without is, always.
         """
-        closed = (self._values["normal_traction"] < 0) | self.law.has_tension
+        closed = self.paired & ((self._values["normal_traction"] < 0) | self.law.has_tension)
         status = np.where(closed, Status.SLIP, Status.OPEN).astype(np.int8)
         if self.law.has_tangential:
             status[closed & np.all(self.slip_increment == 0, axis=1)] = Status.STICK
@@ -1066,6 +1197,17 @@ class Contact:
         return vectors | {n: rows[:, 3 * d + i] for i, n in enumerate(names)}
 
 
+def passing(contacts: Sequence[Contact]) -> dict[str, tuple[float, list[float]]]:
+    """`Contact.unseen_penetration` by the names of the contacts that have any. Collective."""
+    found = {}
+    for contact in contacts:
+        others = [c for c in contacts if c is not contact]
+        depth, place = contact.unseen_penetration(others)
+        if not depth <= 0:
+            found[contact.name] = depth, [float(x) for x in place]
+    return found
+
+
 def _range_error(contact: str, name: str, value: float, positive: bool) -> str:
     wanted = "greater than zero" if positive else "zero or greater"
     wanted += " (stress/length)" if name.startswith("k_") else ""
@@ -1108,7 +1250,8 @@ class _Reactions:
     def traction(self, jump: Any) -> Any:
         """r_n n + τ on the body (UFL)."""
         contact = self._contact
-        response = self._law.response(contact._kinematics(jump, self._law), self._parameters)
+        kinematics = contact._kinematics(jump, self._law)
+        response = contact._response(self._law, kinematics, self._parameters)
         total = response.normal_traction * contact._normal
         return total if response.traction is None else total + response.traction
 
@@ -1123,7 +1266,7 @@ class _Reactions:
         """The weighted "potential" per area, (n_points,)."""
         contact = self._contact
         kinematics = contact._kinematics(contact._jump, self._law)
-        density = self._law.potential(kinematics, self._parameters)
+        density = contact._acting_there(self._law.potential(kinematics, self._parameters))
         return PointEvaluator(contact.quadrature, {"potential": contact.weight * density})
 
     @cached_property

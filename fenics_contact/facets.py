@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import basix
 import dolfinx
@@ -17,8 +18,10 @@ __all__ = ["FacetSet", "tabulate"]
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.integer[Any]]
+# Of points, facets, places on them and signed distances: which of these hits count.
+Rule: TypeAlias = Callable[[Index, Index, Array, Array], npt.NDArray[np.bool_]]
 
-# Facets tried first for every point, nearest first; only points that meet none of them see all.
+# Facets tried first for every point, nearest first; more only where these need not be enough.
 _NEAREST = 12
 # How far outside its facet, in its reference coordinates, a point may be met: neighbours overlap by
 # this much, so that no ray slips through between them.
@@ -68,9 +71,11 @@ class FacetSet:
         cell_type = basix.CellType[mesh.topology.cell_name()]
         geometry, topology = basix.geometry(cell_type), basix.topology(cell_type)
         corners = np.array([geometry[vertices] for vertices in topology[d - 1]])
+        at_corners = np.array(topology[d - 1])
         origins = corners[:, 0]
         edges = np.swapaxes(corners[:, 1:d] - corners[:, :1], 1, 2)
         self._origin, self._edges = origins[local], edges[local]
+        self._at_corners = at_corners[local]
         self.simplex = cell_type in (basix.CellType.triangle, basix.CellType.tetrahedron)
         self._geometry_basis = compat.geometry_element(mesh)
         self._basis = space.element.basix_element
@@ -81,6 +86,7 @@ class FacetSet:
         self._corners = np.vstack([np.zeros(d - 1), np.eye(d - 1)])
         if not self.simplex and d == 3:
             self._corners = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+            self._at_corners = self._at_corners[:, [0, 1, 3, 2]]
         every = np.arange(len(self.cells))
         on_facet, tangents = self.positions(every, self._middle.repeat(len(every), axis=0))
         table = tabulate(self._geometry_basis, 0, geometry.mean(axis=0)[None])[0, 0, :, 0]
@@ -113,9 +119,9 @@ class FacetSet:
             gradient = gradient + np.einsum("jpk,pkd->pdj", table[1:], values)
         return position, np.einsum("pdj,pjk->pdk", gradient, self._edges[facet])
 
-    def normals(self, facet: Index, place: Array) -> Array:
-        """Outward unit normals of the undeformed body, (n, d)."""
-        _, tangents = self.positions(facet, place)
+    def normals(self, facet: Index, place: Array, u: fem.Function | None = None) -> Array:
+        """Outward unit normals, (n, d), of the body displaced by ``u``."""
+        _, tangents = self.positions(facet, place, u)
         if self._d == 2:
             across: Array = np.column_stack([tangents[:, 1, 0], -tangents[:, 0, 0]])
         else:
@@ -134,6 +140,32 @@ class FacetSet:
         every = np.arange(len(self.cells))
         return self.normals(every, self._middle.repeat(len(every), axis=0))
 
+    def corners(self) -> tuple[Index, Array]:
+        """Every facet with each of its corners and its middle: (n,), places (n, d - 1)."""
+        places = np.vstack([self._corners, self._middle])
+        every = np.arange(len(self.cells))
+        return np.repeat(every, len(places)), np.tile(places, (len(every), 1))
+
+    def corner_vertices(self) -> Index:
+        """Global numbers of the facets' vertices, see `vertices`, (n_facets, n_corners)."""
+        return np.take_along_axis(self.vertices(), self._at_corners, axis=1)
+
+    def heights(self) -> Array:
+        """How far the cells reach below their facets, (n_facets,) (length)."""
+        every = np.arange(len(self.cells))
+        middle, _ = self.positions(every, self._middle.repeat(len(every), axis=0))
+        arm = middle[:, None] - self._x[self._nodes][:, :, : self._d]
+        depth: Array = np.einsum("fkd,fd->fk", arm, self.mean_normals())
+        return depth.max(axis=1, initial=0.0)
+
+    def vertices(self) -> Index:
+        """Global numbers of the cells' vertices, as nodes of the displacement: (n_facets, n)."""
+        n = len(basix.topology(basix.CellType[self.space.mesh.topology.cell_name()])[0])
+        layout = self.space.dofmap.dof_layout
+        local = self._dofs[:, [layout.entity_dofs(0, i)[0] for i in range(n)]]
+        nodes = self.space.dofmap.index_map.local_to_global(local.ravel().astype(np.int32))
+        return nodes.reshape(local.shape)
+
     def interpolation(self, facet: Index, place: Array) -> tuple[Index, Array]:
         """Global nodes and weights of the displacement at places: (n, n_basis) each."""
         weights = tabulate(self._basis, 0, self._in_cell(facet, place))[0, :, :, 0]
@@ -142,15 +174,15 @@ class FacetSet:
         return nodes.reshape(weights.shape), weights
 
     def search(
-        self, x: Array, ray: Array, reach: float, u: fem.Function | None
+        self, x: Array, ray: Array, u: fem.Function | None, counts: Rule
     ) -> tuple[Index, Array, Array]:
         """The nearest facet of this rank that looks back along each ray.
 
         Args:
             x: Points, (n, d).
             ray: Unit directions, (n, d); facets behind the point are met too.
-            reach: Largest distance.
             u: Displacement of the facets; none: they are undeformed.
+            counts: Which hits are taken.
 
         Returns:
             Facet or -1, (n,); place on it, (n, d - 1); signed distance along the ray, (n,).
@@ -163,24 +195,31 @@ class FacetSet:
         middle, tangents = self.positions(every, self._middle.repeat(n_facets, axis=0), u)
         radius = 1.5 * np.linalg.norm(tangents, axis=1).max(axis=1)
         near = min(_NEAREST, n_facets)
-        _, candidates = scipy.spatial.cKDTree(middle).query(x, k=near)
-        self._keep_nearest(
-            x, ray, (np.repeat(np.arange(n), near), candidates.reshape(-1)), reach, u, best
-        )
-        # The nearest need not be the ones ahead: a long facet, or a far one.
-        missed = np.flatnonzero(best[0] < 0)
-        step = max(1, _CHUNK // n_facets)
-        for i in range(0, len(missed), step):
-            rows = missed[i : i + step]
-            arm = middle[None] - x[rows, None]
-            along = np.einsum("pfd,pd->pf", arm, ray[rows])
-            off = np.linalg.norm(arm - along[..., None] * ray[rows, None], axis=2)
-            row, facet = np.nonzero(off <= radius[None])
-            self._keep_nearest(x, ray, (rows[row], facet), reach, u, best)
+        away, candidates = scipy.spatial.cKDTree(middle).query(x, k=[*range(1, near + 1)])
+        pairs = np.repeat(np.arange(n), near), candidates.reshape(-1)
+        self._keep_nearest(x, ray, pairs, u, best, counts)
+        if near == n_facets:
+            return best
+        # The nearest need not be the ones ahead: a long facet, or a far one. Where something was
+        # met, all that is nearer has its middle within its own radius of there.
+        missed = best[0] < 0
+        size = 1.1 * np.linalg.norm(self.moved_corners(u) - middle[:, None], axis=2).max()
+        unsure = ~missed & (away[:, -1] < np.abs(best[2]) + size)
+        for rows in (np.flatnonzero(missed), np.flatnonzero(unsure)):
+            step = max(1, _CHUNK // n_facets)
+            for i in range(0, len(rows), step):
+                some = rows[i : i + step]
+                arm = middle[None] - x[some, None]
+                along = np.einsum("pfd,pd->pf", arm, ray[some])
+                off = np.linalg.norm(arm - along[..., None] * ray[some, None], axis=2)
+                hopeful = off <= radius[None]
+                hopeful &= np.abs(along) <= np.abs(best[2][some, None]) + radius[None]
+                row, facet = np.nonzero(hopeful)
+                self._keep_nearest(x, ray, (some[row], facet), u, best, counts)
         return best
 
     def _keep_nearest(
-        self, x: Array, ray: Array, pairs: tuple[Index, Index], reach: float, u: Any, best: Any
+        self, x: Array, ray: Array, pairs: tuple[Index, Index], u: Any, best: Any, counts: Rule
     ) -> None:
         """Meet the facets of some pairs and keep the nearest hits in ``best``."""
         point, facet = pairs
@@ -188,7 +227,8 @@ class FacetSet:
         _, tangents = self.positions(facet, place, u)
         # Only a facet that looks back at the point can be opposite.
         facing = self.outward[facet] * _side(tangents, ray[point]) < 0
-        good = met & facing & (np.abs(distance) <= reach)
+        good = np.flatnonzero(met & facing)
+        good = good[counts(point[good], facet[good], place[good], distance[good])]
         point, facet, place, distance = point[good], facet[good], place[good], distance[good]
         order = np.lexsort((facet, np.abs(distance), point))
         chosen = order[np.append(True, np.diff(point[order]) > 0)[: len(order)]]

@@ -44,7 +44,9 @@ def surface_fields(contact: Contact) -> dict[str, fem.Function]:
         contact: An evaluated contact.
 
     Returns:
-        pressure, tangential_traction, gap, slip (length, sum of the modes) and status, by name.
+        pressure, tangential_traction, gap, slip (length, sum of the modes) and status, by name. A
+        gap of 0 stands for points without an opposite, whose share of a facet is "unpaired", there
+        if the support is deformable.
     """
     submesh = contact.surface.submesh
     points, weights = contact.quadrature.space().ufl_element().custom_quadrature()
@@ -57,7 +59,7 @@ def surface_fields(contact: Contact) -> dict[str, fem.Function]:
     values = {
         "pressure": contact.pressure,
         "tangential_traction": contact.tangential_traction,
-        "gap": contact.gap,
+        "gap": np.nan_to_num(contact.gap),
         "slip": contact.slip.sum(axis=1),
     }
     result = {}
@@ -77,6 +79,12 @@ def surface_fields(contact: Contact) -> dict[str, fem.Function]:
         function.x.array.reshape((-1, *shape))[dofs] = fitted
         function.x.scatter_forward()
         result[name] = function
+    if not contact.rigid:
+        unpaired = fem.Function(fem.functionspace(submesh, ("DG", 0)), name="unpaired")
+        dofs = unpaired.function_space.dofmap.list[: cells.size_local, 0]
+        unpaired.x.array[dofs] = np.mean(~contact.paired[rows], axis=1)
+        unpaired.x.scatter_forward()
+        result["unpaired"] = unpaired
     status = fem.Function(fem.functionspace(submesh, ("DG", 0)), name="status")
     counts = np.stack([(contact.status[rows] == s).sum(axis=1) for s in range(3)])
     status.x.array[status.function_space.dofmap.list[: cells.size_local, 0]] = counts.argmax(axis=0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -20,6 +21,7 @@ __all__ = [
     "global_max",
     "global_min",
     "global_sum",
+    "warn",
 ]
 
 
@@ -84,6 +86,20 @@ def collective_errors(comm: MPI.Comm) -> Iterator[None]:
         raise error
     kind, text = first
     raise (kind(text) if kind in (ValueError, TypeError) else RuntimeError(text))
+
+
+def warn(comm: MPI.Comm, text: str) -> None:
+    """Warn: in the log of the first rank, and by a Python warning on every rank. Collective.
+
+    On all of them, because a warning may have been made an error.
+
+    Args:
+        comm: The ranks.
+        text: The same on every rank.
+    """
+    if comm.rank == 0:
+        logger.warning(text)
+    warnings.warn(text, UserWarning, stacklevel=3)
 
 
 def agreed(comm: MPI.Comm, value: Any) -> Any:

@@ -23,7 +23,7 @@ from fenics_contact.bulk import Bulk
 from fenics_contact.callbacks import Callbacks, interrupts_held, release_interrupt
 from fenics_contact.chattering import StatusWatch
 from fenics_contact.condense import CondensedSpace, touched, worthwhile
-from fenics_contact.contact import Contact, Found, Resultants, Status
+from fenics_contact.contact import Contact, Found, Resultants, Status, passing
 from fenics_contact.continuation import Continuation
 from fenics_contact.defaults import Defaults, take_command_line
 from fenics_contact.energy import Energy, EnergyState, Forces
@@ -1164,6 +1164,8 @@ class ContactProblem:
             laws={c.name: check_laws(c) for c in self.contacts} if laws else {},
             enforcement={c.name: c.enforcement_error() for c in augmented},
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
+            # Of the opposite only what Γc meets is known before u is complete.
+            unseen=passing(self.contacts) if space is self._whole else {},
         )
         return verdict, reaction
 

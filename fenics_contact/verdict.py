@@ -57,6 +57,8 @@ class Verdict:
         laws: Largest violations by contact and by law, relative; see `check_laws`.
         enforcement: `Contact.enforcement_error` of the contacts with multipliers, by name.
         enforcement_tolerance: What passes, by name.
+        unseen: How deep the opposite body passes through Γc between its points (length), and where,
+            by the names of the contacts where it does; see `Contact.unseen_penetration`.
     """
 
     equations: dict[str, Balance]
@@ -64,6 +66,7 @@ class Verdict:
     laws: dict[str, dict[str, float]] = field(default_factory=dict)
     enforcement: dict[str, float] = field(default_factory=dict)
     enforcement_tolerance: dict[str, float] = field(default_factory=dict)
+    unseen: dict[str, tuple[float, list[float]]] = field(default_factory=dict)
 
     @property
     def residual(self) -> float:
@@ -125,6 +128,12 @@ class Verdict:
                     f"traction in the springs, above {allowed:.3e}; a larger tolerance, or "
                     "k_n and k_t nearer to 10 E/h, take fewer rounds"
                 )
+        for contact, (depth, place) in self.unseen.items():
+            found.append(
+                f"{contact}: the opposite body passes through Γc between its points, {depth:.3e} "
+                f"deep near {np.round(place, 6).tolist()}; let the finer surface be Γc, refine Γc "
+                "there, or add a second contact with the surfaces swapped"
+            )
         return found
 
 
@@ -145,7 +154,10 @@ def check_laws(contact: Contact) -> dict[str, float]:
         "stiffness" holds τ = -K_t u_t too, or τ = 0 where open. NaN where something is not finite.
     """
     comm = contact.surface.mesh.comm
-    law, v = contact.law, contact.values
+    # Points without an opposite bear nothing, whatever they do.
+    law, paired, v = contact.law, contact.paired, contact.values
+    if not paired.all():
+        v = {name: values[paired] for name, values in v.items()}
 
     def worst(*violations: np.ndarray) -> float:
         return max(global_max(comm, np.abs(x)) for x in violations)
@@ -178,13 +190,14 @@ def check_laws(contact: Contact) -> dict[str, float]:
     elif law.has_normal_stiffness:
         elastic = v["parameter k_n"] * penetration
         violations.append(relative(worst(np.maximum(r_n, 0), r_n + elastic), r_n))
+    violations.append(relative(worst(contact.traction[~paired]), contact.traction))
     found = {"stiffness" if law.has_tension else "complementarity": max(violations)}
     if not law.has_tangential:
         return found
 
-    tau, stiffness = v["traction"], contact.tangential_stiffness
+    tau, stiffness = v["traction"], contact.tangential_stiffness[paired]
     if not law.has_friction:
-        elastic = np.einsum("qij,qj->qi", stiffness, contact.tangential_displacement)
+        elastic = np.einsum("qij,qj->qi", stiffness, contact.tangential_displacement[paired])
         if not law.has_tension:
             elastic[penetration <= 0] = 0.0
         # Round-off in u_t is that of the displacement it is a part of.
@@ -194,7 +207,7 @@ def check_laws(contact: Contact) -> dict[str, float]:
         return found
 
     limit, beta, normal = v["limit"], v["slip_increment"], v["normal"]
-    functions, gradients = contact.evaluate_yield()
+    functions, gradients = (rows[paired] for rows in contact.evaluate_yield())
     # K_t has no inverse along the normal, and nothing acts there: any stiffness will do.
     along = np.einsum("q,qi,qj->qij", v["parameter k_t"], normal, normal)
     change = tau - v["old_traction"]
