@@ -471,7 +471,7 @@ class ContactProblem:
             obstacle = "the caller wants none"
         elif self._condensation is None and not obstacle:
             n, n_touched = self.unknowns.n_local, touched(self.contacts, self.unknowns).size
-            if not worthwhile(n, n_touched, len(self.u)):
+            if n_touched == n or not worthwhile(n, n_touched, len(self.u)):
                 obstacle = f"contact touches {n_touched} of {n} unknowns, too many to gain by it"
             elif not self.unknowns.n_motions and self._linear_solver is None:
                 n_bytes = linear.factor_bytes(n, len(self.u), symmetric=self.bulk.symmetric)
