@@ -5,19 +5,23 @@ what is solved for is met to 1e-8, and what follows from the same arrays to roun
 """
 
 import sys
+import warnings
+from contextlib import contextmanager
 
+import basix.ufl
+import dolfinx
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from running import ROOT
-from scenes import close, gathered, raised_everywhere
-from test_pairs import FLOOR, LOWER, ROOF, SIDES, UPPER, E, at, balance, between, joint, stack
+from scenes import close, raised_everywhere
+from test_pairs import FLOOR, LOWER, ROOF, SIDES, UPPER, E, at, between, joint, stack
 
 sys.path.insert(0, str(ROOT / "verification"))
 
-from bodies import Bodies, boxes
+from bodies import Bodies, _tagged, boxes
 
 import fenics_contact as fc
 from fenics_contact import output
@@ -30,6 +34,17 @@ pytestmark = pytest.mark.mpi
 
 def either(*choices):
     return lambda x, cell: np.any([choice(x, cell) for choice in choices], axis=0)
+
+
+@contextmanager
+def _told(expected, *words):
+    """Assert that there is a warning with these words, on every rank, or none at all."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield
+    texts = [str(w.message) for w in caught if "opposite" in str(w.message)]
+    found = bool(texts) and all(word in texts[0] for word in words)
+    assert all(flag == expected for flag in COMM.allgather(found)), texts
 
 
 # ---- what is opposite ----------------------------------------------------------------------------
@@ -74,3 +89,454 @@ def test_a_plate_is_not_opposite_its_own_back(cell, layers):
     assert np.all(np.isnan(points["gap"][~inner]))
     assert close(points["gap"][inner], np.full(inner.sum(), 0.2), 1e-12)
     assert contact.n_unpaired == np.count_nonzero(~inner)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
+def test_lifted_plates_bear_nothing(cell):
+    """A plate lifted by four times its thickness, and moved down onto the other one again."""
+    sunk, k_n = 1e-3, 1e7
+    axes, marks = plates(cell, 0.05, [0.0])
+    d = len(axes[0])
+    marks = {FLOOR: at(d - 1, 0), UPPER: marks[10 + UPPER], LOWER: marks[LOWER]}
+    marks[ROOF] = at(d - 1, 0.1)
+    body = Bodies(boxes(axes, marks, simplex=cell == "triangle"), E, 0.0)
+    up = body.constant(0.0)
+    body.hold(FLOOR, *range(d))
+    body.hold(ROOF, *range(d - 1))
+    body.hold(ROOF, d - 1, value=up)
+    surface = fc.ContactSurface(body.mesh, body.tags, UPPER)
+    support = fc.DeformableBody(body.tags, [LOWER, ROOF], update="increment")
+    contact = fc.Contact(body.u, surface, support, fc.Frictionless(k_n))
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    for height in (0.2, -sunk, 0.2, -sunk):
+        up.value = height
+        problem.solve()
+        problem.commit()
+        assert contact.n_unpaired == 0
+        expected = 0.0 if height > 0 else sunk / (0.1 / E + 1 / k_n)
+        assert close(contact.resultants().normal_force, expected, 1e-8, scale=1e3)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
+def test_leaves_in_one_tag(cell):
+    """Three thin leaves, all their faces Γc and opposite: each joint bears q, evenly."""
+    q, k_n = 5e3, 1e7
+    axes, marks = plates(cell, 0.02, [0.0, 0.0], layers=1)
+    d = 3 if cell == "hexahedron" else 2
+    ends = either(*(at(i, v) for i in range(d - 1) for v in (0.0, 1.0)))
+    body = Bodies(boxes(axes, {BOTH: marks[BOTH], SIDES: ends}, simplex=cell == "triangle"), E, 0.0)
+    space = body.u.function_space
+    low = dolfinx.mesh.locate_entities_boundary(body.mesh, d - 1, lambda x: np.abs(x[d - 1]) < 1e-9)
+    still = fem.locate_dofs_topological(space.sub(d - 1), d - 1, low)
+    body.bcs = [fem.dirichletbc(body.constant(0.0), still, space.sub(d - 1))]
+    body.hold(SIDES, *range(d - 1))
+    top = ufl.conditional(ufl.gt(body.x[d - 1], 0.06 - 1e-9), 1.0, 0.0)
+    body.F += q * top * body.v[d - 1] * body.ds(BOTH)
+    surface = fc.ContactSurface(body.mesh, body.tags, BOTH)
+    support = fc.DeformableBody(body.tags, BOTH)
+    contact = fc.Contact(body.u, surface, support, fc.Frictionless(k_n))
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    problem.solve()
+    points = contact.gather()
+    inner = (points["x"][:, -1] > 1e-6) & (points["x"][:, -1] < 0.06 - 1e-6)
+    assert contact.n_unpaired == np.count_nonzero(~inner)
+    assert close(points["pressure"][inner], np.full(inner.sum(), q / 2), 1e-8)
+    assert np.all(points["pressure"][~inner] == 0.0)
+
+
+def test_a_long_facet_in_front_of_short_ones():
+    """The nearest of all facets is met, also where many a middle is nearer than its own."""
+    axes = [
+        [np.linspace(0, 1, 81), np.array([-0.05, 0.0])],
+        [np.array([0.0, 1.0]), np.array([0.01, 0.02])],
+        [np.linspace(0, 1, 8), np.array([0.03, 0.1])],
+    ]
+    sides = {LOWER: either(at(1, 0.0), at(1, 0.02)), UPPER: at(1, 0.03)}
+    body = Bodies(boxes(axes, sides), E, 0.3)
+    surface = fc.ContactSurface(body.mesh, body.tags, UPPER)
+    contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, LOWER), fc.Frictionless(1e6))
+    gap = contact.gather()["gap"]
+    assert close(gap, np.full(len(gap), 0.01), 1e-12)
+
+
+@pytest.mark.parametrize("opening", [0.0, 0.05])
+def test_lips_of_a_notch_meet_down_to_its_root(opening):
+    """Lips whose cells share the root are opposite each other, though of one body.
+
+    A square of 2 × 2, cut from its right side to its middle; opened to a wedge.
+    """
+    mesh, tags = cut_square(8, opening)
+    body = Bodies((mesh, tags), E, 0.3)
+    surface = fc.ContactSurface(mesh, tags, FLOOR)
+    contact = fc.Contact(body.u, surface, fc.DeformableBody(tags, ROOF), fc.Frictionless(1e7))
+    assert contact.n_unpaired == 0
+    points = contact.gather()
+    assert np.all(points["gap"] >= -1e-12)
+    assert (points["gap"].max() > 0.02) == (opening > 0)
+
+
+def cut_square(n, opening):
+    """A square of n × n cells on [-1, 1]², cut along y = 0 < x; FLOOR over the cut, ROOF under."""
+    line = np.linspace(-1, 1, n + 1)
+    x = np.array([(a, b) for b in line for a in line])
+    number = np.arange(len(x)).reshape(n + 1, n + 1)
+    cells = np.column_stack(
+        [number[i : n + i, j : n + j].ravel() for i in range(2) for j in range(2)]
+    )
+    cut = np.flatnonzero((np.abs(x[:, 1]) < 1e-12) & (x[:, 0] > 1e-12))
+    twin = np.arange(len(x))
+    twin[cut] = len(x) + np.arange(len(cut))
+    above = x[cells].mean(axis=1)[:, 1] > 0
+    cells[above] = twin[cells[above]]
+    x = np.concatenate([x, x[cut] + np.column_stack([0 * cut, opening * x[cut, 0]])])
+    cells = cells.astype(np.int64)
+    if COMM.rank:
+        x, cells = x[:0], cells[:0]
+    element = ufl.Mesh(basix.ufl.element("Lagrange", "quadrilateral", 1, shape=(2,)))
+    mesh = dolfinx.mesh.create_mesh(COMM, cells=cells, x=x, e=element)
+
+    def lip(side):
+        return lambda x, cell: (
+            (np.abs(x[:, 1]) < 0.06) & (x[:, 0] % 1 > 1e-9) & (side * cell[:, 1] > 0)
+        )
+
+    return mesh, _tagged(mesh, {FLOOR: lip(1), ROOF: lip(-1), SIDES: at(0, -1)})
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_interference_deeper_than_the_cells(cell):
+    """Blocks that overlap by 0.2, twice the height of their cells: they are opposite, all over."""
+    body = stack(cell, (10, 10) if cell == "triangle" else (4, 5), (0.5, 0.5), apart=-0.2)
+    contact = joint(body, 1, fc.Frictionless(1e6))
+    assert contact.n_unpaired == 0
+    gap = contact.gather()["gap"]
+    assert close(gap, np.full(len(gap), -0.2), 1e-12)
+
+
+def test_release():
+    """The bound is the user's where it is given; a negative one is refused."""
+    body = stack("quadrilateral", (10, 10), (0.5, 0.5), apart=-0.2)
+    surface = fc.ContactSurface(body.mesh, body.tags, 10 + UPPER)
+    law = fc.Frictionless(1e6)
+    for release, unpaired in ((0.25, False), (0.15, True)):
+        support = fc.DeformableBody(body.tags, 10 + LOWER, release=release)
+        with _told(unpaired, "behind"):
+            contact = fc.Contact(body.u, surface, support, law)
+        assert (contact.n_unpaired > 0) == unpaired
+    raised_everywhere(
+        lambda: fc.DeformableBody(body.tags, 10 + LOWER, release=-1.0), ValueError, "release"
+    )
+
+
+def test_soft_contact_keeps_its_pairs():
+    """Springs so soft that the bodies pass through each other by three cells: still opposite."""
+    body = stack("quadrilateral", (8, 10), (0.5, 0.5))
+    body.hold(FLOOR, 0, 1)
+    down = body.constant(0.0)
+    body.hold(ROOF, 0)
+    body.hold(ROOF, 1, value=down)
+    surface = fc.ContactSurface(body.mesh, body.tags, 10 + UPPER)
+    support = fc.DeformableBody(body.tags, 10 + LOWER, update="increment")
+    contact = fc.Contact(body.u, surface, support, fc.Frictionless(1.0))
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    for depth in (0.02, 0.04, 0.08, 0.15, 0.25):
+        down.value = -depth
+        problem.solve()
+        problem.commit()
+        assert contact.n_unpaired == 0
+        assert close(contact.resultants().normal_force, depth, 1e-4)
+
+
+# ---- points without an opposite ------------------------------------------------------------------
+
+
+def overhang(cell, law, *, tags=(LOWER,), gap=-0.01, **options):
+    """A slab of width 1 on a pillar of 0.6, both clamped outside, with an interference of 0.01."""
+    body = stack(cell, (5, 8), (0.5, 0.25), widths=[0.6, 1.0], nu=0.3)
+    body.hold(FLOOR, *range(body.d))
+    body.lift = body.constant(0.0)
+    body.hold(ROOF, *range(body.d - 1))
+    body.hold(ROOF, body.d - 1, value=body.lift)
+    contact = joint(body, 1, law, gap=gap, **options)
+    outside = np.any(np.abs(contact.gather()["x"][:, : body.d - 1] - 0.5) > 0.3, axis=1)
+    assert 0 < contact.n_unpaired == np.count_nonzero(outside)
+    return body, contact, outside
+
+
+def reaction(body, tag):
+    """Force that the support on a side exerts on the bodies, by assembly of the bulk alone."""
+    space = body.u.function_space
+    residual = fem.Function(space)
+    fem.assemble_vector(residual.x.array, fem.form(body.F))
+    residual.x.scatter_reverse(dolfinx.la.InsertMode.add)
+    nodes = fem.locate_dofs_topological(space, body.d - 1, body.tags.find(tag))
+    nodes = nodes[nodes < space.dofmap.index_map.size_local]
+    return COMM.allreduce(residual.x.array.reshape(-1, body.d)[nodes].sum(axis=0))
+
+
+LAWS = {
+    "frictionless": fc.Frictionless(1e7),
+    "coulomb": fc.Coulomb(0.3, 1e7, 1e7),
+    "bonded": fc.Foundation(1e7, 1e7),
+    "loose": fc.Foundation(1e7, 1e7, tension=False),
+    "tresca": fc.Tresca(0.3, 2e3, 1e7, 1e7),
+    "prescribed": fc.Tresca(0.3, 2e3, k_t=1e7, unilateral=False),
+}
+
+
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_a_prescribed_gap_over_an_edge(cell, name, enforcement):
+    """What is reported is what the supports feel, whatever the law; what overhangs is open."""
+    law = LAWS[name]
+    if enforcement == "augmented" and (law.is_physical or cell == "hexahedron"):
+        pytest.skip("no multipliers for a physical layer; once is enough")
+    body, contact, outside = overhang(cell, law, enforcement=enforcement)
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    for lift in (-0.002, 0.001):
+        body.lift.value = lift
+        step = problem.solve()
+        r = step.contacts["contact" if "contact" in step.contacts else "joint 1"]
+        support = reaction(body, ROOF)
+        assert np.abs(support).max() > 1.0
+        assert close(r.force, -support, 1e-7)
+        assert close(reaction(body, FLOOR), -support, 1e-7)
+        points = contact.gather()
+        assert close(points["measure"] @ points["pressure"], r.normal_force, 1e-12)
+        assert np.all(points["pressure"][outside] == 0.0)
+        assert np.all(points["tangential_traction"][outside] == 0.0)
+        assert np.all(points["status"][outside] == fc.Status.OPEN)
+        assert np.array_equal(np.isnan(points["gap"]), outside)
+        assert r.open >= np.count_nonzero(outside)
+        opposed = points["measure"][~outside].sum()
+        assert r.area <= opposed * (1 + 1e-12)
+        if law.has_tension:
+            assert close(r.area, opposed, 1e-12)
+        energy = step.energy
+        size = abs(energy.work) + abs(energy.elastic) + 1e-12
+        assert abs(energy.imbalance) <= 1e-6 * size
+        fields = output.surface_fields(contact)
+        assert np.isfinite(fields["gap"].x.array).all()
+        empty = fields["unpaired"].x.array == 1.0
+        assert np.all(fields["status"].x.array[empty] == fc.Status.OPEN)
+        pressure = fields["pressure"]
+        cells = np.flatnonzero(empty[fields["unpaired"].function_space.dofmap.list[:, 0]])
+        dofs = pressure.function_space.dofmap.list[cells]
+        assert np.abs(pressure.x.array[dofs]).max(initial=0.0) <= 1e-9 * contact_scale(contact)
+        problem.commit()
+    budget = fc.estimate_errors(problem, body.stress)
+    assert all(np.isfinite(v) for part in budget.parts.values() for v in part.values())
+
+
+def contact_scale(contact):
+    """The largest pressure on any rank."""
+    return max(contact.resultants().max_pressure, 1.0)
+
+
+def test_checks_see_tractions_where_nothing_is_opposite():
+    """A traction at a point without an opposite breaks the laws, whatever its size."""
+    from fenics_contact.verdict import check_laws
+
+    _, contact, _ = overhang("triangle", fc.Frictionless(1e7))
+    contact.evaluate()
+    assert check_laws(contact)["complementarity"] <= 1e-12
+    contact._values["normal_traction"][~contact.paired] = -1.0
+    assert check_laws(contact)["complementarity"] > 1e-10
+
+
+def test_the_warning_says_how_many_and_why():
+    """More than half of the points without an opposite: told on all ranks, with the reason."""
+    axes = [
+        [np.linspace(0, 1, 9), np.linspace(0, 0.5, 3)],
+        [np.linspace(0, 1, 9), np.linspace(0.6, 1, 3)],
+    ]
+    sides = {LOWER: at(1, 0.5), UPPER: at(1, 0.6), ROOF: at(1, 1.0), FLOOR: at(1, 0.0)}
+    body = Bodies(boxes(axes, sides), E, 0.3)
+    law = fc.Frictionless(1e6)
+
+    def made(here, there, **options):
+        surface = fc.ContactSurface(body.mesh, body.tags, here)
+        return fc.Contact(body.u, surface, fc.DeformableBody(body.tags, there, **options), law)
+
+    with _told(False):
+        assert made(UPPER, LOWER).n_unpaired == 0
+    for here, there, options, word in (
+        (UPPER, LOWER, {"reach": 0.05}, "reach"),
+        (UPPER, ROOF, {}, "own body"),
+        (LOWER, ROOF, {}, "nothing"),
+        (ROOF, FLOOR, {}, "behind"),
+    ):
+        with _told(True, "16 of the 16 points", word):
+            assert made(here, there, **options).n_unpaired == 16
+
+
+# ---- what passes between the points --------------------------------------------------------------
+
+
+def indented(cell, width, depth, *, coarse=2, swap=False, both=False, raised=0.0, fine=2):
+    """A block of ``coarse`` cells on its top, and over its middle a narrow one, moved down."""
+    d = 3 if cell in ("hexahedron", "tetrahedron") else 2
+    wide = np.linspace(0, 1, coarse + 1)
+    where = 0.5 / coarse
+    narrow = np.linspace(where - width / 2, where + width / 2, fine + 1)
+    axes = [
+        [wide] * (d - 1) + [np.linspace(0, 0.5, 3)],
+        [narrow] * (d - 1) + [0.5 + raised + np.linspace(0, width, 3)],
+    ]
+    low, high = 0.5, 0.5 + raised
+    sides = {
+        FLOOR: at(d - 1, 0),
+        LOWER: between(d - 1, low, above=False),
+        UPPER: between(d - 1, high, above=True),
+        ROOF: at(d - 1, high + width),
+    }
+    body = Bodies(boxes(axes, sides, simplex=cell == "triangle"), E, 0.3)
+    body.hold(FLOOR, *range(d))
+    down = body.constant(-depth)
+    body.hold(ROOF, *range(d - 1))
+    body.hold(ROOF, d - 1, value=down)
+    faces = [(UPPER, LOWER)] if swap else [(LOWER, UPPER)]
+    faces += [(UPPER, LOWER)] if both else []
+    contacts = [
+        fc.Contact(
+            body.u,
+            fc.ContactSurface(body.mesh, body.tags, here),
+            fc.DeformableBody(body.tags, there),
+            fc.Frictionless(),
+            name=f"side {i}",
+        )
+        for i, (here, there) in enumerate(faces)
+    ]
+    return body, contacts, fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=contacts)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
+def test_a_narrow_indenter_does_not_pass(cell):
+    """An indenter of 0.05 between points 0.29 apart is refused, and told what to do.
+
+    With the surfaces swapped, or from both sides, it is held up.
+    """
+    body, contacts, problem = indented(cell, 0.05, 1e-3)
+    text = raised_everywhere(problem.solve, fc.NotConverged, "passes through", "swapped", "side 0")
+    assert "1.000e-03 deep" in text
+    assert contacts[0].resultants().normal_force == 0.0
+    for options in ({"swap": True}, {"both": True}):
+        body, contacts, problem = indented(cell, 0.05, 1e-3, **options)
+        step = problem.solve()
+        assert step.verdict.unseen == {}
+        assert sum(r.normal_force for r in step.contacts.values()) > 1.0
+        assert close(-sum(r.normal_force for r in step.contacts.values()),
+                     reaction(body, ROOF)[body.d - 1], 1e-7)  # fmt: skip
+
+
+def test_touching_is_not_passing():
+    """Not before the gap is closed, and not by less than a hundredth of the way."""
+    for depth, fails in ((0.0, False), (9e-4, False), (1.1e-3, True)):
+        *_, problem = indented("triangle", 0.05, depth, raised=1e-3)
+        if fails:
+            raised_everywhere(problem.solve, fc.NotConverged, "passes through")
+        else:
+            assert problem.solve().verdict.unseen == {}
+
+
+@pytest.mark.parametrize("counts", [(1, 20), (20, 1), (3, 20), (20, 3), (7, 8)])
+@pytest.mark.parametrize("swap", [False, True])
+def test_meshes_of_any_ratio_pass(counts, swap):
+    """Blocks pressed askew, so that they part on one side: nothing passes through unseen."""
+    body = stack("quadrilateral", counts, (0.5, 0.5), nu=0.3)
+    body.hold(FLOOR, 0, 1)
+    body.hold(ROOF, 0)
+    top = fem.Function(body.u.function_space.sub(1).collapse()[0])
+    spaces = body.u.function_space.sub(1), top.function_space
+    dofs = fem.locate_dofs_topological(spaces, 1, body.tags.find(ROOF))
+    body.bcs.append(fem.dirichletbc(top, dofs, spaces[0]))
+    contact = joint(body, 1, fc.Coulomb(0.3), swap=swap)
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    for share in (0.5, 1.0):
+        top.interpolate(lambda x, share=share: share * 0.01 * (x[0] - 0.4))
+        step = problem.solve()
+        problem.commit()
+        assert step.verdict.unseen == {}
+    assert contact.resultants().normal_force > 10
+
+
+@pytest.mark.parametrize("counts", [(5, 9), (9, 5), (4, 40), (40, 4), (6, 6)])
+@pytest.mark.parametrize("swap", [False, True])
+@pytest.mark.parametrize("degree", [1, 2])
+def test_facets_of_curved_surfaces_are_no_penetration(counts, swap, degree):
+    """Rings of straight or curved cells, not loaded and pressed: chords overlap, and are borne."""
+    angle = 1.5
+    axes = [
+        [np.linspace(0, angle, counts[0] + 1), np.linspace(10, 20, 4)],
+        [np.linspace(0, angle, counts[1] + 1), np.linspace(20, 40, 4)],
+    ]
+
+    def bend(x):
+        return np.column_stack([x[:, 1] * np.cos(x[:, 0]), x[:, 1] * np.sin(x[:, 0])])
+
+    sides = {
+        LOWER: between(1, 20, above=False),
+        UPPER: between(1, 20, above=True),
+        FLOOR: at(0, 0),
+        ROOF: at(0, angle),
+        9: at(1, 40),
+    }
+    body = Bodies(boxes(axes, sides, bend=bend, degree=degree), E, 0.3, degree=degree)
+    body.hold(FLOOR, 0, 1)
+    squeeze = body.constant(0.0)
+    body.F += squeeze * ufl.dot(ufl.FacetNormal(body.mesh), body.v) * body.ds(9)
+    here, there = (UPPER, LOWER) if swap else (LOWER, UPPER)
+    surface = fc.ContactSurface(body.mesh, body.tags, here)
+    contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, there), fc.Coulomb(0.3))
+    assert contact.unseen_penetration()[0] == 0.0
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    for load in (1.0, 1e3):
+        squeeze.value = load
+        assert problem.solve().verdict.unseen == {}
+        problem.commit()
+
+
+# ---- the true gap --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron", "hexahedron"])
+def test_true_gap(cell):
+    """The upper block turned by 0.3 and lifted: the distance along the turned normal to z = 0.5.
+
+    Under the pillar all is as the formula says, to round-off; the pairs stay as they are.
+    """
+    kind = "hexahedron" if cell == "tetrahedron" else cell
+    body = stack(kind, (8, 4), (0.5, 0.25), widths=[3.0, 1.0])
+    contact = joint(body, 1, fc.Frictionless(1e6))
+    d, angle, lift = body.d, 0.3, 0.25
+    turn = np.eye(d)
+    turn[0, 0] = turn[-1, -1] = np.cos(angle)
+    turn[0, -1], turn[-1, 0] = -np.sin(angle), np.sin(angle)
+    pivot = np.full(d, 0.5)
+
+    def moved(x):
+        arm = x[:d] - pivot[:, None]
+        return turn @ arm - arm + lift * np.eye(d)[:, -1:]
+
+    index_map = body.mesh.topology.index_map(d)
+    cells = np.arange(index_map.size_local + index_map.num_ghosts, dtype=np.int32)
+    middle = dolfinx.mesh.compute_midpoints(body.mesh, d, cells).reshape(-1, 3)
+    body.u.interpolate(moved, cells0=cells[middle[:, d - 1] > 0.5])
+    body.u.x.scatter_forward()
+    before = contact.points, contact.pairings
+    gap, normal = contact.true_gap()
+    assert contact.pairings == before[1]
+    exact = -turn[:, -1]
+    assert close(normal, np.tile(exact, (len(normal), 1)), 1e-12, scale=1.0)
+    x = before[0] + moved(before[0].T).T
+    assert COMM.allreduce(np.count_nonzero(np.isnan(gap))) == 0
+    assert close(gap, (x[:, -1] - 0.5) / np.cos(angle), 1e-12, scale=1.0)
+    linear = contact.gap
+    assert COMM.allreduce(np.abs(linear - gap).max(initial=0.0), op=MPI.MAX) > 1e-3
+    raised_everywhere(
+        fc.Contact(body.u, contact.surface, fc.HalfSpace(0 * pivot, np.eye(d)[-1]),
+                   fc.Frictionless(1e6)).true_gap,
+        ValueError,
+        "no DeformableBody",
+    )  # fmt: skip
