@@ -176,7 +176,7 @@ def newton(
     """
     residual = fem.form(F)
     tangent = fem.form(ufl.derivative(F, u, ufl.TrialFunction(u.function_space)))
-    matrix, b = fem.petsc.create_matrix(tangent), fem.petsc.create_vector(residual)
+    matrix, b = fem.petsc.create_matrix(tangent), u.x.petsc_vec.duplicate()
 
     def assemble_residual(snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
         x.copy(u.x.petsc_vec)

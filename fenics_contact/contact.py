@@ -38,6 +38,8 @@ _TOLERANCE = 1e-5
 _PARALLEL = 1e-6
 # Share of the approach of two bodies that is no penetration between the points yet.
 _UNSEEN = 0.01
+# The size of the mesh times this is a penetration that is next to none.
+_BARELY = 1e-8
 
 
 class Status(IntEnum):
@@ -168,6 +170,7 @@ class Contact:
         self._gdim = gdim = mesh.geometry.dim
         degree = _displacement_degree(u, mesh, name)
         try:
+            law.check_complete()
             law.check_dimension(gdim)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
@@ -268,6 +271,8 @@ class Contact:
             "shift": self._prescribed_shift(),
             "stored": self._acting_there(law.stored(kinematics, response, parameters)),
         } | {f"parameter {n}": v for n, v in parameters.items()}
+        if law.has_own_normal:
+            expressions |= self._own_normal(kinematics, response)
         if law.has_tangential:
             stiffness = law.tangential_stiffness(kinematics, parameters)
             expressions |= {
@@ -321,7 +326,7 @@ class Contact:
             springs = [n for n, v in self.law.parameters().items() if isinstance(v, Springs)]
             what = f"{springs[0]} by Springs" if springs else type(self.law).__name__
             raise ValueError(
-                f"{self.name}: {what} is the stiffness of something that is there, and multipliers "
+                f"{self.name}: {what} has the stiffness of something that is there; multipliers "
                 'would take it away; use enforcement="penalty", or a law and stiffness that stand '
                 "for rigid contact"
             )
@@ -387,6 +392,24 @@ class Contact:
             limit=None if response.limit is None else there(response.limit),
             slip=tuple(there(mode) for mode in response.slip),
         )
+
+    def _own_normal(self, kinematics: Kinematics, response: Response) -> dict[str, Any]:
+        """What is known of r_n that does not follow from k_n (UFL): stiffness, and another way."""
+        law, parameters, comm = self.law, self._law_parameters, self.surface.mesh.comm
+        u_n = ufl.variable(kinematics.normal_displacement)
+        at_variable = replace(kinematics, normal_displacement=u_n)
+        x = self.surface.mesh.geometry.x
+        barely = fem.Constant(
+            self.surface.mesh, _BARELY * (global_max(comm, x) - global_min(comm, x))
+        )
+        # Where nothing acts the stiffness is that of a point that has just closed.
+        acts = ufl.ne(response.normal_traction, 0)
+        closed = ufl.conditional(acts, kinematics.normal_displacement, kinematics.gap + barely)
+        at_closed = replace(kinematics, normal_displacement=closed)
+        return {
+            "normal_reaction": -ufl.diff(law.normal_potential(at_variable, parameters), u_n),
+            "normal_stiffness": law.normal_stiffness(at_closed, parameters),
+        }
 
     # ---- forms -----------------------------------------------------------------------------------
 
@@ -573,7 +596,7 @@ class Contact:
         along = np.einsum("qi,qj->qij", values["normal"], values["normal"])
         blocks = np.zeros((n, d, d))
         if self.law.has_normal_stiffness:
-            blocks += (np.asarray(normal) * values["parameter k_n"])[:, None, None] * along
+            blocks += (np.asarray(normal) * self.normal_stiffness)[:, None, None] * along
         if self.law.has_tangential:
             share = np.broadcast_to(np.asarray(tangential), (n,))
             blocks += share[:, None, None] * self.tangential_stiffness
@@ -1086,6 +1109,11 @@ class Contact:
         if self.law.has_tangential:
             return self._values["traction"]
         return np.zeros_like(self.points)
+
+    @property
+    def normal_stiffness(self) -> Array:
+        """-∂r_n/∂u_n where closed, (n_points,), in stress/length; see `Law.normal_stiffness`."""
+        return self._values["normal_stiffness" if self.law.has_own_normal else "parameter k_n"]
 
     @property
     def tangential_stiffness(self) -> Array:

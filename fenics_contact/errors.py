@@ -267,10 +267,10 @@ class _Springs:
             follows = closed & (status == Status.SLIP) & (pressure > 0) & (not law.has_potential)
             ratio = np.where(follows, 1.0, 0.0) / np.where(pressure > 0, pressure, 1.0)
             direction = normal - ratio[:, None] * tangential
-            k_n = np.where(closed, values["parameter k_n"], 0.0)
+            k_n = np.where(closed, contact.normal_stiffness, 0.0)
             stiffness += k_n[:, None, None] * np.einsum("qi,qj->qij", direction, normal)
             along = -np.sum(borne * normal, axis=1)
-            stretch += (along / values["parameter k_n"])[:, None] * normal
+            stretch += (along / contact.normal_stiffness)[:, None] * normal
         if law.has_tangential:
             k_t, stick = contact.tangential_stiffness, status == Status.STICK
             stiffness += np.where(stick[:, None, None], k_t, 0.0)

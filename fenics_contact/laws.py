@@ -4,13 +4,18 @@ A law maps the kinematics of a point of Γc (`Kinematics`) to the reactions ther
 definition serves two and three dimensions and every support. Signs are the paper's: the traction on
 the body is r_n n + τ, with n from the body to the support and r_n ≤ 0 (but for `Foundation`, which
 may pull).
+
+A law of one's own is a subclass of `Law`, or of `FrictionLaw` with friction, and a dataclass of its
+parameters. It says `Law.response`; where r_n is not -k_n δ₋ of a parameter "k_n", also its
+`normal_potential`, against which the verdict checks r_n; and the parameters that must not vanish,
+`positive`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral, Real
 from typing import Any, TypeAlias
 
@@ -145,14 +150,20 @@ class Law:
         return True
 
     @property
+    def has_own_normal(self) -> bool:
+        """Whether r_n follows from a `normal_potential` of the subclass, and not from k_n."""
+        own = type(self).normal_potential is not Law.normal_potential
+        return self.has_normal_stiffness and (own or "k_n" not in self.parameters())
+
+    @property
     def has_tension(self) -> bool:
         """Whether r_n pulls where the gap is open: such points are never open."""
         return False
 
     @property
     def is_physical(self) -> bool:
-        """Whether k_n and k_t are those of a layer that is there, and stand for no constraint."""
-        return False
+        """Whether the stiffness is that of a layer that is there, and stands for no constraint."""
+        return self.has_own_normal
 
     @property
     def positive(self) -> frozenset[str]:
@@ -170,9 +181,42 @@ class Law:
             ValueError: It says what was given, and what is expected.
         """
 
+    def check_complete(self) -> None:
+        """Refuse a subclass that does not say what the solver and the verdict ask of it.
+
+        Raises:
+            ValueError: It says what is missing.
+        """
+        name, parameters = type(self).__name__, self.parameters()
+        if type(self).response is Law.response:
+            raise ValueError(f"{name} is no law: a subclass of Law must say its response")
+        if self.has_own_normal and type(self).normal_potential is Law.normal_potential:
+            raise ValueError(
+                f"{name} has no parameter k_n; it must say its own normal_potential(kinematics, "
+                "parameters), minus whose derivative by the normal displacement is the normal "
+                "traction: energies, solver and verdict need it"
+            )
+        if self.has_tangential and "k_t" not in parameters:
+            raise ValueError(
+                f"{name} has tangential tractions, but no parameter k_t, the stiffness of points "
+                "that stick (stress/length); add one"
+            )
+
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """The reactions; ``parameters`` are those of `parameters`, as UFL."""
         raise NotImplementedError
+
+    def normal_potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+        """Energy per area of r_n, which is minus its derivative by u_n; by default eq. (19)."""
+        return signorini_potential(kinematics, parameters["k_n"])
+
+    def normal_stiffness(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+        """-∂r_n/∂u_n where the gap is closed (stress/length)."""
+        if not self.has_own_normal:
+            return parameters["k_n"]
+        u_n = ufl.variable(kinematics.normal_displacement)
+        density = self.normal_potential(replace(kinematics, normal_displacement=u_n), parameters)
+        return ufl.diff(ufl.diff(density, u_n), u_n)
 
     def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
         """Potential per area whose derivative by the displacement is minus the traction.
@@ -180,6 +224,8 @@ class Law:
         Raises:
             ValueError: There is none.
         """
+        if self.has_potential and not self.has_tangential:
+            return self.normal_potential(kinematics, parameters)
         raise ValueError(
             f"{type(self).__name__} has no potential: its slip is not associated (eq. 46)"
         )
@@ -223,7 +269,7 @@ class Law:
     def stored(
         self, kinematics: Kinematics, response: Response, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """Energy per area in the springs, r_n²/2k_n + τ·K_t⁻¹τ/2.
+        """Energy per area in the springs, r_n²/2k_n or `normal_potential`, and τ·K_t⁻¹τ/2.
 
         With multipliers the springs bear what these do not, in the end nothing.
         """
@@ -232,7 +278,9 @@ class Law:
         if kinematics.multiplier is not None:
             r_n = r_n + kinematics.multiplier
             tau = None if tau is None else tau - kinematics.traction
-        if self.has_normal_stiffness:
+        if self.has_own_normal:
+            stored += self.normal_potential(kinematics, parameters)
+        elif self.has_normal_stiffness:
             stored += r_n**2 / (2 * parameters["k_n"])
         if tau is not None:
             stored += ufl.dot(tau, self.elastic_displacement(kinematics, tau, parameters)) / 2
@@ -364,10 +412,6 @@ class Frictionless(Law):
         """See `Law.response`."""
         return Response(*signorini(kinematics, parameters["k_n"]))
 
-    def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
-        """Eq. (19)."""
-        return signorini_potential(kinematics, parameters["k_n"])
-
 
 @dataclass(frozen=True)
 class Foundation(Law):
@@ -470,9 +514,9 @@ class FrictionLaw(Law):
 
     friction: Any
     k_t: Any
-    modes: int | None
-    transverse_friction: Any
-    direction: Any
+    modes: int | None = None
+    transverse_friction: Any = None
+    direction: Any = None
 
     def __post_init__(self) -> None:
         """Refuse a polygon of fewer than three sides, and a direction that is missing or unused.
@@ -502,6 +546,11 @@ class FrictionLaw(Law):
         return True
 
     @property
+    def has_potential(self) -> bool:
+        """See `Law.has_potential`: none where the limit follows the pressure."""
+        return False
+
+    @property
     def positive(self) -> frozenset[str]:
         """See `Law.positive`: the axes of an ellipse must not vanish."""
         axes = (
@@ -509,10 +558,16 @@ class FrictionLaw(Law):
         )
         return super().positive | axes
 
-    def _friction_parameters(self) -> dict[str, Any]:
-        optional = {"transverse_friction": self.transverse_friction, "direction": self.direction}
-        given = {name: value for name, value in optional.items() if value is not None}
-        return {"friction": self.friction, "k_t": self.k_t} | given
+    def parameters(self) -> dict[str, Any]:
+        """See `Law.parameters`: all but the number of sides, and what may be left out."""
+        optional = ("transverse_friction", "direction")
+        given = {n: v for n, v in vars(self).items() if not (v is None and n in optional)}
+        given.pop("modes", None)
+        return given
+
+    def at_pressure(self, pressure: Expr) -> Law:
+        """See `Law.at_pressure`: the pressure sets the limit of friction, and nothing else."""
+        return self if self.has_potential else _AtPressure(self)
 
     def check_dimension(self, gdim: int) -> None:
         """See `Law.check_dimension`."""
@@ -621,6 +676,43 @@ class FrictionLaw(Law):
         _, sigma, slip = self._return(kinematics, limit, parameters)
         return self._stretched(sigma, 1, kinematics.normal, parameters), slip
 
+    def sliding_potential(
+        self, kinematics: Kinematics, limit: Expr, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """Minus its derivative by Δu_t is τ for a given limit: ½|σ*|²/k_t, linear beyond it.
+
+        That is (|σ*|² - |σ* - σ|²)/(2 k_t), whose gradient by σ* is the closest point σ over k_t.
+        """
+        trial, sigma, _ = self._return(kinematics, limit, parameters)
+        return ufl.dot(sigma, trial - sigma / 2) / parameters["k_t"]
+
+
+class _AtPressure(FrictionLaw):
+    """Another law, but for the limit of its friction, which is μ times a given "pressure"."""
+
+    def __init__(self, law: FrictionLaw) -> None:
+        self._law, self.friction, self.k_t = law, law.friction, law.k_t
+        self.modes, self.direction = law.modes, law.direction
+        self.transverse_friction = law.transverse_friction
+
+    @property
+    def has_potential(self) -> bool:
+        """See `Law.has_potential`."""
+        return True
+
+    def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
+        """See `Law.response`."""
+        limit = parameters["friction"] * parameters["pressure"]
+        traction, slip = self.slide(kinematics, limit, parameters)
+        found = self._law.response(kinematics, parameters)
+        return replace(found, traction=traction, limit=limit, slip=slip)
+
+    def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+        """See `Law.potential`."""
+        limit = parameters["friction"] * parameters["pressure"]
+        normal = self._law.normal_potential(kinematics, parameters)
+        return normal + self.sliding_potential(kinematics, limit, parameters)
+
 
 def _perpendicular(normal: Expr) -> Expr:
     return ufl.as_vector([-normal[1], normal[0]])
@@ -650,20 +742,6 @@ class Coulomb(FrictionLaw):
     modes: int | None = None
     transverse_friction: Any = None
     direction: Any = None
-
-    @property
-    def has_potential(self) -> bool:
-        """See `Law.has_potential`."""
-        return False
-
-    def parameters(self) -> dict[str, Any]:
-        """See `Law.parameters`."""
-        return self._friction_parameters() | {"k_n": self.k_n}
-
-    def at_pressure(self, pressure: Expr) -> Law:
-        """See `Law.at_pressure`: the pressure sets the limit of friction, and nothing else."""
-        shape = (self.modes, self.transverse_friction, self.direction)
-        return Tresca(self.friction, pressure, self.k_n, self.k_t, True, *shape)
 
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """See `Law.response`. Where the gap is open τ = 0, and moving is not slipping."""
@@ -704,10 +782,15 @@ class Tresca(FrictionLaw):
         """See `Law.has_normal_stiffness`."""
         return self.unilateral
 
+    @property
+    def has_potential(self) -> bool:
+        """See `Law.has_potential`."""
+        return True
+
     def parameters(self) -> dict[str, Any]:
         """See `Law.parameters`."""
-        normal = {"k_n": self.k_n} if self.unilateral else {}
-        return self._friction_parameters() | {"pressure": self.pressure} | normal
+        without = {"unilateral"} if self.unilateral else {"unilateral", "k_n"}
+        return {n: v for n, v in super().parameters().items() if n not in without}
 
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """See `Law.response`."""
@@ -720,13 +803,9 @@ class Tresca(FrictionLaw):
         return Response(r_n, opening, penetration, traction, limit, slip)
 
     def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
-        """Eq. (19) and (43): in Δu_t it is ½|σ*|²/k_t up to the limit, linear beyond.
-
-        That is (|σ*|² - |σ* - σ|²)/(2 k_t), whose gradient by σ* is the closest point σ over k_t.
-        """
+        """Eq. (19) and (43)."""
         limit = parameters["friction"] * parameters["pressure"]
-        trial, sigma, _ = self._return(kinematics, limit, parameters)
-        tangential = ufl.dot(sigma, trial - sigma / 2) / parameters["k_t"]
+        tangential = self.sliding_potential(kinematics, limit, parameters)
         if not self.unilateral:
             return tangential + parameters["pressure"] * kinematics.normal_displacement
         return tangential + signorini_potential(kinematics, parameters["k_n"])

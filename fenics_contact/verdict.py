@@ -146,7 +146,8 @@ def check_laws(contact: Contact) -> dict[str, float]:
     Returns:
         Largest violations, relative to the largest value concerned. "complementarity"
         (eq. 6-11: r_n ≤ 0, δ± ≥ 0, δ₊δ₋ = 0, r_n δ₊ = 0, s - u_n = δ₊ - δ₋, r_n = -k_n δ₋;
-        with multipliers r_n = -k_n (u_n - s) - λ_n where that is < 0), or
+        with multipliers r_n = -k_n (u_n - s) - λ_n where that is < 0; of a law with its own
+        `normal_potential` r_n is minus the derivative of it by u_n instead), or
         where the law bears tension "stiffness" (r_n = -k_n (u_n - s)). With friction, by the law's
         yield functions g_j: "cone" (g_j ≤ 0), "slip" (eq. 44: Δβ ≥ 0, the change of the traction
         is that of adherence and associated slip, Δτ = -K_t (Δu_t + Σ Δβ_j ∂g_j/∂τ)) and
@@ -179,7 +180,12 @@ def check_laws(contact: Contact) -> dict[str, float]:
             *length,
         )
     ]
-    if law.has_tension:
+    if law.has_own_normal:
+        k = np.where(r_n != 0, contact.normal_stiffness, 0.0)
+        parts = (k * v["normal_displacement"], k * v["gap"])  # whose round-off is in r_n
+        pull = np.maximum(r_n, 0) if not law.has_tension else np.zeros_like(r_n)
+        violations.append(relative(worst(pull, r_n - v["normal_reaction"]), r_n, *parts))
+    elif law.has_tension:
         k_n = v["parameter k_n"]
         elastic = k_n * (v["normal_displacement"] - v["gap"])
         parts = (k_n * v["normal_displacement"], k_n * v["gap"])  # whose round-off is in r_n

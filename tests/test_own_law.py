@@ -1,0 +1,230 @@
+"""A law of the user's own: an exponential overclosure, with friction and without."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import ufl
+from mpi4py import MPI
+from scenes import TOP, block, close, gathered, raised_everywhere
+
+import fenics_contact as fc
+from fenics_contact.laws import FrictionLaw, Law, Response, positive_part
+
+COMM = MPI.COMM_WORLD
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+
+E, NU = 1000.0, 0.3
+P0, H = 0.5, 2e-3
+
+
+# ---- the laws, as a user writes them -------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Overclosure(Law):
+    """Pressure p0 exp(δ/h) at the overclosure δ = u_n - s: asperities that touch at a distance."""
+
+    p0: Any
+    h: Any
+
+    @property
+    def positive(self):
+        """Both."""
+        return frozenset({"p0", "h"})
+
+    def pressure(self, closing, parameters):
+        """p0 exp(δ/h)."""
+        return parameters["p0"] * ufl.exp(closing / parameters["h"])
+
+    def response(self, kinematics, parameters):
+        """The pressure, nothing along Γc."""
+        closing = kinematics.normal_displacement - kinematics.gap
+        pressure = self.pressure(closing, parameters)
+        return Response(-pressure, positive_part(-closing), positive_part(closing))
+
+    def normal_potential(self, kinematics, parameters):
+        """∫ p dδ."""
+        closing = kinematics.normal_displacement - kinematics.gap
+        return parameters["h"] * self.pressure(closing, parameters)
+
+
+@dataclass(frozen=True)
+class Asperities(FrictionLaw):
+    """Coulomb's friction on a pressure p0 (exp(δ/h) - 1) of the penetration δ alone."""
+
+    friction: Any
+    p0: Any
+    h: Any
+    k_t: Any
+
+    @property
+    def positive(self):
+        """All but friction."""
+        return frozenset({"p0", "h", "k_t"})
+
+    def response(self, kinematics, parameters):
+        """The pressure, and friction up to μ times it."""
+        closing = kinematics.normal_displacement - kinematics.gap
+        penetration = positive_part(closing)
+        pressure = parameters["p0"] * (ufl.exp(penetration / parameters["h"]) - 1)
+        limit = parameters["friction"] * pressure
+        traction, slip = self.slide(kinematics, limit, parameters)
+        return Response(-pressure, positive_part(-closing), penetration, traction, limit, slip)
+
+    def normal_potential(self, kinematics, parameters):
+        """∫ p dδ."""
+        p0, h = parameters["p0"], parameters["h"]
+        penetration = positive_part(kinematics.normal_displacement - kinematics.gap)
+        return p0 * h * (ufl.exp(penetration / h) - 1) - p0 * penetration
+
+
+# ---- against closed answers ----------------------------------------------------------------------
+
+# Newton's method and L-BFGS to 1e-9 of the forces; of the overclosure that is as much of h.
+EXACT = 1e-7
+METHODS = ("lbfgs", "newton", "continuation", "alternating")
+
+
+@pytest.mark.parametrize("condensation", [None, False] if COMM.size == 1 else [None])
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_overclosure(cell, method, condensation):
+    """A block pressed uniformly: δ = h ln(p/p0) everywhere, and the energy is conserved.
+
+    With the first increment p < p0, so that the law acts at a distance, then more.
+    """
+    scene = block(cell, E=E, nu=NU)
+    law = Overclosure(P0, H)
+    problem, contact = scene.problem(law, scene.rollers(), method=method, condensation=condensation)
+    for p in (0.2, 3.0, 20.0):
+        scene.load(up=-p)
+        step = problem.solve()
+        assert step.verdict.failures == []
+        assert close(gathered(COMM, contact.pressure), np.full_like(_ones(contact), p), EXACT)
+        overclosure = -gathered(COMM, contact.gap)
+        assert close(overclosure, H * np.log(p / P0) * _ones(contact), EXACT, scale=H)
+        problem.commit()
+    # Work of the load by the trapezoidal rule is not that of a nonlinear law; its springs are.
+    assert step.energy.springs == pytest.approx(H * (20.0 - 3.0), rel=1e-6)
+
+
+def _ones(contact):
+    return np.ones(len(gathered(COMM, contact.pressure)))
+
+
+def test_any_units():
+    """The same in MPa and in Pa, in metres and in micrometres: relative results are equal."""
+    found = []
+    for stress, length in ((1.0, 1.0), (1e6, 1.0), (1.0, 1e6)):
+        size = [length, length]
+        scene = block("quadrilateral", E=E * stress, nu=NU, up=-3.0 * stress, size=size)
+        problem, contact = scene.problem(Overclosure(P0 * stress, H * length), scene.rollers())
+        problem.solve()
+        found.append(-gathered(COMM, contact.gap) / length)
+    assert close(found[1], found[0], EXACT) and close(found[2], found[0], EXACT)
+
+
+@pytest.mark.parametrize("condensation", [None, False] if COMM.size == 1 else [None])
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_overclosure_with_friction(cell, method, condensation):
+    """Pressed by its top, dragged until all slips, and back: T = ±μN, p = p0 (exp(δ/h) - 1)."""
+    mu = 0.3
+    scene = block(cell, E=E, nu=NU, n=3)
+    d = scene.dim
+    push, press = (scene.hold(TOP, i) for i in (0, d - 1))
+    held = [scene.hold(TOP, 1)] if d == 3 else []
+    problem, contact = scene.problem(
+        Asperities(mu, P0, H, fc.Scaled()),
+        [push, press, *held],
+        method=method,
+        condensation=condensation,
+    )
+    for side, down in ((0.0, 1e-2), (2e-2, 1e-2), (-2e-2, 1e-2)):
+        push.g.value[...], press.g.value[...] = side, -down
+        step = problem.solve()
+        assert step.verdict.failures == []
+        penetration = np.maximum(-gathered(COMM, contact.gap), 0.0)
+        expected = P0 * (np.exp(penetration / H) - 1)
+        assert close(gathered(COMM, contact.pressure), expected, 1e-10)
+        if side:
+            r = step.contacts["contact"]
+            assert r.stick == 0
+            assert r.tangential_force == pytest.approx(mu * r.normal_force, rel=1e-9)
+            assert r.force[0] * side < 0.0
+        problem.commit()
+    assert step.energy.dissipation > 0
+
+
+# ---- what is refused, and what is found out ------------------------------------------------------
+
+
+def test_multipliers_are_refused():
+    """They would take the stiffness away that the law is about."""
+    scene = block()
+    raised_everywhere(
+        lambda: scene.contact(Overclosure(P0, H), enforcement="augmented"),
+        ValueError,
+        "Overclosure",
+        "penalty",
+    )
+    assert scene.contact(Overclosure(P0, H), accuracy="standard").multipliers is None
+
+
+def test_a_law_that_does_not_say_enough():
+    """Without k_n a potential is wanted, and k_t where there is friction; each by its name."""
+
+    @dataclass(frozen=True)
+    class Silent(Law):
+        p0: Any
+
+        def response(self, kinematics, parameters):
+            closing = kinematics.normal_displacement - kinematics.gap
+            r_n = -parameters["p0"] * positive_part(closing) ** 2
+            return Response(r_n, positive_part(-closing), positive_part(closing))
+
+    scene = block()
+    raised_everywhere(
+        lambda: scene.contact(Silent(1.0)), ValueError, "contact", "Silent", "normal_potential"
+    )
+    raised_everywhere(lambda: scene.contact(Law()), ValueError, "contact", "Law", "response")
+
+    @dataclass(frozen=True)
+    class Slippery(FrictionLaw):
+        friction: Any
+        k_n: Any
+
+        def response(self, kinematics, parameters):
+            return None
+
+    raised_everywhere(
+        lambda: scene.contact(Slippery(0.3, 1.0)), ValueError, "contact", "Slippery", "k_t"
+    )
+
+
+def test_a_potential_of_another_law():
+    """A response and a potential that do not belong together are found by the verdict."""
+
+    class Wrong(Overclosure):
+        """Its energy is too large by a thousandth."""
+
+        def normal_potential(self, kinematics, parameters):
+            """∫ p dδ, nearly."""
+            return 1.001 * super().normal_potential(kinematics, parameters)
+
+    scene = block(up=-3.0)
+    problem, _ = scene.problem(Wrong(P0, H), scene.rollers())
+    with pytest.raises(fc.NotConverged, match="complementarity violated by"):
+        problem.solve()
+
+
+@pytest.mark.parametrize(("name", "value"), [("p0", 0.0), ("h", -1.0), ("h", np.nan)])
+def test_parameters_of_an_own_law(name, value):
+    """They are checked as those of the others."""
+    scene = block()
+    law = replace(Overclosure(P0, H), **{name: value})
+    raised_everywhere(lambda: scene.contact(law), ValueError, "contact", name)
