@@ -1,5 +1,6 @@
 """Frictional contact for FEniCSx: contact as a boundary form, an answer that is checked."""
 
+import fenics_contact.compat  # noqa: F401  # first: it refuses releases that are too old
 from fenics_contact import elasticity
 from fenics_contact._version import __version__
 from fenics_contact.accuracy import Accuracy

@@ -18,6 +18,12 @@ from petsc4py import PETSc
 
 __all__ = ["compile_form", "create_facet_submesh", "interpolation_points", "model_to_mesh"]
 
+if tuple(map(int, dolfinx.__version__.split(".")[:2])) < (0, 9):
+    raise ImportError(
+        f"fenics_contact needs DOLFINx 0.9 or later, and this is {dolfinx.__version__}: install a "
+        "later one, or use the container (docker/run)"
+    )
+
 # PETSc's line search for the least residual, renamed in 3.24; bound to Python since 3.23.
 _line_searches = getattr(getattr(PETSc, "SNESLineSearch", None), "Type", None)
 LEAST_RESIDUAL = getattr(_line_searches, "SECANT", "l2")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.accuracy import DEFAULT_FACTOR, Accuracy, modulus_over_height
+from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.augmented import Multipliers, TraceProjection
 from fenics_contact.history import History
 from fenics_contact.laws import Kinematics, Law, Response, Scaled, Springs
@@ -27,9 +29,11 @@ from fenics_contact.supports import Motion, Placement, Support, nonzero_vector
 from fenics_contact.surface import ContactSurface, PointEvaluator, VertexAreas
 from fenics_contact.unknowns import Selection, Unknowns
 
-__all__ = ["Contact", "Resultants", "Status", "passing"]
+__all__ = ["Contact", "Found", "Resultants", "Status", "displacement_degree", "passing"]
 
 Array = npt.NDArray[np.float64]
+
+logger = logging.getLogger("fenics_contact")
 
 _ENFORCEMENTS = ("penalty", "augmented")
 # Of augmented enforcement, where nothing is said.
@@ -38,8 +42,8 @@ _TOLERANCE = 1e-5
 _PARALLEL = 1e-6
 # Share of the approach of two bodies that is no penetration between the points yet.
 _UNSEEN = 0.01
-# The size of the mesh times this is a penetration that is next to none.
-_BARELY = 1e-8
+# The size of the mesh times this is a penetration that is next to none, or one that no mesh has.
+_BARELY, _DEEP = 1e-8, 0.1
 
 
 class Status(IntEnum):
@@ -161,6 +165,15 @@ class Contact:
             ValueError: ``u`` is no displacement of this mesh, or data of support or law are wrong.
             TypeError: A parameter is of a type that cannot be a coefficient.
         """
+        check_instance("name", name, str)
+        order = "the order is Contact(u, surface, support, law)"
+        for what, value, kind in (
+            ("u", u, fem.Function),
+            ("surface", surface, ContactSurface),
+            ("support", support, Support),
+            ("law", law, Law),
+        ):
+            check_instance(f"{name}: {what}", value, kind, order)
         self.name = name
         self.u = u
         self.surface, self.support, self.law = surface, support, law
@@ -168,7 +181,7 @@ class Contact:
         self.parameters: dict[str, fem.Constant] = {}
         mesh = surface.mesh
         self._gdim = gdim = mesh.geometry.dim
-        degree = _displacement_degree(u, mesh, name)
+        degree = displacement_degree(u, mesh, name)
         try:
             law.check_complete()
             law.check_dimension(gdim)
@@ -261,6 +274,7 @@ class Contact:
             "x": x,
             "normal": self._normal,
             "direction_length": length,
+            "facing": ufl.dot(self._normal, ufl.FacetNormal(mesh)),
             "weight": self.weight,
             "gap": self._gap,
             "normal_displacement": kinematics.normal_displacement,
@@ -316,7 +330,7 @@ class Contact:
             raise ValueError(
                 f"{self.name}: enforcement is {enforcement!r}; use one of {_ENFORCEMENTS}"
             )
-        if not (np.ndim(self.tolerance) == 0 and 0.0 < self.tolerance < 1.0):
+        if not (is_number(self.tolerance) and 0.0 < self.tolerance < 1.0):
             raise ValueError(
                 f"{self.name}: tolerance is {self.tolerance!r}; it must be a number between 0 and 1"
             )
@@ -668,9 +682,10 @@ class Contact:
         if self._scale is None:
             return
         if not isinstance(modulus, fem.Function):
-            if not (np.ndim(modulus) == 0 and np.isfinite(modulus) and modulus > 0):
+            if not (is_number(modulus) and np.isfinite(modulus) and modulus > 0):
                 raise ValueError(
-                    f"{self.name}: modulus is {modulus!r}; it must be a positive number"
+                    f"{self.name}: modulus is {modulus!r}; it must be a positive number, or a "
+                    "fem.Function with one value per cell"
                 )
             value = float(modulus)
             modulus = fem.Function(fem.functionspace(self.surface.mesh, ("DG", 0)))
@@ -695,7 +710,7 @@ class Contact:
             factor = self.accuracy.factor if self.accuracy else DEFAULT_FACTOR
             return self._to_ufl(name, value.factor or factor) * self._scale
         positive = name in self.law.positive
-        if np.ndim(value) == 0 and isinstance(value, int | float | np.number):
+        if is_number(value):
             bad = not np.isfinite(value) or value < 0 or (positive and value == 0)
             if bad:
                 raise ValueError(_range_error(self.name, name, float(value), positive))
@@ -714,13 +729,15 @@ class Contact:
         if isinstance(value, ufl.core.expr.Expr):
             return value
         try:
-            array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
+            array = np.asarray(value)
+        except ValueError:  # a ragged list
+            array = np.asarray(None)
+        if array.dtype.kind not in "iuf":
             raise TypeError(
                 f"{self.name}: {name} is {value!r}; give numbers, a fem.Constant, a fem.Function "
                 "or a UFL expression"
-            ) from None
-        constant = fem.Constant(self.surface.mesh, array)
+            )
+        constant = fem.Constant(self.surface.mesh, array.astype(np.float64))
         if name != "support":
             self.parameters[name] = constant
         return constant
@@ -732,6 +749,11 @@ class Contact:
         for i, value in given.items():
             shift[i] = self._scalar(f"displacement {i}", value)
         for i, value in forces.items():
+            if not (is_number(value) or (isinstance(value, fem.Constant) and not value.ufl_shape)):
+                raise TypeError(
+                    f"{self.name}: force {i} of the Motion is {value!r}; give a number or a scalar "
+                    "fem.Constant"
+                )
             self.applied_force[i] = value
             self.free_motion[i] = fem.Constant(self.surface.mesh, 0.0)
             shift[i] = self._free_shift[i] = ufl.variable(self.free_motion[i])
@@ -1033,6 +1055,27 @@ class Contact:
                     "follows the surface"
                 )
 
+    def check_side(self) -> None:
+        """Refuse, or warn of, a support that all of Γc looks away from. Collective.
+
+        Raises:
+            ValueError: The body is deep inside of it, too.
+        """
+        comm, values = self.surface.mesh.comm, self._values
+        if global_max(comm, values["facing"]) > -_PARALLEL:  # NaN has its own errors
+            return
+        x, depth = self.surface.mesh.geometry.x, -global_min(comm, values["gap"])
+        text = (
+            f"{self.name}: the normal from the body to the support points into the body at every "
+            "point of Γc: turn it round (a HalfSpace's points out of it, to the body: up for a "
+            "floor; a Ball or Cylinder around the body has inside=True)"
+        )
+        size = global_max(comm, x) - global_min(comm, x)
+        if depth > _DEEP * size and not self.gap_prescribed:
+            raise ValueError(f"{text}; the body is inside of the support, by up to {depth:g}")
+        if comm.rank == 0:
+            logger.warning(text)
+
     def found(self) -> Found:
         """The state as evaluated, for `commit`: nothing that changes later changes it."""
         points = self._values
@@ -1242,11 +1285,15 @@ def _range_error(contact: str, name: str, value: float, positive: bool) -> str:
     return f"{contact}: {name} is {value:g} at a point of Γc; it must be finite and {wanted}"
 
 
-def _displacement_degree(u: fem.Function, mesh: Any, name: str) -> int:
+def displacement_degree(u: fem.Function, mesh: Any, name: str) -> int:
     """Check that ``u`` is a displacement of ``mesh`` and return its element's degree."""
-    if not isinstance(u, fem.Function):
-        raise ValueError(f"{name}: u is a {type(u).__name__}; it must be a dolfinx fem.Function")
-    gdim = mesh.geometry.dim
+    gdim, space = mesh.geometry.dim, u.function_space
+    if space.component() or (space.num_sub_spaces and space.dofmap.index_map_bs == 1):
+        raise ValueError(
+            f"{name}: u is in a mixed element, or a part of one; u must be in a space of its own, "
+            f'functionspace(mesh, ("Lagrange", degree, ({gdim},))): mixed formulations are not '
+            "supported; for bodies that are nearly incompressible take degree 2 or higher"
+        )
     if u.ufl_shape != (gdim,):
         raise ValueError(
             f"{name}: u has shape {u.ufl_shape}; a displacement on this mesh has shape ({gdim},): "

@@ -15,6 +15,8 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
+from fenics_contact.arguments import is_number
+
 __all__ = ["KINDS", "LinearElastic"]
 
 # Space dimension of every kind.
@@ -111,6 +113,6 @@ def _coefficient(mesh: Any, name: str, value: Any, low: float, high: float) -> A
     """Numbers become constants of the mesh, so that their value is not compiled in."""
     if isinstance(value, ufl.core.expr.Expr):
         return value
-    if not (np.ndim(value) == 0 and low < value < high):
+    if not (is_number(value) and low < value < high):
         raise ValueError(f"{name} is {value!r}; it must be a number between {low:g} and {high:g}")
     return fem.Constant(mesh, float(value))

@@ -52,7 +52,9 @@ class Scaled:
 
     def __post_init__(self) -> None:
         """Refuse a factor that is no positive number."""
-        if self.factor is not None and not (0.0 < self.factor < float("inf")):
+        if self.factor is None:
+            return
+        if not (isinstance(self.factor, Real) and 0.0 < self.factor < float("inf")):
             raise ValueError(f"factor is {self.factor!r}; it must be a number greater than zero")
 
 

@@ -30,6 +30,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from fenics_contact.arguments import is_number
 from fenics_contact.bodies import connected_bodies
 from fenics_contact.facets import FacetSet, tabulate
 from fenics_contact.parallel import collective_errors, gather_rows
@@ -89,7 +90,7 @@ class DeformableBody(Support):
 
     def __post_init__(self) -> None:
         """Refuse what has no sense."""
-        if not self.reach > 0:
+        if not (is_number(self.reach) and self.reach > 0):
             raise ValueError(f"reach is {self.reach!r}; it must be a length greater than zero")
         if self.update not in ("never", "increment"):
             raise ValueError(f"update is {self.update!r}; use 'never' or 'increment'")

@@ -18,12 +18,20 @@ from petsc4py import PETSc
 
 from fenics_contact import accuracy, compat, dense, linear
 from fenics_contact.alternating import Alternation
+from fenics_contact.arguments import check_instance, is_number, listed
 from fenics_contact.balance import Norms
 from fenics_contact.bulk import Bulk
 from fenics_contact.callbacks import Callbacks, interrupts_held, release_interrupt
 from fenics_contact.chattering import StatusWatch
 from fenics_contact.condense import CondensedSpace, touched, worthwhile
-from fenics_contact.contact import Contact, Found, Resultants, Status, passing
+from fenics_contact.contact import (
+    Contact,
+    Found,
+    Resultants,
+    Status,
+    displacement_degree,
+    passing,
+)
 from fenics_contact.continuation import Continuation
 from fenics_contact.defaults import Defaults, take_command_line
 from fenics_contact.energy import Energy, EnergyState, Forces
@@ -239,7 +247,7 @@ class ContactProblem:
         Raises:
             ValueError: Input that has no sense; the text says what and what to do. On all ranks.
         """
-        if method is not None and method not in _METHODS:
+        if method not in (None, *_METHODS):
             raise ValueError(f"method is {method!r}; use one of {sorted(_METHODS)}")
         if linear_solver not in (None, *linear.KINDS):
             raise ValueError(
@@ -247,18 +255,23 @@ class ContactProblem:
                 "for the one that suits the size of the problem"
             )
         for name, share in (("alpha", alpha), ("phi", phi)):
-            if not 0.0 <= share <= 1.0:
+            if not (is_number(share) and 0.0 <= share <= 1.0):
                 raise ValueError(f"{name} is {share!r}; it must lie between 0 and 1")
+        check_instance("u", u, fem.Function)
+        displacement_degree(u, u.function_space.mesh, "problem")
+        check_instance("prefix", prefix, str)
+        if petsc_options is not None:
+            check_instance("petsc_options", petsc_options, Mapping)
+        self.contacts = listed("contacts", contacts, Contact)
+        self._bcs = listed("bcs", bcs, fem.DirichletBC)
         compat.warn_of_slow_blas()
         self.u = u
-        self.contacts = list(contacts)
         self.bulk = Bulk(F, u)
         said = [c.accuracy for c in self.contacts if c.accuracy is not None]
         all_say = bool(said) and len(said) == len(self.contacts)
         self.accuracy = min(said, key=lambda a: a.error) if all_say else None
         self.increment = 0
         self._comm = u.function_space.mesh.comm
-        self._bcs = list(bcs)
         self._alpha, self._phi = alpha, phi
         n_motions = sum(len(contact.free_motion) for contact in self.contacts)
         self.unknowns = Unknowns(u.function_space, n_motions)
@@ -351,6 +364,7 @@ class ContactProblem:
         worst = 0.0
         for contact in self.contacts:
             contact.check_input()
+            contact.check_side()
             gap = global_min(self._comm, contact.values["gap"])
             if gap < -_TOUCHING * self.motions.size and not contact.gap_prescribed:
                 worst = max(worst, -gap)

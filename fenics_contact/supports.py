@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import ufl
 
+from fenics_contact.arguments import is_number
+
 __all__ = ["Ball", "Cylinder", "HalfSpace", "Motion", "Obstacle", "Placement", "Support"]
 
 ToUFL = Callable[[Any], ufl.core.expr.Expr]
@@ -55,9 +57,11 @@ class Motion:
             ValueError: A component has both or is missing.
         """
         given = self.displacement if self.displacement is not None else (None,) * gdim
-        if len(self.force) != gdim or len(given) != gdim:
+        lists = (v if isinstance(v, Sequence | np.ndarray) else () for v in (self.force, given))
+        sizes = [len(v) for v in lists]
+        if sizes != [gdim, gdim]:
             raise ValueError(
-                f"Motion has {len(self.force)} forces and {len(given)} displacements; it must have "
+                f"Motion has {sizes[0]} forces and {sizes[1]} displacements; it must have "
                 f"{gdim} of each on this mesh, None where the other one is given"
             )
         both = [i for i in range(gdim) if self.force[i] is not None and given[i] is not None]
@@ -104,10 +108,10 @@ def _vector(name: str, value: Any, gdim: int) -> Any:
         if value.ufl_shape != (gdim,):
             raise ValueError(f"{name} has shape {value.ufl_shape}; the mesh needs ({gdim},)")
         return value
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != (gdim,) or not np.all(np.isfinite(array)):
+    entries = value if isinstance(value, Sequence | np.ndarray) else ()
+    if len(entries) != gdim or not all(is_number(v) and np.isfinite(v) for v in entries):
         raise ValueError(f"{name} is {value!r}; it must be {gdim} finite numbers on this mesh")
-    return array
+    return np.asarray(value, dtype=np.float64)
 
 
 def nonzero_vector(name: str, value: Any, gdim: int) -> Any:
@@ -125,7 +129,7 @@ def _positive(name: str, value: Any) -> Any:
     """Check a length given by a number."""
     if isinstance(value, ufl.core.expr.Expr):
         return value
-    if not (np.ndim(value) == 0 and np.isfinite(value) and value > 0):
+    if not (is_number(value) and np.isfinite(value) and value > 0):
         raise ValueError(f"{name} is {value!r}; it must be a number greater than zero")
     return value
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 
 import basix.ufl
 import dolfinx.fem.petsc
@@ -13,6 +14,7 @@ from dolfinx import fem, la
 from petsc4py import PETSc
 
 from fenics_contact import compat
+from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.parallel import collective_errors, gather_rows, global_min
 
 __all__ = ["ContactSurface", "PointEvaluator", "SurfaceQuadrature", "VertexAreas"]
@@ -62,8 +64,11 @@ class ContactSurface:
         """
         if quadrature_scheme is not None and quadrature_scheme not in _SCHEMES:
             raise ValueError(f"quadrature_scheme is {quadrature_scheme!r}; use one of {_SCHEMES}")
-        if quadrature_degree is not None and quadrature_degree < 1:
-            raise ValueError(f"quadrature_degree is {quadrature_degree}; it must be at least 1")
+        whole = is_number(quadrature_degree) and isinstance(quadrature_degree, Integral)
+        if quadrature_degree is not None and not (whole and quadrature_degree >= 1):
+            raise ValueError(
+                f"quadrature_degree is {quadrature_degree!r}; it must be a whole number, at least 1"
+            )
         self.mesh = mesh
         self.facets = tagged_facets(mesh, facet_tags, tags)
         self.quadrature_degree = quadrature_degree
@@ -112,7 +117,12 @@ def tagged_facets(
     Raises:
         ValueError: Wrong dimension, a tag that no facet has, an interior facet with the tag.
     """
-    wanted = np.unique(np.atleast_1d(np.asarray(tags, dtype=np.int32)))
+    check_instance("mesh", mesh, dolfinx.mesh.Mesh)
+    check_instance("facet_tags", facet_tags, dolfinx.mesh.MeshTags)
+    wanted = np.unique(np.asarray(tags))
+    if wanted.size and wanted.dtype.kind not in "iu":
+        raise ValueError(f"tags is {tags!r}; it must be a whole number, or a list of them")
+    wanted = wanted.astype(np.int32)
     tdim = mesh.topology.dim
     if tdim not in (2, 3) or mesh.geometry.dim != tdim:
         raise ValueError(

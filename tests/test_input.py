@@ -1,12 +1,16 @@
 """Bad input: an error that names the thing, on every rank."""
 
+import subprocess
+import sys
 from collections.abc import Callable
 
+import basix.ufl
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
+from running import environment
 from scenes import (
     BOTTOM,
     LEFT,
@@ -284,7 +288,7 @@ def test_tresca_pressure_out_of_range(pressure):
     raised_everywhere(lambda: scene.contact(law), ValueError, "pressure")
 
 
-@pytest.mark.parametrize("value", ["rough", {}, ["a", "b"]])
+@pytest.mark.parametrize("value", ["rough", "0.3", True, 0.3 + 1j, {}, ["a", "b"], [[1.0], 2.0]])
 def test_parameter_of_a_wrong_type(value):
     """What cannot be a coefficient is a TypeError that names the parameter."""
     scene = pressed()
@@ -307,7 +311,7 @@ def test_parameter_of_a_wrong_shape():
     raised_everywhere(lambda: scene.contact(coulomb(x)), ValueError, "friction", "scalar")
 
 
-@pytest.mark.parametrize("factor", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("factor", [0.0, -1.0, np.nan, np.inf, "10"])
 def test_scaled_factor_out_of_range(factor):
     """A factor of E/h is a positive number."""
     raised_everywhere(lambda: fc.Scaled(factor), ValueError, "factor")
@@ -394,7 +398,7 @@ def test_missing_modulus():
     raised_everywhere(lambda: contact.form(v), ValueError, "modulus", "k_n")
 
 
-@pytest.mark.parametrize("modulus", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("modulus", [0.0, -1.0, np.nan, np.inf, "E", True])
 def test_modulus_out_of_range(modulus):
     """A modulus is positive and finite."""
     scene = pressed()
@@ -473,6 +477,147 @@ def test_displacement_of_another_problem():
         ValueError,
         "contact: its u",
     )
+
+
+def test_displacement_in_a_mixed_element():
+    """A pressure beside it, whole or in part, or scalars for its components: the reason is told."""
+    scene = pressed()
+    line = basix.ufl.element("P", "quadrilateral", 1)
+    vector = basix.ufl.element("P", "quadrilateral", 2, shape=(2,))
+    both = fem.Function(fem.functionspace(scene.mesh, basix.ufl.mixed_element([vector, line])))
+    scalars = fem.Function(fem.functionspace(scene.mesh, basix.ufl.mixed_element([line, line])))
+    for u in (both, both.sub(0), scalars):
+        raised_everywhere(contact_with(u, scene), ValueError, "contact: u is in a mixed element")
+    v = ufl.TestFunction(both.function_space)
+    F = ufl.inner(ufl.grad(both), ufl.grad(v)) * ufl.dx
+    raised_everywhere(lambda: fc.ContactProblem(F, both), ValueError, "u is in a mixed element")
+
+
+# ---- what is no argument at all ------------------------------------------------------------------
+
+
+def test_arguments_of_a_contact():
+    """Swapped, missing, a class for an object: named, with the order there is."""
+    scene = pressed()
+    u, surface, floor, law = scene.u, scene.surface, scene.floor(), coulomb()
+    for arguments, words in (
+        ((u, surface, law, floor), ("support is a Coulomb", "must be a Support", "(u, surface,")),
+        ((surface, u, floor, law), ("u is a ContactSurface", "must be a Function")),
+        ((u, scene.mesh, floor, law), ("surface is a Mesh", "must be a ContactSurface")),
+        ((u, surface, None, law), ("support is a NoneType",)),
+        ((u, surface, floor, 0.3), ("law is a float", "must be a Law")),
+        ((u, surface, floor, fc.Frictionless), ("law is the class Frictionless", "(...)")),
+        ((u, surface, fc.HalfSpace, law), ("support is the class HalfSpace",)),
+    ):
+        raised_everywhere(lambda a=arguments: fc.Contact(*a), ValueError, "contact: ", *words)
+    raised_everywhere(lambda: scene.contact(law, name=3), ValueError, "name is a int")
+    raised_everywhere(lambda: scene.contact(law, tolerance="1e-3"), ValueError, "tolerance is '1e-")
+
+
+def test_arguments_of_a_problem():
+    """One contact or condition for a list of them, other things in the list, no mapping."""
+    scene = pressed()
+    contact, bcs = scene.contact(coulomb()), scene.rollers()
+    for arguments, words in (
+        ({"contacts": contact}, ("contacts is a single Contact", "contacts=[...]")),
+        ({"contacts": None}, ("contacts is None", "list of Contact")),
+        ({"contacts": [coulomb()]}, ("contacts[0] is a Coulomb",)),
+        ({"bcs": bcs[0]}, ("bcs is a single DirichletBC", "bcs=[...]")),
+        ({"bcs": [*bcs, 0]}, (f"bcs[{len(bcs)}] is a int",)),
+        ({"petsc_options": "-snes_monitor"}, ("petsc_options is a str", "Mapping")),
+        ({"prefix": None}, ("prefix is a NoneType",)),
+        ({"method": ["newton"]}, ("method is ['newton']",)),
+    ):
+        call = {"bcs": bcs, "contacts": [contact]} | arguments
+        raised_everywhere(
+            lambda c=call: fc.ContactProblem(scene.F, scene.u, **c), ValueError, *words
+        )
+    raised_everywhere(lambda: fc.ContactProblem(scene.u, scene.F), ValueError, "u is a Form")
+
+
+def test_arguments_of_a_surface():
+    """Mesh and tags swapped, facets for tags, a tag that is no whole number."""
+    scene = pressed()
+    mesh, tags = scene.mesh, scene.tags
+    for arguments, word in (
+        ((tags, mesh, BOTTOM), "mesh is a MeshTags"),
+        ((mesh, tags.find(BOTTOM), BOTTOM), "facet_tags is a ndarray"),
+        ((mesh, tags, "bottom"), "tags is 'bottom'"),
+        ((mesh, tags, 1.5), "tags is 1.5"),
+        ((mesh, tags, None), "tags is None"),
+        ((mesh, tags, []), "Γc is empty"),
+    ):
+        raised_everywhere(lambda a=arguments: fc.ContactSurface(*a), ValueError, word)
+    for body, word in (((TOP, tags), "facet_tags is a int"), ((tags, "top"), "tags is 'top'")):
+        support = fc.DeformableBody(*body)
+        raised_everywhere(lambda s=support: scene.contact(coulomb(), support=s), ValueError, word)
+    raised_everywhere(lambda: fc.DeformableBody(tags, TOP, reach="far"), ValueError, "reach is 'f")
+
+
+@pytest.mark.parametrize("degree", [2.5, 2.0, "2", True, 0, -1])
+def test_quadrature_degree(degree):
+    """A degree is a whole number from 1."""
+    scene = pressed()
+    raised_everywhere(
+        lambda: fc.ContactSurface(scene.mesh, scene.tags, BOTTOM, quadrature_degree=degree),
+        ValueError,
+        f"quadrature_degree is {degree!r}",
+        "whole number",
+    )
+
+
+def test_numbers_of_supports():
+    """Texts for numbers in points, radii and forces; no list where one is wanted."""
+    scene = pressed()
+    for support, word in (
+        (fc.HalfSpace("origin", (0, 1)), "point of the HalfSpace is 'origin'"),
+        (fc.HalfSpace((0, "0"), (0, 1)), "point of the HalfSpace is (0, '0')"),
+        (fc.Ball((0, -1), "1"), "radius of the Ball is '1'"),
+        (scene.floor(displacement=fc.Motion(5.0)), "Motion has 0 forces"),
+        (scene.floor(displacement=fc.Motion((None, "5"))), "force 1 of the Motion is '5'"),
+    ):
+        raised_everywhere(
+            lambda s=support: scene.contact(coulomb(), support=s), (ValueError, TypeError), word
+        )
+    raised_everywhere(
+        lambda: fc.elasticity.LinearElastic(scene.u, "E", 0.3, "plane strain"),
+        ValueError,
+        "E is 'E",
+    )
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_support_turned_round(held, caplog):
+    """The normal of a floor points down, a ball is outside of what it should surround.
+
+    The body is inside: refused. A floor that just touches is one that the body leaves: warned.
+    """
+    scene = pressed()
+    bcs = [*scene.rollers(), scene.hold(TOP, 1)] if held else scene.rollers()
+    for support in (fc.HalfSpace((0, -0.5), (0, -1)), fc.Ball((0.5, 0.5), 2.0)):
+        raised_everywhere(
+            lambda s=support: scene.problem(coulomb(), bcs, contact={"support": s}),
+            ValueError,
+            "contact: the normal from the body to the support points into the body",
+            "inside of the support",
+        )
+    with caplog.at_level("WARNING", logger="fenics_contact"):
+        scene.problem(coulomb(), bcs, contact={"support": fc.HalfSpace((0, 0), (0, -1))})
+    assert ("points into the body" in caplog.text) == (COMM.rank == 0)
+    caplog.clear()
+    scene.problem(coulomb(), bcs, contact={"support": fc.Ball((0.5, 0.5), 2.0, inside=True)})
+    assert "points into the body" not in caplog.text
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="starts a process of its own")
+@pytest.mark.parametrize("version", ["0.8.0", "0.5.2.dev0"])
+def test_a_release_that_is_too_old(version):
+    """One sentence at import, with what to do."""
+    script = f"import dolfinx; dolfinx.__version__ = {version!r}; import fenics_contact"
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True)
+    last = done.stderr.strip().splitlines()[-1]
+    assert "ImportError: fenics_contact needs DOLFINx 0.9 or later" in last and version in last
 
 
 # ---- the form ------------------------------------------------------------------------------------
@@ -779,7 +924,7 @@ def test_unknown_method():
     )
 
 
-@pytest.mark.parametrize("value", [-0.1, 1.1, np.nan])
+@pytest.mark.parametrize("value", [-0.1, 1.1, np.nan, "1"])
 @pytest.mark.parametrize("name", ["alpha", "phi"])
 def test_shares_out_of_range(name, value):
     """α and φ are shares, 0 to 1 (section 5)."""

@@ -1,0 +1,56 @@
+"""Checks of arguments, before any work: an error that says what was given and what is expected."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+__all__ = ["check_instance", "is_number", "listed"]
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a real number, of Python or NumPy; a text or a truth value is none."""
+    if not isinstance(value, int | float | np.number | np.ndarray):
+        return False
+    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
+
+
+def check_instance(name: str, value: Any, kind: type, advice: str = "") -> None:
+    """Refuse what is of another class.
+
+    Args:
+        name: Of the argument.
+        value: What was given.
+        kind: The class.
+        advice: What to do, at the end of the message.
+
+    Raises:
+        ValueError: It names the argument, what it is, and what it must be.
+    """
+    if isinstance(value, kind):
+        return
+    advice = f"; {advice}" if advice else ""
+    if isinstance(value, type) and issubclass(value, kind):
+        made = value.__name__
+        raise ValueError(f"{name} is the class {made}; give an object of it, {made}(...){advice}")
+    raise ValueError(f"{name} is a {type(value).__name__}; it must be a {kind.__name__}{advice}")
+
+
+def listed(name: str, values: Iterable[Any], kind: type) -> list[Any]:
+    """The values as a list, all of them of the class.
+
+    Raises:
+        ValueError: They are not; it says what was given.
+    """
+    if isinstance(values, kind):
+        raise ValueError(f"{name} is a single {kind.__name__}; give a list, {name}=[...]")
+    if not isinstance(values, Iterable):
+        raise ValueError(
+            f"{name} is {values!r}; it must be a list of {kind.__name__} objects, {name}=[...]"
+        )
+    found = list(values)
+    for i, value in enumerate(found):
+        check_instance(f"{name}[{i}]", value, kind)
+    return found
