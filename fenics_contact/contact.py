@@ -40,6 +40,8 @@ _ENFORCEMENTS = ("penalty", "augmented")
 _TOLERANCE = 1e-5
 # A direction with no more than this share across the normal counts as parallel to it.
 _PARALLEL = 1e-6
+# Deviation of a gap's slope along the normal from -1 with which it is no distance.
+_NO_DISTANCE = 0.5
 # Share of the approach of two bodies that is no penetration between the points yet.
 _UNSEEN = 0.01
 # The size of the mesh times this is a penetration that is next to none, or one that no mesh has.
@@ -241,7 +243,8 @@ class Contact:
             placement = support.place(x, shift, lambda v: self._to_ufl("support", v))
         length = ufl.sqrt(ufl.dot(placement.direction, placement.direction))
         self._normal = placement.direction / length
-        self._gap = placement.gap
+        self._placement, self._gap = placement, placement.gap
+        self._evaluate_placement: PointEvaluator | None = None
         self.gap_prescribed = gap is not None
         if gap is not None:
             self._gap = self._scalar("gap", gap)
@@ -636,6 +639,14 @@ class Contact:
         vector.destroy()
         return self._reaction.array.reshape(-1, self._gdim).copy()
 
+    def felt(self, unknowns: PETSc.Vec) -> Array:
+        """Displacement relative to the support by a vector over the unknowns, (n_points, gdim).
+
+        Collective.
+        """
+        self._felt_map.mult(unknowns, self._reaction)
+        return self._reaction.array.reshape(-1, self._gdim).copy()
+
     def _update_jump(self) -> None:
         self._map.mult(self.u.x.petsc_vec, self._jump.x.petsc_vec)
         self._jump.x.scatter_forward()
@@ -856,6 +867,48 @@ class Contact:
         """Depth of evaluated points in the opposite, whatever gap is prescribed: (n_points,)."""
         depth = points["normal_displacement"] - self._distance.x.array[: self.quadrature.n_points]
         return np.where(self.paired, np.maximum(depth, 0.0), 0.0)
+
+    def own_displacement(self) -> Array:
+        """Of the body that has Γc, at the points, (n_points, gdim) (length). Collective."""
+        product = self._own_map.createVecLeft()
+        self._own_map.mult(self.u.x.petsc_vec, product)
+        values = product.array_r.reshape(-1, self._gdim).copy()
+        product.destroy()
+        return values
+
+    def relative_slide(self) -> Array:
+        """Tangential displacement since pairs were found, (n_points, gdim) (length)."""
+        jump, normal = self._values["jump"], self._values["normal"]
+        if self._paired_at is not None:
+            jump = jump - self.committed_jump
+        return jump - np.sum(jump * normal, axis=1)[:, None] * normal
+
+    def true_placement(self) -> tuple[Array, Array]:
+        """Gap and normal where the body has moved to: at X + u instead of X. Collective.
+
+        Returns:
+            Gap, (n_points,) (length): NaN where there is no opposite, and infinite where an
+            `Obstacle` says no distance that could be told at other places; and unit normals from
+            body to support, (n_points, gdim).
+        """
+        if not self.rigid:
+            return self.true_gap()
+        if self._evaluate_placement is None:
+            x = ufl.SpatialCoordinate(self.surface.mesh)
+            moved = ufl.variable(x + self._jump)
+            gap, direction = (
+                ufl.replace(e, {x: moved}) for e in (self._placement.gap, self._placement.direction)
+            )
+            normal = direction / ufl.sqrt(ufl.dot(direction, direction))
+            slope = ufl.dot(ufl.diff(gap, moved), normal)
+            self._evaluate_placement = PointEvaluator(
+                self.quadrature, {"gap": gap, "normal": normal, "slope": slope}
+            )
+        self._update_jump()
+        found = self._evaluate_placement()
+        # A distance falls along the normal as fast as one moves.
+        told = np.abs(found["slope"] + 1) < _NO_DISTANCE
+        return np.where(told, found["gap"], np.inf), found["normal"]
 
     def true_gap(self) -> tuple[Array, Array]:
         """Distances to the opposite in the bodies as they are displaced now, by a search anew.

@@ -21,6 +21,7 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.contact import Contact, Status
+from fenics_contact.motion import LinearSprings
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.problem import ContactProblem
 from fenics_contact.surface import PointEvaluator
@@ -239,58 +240,12 @@ def _displacement(problem: ContactProblem, state: Array) -> float:
 # ---- enforcement and solver ----------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Springs:
-    """A contact's springs at the present state, linearised with their status as it is.
-
-    Attributes:
-        stiffness: What the traction loses per displacement, (n_points, gdim, gdim).
-        stretch: Displacement that is in the springs because their stiffness stands for none at
-            all, as far as displacements of Γc can answer it, (n_points, gdim) (length).
-    """
-
-    stiffness: Array
-    stretch: Array
-
-    @classmethod
-    def of(cls, contact: Contact) -> _Springs:
-        law, values, status = contact.law, contact.values, contact.status
-        normal = values["normal"]
-        tangential, pressure = contact.tangential_traction, contact.pressure
-        closed = status != Status.OPEN
-        d = normal.shape[1]
-        stiffness = np.zeros((len(normal), d, d))
-        stretch = np.zeros_like(normal)
-        borne = contact.borne_by_springs()
-        if law.has_normal_stiffness:
-            # A slipping point's friction follows the pressure, unless its limit is given.
-            follows = closed & (status == Status.SLIP) & (pressure > 0) & (not law.has_potential)
-            ratio = np.where(follows, 1.0, 0.0) / np.where(pressure > 0, pressure, 1.0)
-            direction = normal - ratio[:, None] * tangential
-            k_n = np.where(closed, contact.normal_stiffness, 0.0)
-            stiffness += k_n[:, None, None] * np.einsum("qi,qj->qij", direction, normal)
-            along = -np.sum(borne * normal, axis=1)
-            stretch += (along / contact.normal_stiffness)[:, None] * normal
-        if law.has_tangential:
-            k_t, stick = contact.tangential_stiffness, status == Status.STICK
-            stiffness += np.where(stick[:, None, None], k_t, 0.0)
-            # K_t has no inverse along the normal, where nothing acts: any stiffness will do.
-            along = np.einsum("q,qi,qj->qij", values["parameter k_t"], normal, normal)
-            side = borne - np.sum(borne * normal, axis=1)[:, None] * normal
-            stretch -= np.linalg.solve(k_t + along, side[:, :, None])[:, :, 0]
-        return cls(stiffness, stretch)
-
-    def change(self, jump: Array) -> Array:
-        """Of the traction, by a change of the relative displacement, (n_points, gdim)."""
-        return -np.einsum("qij,qj->qi", self.stiffness, jump)
-
-
 def _linear_parts(
     problem: ContactProblem, values: Mapping[str, float]
 ) -> dict[str, dict[str, float]]:
     """What the springs and the residual that is left have changed in the quantities."""
     contacts = problem.contacts
-    springs = [_Springs.of(contact) for contact in contacts]
+    springs = [LinearSprings.of(contact) for contact in contacts]
     found = {}
 
     def differences(way: Array, shifts: list[Array]) -> dict[str, float]:

@@ -36,7 +36,8 @@ from fenics_contact.continuation import Continuation
 from fenics_contact.defaults import Defaults, take_command_line
 from fenics_contact.energy import Energy, EnergyState, Forces
 from fenics_contact.facets import facet_cells, local_facets
-from fenics_contact.parallel import fail_together, global_max, global_min, global_sum
+from fenics_contact.motion import Linearisation, linearisation
+from fenics_contact.parallel import fail_together, global_max, global_min, global_sum, warn
 from fenics_contact.quasi_newton import QuasiNewton
 from fenics_contact.rigid import RigidMotions
 from fenics_contact.spaces import WholeSpace
@@ -64,6 +65,8 @@ _FAR = 100.0
 _TOUCHING = 1e-12
 # Contact that bears less than this share of the load bears nothing yet.
 _IDLE = 1e-3
+# Share by which small displacements may change forces or pressures before it is said.
+_NOTABLE = 0.01
 # Increments expected where nothing is said.
 _EXPECTED = 4
 # Iterations of Newton's method without a lower residual after which another method takes over.
@@ -194,6 +197,7 @@ class ContactProblem:
         snes: The PETSc solver.
         accuracy: That of the contact that wants most, None if not every contact says one.
         increment: Number of committed increments.
+        kinematics: See the argument.
         initial_penetration: Largest penetration of the undeformed body (length), 0 if none; an
             interference by a prescribed gap is none.
     """
@@ -213,6 +217,7 @@ class ContactProblem:
         linear_solver: str | None = None,
         petsc_options: Mapping[str, Any] | None = None,
         prefix: str = "contact_",
+        kinematics: float = 0.2,
     ) -> None:
         """Compile the forms, measure the scales and check the input. Collective.
 
@@ -243,6 +248,9 @@ class ContactProblem:
             petsc_options: Options without prefix; they win over the method's, the command line
                 over both.
             prefix: Prefix of the options.
+            kinematics: Displacements are taken as small; an increment fails where that changes the
+                contact force or the largest pressure by more than this share, and is warned of from
+                a hundredth on. Infinite: it never fails.
 
         Raises:
             ValueError: Input that has no sense; the text says what and what to do. On all ranks.
@@ -311,6 +319,10 @@ class ContactProblem:
         self._rate: Array | None = None
         self._solved: _Solved | None = None
         self._cold = True
+        self.kinematics = kinematics
+        self._large: set[str] = set()
+        n_nodes = self.unknowns.first_motion / len(u)
+        self._cell_size = self._length / n_nodes ** (1 / len(u))
         self._watch = StatusWatch(self.contacts)
         self._round_rtol = 0.0
         self._condensation, self._linear_solver = condensation, linear_solver
@@ -844,6 +856,7 @@ class ContactProblem:
         verdict = self._judge_kept() if lags else self._judge_all()
         if reason <= 0 or verdict.failures:
             raise NotConverged(self.increment + 1, reason, verdict, rungs)
+        self._warn_of_large_motion(verdict)
         self._solved = _Solved(self._whole.state(), [c.found() for c in self.contacts])
         return Step(
             increment=self.increment + 1,
@@ -1180,8 +1193,60 @@ class ContactProblem:
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
             # Of the opposite only what Γc meets is known before u is complete.
             unseen=passing(self.contacts) if space is self._whole else {},
+            kinematics=self._linearisation(space) if laws else {},
+            kinematics_allowed=self.kinematics,
         )
         return verdict, reaction
+
+    def _linearisation(self, entered: WholeSpace) -> dict[str, Linearisation]:
+        """What taking displacements as small changes at the state judged, by contact. Collective.
+
+        To some digits: with the matrix factored last, which is the tangent near the solution.
+
+        Args:
+            entered: The space that the contacts speak of, now and afterwards.
+        """
+        if not self.contacts:
+            return {}
+        space, consistent = self._space, self._consistent or True in self._matrices
+        modulus = self.bulk.scale * self._cell_size ** (2 - len(self.u))
+
+        def respond(tractions: Sequence[Array]) -> list[Array]:
+            space.enter()
+            right, left = space.vector(), space.vector()
+            ksp = PETSc.KSP().create(self._comm)
+            try:
+                if consistent not in self._matrices:  # nothing was iterated yet
+                    self._assemble_matrix(self._matrix(consistent), self._tangents())
+                for contact, traction in zip(self.contacts, tractions, strict=True):
+                    contact.add_force(right, traction)
+                right.array[space.constrained] = 0.0
+                right.scale(-1.0 / self.bulk.scale)
+                ksp.setOperators(self._matrix(consistent))
+                ksp.setType(PETSc.KSP.Type.GMRES)
+                ksp.setPC(self._solvers[consistent].getPC())
+                ksp.setTolerances(rtol=1e-2, max_it=30)
+                ksp.solve(right, left)
+                return [contact.felt(left) for contact in self.contacts]
+            finally:
+                entered.enter()
+                for item in (ksp, right, left):
+                    item.destroy()
+
+        return linearisation(self.contacts, modulus, respond)
+
+    def _warn_of_large_motion(self, verdict: Verdict) -> None:
+        """Say once of every contact that displacements are not small. Collective."""
+        for name, found in verdict.kinematics.items():
+            if found.worst > _NOTABLE and name not in self._large:
+                self._large.add(name)
+                warn(
+                    self._comm,
+                    f"{name}: displacements are taken as small, with gap and normals of the "
+                    "undeformed body; where it has moved to, the contact force would differ by "
+                    f"{100 * found.force:.2g} % and the largest pressure by "
+                    f"{100 * found.pressure:.2g} %",
+                )
 
     def _force_sums(
         self, space: WholeSpace, internal: Array, forces: Sequence[Array]

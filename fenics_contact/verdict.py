@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fenics_contact.contact import Contact
+from fenics_contact.motion import Linearisation
 from fenics_contact.parallel import collective_errors, global_max
 
 __all__ = ["NotConverged", "Rung", "Verdict", "check_laws"]
@@ -59,6 +60,8 @@ class Verdict:
         enforcement_tolerance: What passes, by name.
         unseen: How deep the opposite body passes through Γc between its points (length), and where,
             by the names of the contacts where it does; see `Contact.unseen_penetration`.
+        kinematics: What taking displacements as small changes, relative, by contact.
+        kinematics_allowed: What passes.
     """
 
     equations: dict[str, Balance]
@@ -67,6 +70,8 @@ class Verdict:
     enforcement: dict[str, float] = field(default_factory=dict)
     enforcement_tolerance: dict[str, float] = field(default_factory=dict)
     unseen: dict[str, tuple[float, list[float]]] = field(default_factory=dict)
+    kinematics: dict[str, Linearisation] = field(default_factory=dict)
+    kinematics_allowed: float = np.inf
 
     @property
     def residual(self) -> float:
@@ -127,6 +132,16 @@ class Verdict:
                     f"{contact}: penetration or elastic slip left, {error:.3e} of the largest "
                     f"traction in the springs, above {allowed:.3e}; a larger tolerance, or "
                     "k_n and k_t nearer to 10 E/h, take fewer rounds"
+                )
+        for contact, change in self.kinematics.items():
+            if not change.worst <= self.kinematics_allowed:
+                found.append(
+                    f"{contact}: displacements are too large to be taken as small: with gap and "
+                    "normals where the body has moved to, the contact force would differ by "
+                    f"{100 * change.force:.2g} % and the largest pressure by "
+                    f"{100 * change.pressure:.2g} %, above {100 * self.kinematics_allowed:.2g} %; "
+                    "load in smaller steps, describe the motion as one of the support, find pairs "
+                    'anew (update="increment"), or accept it: ContactProblem(kinematics=inf)'
                 )
         for contact, (depth, place) in self.unseen.items():
             found.append(

@@ -1,0 +1,122 @@
+"""Displacements are taken as small: what that leaves out is told, warned of, and refused.
+
+The reference is the same scene with the other one moved: to drag the support is exact, since its
+gap and normals are those of where it is; to drag the body as far the other way is not.
+"""
+
+import warnings
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from scenes import TOP, at_points, block, close
+
+import fenics_contact as fc
+
+COMM = MPI.COMM_WORLD
+RADIUS, DEPTH = 4.0, 0.05
+
+pytestmark = pytest.mark.mpi
+
+
+def pressed(cell="quadrilateral", *, body=0.0, support=0.0, kinematics=np.inf, **options):
+    """A block on a cylinder or ball, pressed down by a prescribed way, one of them moved along x."""
+    scene = block(cell, n=8 if cell == "quadrilateral" else 3, size=(2.0,) * options.pop("d", 2))
+    d = scene.dim
+    center = np.full(d, 1.0)
+    center[-1] = -RADIUS
+    motion = np.zeros(d)
+    motion[0] = support
+    ball = fc.Ball(center, RADIUS, displacement=motion)
+    bcs = [scene.hold(TOP, d - 1, -DEPTH), scene.hold(TOP, 0, body)]
+    if d == 3:
+        bcs.append(scene.hold(TOP, 1))
+    problem, contact = scene.problem(
+        fc.Frictionless(), bcs, contact={"support": ball}, kinematics=kinematics, **options
+    )
+    return problem, contact
+
+
+def solved(**scene):
+    problem, contact = pressed(**scene)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        step = problem.solve()
+    return step.verdict.kinematics["contact"], contact.resultants().force
+
+
+@pytest.mark.parametrize("options", [{}, {"condensation": False, "method": "lbfgs"}])
+@pytest.mark.parametrize("way", [0.05, 0.2])
+def test_what_dragging_the_body_leaves_out_is_told(way, options):
+    """The estimate is of the size of the difference to the support dragged, within a half of it."""
+    told, dragged = solved(body=-way, **options)
+    nearly, exact = solved(support=way, **options)
+    missing = np.abs(dragged - exact).max() / np.linalg.norm(dragged)
+    small = max(nearly.worst, told.force / 5)
+    assert 0.5 * (missing - small) <= told.force <= 2 * (missing + small)
+    assert missing > 0.005
+
+
+def test_a_flat_support_leaves_nothing_out():
+    """However far the body slides along it."""
+    scene = block("quadrilateral", n=4, up=-10.0)
+    problem, contact = scene.problem(fc.Coulomb(0.1), [scene.hold(TOP, 0, 30.0)])
+    step = problem.solve()
+    assert step.verdict.kinematics["contact"].worst <= 1e-12
+    _, normal = contact.true_placement()
+    assert close(at_points(contact, normal), at_points(contact, contact.values["normal"]), 1e-14)
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_the_true_gap(cell):
+    """Distance from the ball's surface at X + u, and the direction to its centre."""
+    d = 2 if cell == "quadrilateral" else 3
+    problem, contact = pressed(cell, d=d, body=0.3)
+    problem.u.interpolate(lambda x: np.stack([0.1 + 0.05 * x[0] - 0.02 * x[i] for i in range(d)]))
+    contact.evaluate()
+    gap, normal = contact.true_placement()
+    center = np.full(d, 1.0)
+    center[-1] = -RADIUS
+    x = contact.points
+    arm = x + np.stack([0.1 + 0.05 * x[:, 0] - 0.02 * x[:, i] for i in range(d)], axis=1) - center
+    length = np.linalg.norm(arm, axis=1)
+    assert close(at_points(contact, gap), at_points(contact, length - RADIUS), 1e-12)
+    assert close(at_points(contact, normal), at_points(contact, -arm / length[:, None]), 1e-12)
+
+
+def test_motion_that_is_not_small_fails():
+    problem, contact = pressed(body=-1.0, kinematics=0.2)
+    with pytest.raises(fc.NotConverged, match="too large to be taken as small"):
+        problem.solve()
+    assert close(contact.history.rows(), 0 * contact.history.rows(), 0.0, scale=1.0)
+
+
+def test_motion_that_is_hardly_small_is_warned_of_once():
+    problem, _ = pressed(body=-0.2, kinematics=0.5)
+    with pytest.warns(UserWarning, match="taken as small") as caught:
+        problem.solve()
+    problem.commit()
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        problem.solve()
+
+
+def test_small_motion_is_no_matter():
+    problem, _ = pressed(body=-1e-4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        step = problem.solve()
+    assert step.verdict.kinematics["contact"].worst < 0.01
+
+
+def test_an_obstacle_that_tells_no_distance():
+    """A gap given as a number of its own is not looked at elsewhere; its normal is."""
+    scene = block("quadrilateral", n=4, up=-10.0)
+    support = fc.Obstacle(0.0, (0.0, -1.0))
+    problem, contact = scene.problem(
+        fc.Frictionless(), scene.rollers(), contact={"support": support}
+    )
+    assert problem.solve().verdict.kinematics["contact"].worst == 0.0
+    gap, _ = contact.true_placement()
+    assert np.all(np.isinf(gap))
