@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import dolfinx.fem.petsc
 import numpy as np
@@ -117,6 +118,19 @@ class Bulk:
         if self.linear:
             self._fingerprint = fingerprint
         return True
+
+    @contextmanager
+    def present_stiffness(self) -> Iterator[PETSc.Mat]:
+        """The tangent at the present ``u`` and data; `stiffness` stays as it is. Collective."""
+        if self.is_current():
+            yield self.stiffness
+            return
+        matrix = fem.petsc.assemble_matrix(self._compiled_tangent)
+        matrix.assemble()
+        try:
+            yield matrix
+        finally:
+            matrix.destroy()
 
     def check_elastic(self) -> None:
         """Refuse a tangent without stiffness, after `update`.

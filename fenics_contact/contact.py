@@ -1166,6 +1166,34 @@ class Contact:
         if self.multipliers is not None:
             self.multipliers.restore(self.history)
 
+    def given(self) -> dict[str, Array]:
+        """The data of law, support and contact at this rank's points, by name. Collective.
+
+        What was evaluated before stays.
+        """
+        if self._tributary is not None:
+            self._tributary.update()
+        data = self._evaluate_points()
+        names = ["weight", "normal", "shift"]
+        if self.gap_prescribed or not self.pairs_anew:  # else it is that of the latest pairs
+            names.append("gap")
+        return {n: v for n, v in data.items() if n in names or n.startswith("parameter ")}
+
+    def take_up(self, history: Array, values: Mapping[str, Array]) -> None:
+        """Make a state of another run the committed one, at the u that it has. Collective.
+
+        Args:
+            history: `History.rows` of that run, with ``u`` and loads as they were in it.
+            values: Its `values`, for the results to be those of its solution.
+        """
+        self.history.set_rows(history)
+        if self.pairs_anew:
+            self.pair(self.u)
+        self.restore()
+        self.committed_jump = self._values["jump"]
+        if {n: v.shape for n, v in values.items()} == {n: v.shape for n, v in self._values.items()}:
+            self._points = dict(values)
+
     @property
     def _values(self) -> dict[str, Array]:
         if self._points is None:

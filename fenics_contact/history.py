@@ -15,7 +15,7 @@ __all__ = ["History"]
 
 
 class History:
-    """Named fields in one quadrature function, changed by `commit` and by nothing else.
+    """Named fields in one quadrature function, changed by `commit` and `set_rows` alone.
 
     Attributes:
         function: The function that holds all fields, for use in forms (a coefficient on the
@@ -41,6 +41,11 @@ class History:
     def __contains__(self, name: str) -> bool:
         """Whether there is such a field."""
         return name in self._slices
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the fields."""
+        return list(self._slices)
 
     def ufl(self, name: str) -> ufl.core.expr.Expr:
         """The field as a UFL scalar or vector, for use in forms."""

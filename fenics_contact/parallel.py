@@ -66,7 +66,8 @@ def collective_errors(comm: MPI.Comm) -> Iterator[None]:
 
     Raises:
         BaseException: The error of this rank, or else the same type and text as on the first rank
-            that raised (types that cannot be rebuilt from their text become RuntimeError).
+            that raised (those of OSError become that, and types that cannot be rebuilt from their
+            text RuntimeError).
     """
     if comm.size == 1:
         yield
@@ -85,6 +86,8 @@ def collective_errors(comm: MPI.Comm) -> Iterator[None]:
     if error is not None:
         raise error
     kind, text = first
+    if issubclass(kind, OSError):
+        raise OSError(text)
     raise (kind(text) if kind in (ValueError, TypeError) else RuntimeError(text))
 
 

@@ -463,8 +463,8 @@ class ContactProblem:
         """
         if increments < 1:
             raise ValueError(f"increments is {increments}; expect at least 1")
-        before, self._expected = self._expected, increments
-        if self._fresh and before != increments:
+        if self._fresh and self._expected != increments:
+            self._expected = increments
             chosen = self._choose_condensation(self._named_solvers)
             if chosen != self._condensed:
                 self._configure()
@@ -756,6 +756,8 @@ class ContactProblem:
             rank's unknowns. Collective.
         """
         self.complete()
+        # After a history that was taken up and is at its end nothing has been assembled yet.
+        self._update_space(self._update_bulk())
         self._predicts = False  # by the matrix that is about to be used
         space = self._space
         space.begin(self._load)
@@ -1317,40 +1319,102 @@ class ContactProblem:
         for contact in self.contacts:
             contact.restore()
 
+    # ---- going on in another run -----------------------------------------------------------------
+
     def committed_state(self) -> tuple[Array, Array]:
-        """This rank's unknowns at the last commit, and by how much that increment moved them.
+        """What another run needs of the last commit to go on from it. Collective.
 
-        Collective: u is completed, if it is behind.
+        u is completed, if it is behind.
+
+        Returns:
+            Rows over this rank's unknowns, (6, n_local): their values, by how much the last
+            increment moved them, internal and external forces at them (force), and masks of those
+            kept when condensed and of those with Dirichlet conditions; and two numbers: of
+            increments, and how many of them were expected.
+
+        Raises:
+            ValueError: The state is not that of the last commit.
         """
+        now = self._whole.state()
+        differs = self._behind is not self._committed_lag[0] or not np.array_equal(
+            now, self._committed
+        )
+        if self._comm.allreduce(int(differs)):
+            raise ValueError(
+                "u is not that of the last commit: a solved increment was not committed, or its "
+                "values were changed; call commit() or restore() before the state is saved"
+            )
         self.complete()
-        rate = np.zeros_like(self._committed) if self._rate is None else self._rate
-        return self._committed.copy(), rate.copy()
+        forces = self._committed_energy.forces[self._whole.mark]
+        kept = np.zeros(self.unknowns.n_local)
+        if self._condensed:
+            kept[self._space.unknowns.kept] = 1.0
+        rate = np.zeros_like(kept) if self._rate is None else self._rate
+        rows = (self._committed, rate, forces.internal, forces.external, kept, self._constrained)
+        numbers = np.array([self.increment, self._expected], dtype=np.float64)
+        return np.stack(rows).astype(np.float64), numbers
 
-    def set_committed(self, state: Array, rate: Array, increment: int) -> None:
-        """Take up a history where another run left it; the contacts' are set apart. Collective."""
-        self._committed, self._rate = state.copy(), rate.copy()
-        self._committed_lag = None, self._load
+    @contextmanager
+    def at_state(self, state: Array) -> Iterator[None]:
+        """Let unknowns be the present ones inside of the block. Collective."""
+        before = self._whole.state()
+        try:
+            self._whole.set_state(state)
+            yield
+        finally:
+            self._whole.set_state(before)
+
+    def present_load(self) -> Array:
+        """External forces as they are now at this rank's unknowns (force). Collective."""
+        return -self._whole.with_supports(self.bulk.update_load())
+
+    def prescribed_values(self) -> Array:
+        """Values of the Dirichlet conditions as they are now, u elsewhere, at the unknowns."""
+        values = self.u.x.array.copy()
+        for bc in self._bcs:
+            bc.set(values)
+        return self.unknowns.joined(values[: self._n_owned], np.zeros(self.unknowns.n_motions))
+
+    def set_committed(
+        self,
+        rows: Array,
+        numbers: Array,
+        points: Sequence[tuple[Array, Mapping[str, Array]]],
+    ) -> None:
+        """Take up what `committed_state` gave in another run, under its loads. Collective.
+
+        Args:
+            rows: What it gave.
+            numbers: Likewise.
+            points: Of every contact what `Contact.take_up` takes.
+        """
+        state, rate, internal, external, kept, _ = rows
+        increment, expected = (int(value) for value in numbers)
+        self.expect(expected)
+        self._fresh, self._solved = False, None
+        if self._condensed and kept.any():
+            self._set_space(np.flatnonzero(kept).astype(np.int32))
+            self.snes.reset()
         self.increment = increment
-        self._fresh = False
-        self.restore()
-        self.restart_solver()
-
-    def take_up_loads(self) -> None:
-        """Take the loads as they are now for those of the committed state. Collective."""
-        self._load = -self._whole.with_supports(self.bulk.update_load())
+        self._committed, self._rate = state.copy(), rate.copy() if increment else None
+        self._whole.set_state(state)
+        self._behind, self._load = None, self.present_load()
         self._committed_lag = None, self._load
         self._whole.begin(self._load)
-        for contact in self.contacts:
-            contact.evaluate()
-        bulk = self._whole.with_supports(self.bulk.assemble_residual())
-        _, reaction = self._judge(self._whole, bulk, laws=False)
-        forces: dict[object, Forces] = {self._whole.mark: self._whole.forces(bulk, reaction)}
-        self._energy = self._committed_energy = EnergyState.at(forces, self.contacts)
+        for contact, (history, values) in zip(self.contacts, points, strict=True):
+            contact.take_up(history, values)
+        forces: dict[object, Forces] = {self._whole.mark: Forces(state, internal, external)}
+        energy = EnergyState.at(forces, self.contacts)
+        self._energy = energy.between([c.committed_jump for c in self.contacts])
+        self._committed_energy = self._energy
+        self.restart_solver()
 
     def restart_solver(self) -> None:
         """Drop what the solver has kept from earlier increments. Collective."""
         self._space.forget()
         self._make_matrices()
+        for mark in set(self._committed_energy.forces) - {self._whole.mark}:
+            del self._committed_energy.forces[mark]
 
 
 def _facets_held(contact: Contact, constrained: Array) -> int:

@@ -391,6 +391,7 @@ def test_checkpoint(tmp_path: Path) -> None:
         law = fc.Coulomb(0.3, k_n=1e4, k_t=1e4)
         problem, contact = scene.problem(law, [], contact=AUGMENTED)
         if take_up:
+            scene.load(up=-10.0, side=1.0)
             checkpoint.load(problem, folder / "state.npz")
         else:
             scene.load(up=-10.0, side=1.0)
