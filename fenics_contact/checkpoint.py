@@ -499,7 +499,7 @@ def _compare_shapes(
     gdim, n_motions = len(problem.u), problem.unknowns.n_motions
     wanted: dict[str, tuple[int | None, ...]] = {
         "numbers": (None,),
-        "state": (4,),
+        "state": (2,),
         "motions": (6, n_motions),
         "nodes": (None, 8 * gdim),
         "stiffness": (2, 9),

@@ -116,7 +116,7 @@ class WholeSpace:
         """
         pairings, shares = self._shares.get(contact, (-1, np.zeros((0, 0))))
         if pairings != contact.pairings:
-            n = self.n_bodies - len(self.motions)
+            n, dofs = self.n_bodies - len(self.motions), self.label[: self.unknowns.n_dofs]
             shares = np.zeros((contact.quadrature.n_points, n))
             rows = contact.quadrature.point_rows()
             space = self.u.function_space
@@ -127,10 +127,10 @@ class WholeSpace:
                 # What of the bodies a point feels is what its traction acts on.
                 for b in range(n):
                     push = np.zeros(self.unknowns.n_local)
-                    push[: self.unknowns.n_dofs : len(self.u)] = (
-                        self.label[: self.unknowns.n_dofs : len(self.u)] == b
-                    )
-                    shares[:, b] = contact.at_points(push)[:, 0]
+                    push[: dofs.size : len(self.u)] = dofs[:: len(self.u)] == b
+                    felt = contact.at_points(push)[:, 0]
+                    # A point without an opposite feels none: a traction there would be left over.
+                    shares[contact.paired, b] = felt[contact.paired]
             self._shares[contact] = contact.pairings, shares
         return shares
 

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.mpi
 
 
 def pressed(cell="quadrilateral", *, body=0.0, support=0.0, kinematics=np.inf, **options):
-    """A block on a cylinder or ball, pressed down by a prescribed way, one of them moved along x."""
+    """A block on a cylinder or ball, pressed down by a prescribed way, one of them moved."""
     scene = block(cell, n=8 if cell == "quadrilateral" else 3, size=(2.0,) * options.pop("d", 2))
     d = scene.dim
     center = np.full(d, 1.0)
