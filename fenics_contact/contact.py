@@ -1262,6 +1262,19 @@ class Contact:
         jump, normal = self._values["jump"], self._values["normal"]
         return jump - np.sum(jump * normal, axis=1)[:, None] * normal
 
+    def slip_vector(self) -> Array:
+        """Slip Δu_t + K_t⁻¹ Δτ of the increment, as a vector, (n_points, gdim), in length.
+
+        Where the gap opens the way beyond what the springs give back counts, too.
+        """
+        values, normal = self._values, self._values["normal"]
+        along = np.einsum("q,qi,qj->qij", values["parameter k_t"], normal, normal)
+        change = (values["traction"] - values["old_traction"])[:, :, None]
+        return (
+            values["increment"]
+            + np.linalg.solve(self.tangential_stiffness + along, change)[:, :, 0]
+        )
+
     @property
     def slip_increment(self) -> Array:
         """Δβ of every mode since the last commit, shape (n_points, n_modes), in length."""

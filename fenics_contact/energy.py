@@ -32,6 +32,9 @@ class Energy:
         dissipation: Work of friction on the slip, ≥ 0.
         remainder: What of the work is in none of them: contact that changes within the increment
             (gets less with smaller increments), and springs let go where contact opens.
+        friction: Work of friction on the body by the mean of the tractions at both ends, on the
+            slip: negative where it brakes. Positive in one long increment where the slip turns
+            round within it, or where the state is none that smaller increments lead to.
         imbalance: Work minus elastic minus the work of all tractions on Γc: zero by equilibrium
             at both ends, up to the solver's tolerance.
     """
@@ -41,7 +44,14 @@ class Energy:
     springs: float
     dissipation: float
     remainder: float
+    friction: float
     imbalance: float
+
+    @property
+    def created(self) -> float:
+        """Share of the energy exchanged that friction has given instead of taken, 0 if none."""
+        exchanged = abs(self.work) + abs(self.elastic) + abs(self.springs)
+        return self.friction / exchanged if self.friction > 0 and exchanged > 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -101,8 +111,8 @@ class EnergyState:
         mark = next(mark for mark in self.forces if mark in before.forces)
         old, new = before.forces[mark], self.forces[mark]
         way = new.unknowns - old.unknowns
-        # Work, elastic, springs, dissipation, and work of the tractions.
-        sums = np.zeros(5)
+        # Work, elastic, springs, dissipation, work of the tractions, and that of friction.
+        sums = np.zeros(6)
         sums[0] = 0.5 * (old.external + new.external) @ way
         sums[1] = 0.5 * (old.internal + new.internal) @ way
         sums[2] = self.springs - before.springs
@@ -112,6 +122,12 @@ class EnergyState:
             sums[4] -= np.sum(mean * (here[1] - there[1]))
             if contact.law.has_friction:
                 sums[3] += contact.measure @ contact.values["dissipated"]
-        work, elastic, springs, dissipation, tractions = (float(v) for v in global_sum(comm, sums))
+                # Tractions before are those of the commit, not multipliers in their place.
+                normal = contact.values["normal"]
+                along = np.sum(mean * normal, axis=1)[:, None] * normal
+                sums[5] += np.sum((mean - along) * contact.slip_vector())
+        total = (float(v) for v in global_sum(comm, sums))
+        work, elastic, springs, dissipation, tractions, friction = total
         remainder = work - elastic - springs - dissipation
-        return Energy(work, elastic, springs, dissipation, remainder, work - elastic - tractions)
+        imbalance = work - elastic - tractions
+        return Energy(work, elastic, springs, dissipation, remainder, friction, imbalance)

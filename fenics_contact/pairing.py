@@ -359,8 +359,8 @@ class Opposite:
         facets, comm = side.facets, self._comm
         n = len(facets.cells)
         facet, place = facets.corners()
-        normal = facets.normals(facet, place).reshape(n, -1, self._d)[:, :-1]
         corners = facets.moved_corners(None)
+        normal = facets.normals(facet, place).reshape(n, corners.shape[1] + 1, self._d)[:, :-1]
         size = np.linalg.norm(corners - corners.mean(axis=1)[:, None], axis=2).max(axis=1)
         vertex = np.concatenate(comm.allgather(facets.corner_vertices()))
         normal, size = gather_rows(comm, normal), gather_rows(comm, size)

@@ -572,6 +572,7 @@ class ContactProblem:
     def _forget_matrices(self) -> None:
         """Drop the matrices of H₀ and of the consistent tangent. Collective."""
         self._matrices: dict[bool, PETSc.Mat] = {}
+        self._filled: set[bool] = set()
         for ksp in self._solvers.values():
             ksp.reset()
         self._rounds.forget()
@@ -683,6 +684,7 @@ class ContactProblem:
             contacts: Contact's part, used up.
         """
         self._factorisations += self._space.fill(matrix, self._bulk_matrix, contacts)
+        self._filled |= {c for c, m in self._matrices.items() if m.handle == matrix.handle}
 
     def _tangents(self) -> Iterator[PETSc.Mat]:
         return (contact.tangent_matrix() for contact in self.contacts)
@@ -858,6 +860,10 @@ class ContactProblem:
         verdict = self._judge_kept() if lags else self._judge_all()
         if reason <= 0 or verdict.failures:
             raise NotConverged(self.increment + 1, reason, verdict, rungs)
+        energy = self._energy.since(self._committed_energy, self.contacts, self._comm)
+        verdict = replace(verdict, created=energy.created)
+        if verdict.failures:
+            raise NotConverged(self.increment + 1, reason, verdict, rungs)
         self._warn_of_large_motion(verdict)
         self._solved = _Solved(self._whole.state(), [c.found() for c in self.contacts])
         return Step(
@@ -869,7 +875,7 @@ class ContactProblem:
             factorisations=self._factorisations,
             verdict=verdict,
             contacts={c.name: c.resultants() for c in self.contacts},
-            energy=self._energy.since(self._committed_energy, self.contacts, self._comm),
+            energy=energy,
             rungs=tuple(rungs),
             wall_seconds=time.perf_counter() - start,
             complete=not lags,
@@ -1210,7 +1216,7 @@ class ContactProblem:
         """
         if not self.contacts:
             return {}
-        space, consistent = self._space, self._consistent or True in self._matrices
+        space, consistent = self._space, self._consistent or self._filled != {False}
         modulus = self.bulk.scale * self._cell_size ** (2 - len(self.u))
 
         def respond(tractions: Sequence[Array]) -> list[Array]:
@@ -1218,7 +1224,7 @@ class ContactProblem:
             right, left = space.vector(), space.vector()
             ksp = PETSc.KSP().create(self._comm)
             try:
-                if consistent not in self._matrices:  # nothing was iterated yet
+                if consistent not in self._filled:  # nothing was iterated yet
                     self._assemble_matrix(self._matrix(consistent), self._tangents())
                 for contact, traction in zip(self.contacts, tractions, strict=True):
                     contact.add_force(right, traction)

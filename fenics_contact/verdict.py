@@ -15,6 +15,9 @@ __all__ = ["NotConverged", "Rung", "Verdict", "check_laws"]
 
 # The laws hold point by point up to rounding of their few operations.
 _LAW_TOLERANCE = 1e-10
+# Share of the energy exchanged that friction may seem to give, by the mean of the tractions at both
+# ends of an increment in which the slip turns round.
+_CREATED = 0.05
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,7 @@ class Verdict:
             by the names of the contacts where it does; see `Contact.unseen_penetration`.
         kinematics: What taking displacements as small changes, relative, by contact.
         kinematics_allowed: What passes.
+        created: Share of the energy exchanged that friction has given; see `Energy.created`.
     """
 
     equations: dict[str, Balance]
@@ -72,6 +76,7 @@ class Verdict:
     unseen: dict[str, tuple[float, list[float]]] = field(default_factory=dict)
     kinematics: dict[str, Linearisation] = field(default_factory=dict)
     kinematics_allowed: float = np.inf
+    created: float = 0.0
 
     @property
     def residual(self) -> float:
@@ -133,6 +138,12 @@ class Verdict:
                     f"traction in the springs, above {allowed:.3e}; a larger tolerance, or "
                     "k_n and k_t nearer to 10 E/h, take fewer rounds"
                 )
+        if not self.created <= _CREATED:
+            found.append(
+                f"friction would drive the slip, by {100 * self.created:.2g} % of the energy "
+                "exchanged: another state than smaller increments lead to, where several satisfy "
+                "the equations; use smaller ones (increments() cuts them by itself)"
+            )
         for contact, change in self.kinematics.items():
             if not change.worst <= self.kinematics_allowed:
                 found.append(

@@ -1,0 +1,96 @@
+"""Among several equilibria with friction: the one that smaller increments lead to.
+
+A wedge of half-angle atan(0.2) between walls with μ = 0.5 is self-locking: pressed in and let go it
+stays, and the walls still press on it. In one increment its equations have another solution, too:
+out of the walls, without any force. The reference is the same history in eight increments.
+"""
+
+import warnings
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from scenes import LEFT, RIGHT, block, close
+
+import fenics_contact as fc
+
+COMM = MPI.COMM_WORLD
+PRESS = 10.0
+
+pytestmark = pytest.mark.mpi
+
+
+def wedge(**options):
+    """Wedge between an upright wall and one that leans, held by friction alone."""
+    scene = block("quadrilateral", n=6)
+    x = scene.mesh.geometry.x
+    x[:, 0] *= 1 + 0.2 * x[:, 1]
+    contacts = [
+        fc.Contact(
+            scene.u,
+            fc.ContactSurface(scene.mesh, scene.tags, tag),
+            fc.HalfSpace(point, normal),
+            fc.Coulomb(0.5),
+            name=name,
+        )
+        for name, tag, point, normal in (
+            ("upright", LEFT, (0, 0), (1, 0)),
+            ("leaning", RIGHT, (1, 0), (-1, 0.2)),
+        )
+    ]
+    problem = fc.ContactProblem(scene.F, scene.u, contacts=contacts, kinematics=np.inf, **options)
+    return scene, problem, contacts
+
+
+def released(steps, **options):
+    """Pressed in by one increment and let go in a number of them: normal forces at the end."""
+    scene, problem, contacts = wedge(**options)
+
+    def load(share):
+        scene.load(up=-PRESS * share)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        list(fc.increments(problem, load, 0.0, 1.0))
+        taken = list(fc.increments(problem, load, 1.0, 0.0, steps=steps))
+    return np.array([c.resultants().normal_force for c in contacts]), taken
+
+
+@pytest.mark.parametrize("method", [None, "newton", "continuation"])
+def test_a_locked_wedge_stays(method):
+    """Let go in one increment that is cut where it pops out: the force of eight, within 2 %."""
+    expected, steps = released(8)
+    assert len(steps) == 8 and np.all(expected > 5.0)
+    found, _ = released(1, method=method)
+    assert close(found, expected, 0.02)
+
+
+def test_popping_out_is_no_solution():
+    """Without increments to cut it is refused, with the reason, and u and history stay."""
+    scene, problem, contacts = wedge(method="newton")
+    scene.load(up=-PRESS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        problem.solve()
+        problem.commit()
+        before = [c.history.rows() for c in contacts]
+        scene.load()
+        with pytest.raises(fc.NotConverged, match="friction would drive the slip"):
+            problem.solve()
+    for contact, rows in zip(contacts, before, strict=True):
+        assert close(contact.history.rows(), rows, 0.0)
+
+
+def test_friction_takes_energy():
+    """It brakes in every increment of a cycle of pressing, letting go and pressing again.
+
+    Where slip turns round within an increment the mean of the tractions does not see it: 1 %.
+    """
+    scene, problem, _ = wedge()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        for share in (0.5, 1.0, 0.75, 0.5, 0.25, 0.0, 0.5, 1.0):
+            scene.load(up=-PRESS * share)
+            step = problem.solve()
+            problem.commit()
+            assert step.energy.created == step.verdict.created <= 0.01
