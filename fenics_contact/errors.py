@@ -1,4 +1,4 @@
-"""How wrong a solution is, part by part: enforcement, discretisation, increments, solver.
+"""How wrong a solution is, by parts: enforcement, mesh, increments, kinematics, solver.
 
 Each part is estimated apart, in the unit that a user looks at: contact force, peak pressure and
 displacement. Enforcement and solver are what one more step would change, from a linear solve with
@@ -21,7 +21,7 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.contact import Contact, Status
-from fenics_contact.motion import LinearSprings
+from fenics_contact.motion import Deviation, LinearSprings
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.problem import ContactProblem
 from fenics_contact.surface import PointEvaluator
@@ -36,6 +36,7 @@ _REMEDIES = {
     "enforcement": "a higher k_n and k_t",
     "discretisation": "a finer mesh at the contact, or a higher degree",
     "increments": "more increments",
+    "kinematics": "a motion of the support instead of the body, or pairs found anew,",
     "solver": "a smaller snes_rtol",
 }
 
@@ -53,9 +54,9 @@ class ErrorBudget:
             and "peak pressure" (stress), after the contact's name where there are several; and
             "displacement", that of the loads along themselves (length), or without loads the
             largest one.
-        parts: Estimates "enforcement", "discretisation", "increments" and "solver": absolute
-            errors by quantity, signed as value minus truth where a sign is known. A part that
-            could not be told has no entry.
+        parts: Estimates "enforcement", "discretisation", "increments", "kinematics" (what taking
+            displacements as small leaves out) and "solver": absolute errors by quantity, signed as
+            value minus truth where a sign is known. A part that could not be told has no entry.
         wanted: The relative error that the contacts' ``accuracy`` stands for, if it was said.
         h: Mean size of the facets of the contacts that bear pressure (length).
         across: How many of these facets there are in a row, about: their number in two dimensions,
@@ -260,6 +261,13 @@ def _linear_parts(
         # that forces are made of.
         way = solve([s.change(s.stretch) for s in springs])
         found["enforcement"] = differences(way, [s.stretch for s in springs])
+        deviations = [Deviation.of(contact) for contact in contacts]
+        triples = zip(deviations, contacts, springs, strict=True)
+        added = [d.turned(c) + s.change(d.shift(c)) for d, c, s in triples]
+        way = solve(added)
+        triples = zip(added, contacts, springs, strict=True)
+        changes = [t + s.change(c.at_points(way)) for t, c, s in triples]
+        found["kinematics"] = _differences(problem, values, changes, way)
     return found
 
 

@@ -57,7 +57,7 @@ def test_enforcement_of_uniform_pressure(cell, degree, method):
     found = budget(scene, problem)
     assert close(found.parts["enforcement"]["displacement"], p / k, 1e-8)
     size = found.values
-    for part in ("enforcement", "discretisation", "solver"):
+    for part in ("enforcement", "discretisation", "kinematics", "solver"):
         for name in ("normal force", "peak pressure"):
             assert abs(found.parts[part][name]) <= 1e-8 * size[name], (part, name)
     assert abs(found.parts["discretisation"]["displacement"]) <= 1e-8 * size["displacement"]
@@ -149,7 +149,7 @@ def test_nothing_is_changed():
         made.problem.commit()
         if made is asked:
             again = budget(made.scene, made.problem)
-            assert set(again.parts) == {"enforcement", "discretisation", "solver"}
+            assert set(again.parts) == {"enforcement", "discretisation", "kinematics", "solver"}
         made.load(1.0)
         made.problem.solve()
     assert close(nodal(asked.scene.u), nodal(plain.scene.u), 1e-9)
@@ -169,13 +169,13 @@ def test_the_same_before_and_after_the_commit():
 
 
 def test_the_table():
-    """Four lines, one for each part, and what dominates; several contacts by name."""
+    """Five lines, one for each part, and what dominates; several contacts by name."""
     made = Press(k=1e3)
     step = made.solved(estimate=True)
     found = budget(made.scene, made.problem, increments=step.increment_error)
     lines = str(found).splitlines()
-    assert [line.split()[0] for line in lines[1:5]] == list(found.parts)
-    assert found.dominant in lines[5]
+    assert [line.split()[0] for line in lines[1:6]] == list(found.parts)
+    assert found.dominant in lines[6]
     total = found.total["normal force"]
     squares = [found.relative(p)["normal force"] ** 2 for p in found.parts]
     assert close(total, np.sqrt(sum(squares)), 1e-14)

@@ -9,7 +9,7 @@ import warnings
 import numpy as np
 import pytest
 from mpi4py import MPI
-from scenes import TOP, at_points, block, close
+from scenes import TOP, at_points, block, close, stress
 
 import fenics_contact as fc
 
@@ -120,3 +120,21 @@ def test_an_obstacle_that_tells_no_distance():
     assert problem.solve().verdict.kinematics["contact"].worst == 0.0
     gap, _ = contact.true_placement()
     assert np.all(np.isinf(gap))
+
+
+def test_the_error_budget_has_it():
+    """Its line for the normal force is the difference to the support dragged, within a third."""
+
+    def solved(**scene):
+        problem, contact = pressed(**scene)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            problem.solve()
+        return problem, contact.resultants().normal_force
+
+    problem, dragged = solved(body=-0.1)
+    _, exact = solved(support=0.1)
+    plane = stress(problem.u, 1000.0, 0.3)
+    told = fc.estimate_errors(problem, plane).parts["kinematics"]["normal force"]
+    assert close(told, dragged - exact, 1 / 3)
+    assert abs(dragged - exact) > 1e-3 * exact
