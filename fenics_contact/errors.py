@@ -265,8 +265,8 @@ def _linear_parts(
         triples = zip(deviations, contacts, springs, strict=True)
         added = [d.turned(c) + s.change(d.shift(c)) for d, c, s in triples]
         way = solve(added)
-        triples = zip(added, contacts, springs, strict=True)
-        changes = [t + s.change(c.at_points(way)) for t, c, s in triples]
+        tractions = zip(added, contacts, springs, strict=True)
+        changes = [t + s.change(c.at_points(way)) for t, c, s in tractions]
         found["kinematics"] = _differences(problem, values, changes, way)
     return found
 

@@ -32,7 +32,7 @@ _FELT = 1e-10
 _BALANCED = 1e-8
 # Directions by which the friction cone is enclosed in space: a polygon around the circle, so that a
 # balance that exists is never denied.
-_CONE_SIDES = 8
+_CONE_SIDES = 64
 
 
 class RigidMotions:
@@ -84,7 +84,7 @@ class RigidMotions:
         none, still = np.zeros(len(supports)), np.zeros(unknowns.n_dofs)
         of_supports = [unknowns.joined(still, row) for row in np.eye(len(supports))]
         self._modes = np.array([unknowns.joined(mode, none) for mode in modes] + of_supports)
-        self.free = np.zeros((0, len(modes)))
+        self.free: Array = np.zeros((0, len(modes)))
         self._free_fields: Array = np.zeros((0, unknowns.n_local))
         self._balanced: list[Array] = []
         # Counts of pairings, and masks of points that were found to hold all motions.
@@ -114,7 +114,7 @@ class RigidMotions:
         values, vectors = np.linalg.eigh((energy + energy.T) / 2 * np.outer(scale, scale))
         free = agreed(self._comm, (vectors * scale[:, None])[:, values < _FREE])
         self._jumps.clear()
-        self.free = (free / np.abs(free).max(axis=0)).T if free.size else free.T
+        self.free = _plain(free.T)
         self._free_fields = self.free @ self._modes
         self._balanced = []
         self._holding = [], []
@@ -274,12 +274,22 @@ class RigidMotions:
         if len(rays):
             rest *= agreed(self._comm, _unbalanced(rays.T, -resultant / rest))
         if rest > _BALANCED * max(size, np.abs(resultant).max()):
+            scale = np.abs(resultant).max()
+            limits = scale * agreed(self._comm, _borne(rays.T, -resultant / scale))
+            size = max(size, scale)
+            beyond = [i for i, r in enumerate(resultant) if abs(r) > limits[i] + _BALANCED * size]
+            said = [
+                f"({self._describe(self.free[i])}) is {resultant[i]:.6g}, of which contact can "
+                f"bear at most {limits[i]:.6g} with the rest as it is"
+                for i in beyond
+            ]
             worst = int(np.argmax(np.abs(resultant)))
+            said = said or [f"({self._describe(self.free[worst])}) is {resultant[worst]:.6g}"]
             raise ValueError(
                 "no contact force can balance the load: its resultant along the free motion "
-                f"({self._describe(self.free[worst])}) is {resultant[worst]:.6g}, and the contact "
-                "can only push along its normals and rub within the friction cone. Check the sign "
-                "of the load and of the normals, or add a Dirichlet condition"
+                f"{', and along '.join(said)}. Contact can only push along its normals and rub "
+                "within the friction cone. Check the sign and size of the load, and the normals, "
+                "or add a Dirichlet condition"
             )
         self._balanced = data
 
@@ -336,6 +346,47 @@ def _unbalanced(rays: Array, resultant: Array) -> float:
     )
     # What the programme cannot tell is left to the solution itself to show.
     return float(found.fun) if found.status == 0 else 0.0
+
+
+def _borne(rays: Array, wanted: Array) -> Array:
+    """How much of each component of a force rays can make, all others as wanted, (n_free,).
+
+    Of the sign that is wanted; NaN where the others alone cannot be made.
+
+    Args:
+        rays: (n_free, n_rays) of unit length.
+        wanted: The force, (n_free,).
+    """
+    found = np.full(len(wanted), np.nan)
+    if not rays.size:
+        return found
+    for i, value in enumerate(wanted):
+        rest = np.where(np.arange(len(wanted)) == i, 0.0, wanted)
+        along = np.zeros((len(wanted), 1))
+        along[i] = -1.0 if value >= 0 else 1.0
+        cost = np.append(np.zeros(rays.shape[1]), -1.0)
+        made = scipy.optimize.linprog(cost, A_eq=np.hstack([rays, along]), b_eq=rest)
+        if made.status == 0:
+            found[i] = made.x[-1]
+    return found
+
+
+def _plain(rows: Array) -> Array:
+    """The same space, each row with a 1 where all others have none: as few names as can be."""
+    rows = rows.copy()
+    done: list[int] = []
+    for _ in range(len(rows)):
+        open_rows = [i for i in range(len(rows)) if i not in done]
+        part = np.abs(rows[open_rows])
+        i, j = np.unravel_index(np.argmax(part), part.shape)
+        pivot = open_rows[int(i)]
+        rows[pivot] /= rows[pivot, j]
+        for other in range(len(rows)):
+            if other != pivot:
+                rows[other] -= rows[other, j] * rows[pivot]
+        done.append(pivot)
+    rows[np.abs(rows) < _FELT] = 0.0
+    return rows / np.abs(rows).max(axis=1, initial=1.0)[:, None] if rows.size else rows
 
 
 def rigid_motions(arm: Array, size: float) -> dict[str, Array]:

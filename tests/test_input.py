@@ -977,3 +977,16 @@ def test_reductions_over_ranks():
     assert np.isnan(parallel.global_min(COMM, bad))
     rows = parallel.gather_rows(COMM, np.full((COMM.rank + 1, 2), float(COMM.rank)))
     assert rows.shape == (COMM.size * (COMM.size + 1) // 2, 2)
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_load_beyond_friction(cell):
+    """Pushed along by 1 to 8 % more than μN: both are named. What friction can bear is solved."""
+    friction, pressure = 0.3, 2.0
+    words = ["balance", "translation along x", "at most 0.6"]
+    for over in (1.01, 1.08):
+        scene = block(cell, up=-pressure, side=over * friction * pressure)
+        told = [*words, f"{over * friction * pressure:.6g}"]
+        raised_everywhere(build_and_solve(scene, coulomb(friction), []), ValueError, *told)
+    scene = block(cell, up=-pressure, side=0.99 * friction * pressure)
+    assert build_and_solve(scene, coulomb(friction), [])().verdict.failures == []
