@@ -25,6 +25,7 @@ from bodies import Bodies, _tagged, boxes
 
 import fenics_contact as fc
 from fenics_contact import output
+from fenics_contact.verdict import check_laws
 
 COMM = MPI.COMM_WORLD
 BOTH = 40
@@ -297,7 +298,7 @@ def test_a_prescribed_gap_over_an_edge(cell, name, enforcement):
     for lift in (-0.002, 0.001):
         body.lift.value = lift
         step = problem.solve()
-        r = step.contacts["contact" if "contact" in step.contacts else "joint 1"]
+        r = step.contacts["joint 1"]
         support = reaction(body, ROOF)
         assert np.abs(support).max() > 1.0
         assert close(r.force, -support, 1e-7)
@@ -323,21 +324,14 @@ def test_a_prescribed_gap_over_an_edge(cell, name, enforcement):
         pressure = fields["pressure"]
         cells = np.flatnonzero(empty[fields["unpaired"].function_space.dofmap.list[:, 0]])
         dofs = pressure.function_space.dofmap.list[cells]
-        assert np.abs(pressure.x.array[dofs]).max(initial=0.0) <= 1e-9 * contact_scale(contact)
+        assert np.abs(pressure.x.array[dofs]).max(initial=0.0) <= 1e-9 * max(r.max_pressure, 1.0)
         problem.commit()
     budget = fc.estimate_errors(problem, body.stress)
     assert all(np.isfinite(v) for part in budget.parts.values() for v in part.values())
 
 
-def contact_scale(contact):
-    """The largest pressure on any rank."""
-    return max(contact.resultants().max_pressure, 1.0)
-
-
 def test_checks_see_tractions_where_nothing_is_opposite():
     """A traction at a point without an opposite breaks the laws, whatever its size."""
-    from fenics_contact.verdict import check_laws
-
     _, contact, _ = overhang("triangle", fc.Frictionless(1e7))
     contact.evaluate()
     assert check_laws(contact)["complementarity"] <= 1e-12
@@ -426,8 +420,8 @@ def test_a_narrow_indenter_does_not_pass(cell):
         step = problem.solve()
         assert step.verdict.unseen == {}
         assert sum(r.normal_force for r in step.contacts.values()) > 1.0
-        assert close(-sum(r.normal_force for r in step.contacts.values()),
-                     reaction(body, ROOF)[body.d - 1], 1e-7)  # fmt: skip
+        total = sum(r.normal_force for r in step.contacts.values())
+        assert close(-total, reaction(body, ROOF)[body.d - 1], 1e-7)
 
 
 def test_touching_is_not_passing():
@@ -500,14 +494,13 @@ def test_facets_of_curved_surfaces_are_no_penetration(counts, swap, degree):
 # ---- the true gap --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("cell", ["triangle", "tetrahedron", "hexahedron"])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_true_gap(cell):
     """The upper block turned by 0.3 and lifted: the distance along the turned normal to z = 0.5.
 
-    Under the pillar all is as the formula says, to round-off; the pairs stay as they are.
+    To round-off; the pairs stay as they are.
     """
-    kind = "hexahedron" if cell == "tetrahedron" else cell
-    body = stack(kind, (8, 4), (0.5, 0.25), widths=[3.0, 1.0])
+    body = stack(cell, (8, 4), (0.5, 0.25), widths=[3.0, 1.0])
     contact = joint(body, 1, fc.Frictionless(1e6))
     d, angle, lift = body.d, 0.3, 0.25
     turn = np.eye(d)
@@ -524,19 +517,14 @@ def test_true_gap(cell):
     middle = dolfinx.mesh.compute_midpoints(body.mesh, d, cells).reshape(-1, 3)
     body.u.interpolate(moved, cells0=cells[middle[:, d - 1] > 0.5])
     body.u.x.scatter_forward()
-    before = contact.points, contact.pairings
+    x = contact.points
     gap, normal = contact.true_gap()
-    assert contact.pairings == before[1]
-    exact = -turn[:, -1]
-    assert close(normal, np.tile(exact, (len(normal), 1)), 1e-12, scale=1.0)
-    x = before[0] + moved(before[0].T).T
+    assert contact.pairings == 1
+    assert close(normal, np.tile(-turn[:, -1], (len(normal), 1)), 1e-12, scale=1.0)
     assert COMM.allreduce(np.count_nonzero(np.isnan(gap))) == 0
-    assert close(gap, (x[:, -1] - 0.5) / np.cos(angle), 1e-12, scale=1.0)
-    linear = contact.gap
-    assert COMM.allreduce(np.abs(linear - gap).max(initial=0.0), op=MPI.MAX) > 1e-3
-    raised_everywhere(
-        fc.Contact(body.u, contact.surface, fc.HalfSpace(0 * pivot, np.eye(d)[-1]),
-                   fc.Frictionless(1e6)).true_gap,
-        ValueError,
-        "no DeformableBody",
-    )  # fmt: skip
+    height = (x + moved(x.T).T)[:, -1] - 0.5
+    assert close(gap, height / np.cos(angle), 1e-12, scale=1.0)
+    assert COMM.allreduce(np.abs(contact.gap - gap).max(initial=0.0), op=MPI.MAX) > 1e-3
+    rigid = fc.HalfSpace(0 * pivot, np.eye(d)[-1])
+    other = fc.Contact(body.u, contact.surface, rigid, fc.Frictionless(1e6))
+    raised_everywhere(other.true_gap, ValueError, "no DeformableBody")
