@@ -796,13 +796,11 @@ class Contact:
         values = self._values
         if not self.regularised:
             return np.zeros_like(values["x"])
-        if self._projection is None:
-            degree = self.u.function_space.ufl_element().degree
-            self._projection = TraceProjection(self.quadrature, degree)
+        project = self._traces()
         pressure = np.zeros(self.quadrature.n_points)
         if self.law.has_normal_stiffness:
-            pressure = self._projection(self.pressure)
-        side = self._projection(self.tangential_traction)
+            pressure = project(self.pressure)
+        side = project(self.tangential_traction)
         if self.multipliers is not None:
             pressure = pressure - self.multipliers.fields.values("pressure")
             if self.law.has_friction:
@@ -909,6 +907,38 @@ class Contact:
         # A distance falls along the normal as fast as one moves.
         told = np.abs(found["slope"] + 1) < _NO_DISTANCE
         return np.where(told, found["gap"], np.inf), found["normal"]
+
+    def gap_deviation(self) -> tuple[Array, Array]:
+        """True gap minus the linearised one, and the true normals: at X + u, not X. Collective.
+
+        Returns:
+            (n_points,) (length), NaN where there is no opposite in truth, and 0 where an `Obstacle`
+            says no distance that could be told elsewhere; unit normals, (n_points, gdim).
+        """
+        gap, normal = self.true_placement()
+        if self._opposite is None:
+            return np.where(np.isinf(gap), 0.0, gap - self.gap), normal
+        points = self._values
+        linear = self._opposite.linear_gap(
+            points["x"],
+            points["normal"],
+            self._paired_at,
+            self._geometric_penetration(points),
+            self.u,
+            self.own_displacement(),
+        )
+        # Between facets that do not match it jumps from point to point; what is answered to is a
+        # function on Γc.
+        change = gap - linear
+        smooth = self._traces()(np.nan_to_num(change))
+        return np.where(np.isnan(change), np.nan, smooth), normal
+
+    def _traces(self) -> TraceProjection:
+        """The projection on functions on Γc that displacements can answer to. Collective."""
+        if self._projection is None:
+            degree = self.u.function_space.ufl_element().degree
+            self._projection = TraceProjection(self.quadrature, degree)
+        return self._projection
 
     def true_gap(self) -> tuple[Array, Array]:
         """Distances to the opposite in the bodies as they are displaced now, by a search anew.

@@ -21,7 +21,7 @@ __all__ = ["Deviation", "LinearSprings", "Linearisation", "linearisation"]
 Array = npt.NDArray[np.float64]
 
 # Share of the largest pressure, or of the force, below which what is left out needs no solve.
-_NEGLIGIBLE = 1e-4
+_NEGLIGIBLE = 1e-3
 # Slide, as a share of the smallest facet, and difference of the displacements on Γc, as a share of
 # its size, below which pairs in the deformed bodies are those of before.
 _SLID, _TURNED = 1e-2, 1e-3
@@ -112,15 +112,14 @@ class Deviation:
         none = cls(np.zeros(len(closed)), np.zeros_like(values["normal"]))
         if not contact.rigid and not _moves(contact):
             return none
-        gap, normal = contact.true_placement()
+        change, normal = contact.gap_deviation()
         told = closed & np.isfinite(normal).all(axis=1)
         turn = np.where(told[:, None], normal - values["normal"], 0.0)
         if contact.gap_prescribed:
             return cls(none.gap, turn)
         # A point that has left the opposite bears nothing in truth.
-        with np.errstate(invalid="ignore"):
-            change = np.where(np.isnan(gap), values["penetration"], gap - contact.gap)
-        return cls(np.where(told & ~np.isinf(gap), change, 0.0), turn)
+        change = np.where(np.isnan(change), values["penetration"], change)
+        return cls(np.where(told, change, 0.0), turn)
 
     def shift(self, contact: Contact) -> Array:
         """Displacement at the points that closes the linearised gap as much, (n_points, gdim)."""
@@ -151,15 +150,15 @@ def _moves(contact: Contact) -> bool:
 def linearisation(
     contacts: Sequence[Contact],
     modulus: float,
-    respond: Callable[[Sequence[Array]], Sequence[Array]],
+    respond: Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]],
 ) -> dict[str, Linearisation]:
     """What the linearised kinematics change in every contact, by name. Collective.
 
     Args:
         contacts: Evaluated contacts, at a solution.
         modulus: Of the bulk, about (stress): to see whether there is anything to solve for.
-        respond: The change of the relative displacements at the points of every contact by
-            tractions that are added on the bodies, at the tangent of the solution.
+        respond: The change of the relative displacements at the points of every contact, with
+            springs there, by tractions that are added on the bodies.
     """
     deviations = [Deviation.of(c) for c in contacts]
     matters = False
@@ -179,7 +178,7 @@ def linearisation(
     springs = [LinearSprings.of(c) for c in contacts]
     triples = zip(deviations, contacts, springs, strict=True)
     added = [d.turned(c) + s.change(d.shift(c)) for d, c, s in triples]
-    jumps = respond(added)
+    jumps = respond([s.stiffness for s in springs], added)
     return {
         c.name: _relative(c, traction + s.change(jump))
         for c, s, traction, jump in zip(contacts, springs, added, jumps, strict=True)

@@ -419,6 +419,40 @@ class Opposite:
         found.matrix.destroy()
         return found.distance, normal
 
+    def linear_gap(
+        self,
+        x: Array,
+        along: Array,
+        at: fem.Function | None,
+        penetration: Array,
+        u: fem.Function,
+        own: Array,
+    ) -> Array:
+        """The linearised gap s - u_n with the displacement opposite as it is, not projected.
+
+        To compare with `true_gap`, which is of points as well. Collective.
+
+        Args:
+            x: The points in the undeformed body, (n_points, d).
+            along: Unit normals, (n_points, d).
+            at: Displacement at which pairs were found; none: in the undeformed bodies.
+            penetration: As for `pair`.
+            u: The displacement now.
+            own: Of the points, (n_points, d).
+
+        Returns:
+            (n_points,) (length), NaN where there is no opposite.
+        """
+        place, _, _ = self._here.meet(self._facet, x, along)
+        deep = np.maximum(self.largest(penetration), 0.0)
+        found = self._find(self._facet, place, along, at, deep)
+        product = found.matrix.createVecLeft()
+        found.matrix.mult(u.x.petsc_vec, product)
+        jump = own - product.array_r.reshape(own.shape)
+        for item in (product, found.matrix):
+            item.destroy()
+        return np.asarray(np.sum((found.place - x - jump) * along, axis=1), dtype=np.float64)
+
     def _inside(self, x: Array, doubtful: Any) -> Any:
         """Which points of Γc lie in another undeformed body: (n_points,). Collective.
 

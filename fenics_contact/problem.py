@@ -1220,26 +1220,33 @@ class ContactProblem:
         space, consistent = self._space, self._consistent or self._filled != {False}
         modulus = self.bulk.scale * self._cell_size ** (2 - len(self.u))
 
-        def respond(tractions: Sequence[Array]) -> list[Array]:
+        def respond(springs: Sequence[Array], tractions: Sequence[Array]) -> list[Array]:
             space.enter()
-            right, left = space.vector(), space.vector()
+            right, left, diagonal = space.vector(), space.vector(), space.diagonal
+            matrix = space.matrix(self._bulk_matrix, symmetric=False)
             ksp = PETSc.KSP().create(self._comm)
             try:
                 if consistent not in self._filled:  # nothing was iterated yet
                     self._assemble_matrix(self._matrix(consistent), self._tangents())
+                parts = (c.spring_matrix(k) for c, k in zip(self.contacts, springs, strict=True))
+                space.fill(matrix, self._bulk_matrix, parts)
                 for contact, traction in zip(self.contacts, tractions, strict=True):
                     contact.add_force(right, traction)
                 right.array[space.constrained] = 0.0
                 right.scale(-1.0 / self.bulk.scale)
-                ksp.setOperators(self._matrix(consistent))
-                ksp.setType(PETSc.KSP.Type.GMRES)
-                ksp.setPC(self._solvers[consistent].getPC())
-                ksp.setTolerances(rtol=1e-2, max_it=30)
+                ksp.setOperators(matrix)
+                ksp.setType(PETSc.KSP.Type.FGMRES)
+                ksp.getPC().setType("python")
+                ksp.getPC().setPythonContext(_Nearby(self._solvers[consistent]))
+                ksp.setTolerances(rtol=_NOTABLE**2, max_it=100)
                 ksp.solve(right, left)
+                if ksp.getConvergedReason() <= 0:
+                    left.set(np.nan)
                 return [contact.felt(left) for contact in self.contacts]
             finally:
+                space.diagonal = diagonal
                 entered.enter()
-                for item in (ksp, right, left):
+                for item in (ksp, matrix, right, left):
                     item.destroy()
 
         return linearisation(self.contacts, modulus, respond)
@@ -1422,6 +1429,18 @@ class ContactProblem:
         self._make_matrices()
         for mark in set(self._committed_energy.forces) - {self._whole.mark}:
             del self._committed_energy.forces[mark]
+
+
+class _Nearby:
+    """A preconditioner: the solver of a matrix that differs by the status of some points."""
+
+    def __init__(self, ksp: PETSc.KSP) -> None:
+        ksp.setUp()
+        self._pc = ksp.getPC()
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """For PETSc."""
+        self._pc.apply(x, y)
 
 
 def _facets_held(contact: Contact, constrained: Array) -> int:
