@@ -1,0 +1,527 @@
+"""Random scenes, each compared with a second solution: does anything come out silently wrong?
+
+    docker/run python verification/fuzz.py --seed 17                  # one scene, in words
+    docker/run python verification/fuzz.py --scenes 1000 --resume results.csv
+    docker/run python verification/fuzz.py --scenes 200 --ranks 2 --resume results2.csv
+    docker/run python verification/fuzz.py --replay scene.json --minimise
+    docker/run python verification/fuzz.py --table results.csv        # Markdown
+
+Outcomes: "right" (and "another": right by its equations, but not the solution found apart, where
+friction leaves several), "refused" (with the error's class and what it says), "wrong" (the
+package said it is solved and it is not), "crashed" (an error that is no refusal), "slow", and
+"unjudged" (the judge itself failed).
+
+Scenes are solved in processes of their own, many in one: `mpirun` for several ranks. One that hangs
+or dies is noted, and the next process goes on behind it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import copy
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Outcome", "features", "minimise", "play", "table"]
+
+Scene = dict[str, Any]
+
+OUTCOMES = ("right", "another", "refused", "wrong", "crashed", "slow", "unjudged")
+FIELDS = ("seed", "ranks", "outcome", "kind", "increments", "seconds", "features", "detail")
+# What refusals say, by what they are about.
+CATEGORIES = {
+    "no contact force can balance": "load not balanced",
+    "nothing will ever hold": "not held",
+    "did not converge": "not converged",
+    "penetrat": "penetration",
+    "no potential": "no potential",
+    "too large": "too large",
+    "rigid": "rigid motion",
+}
+# Scenes in one process.
+_BATCH = 40
+
+
+@dataclass
+class Outcome:
+    """What became of a scene.
+
+    Attributes:
+        outcome: One of `OUTCOMES`.
+        kind: Of a refusal its class and category; of what is wrong the checks that failed.
+        increments: Number of increments that were solved and judged.
+        seconds: For the package and the judge.
+        detail: In words.
+        worst: Largest figure of every check, in units of what is allowed.
+    """
+
+    outcome: str
+    kind: str
+    increments: int
+    seconds: float
+    detail: list[str]
+    worst: dict[str, float]
+
+
+# ---- one scene -----------------------------------------------------------------------------------
+
+
+class _Slow(BaseException):
+    """The time is up."""
+
+
+@contextlib.contextmanager
+def _limited(seconds: float | None) -> Iterator[None]:
+    """Raise `_Slow` in the block when its time is up; of one rank only."""
+    if not seconds:
+        yield
+        return
+
+    def late(*_: Any) -> None:
+        raise _Slow
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _category(error: BaseException) -> str:
+    text = str(error)
+    for words, name in CATEGORIES.items():
+        if words in text:
+            return f"{type(error).__name__}: {name}"
+    return f"{type(error).__name__}: {re.sub('[0-9.e+-]+', '#', text)[:60]}"
+
+
+def _is_refusal(error: BaseException) -> bool:
+    """Whether the package says so itself, and not something below it."""
+    import fenics_contact as fc
+
+    if isinstance(error, fc.NotConverged):
+        return True
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return isinstance(error, ValueError | TypeError) and "fenics_contact/" in last.filename
+
+
+def play(
+    scene: Scene,
+    comm: Any = None,
+    *,
+    limit: float | None = None,
+    changed: Any = None,
+    spoiled: Callable[[dict[str, Any]], None] | None = None,
+) -> Outcome:
+    """Solve a scene by the package and judge it; the outcome is that of rank 0. Collective.
+
+    Args:
+        scene: The scene.
+        comm: Ranks; by default one alone.
+        limit: Seconds for the package, on one rank.
+        changed: See `fuzz_scenes.history`.
+        spoiled: Changes a record before it is judged, to show that the judge sees it.
+    """
+    import fuzz_judge
+    import fuzz_scenes
+    from mpi4py import MPI
+
+    comm = comm or MPI.COMM_SELF
+    records: list[dict[str, Any]] = []
+    start, outcome, kind, detail = time.perf_counter(), "right", "", []
+    try:
+        with warnings.catch_warnings(), _limited(limit if comm.size == 1 else None):
+            if comm.size == 1:  # on one rank of several it would leave the others waiting
+                warnings.simplefilter("error", RuntimeWarning)
+            fuzz_scenes.history(scene, comm, records.append, changed)
+    except _Slow:
+        outcome = "slow"
+    except Exception as error:
+        outcome = "refused" if _is_refusal(error) else "crashed"
+        kind = _category(error)
+        trace = traceback.extract_tb(error.__traceback__)[-1]
+        detail = [str(error)[:500]]
+        if outcome == "crashed":
+            detail.append(f"{trace.filename}:{trace.lineno}")
+    if comm.rank:
+        return Outcome(outcome, kind, len(records), 0.0, [], {})
+    worst: dict[str, float] = {}
+    try:
+        with warnings.catch_warnings(), _limited(3 * limit if limit and comm.size == 1 else None):
+            warnings.simplefilter("ignore")
+            judge = fuzz_judge.Judge(scene) if records else None
+            for record in records:
+                if spoiled is not None:
+                    spoiled(record)
+                judge.take(record)
+                if judge.wrong:
+                    break
+        if judge is not None:
+            worst = judge.worst
+            if judge.wrong:
+                outcome = "wrong"
+                kind = ", ".join(sorted({w.split(":")[0] for w in judge.wrong}))
+                detail = judge.wrong[:6]
+            elif outcome == "right" and judge.another:
+                outcome, detail = "another", judge.another[:3]
+            detail = detail + judge.unjudged[:2]
+    except (_Slow, Exception) as error:
+        outcome, kind = "unjudged", type(error).__name__
+        detail = traceback.format_exc().strip().splitlines()[-6:]
+    return Outcome(outcome, kind, len(records), time.perf_counter() - start, detail, worst)
+
+
+def features(scene: Scene) -> list[str]:
+    """What a scene has, for tables."""
+    found = [scene["layout"], scene["cell"], f"degree {scene['degree']}", f"drive {scene['drive']}"]
+    for contact in scene["contacts"]:
+        support = contact["support"]
+        found += [f"law {contact['law']['kind']}", f"support {support['kind']}"]
+        found += [f"pairs {support['update']}"] if "update" in support else []
+        found += [f"moving by {support['moving']}"] if "moving" in support else []
+        found += [f"prescribed {n}" for n in ("gap",) if n in contact]
+        found += [f"{n} {contact[n]}" for n in ("scheme", "enforcement", "accuracy") if n in contact]
+        found += [f"k by {contact['law'][k][0]}" for k in ("k_n", "k_t") if contact["law"].get(k)]
+    found += [n for n in ("restart", "ration", "weight") if n in scene]
+    found += [f"method {scene['method']}"] if "method" in scene else []
+    found += ["units"] if scene["units"] != [1.0, 1.0] else []
+    found += ["two scales"] if scene["share"] != 1.0 else []
+    sizes = [s["normal"] for s in scene["stages"] if s["normal"] > 0]
+    found += ["levels"] if sizes and max(sizes) > 50 * min(sizes) else []
+    found += ["off"] if any(s["normal"] <= 0 for s in scene["stages"]) else []
+    return sorted(set(found))
+
+
+# ---- many scenes ---------------------------------------------------------------------------------
+
+
+def _work(seeds: list[int], arguments: argparse.Namespace) -> None:
+    """In a process of its own, on all its ranks: play scenes, a line for each on rank 0."""
+    import gc
+
+    from fuzz_scenes import draw
+    from mpi4py import MPI
+
+    comm = MPI.COMM_WORLD
+    if comm.size > 1:
+        gc.disable()  # destructors are collective: together, between scenes
+    for seed in seeds:
+        scene = draw(seed, without=tuple(arguments.without), ranks=comm.size)
+        if comm.rank == 0:
+            print(json.dumps({"begins": seed}), flush=True)
+        outcome = play(scene, comm if comm.size > 1 else None, limit=arguments.limit)
+        if outcome.outcome == "slow" and comm.size == 1:
+            # Forms may have been compiled meanwhile.
+            outcome = play(scene, None, limit=arguments.limit)
+        gc.collect()
+        comm.barrier()
+        if comm.rank == 0:
+            print(json.dumps({"seed": seed} | vars(outcome)), flush=True)
+
+
+def _environment() -> dict[str, str]:
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
+    return kept | {"OMP_NUM_THREADS": "1"}
+
+
+def _batch(seeds: list[int], arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Results of scenes solved in one process; ends early where it hangs or dies."""
+    command = [sys.executable, __file__, "--work", ",".join(map(str, seeds))]
+    command += ["--limit", str(arguments.limit)]
+    command += [v for name in arguments.without for v in ("--without", name)]
+    if arguments.ranks > 1:
+        command = ["mpirun", "--allow-run-as-root", "--oversubscribe", "-n", str(arguments.ranks), *command]
+    with tempfile.TemporaryFile("w+") as errors:
+        process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            env=_environment(),
+            start_new_session=True,
+        )
+        late: list[bool] = []
+
+        def end() -> None:
+            late.append(True)
+            os.killpg(process.pid, signal.SIGKILL)
+
+        begun = None
+        assert process.stdout is not None
+        patience = 10 * arguments.limit + 60  # compiling included
+        watch = threading.Timer(patience, end)
+        watch.start()
+        try:
+            for line in process.stdout:
+                watch.cancel()
+                watch = threading.Timer(patience, end)
+                watch.start()
+                try:
+                    found = json.loads(line)
+                except json.JSONDecodeError:
+                    continue
+                if "begins" in found:
+                    begun = found["begins"]
+                else:
+                    yield found
+                    begun = None
+            process.wait()
+        finally:
+            watch.cancel()
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+        if begun is not None:
+            errors.seek(0)
+            kind = "hangs" if late else f"process ended with {process.returncode}"
+            text = errors.read()[-1500:].splitlines()[-12:]
+            outcome = Outcome("slow" if late else "crashed", kind, 0, patience, text, {})
+            yield {"seed": begun} | vars(outcome)
+
+
+def run(arguments: argparse.Namespace) -> Counter[str]:
+    """Play scenes that are not in the file of results yet, and add them."""
+    from fuzz_scenes import draw
+
+    path = Path(arguments.resume)
+    done = set()
+    if path.exists():
+        with path.open(newline="") as file:
+            done = {int(row["seed"]) for row in csv.DictReader(file)}
+    seeds = [s for s in range(arguments.start, arguments.start + arguments.scenes) if s not in done]
+    counts: Counter[str] = Counter()
+    lock = threading.Lock()
+
+    def note(found: dict[str, Any]) -> None:
+        scene = draw(found["seed"], without=tuple(arguments.without), ranks=arguments.ranks)
+        row = {n: found.get(n) for n in FIELDS} | {
+            "ranks": arguments.ranks,
+            "features": "; ".join(features(scene)),
+            "detail": " | ".join(found["detail"]),
+            "seconds": f"{found['seconds']:.2f}",
+        }
+        with lock, path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, FIELDS)
+            if file.tell() == 0:
+                writer.writeheader()
+            writer.writerow(row)
+        with lock:
+            counts[found["outcome"]] += 1
+            if found["outcome"] in ("wrong", "crashed", "unjudged") or arguments.verbose:
+                detail = found["detail"][0] if found["detail"] else ""
+                print(f"{found['seed']}: {found['outcome']}: {found['kind']}: {detail}"[:300], flush=True)
+
+    def worker(own: list[int]) -> None:
+        while own:
+            got = set()
+            for found in _batch(own[:_BATCH], arguments):
+                note(found)
+                got.add(found["seed"])
+            if not got:
+                raise RuntimeError(f"no scene of {own[:_BATCH]} could be started")
+            own = [s for s in own if s not in got]
+
+    threads = [
+        threading.Thread(target=worker, args=(seeds[i :: arguments.processes],))
+        for i in range(arguments.processes)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    print(dict(counts))
+    return counts
+
+
+# ---- the shortest scene that fails ---------------------------------------------------------------
+
+
+def _simpler(scene: Scene) -> Iterator[Scene]:
+    """Scenes with one feature less."""
+
+    def changed(change: Callable[[Scene], Any]) -> Iterator[Scene]:
+        other = copy.deepcopy(scene)
+        change(other)
+        if other != scene:
+            yield other
+
+    for name in ("restart", "ration", "method", "condensation", "weight"):
+        if name in scene:
+            yield from changed(lambda s, n=name: s.pop(n))
+    yield from changed(lambda s: s.update(units=[1.0, 1.0]))
+    yield from changed(lambda s: s.update(share=1.0))
+    n_stages = len(scene["stages"])
+    for i in reversed(range(n_stages)):
+        if n_stages > 1:
+            yield from changed(lambda s, i=i: s["stages"].pop(i))
+        yield from changed(lambda s, i=i: s["stages"][i].update(steps=1))
+        yield from changed(lambda s, i=i: s["stages"][i].update(across=0.0))
+        yield from changed(lambda s, i=i: s["stages"][i].update(side=0.0, across=0.0))
+        for n in ("normal", "side"):
+            value = float(f"{scene['stages'][i][n]:.1g}")
+            yield from changed(lambda s, i=i, n=n, v=value: s["stages"][i].update({n: v}))
+    if len(scene["contacts"]) > 1 and scene["layout"] in ("corner", "pair"):
+        yield from changed(lambda s: s["contacts"].pop())
+    for i, contact in enumerate(scene["contacts"]):
+        for name in ("gap", "scheme", "quadrature", "enforcement", "accuracy"):
+            if name in contact:
+                yield from changed(lambda s, i=i, n=name: s["contacts"][i].pop(n))
+        law, support = contact["law"], contact["support"]
+        yield from changed(lambda s, i=i: s["contacts"][i].update(law={"kind": "frictionless", "k_n": ["number", 10.0]}))
+        if law["kind"] not in ("frictionless", "coulomb"):
+            simple = {"kind": "coulomb", "friction": 0.3, "k_n": ["number", 10.0], "k_t": ["number", 10.0]}
+            yield from changed(lambda s, i=i, x=simple: s["contacts"][i].update(law=x))
+        for k in ("k_n", "k_t"):
+            if law.get(k):
+                yield from changed(lambda s, i=i, k=k: s["contacts"][i]["law"].update({k: ["number", 10.0]}))
+        for name in ("slope", "moving"):
+            if name in support:
+                yield from changed(lambda s, i=i, n=name: s["contacts"][i]["support"].pop(n))
+        if support["kind"] != "body":
+            plain = {n: v for n, v in support.items() if n in ("moving", "free")}
+            plain |= {"kind": "halfspace", "clearance": 0.0}
+            yield from changed(lambda s, i=i, p=plain: s["contacts"][i].update(support=p))
+            yield from changed(lambda s, i=i: s["contacts"][i]["support"].update(clearance=0.0))
+        else:
+            yield from changed(lambda s, i=i: s["contacts"][i]["support"].update(update="never"))
+    for b, body in enumerate(scene["bodies"]):
+        yield from changed(lambda s, b=b: s["bodies"][b].update(jitter=0))
+        yield from changed(lambda s, b=b: s["bodies"][b].update(E=1000.0))
+        for i, n in enumerate(body["n"]):
+            for fewer in {1, n - 1}:
+                if 0 < fewer < n:
+                    yield from changed(lambda s, b=b, i=i, f=fewer: s["bodies"][b]["n"].__setitem__(i, f))
+    for i in range(len(scene["holds"])):
+        yield from changed(lambda s, i=i: s["holds"].pop(i))
+    yield from changed(lambda s: s.update(degree=1))
+    yield from changed(lambda s: s.update(nu=0.3))
+    yield from changed(lambda s: s.update(strain=float(f"{s['strain']:.1g}")))
+    if scene["cell"] == "triangle":
+        yield from changed(lambda s: s.update(cell="quadrilateral"))
+    if scene["cell"] == "tetrahedron":
+        yield from changed(lambda s: s.update(cell="hexahedron"))
+
+
+def minimise(
+    scene: Scene, fails: Callable[[Scene], bool], *, seconds: float = 120.0, words: Any = None
+) -> Scene:
+    """Drop features one at a time while ``fails`` stays true, until none can go."""
+    end = time.monotonic() + seconds
+    going = True
+    while going:
+        going = False
+        for simpler in _simpler(scene):
+            if time.monotonic() > end:
+                return scene
+            try:
+                stays = fails(simpler)
+            except Exception:
+                stays = False
+            if stays:
+                scene, going = simpler, True
+                if words:
+                    words(f"simpler: {len(json.dumps(scene))} characters")
+                break
+    return scene
+
+
+# ---- the table -----------------------------------------------------------------------------------
+
+
+def table(paths: list[str]) -> str:
+    """Outcomes by feature and refusals by category, as Markdown."""
+    rows = []
+    for path in paths:
+        with open(path, newline="") as file:
+            rows += list(csv.DictReader(file))
+    by_feature: dict[str, Counter[str]] = {"all": Counter()}
+    for row in rows:
+        for name in ["all", f"ranks {row['ranks']}", *row["features"].split("; ")]:
+            by_feature.setdefault(name, Counter())[row["outcome"]] += 1
+    lines = [f"{len(rows)} scenes, {sum(int(r['increments']) for r in rows)} increments judged.", ""]
+    lines += ["| feature | scenes | " + " | ".join(OUTCOMES) + " |"]
+    lines += ["|---|" + "---|" * (1 + len(OUTCOMES))]
+    for name in ["all", *sorted(set(by_feature) - {"all"})]:
+        counts = by_feature[name]
+        cells = [str(counts[o] or "–") for o in OUTCOMES]
+        lines.append(f"| {name} | {counts.total()} | " + " | ".join(cells) + " |")
+    lines += ["", "| outcome | why | scenes |", "|---|---|---|"]
+    why = Counter((r["outcome"], r["kind"]) for r in rows if r["outcome"] not in ("right", "another"))
+    lines += [f"| {o} | {k or '–'} | {n} |" for (o, k), n in why.most_common()]
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """The command; ends with 1 where something is wrong or crashed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seed", type=int, help="play one scene and tell")
+    parser.add_argument("--replay", help="play the scene in a JSON file and tell")
+    parser.add_argument("--minimise", action="store_true", help="find the shortest that fails alike")
+    parser.add_argument("--scenes", type=int, default=100, help="how many")
+    parser.add_argument("--start", type=int, default=0, help="first seed")
+    parser.add_argument("--ranks", type=int, default=1)
+    parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--limit", type=float, default=10.0, help="seconds for the package")
+    parser.add_argument("--resume", default="fuzz.csv", help="file of results, added to")
+    parser.add_argument("--without", action="append", default=[], help="a feature to leave out")
+    parser.add_argument("--table", nargs="+", help="print the table of files of results")
+    parser.add_argument("--verbose", action="store_true", help="a line for every scene")
+    parser.add_argument("--work", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.table:
+        print(table(arguments.table))
+        return 0
+    if arguments.work:
+        _work([int(s) for s in arguments.work.split(",")], arguments)
+        return 0
+    if arguments.seed is None and arguments.replay is None:
+        counts = run(arguments)
+        return int(counts["wrong"] + counts["crashed"] > 0)
+
+    from fuzz_scenes import draw
+    from mpi4py import MPI
+
+    comm = MPI.COMM_WORLD
+    if arguments.replay:
+        scene = json.loads(Path(arguments.replay).read_text())
+    else:
+        scene = draw(arguments.seed, without=tuple(arguments.without), ranks=comm.size)
+    outcome = play(scene, comm if comm.size > 1 else None, limit=None)
+    bad = outcome.outcome in ("wrong", "crashed", "unjudged")
+    if arguments.minimise and bad and comm.size == 1:
+
+        def fails(other: Scene) -> bool:
+            found = play(other, limit=arguments.limit)
+            same = set(found.kind.split(", ")) & set(outcome.kind.split(", "))
+            return found.outcome == outcome.outcome and bool(same)
+
+        scene = minimise(scene, fails, words=lambda text: print(text, file=sys.stderr))
+        outcome = play(scene)
+    if comm.rank == 0:
+        print(json.dumps(scene))
+        print(f"{outcome.outcome}: {outcome.kind} ({outcome.increments} increments)")
+        print(*outcome.detail, sep="\n")
+        print({k: float(f"{v:.2g}") for k, v in outcome.worst.items()})
+    return int(bad)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,363 @@
+"""Judges what the package found in a scene, increment by increment, by the reference solver.
+
+Two histories are kept. One follows the package's own displacements: its laws, forces and results
+are made anew from these, so that nothing but the equations is asked, however many solutions there
+are. The other is solved apart, from nothing; where it differs, the package's is wrong if the laws
+leave one solution only, and "another solution" else.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import fuzz_scenes
+import numpy as np
+import reference_solver as reference
+import scipy.spatial
+
+__all__ = ["Judge"]
+
+Array = np.ndarray
+
+# Residual in units of what the solver was asked for: SNES stops below 1, the verdict passes 2; the
+# norms here are per body, so that those of all bodies together may be larger by some.
+_RESIDUAL = 30.0
+# Share of K u that rounding may leave.
+_ROUNDING = 300 * np.finfo(float).eps
+# Results that are sums over the points, made twice from the same u.
+_SAME = 1e-9
+# Forces of the nearest exact solution, and of one found apart.
+_NEAREST, _APART = 1e-5, 1e-4
+
+
+class Judge:
+    """Takes the package's increments one by one.
+
+    Attributes:
+        wrong: What is wrong, in words.
+        another: Where the solution differs from the one found apart, which the laws allow.
+        unjudged: Where there is none to compare with.
+        worst: Largest figure of every check, in units of what is allowed.
+    """
+
+    def __init__(self, scene: dict[str, Any]) -> None:
+        """Make the reference's problem twice, once for every history."""
+        self.scene = scene
+        self.wrong: list[str] = []
+        self.another: list[str] = []
+        self.unjudged: list[str] = []
+        self.worst: dict[str, float] = {}
+        self.problem, made, self._load = fuzz_scenes.model(scene)
+        self._apart = fuzz_scenes.model(scene)[0]
+        self._moduli = made.moduli
+        n, m = self.problem.body.places.size, len(self.problem.motions())
+        self._u, self._motion = np.zeros(n), np.zeros(m)
+        self._own_u, self._own_motion = np.zeros(n), np.zeros(m)
+        self._old = [c.start() for c in self.problem.contacts]
+        self._own_old = [c.start() for c in self._apart.contacts]
+        self._before: dict[str, Any] | None = None
+        self._lost = False  # the history apart
+        self._tree = None
+
+    # ---- increments ------------------------------------------------------------------------------
+
+    def take(self, record: dict[str, Any]) -> None:
+        """Judge one committed increment."""
+        name = f"stage {record['stage']} at {record['load']:.4g}"
+        problem, load = self.problem, self._load(record["stage"], record["load"])
+        u = self._numbered(record["u"])
+        motion = np.array([record["contacts"][c]["motion"][i] for c, i in problem.motions()])
+        old = [
+            self._with_multipliers(c, o, r)
+            for c, o, r in zip(problem.contacts, self._old, record["contacts"], strict=True)
+        ]
+        found = problem.respond(u, motion, load, old)
+        now = self._forces(u, load, found)
+        rtol = record["rtol"]
+
+        miss = np.abs(u[load.fixed] - load.values).max(initial=0.0)
+        self._check(name, "conditions", miss, 1e-12 * max(np.abs(u).max(initial=0.0), 1e-300))
+        self._check_equations(name, now, rtol)
+        for i, (c, f, r) in enumerate(zip(problem.contacts, found, record["contacts"], strict=True)):
+            self._check_results(f"{name}, contact {i}", c, f, r)
+            self._check_multipliers(f"{name}, contact {i}", c, f, r)
+        self._check_energy(name, record, u, motion, load, found, now)
+        self._check_nearest(name, record, u, motion, load, old, found, now)
+        self._check_apart(name, record, load, now)
+
+        self._old = [c.next_state(f, o) for c, f, o in zip(problem.contacts, found, old, strict=True)]
+        self._pair_anew(problem, self._old, u)
+        now |= {"u": u, "motion": motion, "load": load, "found": found}
+        now["springs"] = sum(c.stored(f) for c, f in zip(problem.contacts, found, strict=True))
+        self._before, self._u, self._motion = now, u, motion
+
+    def _check(self, where: str, what: str, value: float, allowed: float, text: str = "") -> bool:
+        with np.errstate(all="ignore"):
+            share = float(value / allowed) if allowed > 0 else (0.0 if value == 0 else np.inf)
+        if not np.isfinite(value):
+            share = np.inf
+        self.worst[what] = max(self.worst.get(what, 0.0), share)
+        if share > 1.0:
+            self.wrong.append(f"{what}: {where}: {value:.3g} above {allowed:.3g}{text}")
+        return share <= 1.0
+
+    def _numbered(self, rows: Array) -> Array:
+        """Values at the nodes of the reference, found by box and place."""
+        d, body = self.problem.body.d, self.problem.body
+        size = np.ptp(body.places, axis=0).max()
+        far = 10 * size
+        mine = np.column_stack([body.parts * far, body.places])
+        distance, row = scipy.spatial.cKDTree(
+            np.column_stack([rows[:, 0] * far, rows[:, 1 : d + 1]])
+        ).query(mine)
+        assert distance.max() < 1e-9 * size
+        return rows[row, d + 1 :].ravel().copy()
+
+    def _with_multipliers(self, contact: Any, old: Any, record: dict[str, Any]) -> Any:
+        if contact.project is None:
+            return old
+        row = self._rows(contact, record)
+        traction = old.traction
+        if contact.law.slips:
+            traction = record["lambda_t"][row]
+        return reference.State(old.jump, traction, record["lambda_n"][row])
+
+    def _rows(self, contact: Any, record: dict[str, Any]) -> Array:
+        distance, row = scipy.spatial.cKDTree(record["points"]).query(contact.x)
+        assert distance.max() < 1e-9 * (np.ptp(contact.x, axis=0).max() or 1.0)
+        return row
+
+    def _forces(self, u: Array, load: Any, found: list[dict]) -> dict[str, Any]:
+        """Residual and forces, body by body."""
+        problem = self.problem
+        total, motion = problem.residual(u, load, found)
+        parts = np.repeat(problem.body.parts, problem.body.d)
+        forces = problem.contact_force(found)
+        fixed = np.zeros(len(u), dtype=bool)
+        fixed[load.fixed] = True
+        rounding = np.abs(problem.body.stiffness) @ np.abs(u)
+        bodies = []
+        for b in range(parts.max() + 1):
+            own = parts == b
+            sizes = [np.linalg.norm(load.force[own & ~fixed]), np.linalg.norm(total[own & fixed])]
+            sizes += [np.linalg.norm(f[own]) for f in forces]
+            bodies.append(
+                {
+                    "residual": float(np.linalg.norm(total[own & ~fixed])),
+                    "size": float(max(sizes)),
+                    "rounding": float(np.linalg.norm(rounding[own])),
+                }
+            )
+        contacts = []
+        for c, f in zip(problem.contacts, found, strict=True):
+            w = c.weights * c.paired
+            contacts.append(
+                {
+                    "force": w @ f["traction"],
+                    "normal": float(w @ -f["r_n"]),
+                    "tangential": float(w @ np.linalg.norm(f["tau"], axis=1)),
+                    "size": float(w @ np.linalg.norm(f["traction"], axis=1)),
+                }
+            )
+        return {"bodies": bodies, "contacts": contacts, "total": total, "motion rest": motion}
+
+    def _size(self, now: dict[str, Any], kind: str, i: int) -> float:
+        """Forces of a body or contact at the ends of the increment, the larger one."""
+        sizes = [now[kind][i]["size"]]
+        if self._before is not None:
+            sizes.append(self._before[kind][i]["size"])
+        return max(sizes)
+
+    def _check_equations(self, name: str, now: dict[str, Any], rtol: float) -> None:
+        for b, body in enumerate(now["bodies"]):
+            size = self._size(now, "bodies", b)
+            allowed = _RESIDUAL * rtol * size + _ROUNDING * body["rounding"]
+            text = f"; forces {size:.3g}"
+            self._check(f"{name}, body {b}", "equations", body["residual"], allowed, text)
+        if len(now["motion rest"]):
+            size = max(self._size(now, "contacts", i) for i in range(len(now["contacts"])))
+            rest = float(np.abs(now["motion rest"]).max())
+            rounding = _ROUNDING * max(b["rounding"] for b in now["bodies"])
+            self._check(name, "support", rest, _RESIDUAL * rtol * size + rounding)
+
+    def _check_results(self, name: str, contact: Any, found: dict, record: dict[str, Any]) -> None:
+        """Reported forces, area and fields against those made anew from u."""
+        w = contact.weights
+        r_n, tau = found["r_n"], found["tau"]
+        size = float(w @ np.linalg.norm(found["traction"], axis=1))
+        # Rounding of u_n - s, times the stiffness.
+        places = np.abs(found["closing"]).max() + np.abs(found["relative"]).max()
+        reach = np.abs(contact.x).max() + places
+        stiff = contact.k_n.max() + contact.k_t.max()
+        rounding = 20 * np.finfo(float).eps * stiff * reach
+        allowed = _SAME * size + rounding * w.sum()
+        self._check(name, "reported force", np.abs(record["force"] - w @ found["traction"]).max(), allowed)
+        self._check(name, "reported N", abs(record["normal_force"] + w @ r_n), allowed)
+        tangential = w @ np.linalg.norm(tau, axis=1)
+        self._check(name, "reported T", abs(record["tangential_force"] - tangential), allowed)
+        bears = contact.law.tension | (r_n < 0)
+        doubtful = np.abs(r_n) <= rounding
+        low, high = w @ (bears & ~doubtful), w @ (bears | doubtful)
+        if contact.law.tension:
+            low = 0.0 if not contact.paired.all() else low
+        off = max(low - record["area"], record["area"] - high, 0.0)
+        self._check(name, "reported area", off, 1e-9 * w.sum())
+        row = self._rows(contact, record)
+        if len(np.unique(row)) == len(row):
+            peak = np.abs(found["traction"]).max(initial=0.0)
+            wrong = np.abs(record["pressure"][row] + r_n).max()
+            wrong = max(wrong, np.abs(record["tangential"][row] - tau).max())
+            self._check(name, "reported traction", wrong, _SAME * peak + rounding)
+            self._check(name, "weights", np.abs(record["measure"][row] - w).max(), 1e-9 * w.max())
+
+    def _check_multipliers(self, name: str, contact: Any, found: dict, record: dict) -> None:
+        """What the springs still bear, after projection, relative to the tractions."""
+        if contact.project is None:
+            return
+        row = self._rows(contact, record)
+        scale = max(np.abs(found["r_n"]).max(), np.abs(found["tau"]).max(initial=0.0))
+        for old in (self._before or {}).get("found", []):
+            scale = max(scale, np.abs(old["r_n"]).max(), np.abs(old["tau"]).max(initial=0.0))
+        left = 0.0
+        if contact.law.has_normal:
+            left = np.abs(contact.project @ -found["r_n"] - record["lambda_n"][row]).max()
+        if contact.law.slips:
+            side = np.abs(contact.project @ found["tau"] - record["lambda_t"][row]).max()
+            left = max(left, side)
+        self._check(name, "multipliers", left, 2 * record["tolerance"] * scale)
+
+    def _check_energy(
+        self,
+        name: str,
+        record: dict[str, Any],
+        u: Array,
+        motion: Array,
+        load: Any,
+        found: list[dict],
+        now: dict[str, Any],
+    ) -> None:
+        """Works and energies of the increment against those made anew."""
+        problem, before = self.problem, self._before
+        stiff = problem.body.stiffness
+        way = u - self._u
+        outside = load.force.copy()
+        outside[load.fixed] += now["total"][load.fixed]
+        inside = stiff @ u
+        work = 0.5 * outside @ way
+        elastic = 0.5 * inside @ way
+        springs = sum(c.stored(f) for c, f in zip(problem.contacts, found, strict=True))
+        slid = sum(c.dissipated(f) for c, f in zip(problem.contacts, found, strict=True))
+        pushes = np.array([load.pushes[c][i] for c, i in problem.motions()])
+        work += 0.5 * pushes @ (motion - self._motion)
+        forces = [c["force"] for c in now["contacts"]]
+        ways = load.shifts
+        if before is not None:
+            work += 0.5 * before["outside"] @ way + 0.5 * before["pushes"] @ (motion - self._motion)
+            elastic += 0.5 * before["inside"] @ way
+            springs -= before["springs"]
+            ends = zip(forces, before["contacts"], strict=True)
+            forces = [f + b["force"] for f, b in ends]
+            ways = [s - b for s, b in zip(load.shifts, before["shifts"], strict=True)]
+        work += sum(0.5 * f @ s for f, s in zip(forces, ways, strict=True))
+        now |= {"outside": outside, "inside": inside, "shifts": load.shifts, "pushes": pushes}
+        energy = record["energy"]
+        penalty = all(c.project is None for c in problem.contacts)
+        scale = np.abs(outside) @ np.abs(way) + abs(springs) + abs(slid)
+        if before is not None:
+            scale += np.abs(before["outside"]) @ np.abs(way)
+        allowed = max(1e-6, 300 * record["rtol"]) * scale + _ROUNDING * (np.abs(stiff) @ np.abs(u)) @ np.abs(u)
+        pairs = [("work", energy.work, work), ("elastic", energy.elastic, elastic)]
+        if penalty:
+            pairs += [("springs", energy.springs, springs), ("dissipation", energy.dissipation, slid)]
+        for what, given, own in pairs:
+            self._check(name, f"energy {what}", abs(given - own), allowed)
+        if penalty and slid < -allowed:
+            self.wrong.append(f"energy: {name}: dissipation {slid:.3g} is negative")
+
+    def _tolerance(self, record: dict[str, Any], base: float) -> float:
+        """Of forces, by what was asked for."""
+        found = max(base, 300 * record["rtol"])
+        for contact in record["contacts"]:
+            if contact["lambda_n"] is not None:
+                found = max(found, 30 * contact["tolerance"])
+            if contact["error"]:
+                found = max(found, contact["error"])
+        return found
+
+    def _unique(self) -> bool:
+        laws = [c.law for c in self.problem.contacts]
+        still = all(not c.free for c in self.problem.contacts)
+        return still and all(
+            law.kind in ("frictionless", "tresca") or law.tension or (law.kind == "coulomb" and law.friction == 0)
+            for law in laws
+        )
+
+    def _check_nearest(
+        self,
+        name: str,
+        record: dict[str, Any],
+        u: Array,
+        motion: Array,
+        load: Any,
+        old: list[Any],
+        found: list[dict],
+        now: dict[str, Any],
+    ) -> None:
+        """Distance, in forces, from the exact solution of the same equations next to it."""
+        try:
+            near, moved = self.problem._newton(u, motion, load, old, 1e-12)
+        except reference.Failed as failure:
+            self.unjudged.append(f"{name}: nearest: {failure}")
+            return
+        exact = self._forces(near, load, self.problem.respond(near, moved, load, old))
+        for i, contact in enumerate(exact["contacts"]):
+            size = self._size(now, "contacts", i)
+            rounding = _ROUNDING * max(b["rounding"] for b in now["bodies"])
+            error = np.abs(contact["force"] - now["contacts"][i]["force"]).max()
+            allowed = self._tolerance(record, _NEAREST) * size + 10 * rounding
+            if error > allowed and not self._unique():
+                self.another.append(f"{name}, contact {i}: nearest differs by {error / size:.1e}")
+            else:
+                self._check(f"{name}, contact {i}", "nearest", error, allowed)
+
+    def _check_apart(self, name: str, record: dict[str, Any], load: Any, now: dict[str, Any]) -> None:
+        """Compare with the history solved apart."""
+        if self._lost:
+            return
+        problem = self._apart
+        try:
+            u, motion, old = problem.solve(self._own_u, self._own_motion, load, self._own_old)
+        except (reference.Failed, np.linalg.LinAlgError) as failure:
+            self.unjudged.append(f"{name}: apart: {failure}")
+            self._lost = True
+            return
+        found = problem.respond(u, motion, load, old)
+        tolerance = self._tolerance(record, _APART)
+        worst = 0.0
+        rounding = _ROUNDING * max(b["rounding"] for b in now["bodies"])
+        for i, (c, f) in enumerate(zip(problem.contacts, found, strict=True)):
+            force = (c.weights * c.paired) @ f["traction"]
+            size = max(self._size(now, "contacts", i), float(np.abs(force).max()))
+            error = np.abs(force - now["contacts"][i]["force"]).max()
+            allowed = tolerance * size + 30 * rounding
+            if allowed > 0:
+                worst = max(worst, error / allowed)
+            text = f"{name}, contact {i}: {now['contacts'][i]['force']} here, {force} apart"
+            if error > allowed:
+                (self.wrong if self._unique() else self.another).append("apart: " + text)
+        self.worst["apart"] = max(self.worst.get("apart", 0.0), worst)
+        if worst > 1.0:
+            self._lost = True
+        self._own_old = [c.next_state(f, o) for c, f, o in zip(problem.contacts, found, old, strict=True)]
+        self._pair_anew(problem, self._own_old, u)
+        self._own_u, self._own_motion = u, motion
+
+    @staticmethod
+    def _pair_anew(problem: Any, states: list[Any], u: Array) -> None:
+        """New pairs where they follow the bodies; slip counts from between the new ones."""
+        for contact, state in zip(problem.contacts, states, strict=True):
+            if contact.repair is None:
+                continue
+            before = contact.jump(u)
+            contact.repair(u)
+            state.jump += contact.jump(u) - before

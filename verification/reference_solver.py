@@ -1,0 +1,879 @@
+"""A second solution of frictional contact in plain NumPy, to judge the package by.
+
+It shares nothing with the package but DOLFINx's stiffness and load vector: points, weights and
+normals of Γc, pairs of surfaces, L2 projection, laws, history, condensation and solver are made
+here, dense and by brute force, for problems of some hundred unknowns. What is solved is what the
+package's docstrings define: laws at quadrature points (`laws`), supports (`supports`), pairs
+(`pairing`), multipliers (`augmented`).
+
+Arrays are those of one rank. Numbers of nodes are those of the displacement element.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import basix
+import numpy as np
+import scipy.linalg
+
+__all__ = [
+    "Body",
+    "ContactModel",
+    "Law",
+    "Problem",
+    "State",
+    "Surface",
+    "pair",
+    "smooth_modulus",
+]
+
+Array = np.ndarray
+# Step of the derivatives by complex numbers: exact, whatever its size.
+_STEP = 1e-60
+# Facets are covered if no more than this share of them is not.
+_COVERED = 1e-6
+_OVERLAP = 1e-6
+
+
+# ---- geometry ------------------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class Body:
+    """Mesh, element and stiffness as arrays.
+
+    Attributes:
+        cell: Name of the cells.
+        degree: Of the displacement.
+        x: Vertices of the mesh, (n_vertices, d) (length).
+        vertices: Of every cell, in DOLFINx's order, (n_cells, n).
+        nodes: Displacement nodes of every cell, (n_cells, m).
+        places: Coordinates of the displacement nodes, (n_nodes, d) (length).
+        parts: Number of the connected part that every node is in, (n_nodes,).
+        stiffness: K, (d n_nodes, d n_nodes) (force/length).
+    """
+
+    cell: str
+    degree: int
+    x: Array
+    vertices: Array
+    nodes: Array
+    places: Array
+    parts: Array
+    stiffness: Array
+
+    @property
+    def d(self) -> int:
+        """Dimension."""
+        return int(self.x.shape[1])
+
+
+class Surface:
+    """Facets with straight edges, each by its cell and its number there."""
+
+    def __init__(self, body: Body, facets: Sequence[tuple[int, int]]) -> None:
+        """Take facets of a body."""
+        self.body, self.d = body, body.d
+        self.facets = list(facets)
+        kind = basix.CellType[body.cell]
+        self.simplex = body.cell in ("triangle", "tetrahedron")
+        corners, topology = basix.geometry(kind), basix.topology(kind)[self.d - 1]
+        self.cells = np.array([c for c, _ in self.facets], dtype=int)
+        local = [topology[i] for _, i in self.facets]
+        self.corner_vertices = np.array([body.vertices[c][v] for c, v in zip(self.cells, local)])
+        self._origin = np.array([corners[v[0]] for v in local])
+        self._axes = np.array([[corners[v[k]] - corners[v[0]] for k in range(1, self.d)] for v in local])
+        family = basix.ElementFamily.P
+        variant = basix.LagrangeVariant.gll_warped
+        self._map = basix.create_element(family, kind, 1, variant)
+        self._element = basix.create_element(family, kind, body.degree, variant)
+        middle = body.x[body.vertices[self.cells]].mean(axis=1)
+        centre = self.place(*self.middles())[0]
+        normal = self._across(*self.middles())
+        self._sign = np.sign(np.sum(normal * (centre - middle), axis=1))
+
+    def middles(self) -> tuple[Array, Array]:
+        """Every facet, and the reference coordinates of its middle."""
+        at = 1 / self.d if self.simplex else 0.5
+        return np.arange(len(self.facets)), np.full((len(self.facets), self.d - 1), at)
+
+    def _in_cell(self, facet: Array, xi: Array) -> Array:
+        return self._origin[facet] + np.einsum("pk,pkd->pd", xi, self._axes[facet])
+
+    def place(self, facet: Array, xi: Array, u: Array | None = None) -> tuple[Array, Array]:
+        """Coordinates, (n, d), and tangents, (n, d - 1, d), of places, displaced by u."""
+        inside = self._in_cell(facet, xi)
+        table = self._map.tabulate(1, inside)[..., 0]
+        corners = self.body.x[self.body.vertices[self.cells[facet]]]
+        x = np.einsum("pk,pkd->pd", table[0], corners)
+        slope = np.einsum("jpk,pkd->pjd", table[1:], corners)
+        if u is not None:
+            table = self._element.tabulate(1, inside)[..., 0]
+            moved = u.reshape(-1, self.d)[self.body.nodes[self.cells[facet]]]
+            x = x + np.einsum("pk,pkd->pd", table[0], moved)
+            slope = slope + np.einsum("jpk,pkd->pjd", table[1:], moved)
+        return x, np.einsum("pkj,pjd->pkd", self._axes[facet], slope)
+
+    def _across(self, facet: Array, xi: Array, u: Array | None = None) -> Array:
+        tangents = self.place(facet, xi, u)[1]
+        if self.d == 2:
+            return np.column_stack([tangents[:, 0, 1], -tangents[:, 0, 0]])
+        return np.cross(tangents[:, 0], tangents[:, 1])
+
+    def normal(self, facet: Array, xi: Array, u: Array | None = None) -> Array:
+        """Outward unit normals, (n, d)."""
+        across = self._across(facet, xi, u) * self._sign[facet][:, None]
+        return across / np.linalg.norm(across, axis=1, keepdims=True)
+
+    def interpolation(self, facet: Array, xi: Array) -> Array:
+        """From values at the nodes to those at places: (n, n_nodes)."""
+        table = self._element.tabulate(0, self._in_cell(facet, xi))[0, :, :, 0]
+        matrix = np.zeros((len(facet), len(self.body.places)))
+        for row, (f, values) in enumerate(zip(facet, table)):
+            matrix[row, self.body.nodes[self.cells[f]]] += values
+        return matrix
+
+    def corners(self, u: Array | None = None) -> Array:
+        """Corners in cyclic order, (n_facets, n_corners, d)."""
+        at = np.vstack([np.zeros(self.d - 1), np.eye(self.d - 1)])
+        if self.d == 3 and not self.simplex:
+            at = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+        every = np.arange(len(self.facets))
+        places = [self.place(every, np.tile(p, (len(every), 1)), u)[0] for p in at]
+        return np.stack(places, axis=1)
+
+    def rule(self, degree: int, scheme: str) -> tuple[Array, Array, Array]:
+        """Facet, reference coordinates and weight (length^(d-1)) of every point of Γc."""
+        kind = {2: "interval", 3: "triangle" if self.simplex else "quadrilateral"}[self.d]
+        if scheme == "vertex":
+            points = basix.geometry(basix.CellType[kind])
+            volume = {"interval": 1.0, "triangle": 0.5, "quadrilateral": 1.0}[kind]
+            weights = np.full(len(points), volume / len(points))
+        else:
+            points, weights = basix.make_quadrature(basix.CellType[kind], degree)
+        facet = np.repeat(np.arange(len(self.facets)), len(points))
+        xi = np.tile(points, (len(self.facets), 1))
+        size = np.linalg.norm(self._across(facet, xi), axis=1)
+        return facet, xi, np.tile(weights, len(self.facets)) * size
+
+    def heights(self) -> tuple[Array, Array]:
+        """Height of the cell over every facet, and the facet's size."""
+        kind = basix.CellType[self.body.cell]
+        middle = basix.geometry(kind).mean(axis=0, keepdims=True)
+        slope = self._map.tabulate(1, middle)[1:, 0, :, 0]
+        volume = []
+        for c in self.cells:
+            jacobian = slope @ self.body.x[self.body.vertices[c]]
+            volume.append(abs(np.linalg.det(jacobian)) * basix.cell.volume(kind))
+        size = np.linalg.norm(self._across(*self.middles()), axis=1)
+        size = size * (0.5 if self.d == 3 and self.simplex else 1.0)
+        return (self.d if self.simplex else 1) * np.array(volume) / size, size
+
+    def meet(
+        self, facet: Array, start: Array, ray: Array, u: Array | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Where rays meet facets, pair by pair: coordinates, signed distance, whether they do."""
+        xi = self.middles()[1][facet]
+        distance, bad = np.zeros(len(facet)), np.zeros(len(facet), dtype=bool)
+        for _ in range(30):
+            x, tangents = self.place(facet, xi, u)
+            system = np.concatenate([np.swapaxes(tangents, 1, 2), -ray[:, :, None]], axis=2)
+            rest = x - start - distance[:, None] * ray
+            size = np.prod(np.linalg.norm(system, axis=1), axis=1)
+            bad |= np.abs(np.linalg.det(system)) < 1e-12 * size
+            system[bad], rest[bad] = np.eye(self.d), 0.0
+            step = np.linalg.solve(system, -rest[..., None])[..., 0]
+            xi = np.clip(xi + step[:, :-1], -3, 4)
+            distance = distance + step[:, -1]
+            if np.abs(step[:, :-1]).max(initial=0.0) < 1e-14:
+                break
+        x, tangents = self.place(facet, xi, u)
+        size = np.linalg.norm(tangents, axis=2).max(axis=1)
+        met = ~bad & (np.linalg.norm(x - start - distance[:, None] * ray, axis=1) < 1e-9 * size)
+        met &= np.all(xi >= -_OVERLAP, axis=1)
+        met &= (xi.sum(axis=1) if self.simplex else xi.max(axis=1)) <= 1 + _OVERLAP
+        return xi, distance, met
+
+    def nearest(
+        self, start: Array, ray: Array, reach: float, u: Array | None
+    ) -> tuple[Array, Array]:
+        """The nearest facet that looks back along each ray, -1 without; coordinates on it."""
+        n, m = len(start), len(self.facets)
+        facet = np.tile(np.arange(m), n)
+        xi, distance, met = self.meet(facet, np.repeat(start, m, 0), np.repeat(ray, m, 0), u)
+        looks = np.sum(self.normal_moved(facet, xi, u) * np.repeat(ray, m, 0), axis=1) < 0
+        far = np.where(met & looks & (np.abs(distance) <= reach), np.abs(distance), np.inf)
+        best = far.reshape(n, m).argmin(axis=1)
+        row = np.arange(n) * m + best
+        return np.where(np.isfinite(far[row]), best, -1), xi[row]
+
+    def normal_moved(self, facet: Array, xi: Array, u: Array | None) -> Array:
+        """Outward normals of the displaced facets, not of unit length."""
+        return self._across(facet, xi, u) * self._sign[facet][:, None]
+
+
+def smooth_modulus(surface: Surface, modulus: Array, facet: Array, xi: Array) -> Array:
+    """E/h at points of Γc, smoothed over four facets; see `accuracy.modulus_over_height`.
+
+    Args:
+        surface: Γc.
+        modulus: Young's modulus of the cell behind every facet (stress).
+        facet: Facet of every point.
+        xi: Reference coordinates of every point.
+
+    Returns:
+        (n_points,) (stress/length).
+    """
+    height, size = surface.heights()
+    d = surface.d
+    kind = {2: "interval", 3: "triangle" if surface.simplex else "quadrilateral"}[d]
+    element = basix.create_element(basix.ElementFamily.P, basix.CellType[kind], 1)
+    vertices, numbered = np.unique(surface.corner_vertices, return_inverse=True)
+    numbered = numbered.reshape(surface.corner_vertices.shape)
+    points, weights = basix.make_quadrature(basix.CellType[kind], 6)
+    table = element.tabulate(1, points)[..., 0]
+    left, right = np.zeros((len(vertices),) * 2), np.zeros(len(vertices))
+    for f, own in enumerate(numbered):
+        length = 4.0 * size[f] ** (1 / (d - 1))
+        every = np.full(len(points), f)
+        tangents = surface.place(every, points)[1]
+        for q, weight in enumerate(weights):
+            metric = tangents[q] @ tangents[q].T
+            area = weight * np.sqrt(np.linalg.det(metric))
+            slope = table[1:, q]
+            value = table[0, q]
+            stiff = length**2 * slope.T @ np.linalg.solve(metric, slope)
+            left[np.ix_(own, own)] += area * (np.outer(value, value) + stiff)
+            right[own] += area * value * np.log(modulus[f] / height[f])
+    smooth = np.linalg.solve(left, right)
+    at = element.tabulate(0, xi)[0, :, :, 0]
+    return np.exp(np.einsum("qk,qk->q", at, smooth[numbered[facet]]))
+
+
+# ---- pairs of surfaces ---------------------------------------------------------------------------
+
+
+def pair(
+    here: Surface,
+    there: Surface,
+    points: tuple[Array, Array],
+    *,
+    reach: float = np.inf,
+    u: Array | None = None,
+) -> tuple[Array, Array, Array]:
+    """What lies opposite the points of Γc; see the docstring of the package's ``pairing``.
+
+    Args:
+        here: Γc.
+        there: The opposite surface.
+        points: Facet and reference coordinates of every point.
+        reach: Largest distance.
+        u: Displacement at which to pair; none: undeformed.
+
+    Returns:
+        Interpolation of the opposite displacement, (n_points, n_nodes); the distance in the
+        undeformed bodies, (n_points,); whether there is an opposite, (n_points,).
+    """
+    facet, xi = points
+    normal = here.normal(facet, xi)
+    hit, where = there.nearest(here.place(facet, xi, u)[0], normal, reach, u)
+    paired = hit >= 0
+    gap = np.zeros(len(facet))
+    gap[paired] = np.sum(
+        (there.place(hit[paired], where[paired])[0] - here.place(facet, xi)[0][paired])
+        * normal[paired],
+        axis=1,
+    )
+    matrix = np.zeros((len(facet), len(here.body.places)))
+    matrix[paired] = there.interpolation(hit[paired], where[paired])
+    for f in range(len(here.facets)):
+        own = np.flatnonzero(facet == f)
+        if not paired[own].all():
+            continue
+        pieces, weights = _pieces(here, there, f, u)
+        if not len(pieces):
+            continue
+        f_pieces = np.full(len(pieces), f)
+        ray = here.normal(f_pieces, pieces)
+        met, at = there.nearest(here.place(f_pieces, pieces, u)[0], ray, reach, u)
+        if np.any(met < 0):
+            continue
+        basis = _polynomials(here, len(own))
+        left, at_points = basis(pieces), basis(xi[own])
+        gram = left.T @ (weights[:, None] * left)
+        project = at_points @ np.linalg.solve(gram, left.T * weights)
+        matrix[own] = project @ there.interpolation(met, at)
+    return matrix, gap, paired
+
+
+def _polynomials(surface: Surface, n_points: int) -> Any:
+    """Monomials of the largest complete space of polynomials that so many points carry."""
+    d = surface.d
+    if d == 2:
+        return lambda s: s[:, :1] ** np.arange(n_points)
+    k = 0
+    if surface.simplex:
+        while (k + 2) * (k + 3) // 2 <= n_points:
+            k += 1
+        powers = [(i, j) for i in range(k + 1) for j in range(k + 1 - i)]
+    else:
+        while (k + 2) ** 2 <= n_points:
+            k += 1
+        powers = [(i, j) for i in range(k + 1) for j in range(k + 1)]
+    return lambda s: np.stack([s[:, 0] ** i * s[:, 1] ** j for i, j in powers], axis=1)
+
+
+def _pieces(here: Surface, there: Surface, f: int, u: Array | None) -> tuple[Array, Array]:
+    """Places on facet f, and weights, on the pieces into which the opposite facets cut it."""
+    corners, others = here.corners(u)[f], there.corners(u)
+    mean = here.normal(*here.middles())[f]
+    looks = there.normal(*there.middles()) @ mean < 0
+    points, weights = [], []
+    if here.d == 2:
+        rule, shares = basix.make_quadrature(basix.CellType.interval, 12)
+        origin, edge = corners[0], corners[1] - corners[0]
+        covered = 0.0
+        for other in others[looks]:
+            ends = np.clip((other - origin) @ edge / (edge @ edge), 0, 1)
+            low, high = ends.min(), ends.max()
+            if high - low > 1e-9:
+                covered += high - low
+                points.append(origin + (low + (high - low) * rule) * edge)
+                weights.append((high - low) * shares)
+    else:
+        rule, shares = basix.make_quadrature(basix.CellType.triangle, 12)
+        first = corners[1] - corners[0]
+        first = first - (first @ mean) * mean
+        first /= np.linalg.norm(first)
+        plane = np.column_stack([first, np.cross(mean, first)])
+        window = _anticlockwise((corners - corners[0]) @ plane)
+        size, covered = _area(window), 0.0
+        for other in others[looks]:
+            ring = _clip(_anticlockwise((other - corners[0]) @ plane), window)
+            for i in range(1, len(ring) - 1):
+                edges = np.array([ring[i] - ring[0], ring[i + 1] - ring[0]])
+                twice = np.linalg.det(edges)
+                covered += 0.5 * twice / size
+                if twice > 1e-9 * size:
+                    points.append(corners[0] + (ring[0] + rule @ edges) @ plane.T)
+                    weights.append(twice * shares)
+    if abs(covered - 1) > _COVERED or not points:
+        return np.zeros((0, here.d - 1)), np.zeros(0)
+    flat = np.concatenate(points)
+    xi, _, _ = here.meet(np.full(len(flat), f), flat, np.tile(mean, (len(flat), 1)), u)
+    return xi, np.concatenate(weights)
+
+
+def _area(ring: Array) -> float:
+    x, y = ring.T
+    return float(0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
+
+
+def _anticlockwise(ring: Array) -> Array:
+    return ring if _area(ring) > 0 else ring[::-1]
+
+
+def _clip(ring: Array, window: Array) -> Array:
+    """Intersection of two convex polygons."""
+    for start, end in zip(window, np.roll(window, -1, axis=0)):
+        along, found = end - start, []
+        side = [along[0] * (p[1] - start[1]) - along[1] * (p[0] - start[0]) for p in ring]
+        for i, p in enumerate(ring):
+            j = (i + 1) % len(ring)
+            if side[i] >= 0:
+                found.append(p)
+            if (side[i] >= 0) != (side[j] >= 0):
+                found.append(p + side[i] / (side[i] - side[j]) * (ring[j] - p))
+        ring = np.array(found)
+        if not len(ring):
+            break
+    return ring
+
+
+# ---- laws ----------------------------------------------------------------------------------------
+
+
+@dataclass
+class Law:
+    """A law by its numbers; see the package's ``laws``.
+
+    Attributes:
+        kind: "frictionless", "coulomb", "tresca" or "foundation".
+        friction, pressure, transverse, modes, direction: As there.
+        tension, unilateral: As there.
+    """
+
+    kind: str
+    friction: float = 0.0
+    pressure: float = 0.0
+    transverse: float | None = None
+    modes: int | None = None
+    direction: Sequence[float] | None = None
+    tension: bool = False
+    unilateral: bool = True
+
+    @property
+    def slips(self) -> bool:
+        """Whether there is friction."""
+        return self.kind in ("coulomb", "tresca")
+
+    @property
+    def has_normal(self) -> bool:
+        """Whether the pressure answers the gap."""
+        return self.kind != "tresca" or self.unilateral
+
+    @property
+    def unique(self) -> bool:
+        """Whether an increment has one solution, whatever the numbers."""
+        return self.kind != "coulomb"
+
+    def normal(self, k_n: Array, closing: Array, pressure: Array | None) -> Array:
+        """r_n from u_n - s; ``pressure``: multiplier."""
+        if not self.has_normal:
+            return np.full(closing.shape, -self.pressure, dtype=closing.dtype)
+        elastic = k_n * closing + (0.0 if pressure is None else pressure)
+        if self.tension:
+            return -elastic
+        return -np.where(elastic.real > 0, elastic, 0)
+
+    def frame(self, n: Array) -> tuple[Array, Array]:
+        """Unit tangents along the direction and across it, (n, 3) each."""
+        if self.direction is None:
+            along = (np.abs(n[:, 0].real) < 0.9)[:, None]
+            direction = np.where(along, np.array([1.0, 0, 0]), np.array([0.0, 1, 0]))
+        else:
+            direction = np.tile(np.asarray(self.direction, dtype=float), (len(n), 1))
+        first = direction - np.sum(direction * n, axis=1)[:, None] * n
+        first = first / np.sqrt(np.sum(first * first, axis=1))[:, None]
+        return first, np.cross(n, first)
+
+    def tangential(
+        self, k_t: Array, n: Array, step: Array, old: Array, total: Array, r_n: Array, closing: Array
+    ) -> Array:
+        """τ from Δu_t, the old τ and u_t, all (n, d)."""
+        if self.kind == "foundation":
+            tau = -k_t[:, None] * total
+            return tau if self.tension else np.where((closing.real > 0)[:, None], tau, 0)
+        if not self.slips:
+            return np.zeros_like(step)
+        limit = -self.friction * r_n if self.kind == "coulomb" else 0 * r_n + self.friction * self.pressure
+        if n.shape[1] == 2:
+            tangent = np.column_stack([-n[:, 1], n[:, 0]])
+            trial = np.sum((old - k_t[:, None] * step) * tangent, axis=1)
+            value = np.where(trial.real > limit.real, limit, trial)
+            value = np.where(trial.real < -limit.real, -limit, value)
+            return value[:, None] * tangent
+        first, second = self.frame(n)
+        ratio = 1.0 if self.transverse is None else self.transverse / self.friction
+        # The limit is a circle or polygon in σ = (τ₁, τ₂/r), and K_t is k_t diag(1, r²).
+        trial = np.stack(
+            [
+                np.sum(old * first, axis=1) - k_t * np.sum(step * first, axis=1),
+                np.sum(old * second, axis=1) / ratio - k_t * ratio * np.sum(step * second, axis=1),
+            ],
+            axis=1,
+        )
+        sigma = _nearest_in_circle(trial, limit)
+        if self.modes is not None:
+            sigma = _nearest_in_polygon(trial, limit, self.modes)
+        return sigma[:, :1] * first + ratio * sigma[:, 1:] * second
+
+    def stiffness(self, k_t: Array, n: Array) -> Array:
+        """K_t, (n, d, d)."""
+        d = n.shape[1]
+        if self.transverse is None:
+            return k_t[:, None, None] * (np.eye(d) - n[:, :, None] * n[:, None, :])
+        first, second = self.frame(n)
+        ratio = (self.transverse / self.friction) ** 2
+        both = first[:, :, None] * first[:, None, :] + ratio * second[:, :, None] * second[:, None, :]
+        return k_t[:, None, None] * both
+
+    def stretch(self, k_t: Array, n: Array, tau: Array) -> Array:
+        """K_t⁻¹ τ, (n, d)."""
+        along = k_t[:, None, None] * n[:, :, None] * n[:, None, :]
+        return np.linalg.solve(self.stiffness(k_t, n) + along, tau[..., None])[..., 0]
+
+
+def _nearest_in_circle(trial: Array, limit: Array) -> Array:
+    size = np.sqrt(np.sum(trial * trial, axis=1) + 0j)
+    size = size if np.iscomplexobj(trial) or np.iscomplexobj(limit) else size.real
+    out = size.real > limit.real
+    return np.where(out[:, None], (limit / np.where(out, size, 1.0))[:, None] * trial, trial)
+
+
+def _nearest_in_polygon(trial: Array, limit: Array, modes: int) -> Array:
+    """The nearest point of the polygon: of all its sides' nearest points the nearest one."""
+    half = np.tan(np.pi / modes)
+    inside = np.ones(len(trial), dtype=bool)
+    best, found = np.full(len(trial), np.inf), trial.copy() + 0 * limit[:, None]
+    for j in range(modes):
+        angle = 2 * np.pi * j / modes
+        a, b = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        x, y = trial @ a, trial @ b
+        inside &= x.real <= limit.real
+        y = np.where(y.real > half * limit.real, half * limit, y)
+        y = np.where(y.real < -half * limit.real, -half * limit, y)
+        place = limit[:, None] * a + y[:, None] * b
+        far = np.linalg.norm((place - trial).real, axis=1)
+        nearer = far < best
+        best = np.where(nearer, far, best)
+        found = np.where(nearer[:, None], place, found)
+    return np.where(inside[:, None], trial, found)
+
+
+# ---- a contact -----------------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class State:
+    """What a contact keeps from one increment to the next.
+
+    Attributes:
+        jump: Displacement relative to the support that Δu_t counts from, (n, d) (length).
+        traction: τ, or with multipliers λ_t, (n, d) (stress).
+        pressure: λ_n, (n,) (stress); None without multipliers.
+    """
+
+    jump: Array
+    traction: Array
+    pressure: Array | None = None
+
+
+@dataclass(eq=False)
+class ContactModel:
+    """Γc, its support and its law at points.
+
+    Attributes:
+        place: Function of the shift of the support, (d,): gap (n,) and unit normal (n, d).
+        interpolation: From node values to the body's displacement, less the opposite one,
+            (n_points, n_nodes).
+        weights: (n,).
+        k_n, k_t: Stiffness at the points, (n,).
+        law: The law.
+        paired: Points that may carry tractions, (n,).
+        free: Components of the support's motion that follow from the force on it.
+        project: L2 projection of the multipliers, (n, n); None without multipliers.
+    """
+
+    x: Array
+    place: Any
+    interpolation: Array
+    weights: Array
+    k_n: Array
+    k_t: Array
+    law: Law
+    paired: Array
+    free: tuple[int, ...] = ()
+    project: Array | None = None
+    repair: Any = None  # function of u: new pairs
+
+    @property
+    def d(self) -> int:
+        """Dimension."""
+        return int(self.x.shape[1])
+
+    def start(self) -> State:
+        """No traction, no slip."""
+        zero = np.zeros_like(self.x)
+        return State(zero, zero, None if self.project is None else np.zeros(len(zero)))
+
+    def jump(self, u: Array) -> Array:
+        """Displacement of the body, less that of the opposite one, (n, d)."""
+        return self.interpolation @ u.reshape(-1, self.d)
+
+    def respond(self, jump: Array, shift: Array, old: State) -> dict[str, Array]:
+        """Tractions and what they follow from."""
+        gap, n = self.place(shift)
+        closing = np.sum(jump * n, axis=1) - gap
+        relative = jump - shift
+
+        def across(vector: Array) -> Array:
+            return vector - np.sum(vector * n, axis=1)[:, None] * n
+
+        step, before = across(relative - old.jump), across(old.traction)
+        r_n = self.law.normal(self.k_n, closing, old.pressure)
+        tau = self.law.tangential(self.k_t, n, step, before, across(relative), r_n, closing)
+        r_n, tau = np.where(self.paired, r_n, 0), np.where(self.paired[:, None], tau, 0)
+        traction = r_n[:, None] * n + tau
+        return {
+            "normal": n,
+            "closing": closing,
+            "relative": relative,
+            "step": step,
+            "before": before,
+            "r_n": r_n,
+            "tau": tau,
+            "traction": traction,
+        }
+
+    def derivatives(self, jump: Array, shift: Array, old: State) -> tuple[Array, Array]:
+        """∂t/∂jump, (n, d, d), and ∂t/∂shift, (n, d, d); the last index is the component."""
+        by_jump, by_shift = [], []
+        for i in range(self.d):
+            turn = 1j * _STEP * np.eye(self.d)[i]
+            by_jump.append(self.respond(jump + turn, shift + 0j, old)["traction"].imag / _STEP)
+            by_shift.append(self.respond(jump + 0j, shift + turn, old)["traction"].imag / _STEP)
+        return np.stack(by_jump, axis=2), np.stack(by_shift, axis=2)
+
+    def augment(self, found: dict[str, Array], old: State) -> State:
+        """One round: the multipliers that the tractions found make."""
+        assert self.project is not None
+        pressure = self.project @ -found["r_n"] if self.law.has_normal else 0 * found["r_n"]
+        traction = self.project @ found["tau"] if self.law.slips else old.traction
+        return State(old.jump, traction, pressure)
+
+    def next_state(self, found: dict[str, Array], old: State) -> State:
+        """History of the next increment; ``old`` with the multipliers it was found with."""
+        if self.project is None:
+            return State(found["relative"].copy(), found["tau"].copy())
+        jump = found["relative"]
+        if self.law.slips:
+            borne = found["before"] - found["tau"]
+            jump = jump - self.law.stretch(self.k_t, found["normal"], borne)
+        return State(jump, old.traction.copy(), old.pressure)
+
+    def stored(self, found: dict[str, Array]) -> float:
+        """Energy of the springs, of penalty enforcement."""
+        w, law = self.weights * self.paired, self.law
+        if law.kind == "foundation":
+            across = found["relative"] - np.sum(found["relative"] * found["normal"], axis=1)[:, None] * found["normal"]
+            energy = -found["r_n"] * found["closing"] - np.sum(found["tau"] * across, axis=1)
+            return float(w @ energy / 2)
+        energy = found["r_n"] ** 2 / (2 * self.k_n) if law.has_normal else 0 * found["r_n"]
+        if law.slips:
+            stretch = law.stretch(self.k_t, found["normal"], found["tau"])
+            energy = energy + np.sum(found["tau"] * stretch, axis=1) / 2
+        return float(w @ energy)
+
+    def dissipated(self, found: dict[str, Array]) -> float:
+        """Work of friction on the slip of the increment, of penalty enforcement."""
+        if not self.law.slips:
+            return 0.0
+        stretch = self.law.stretch(self.k_t, found["normal"], found["tau"] - found["before"])
+        return float(-(self.weights * self.paired) @ np.sum(found["tau"] * (found["step"] + stretch), axis=1))
+
+
+# ---- the problem ---------------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class Load:
+    """What drives an increment.
+
+    Attributes:
+        force: Load vector, (N,) (force).
+        fixed: Prescribed unknowns.
+        values: Theirs (length).
+        shifts: Of every contact the prescribed displacement of its support, (d,); zero where free.
+        pushes: Of every contact the force on its support, (d,).
+    """
+
+    force: Array
+    fixed: Array
+    values: Array
+    shifts: list[Array]
+    pushes: list[Array]
+
+
+class Failed(RuntimeError):
+    """No solution was found here."""
+
+
+@dataclass(eq=False)
+class Problem:
+    """A linear bulk and contacts, dense."""
+
+    body: Body
+    contacts: list[ContactModel]
+    notes: list[str] = field(default_factory=list)
+
+    def motions(self) -> list[tuple[int, int]]:
+        """Contact and component of every free motion."""
+        return [(c, i) for c, m in enumerate(self.contacts) for i in m.free]
+
+    def shifts(self, load: Load, motion: Array) -> list[Array]:
+        """Displacements of the supports."""
+        shifts = [np.array(s, dtype=motion.dtype) for s in load.shifts]
+        for value, (c, i) in zip(motion, self.motions()):
+            shifts[c][i] = value
+        return shifts
+
+    def respond(self, u: Array, motion: Array, load: Load, old: list[State]) -> list[dict]:
+        """Tractions of all contacts."""
+        shifts = self.shifts(load, motion)
+        return [
+            c.respond(c.jump(u), s, o) for c, s, o in zip(self.contacts, shifts, old, strict=True)
+        ]
+
+    def contact_force(self, found: list[dict]) -> list[Array]:
+        """Force of every contact on the bodies, (N,) each."""
+        return [
+            (c.interpolation.T @ (c.weights[:, None] * f["traction"])).ravel()
+            for c, f in zip(self.contacts, found, strict=True)
+        ]
+
+    def residual(self, u: Array, load: Load, found: list[dict]) -> tuple[Array, Array]:
+        """K u - f - contact on all unknowns, and force on supports not balanced."""
+        total = self.body.stiffness @ u - load.force - sum(self.contact_force(found))
+        motion = [
+            (self.contacts[c].weights @ found[c]["traction"])[i] - load.pushes[c][i]
+            for c, i in self.motions()
+        ]
+        return total, np.array(motion)
+
+    def solve(
+        self, u: Array, motion: Array, load: Load, old: list[State], *, rtol: float = 1e-12
+    ) -> tuple[Array, Array, list[State]]:
+        """One increment.
+
+        Args:
+            u: Where to start.
+            motion: Likewise.
+            load: At the end of the increment.
+            old: History.
+            rtol: Residual relative to the forces.
+
+        Returns:
+            u, motions, and the history with the multipliers that belong to the solution.
+
+        Raises:
+            Failed: Nothing was found.
+        """
+        if all(c.project is None for c in self.contacts):
+            return *self._newton(u, motion, load, old, rtol), old
+        for _ in range(3000):
+            u, motion = self._newton(u, motion, load, old, rtol)
+            found = self.respond(u, motion, load, old)
+            new = [
+                c.augment(f, o) if c.project is not None else o
+                for c, f, o in zip(self.contacts, found, old, strict=True)
+            ]
+            change = scale = 0.0
+            for a, b in zip(new, old, strict=True):
+                if a.pressure is not None:
+                    change = max(change, np.abs(a.pressure - b.pressure).max(), np.abs(a.traction - b.traction).max())
+                    scale = max(scale, np.abs(a.pressure).max(), np.abs(a.traction).max())
+            old = new
+            if change <= 1e-9 * scale:
+                return u, motion, old
+        raise Failed("multipliers do not settle")
+
+    def _newton(
+        self, u: Array, motion: Array, load: Load, old: list[State], rtol: float
+    ) -> tuple[Array, Array]:
+        """Newton's method on the unknowns of Γc, the others eliminated."""
+        d, n = self.body.d, len(u)
+        felt = np.zeros(n, dtype=bool)
+        for c in self.contacts:
+            felt |= np.repeat(np.any(c.interpolation != 0, axis=0), d)
+        fixed = np.zeros(n, dtype=bool)
+        fixed[load.fixed] = True
+        kept, inner = np.flatnonzero(felt & ~fixed), np.flatnonzero(~felt & ~fixed)
+        stiff = self.body.stiffness
+        u = u.copy()
+        u[load.fixed] = load.values
+        right = load.force - stiff[:, load.fixed] @ load.values
+        if len(inner):
+            factor = scipy.linalg.cho_factor(stiff[np.ix_(inner, inner)])
+            across = stiff[np.ix_(inner, kept)]
+            first = scipy.linalg.cho_solve(factor, right[inner])
+            recover = scipy.linalg.cho_solve(factor, across)
+            schur = stiff[np.ix_(kept, kept)] - across.T @ recover
+            g = right[kept] - across.T @ first
+        else:
+            schur, g = stiff[np.ix_(kept, kept)], right[kept]
+        maps = [np.kron(c.interpolation, np.eye(d))[:, kept] for c in self.contacts]
+        rigid = [np.kron(c.interpolation, np.eye(d))[:, load.fixed] @ load.values for c in self.contacts]
+        free = self.motions()
+
+        def evaluate(z: Array, *, tangent: bool) -> tuple[Array, Array | None, float, Array]:
+            v, m = z[: len(kept)], z[len(kept) :]
+            shifts = self.shifts(load, m)
+            rest = np.concatenate([schur @ v - g, [-load.pushes[c][i] for c, i in free]])
+            floor = np.concatenate([np.abs(schur) @ np.abs(v), np.zeros(len(free))])
+            sizes = [np.linalg.norm(g), np.linalg.norm(schur @ v)]
+            matrix = np.zeros((len(z), len(z))) if tangent else None
+            if tangent:
+                matrix[: len(kept), : len(kept)] = schur
+            for c, model in enumerate(self.contacts):
+                jump = (maps[c] @ v + rigid[c]).reshape(-1, d)
+                found = model.respond(jump, shifts[c], old[c])
+                force = (model.weights[:, None] * found["traction"]).ravel()
+                mine = [len(kept) + k for k, (o, _) in enumerate(free) if o == c]
+                axes = [i for o, i in free if o == c]
+                select = np.kron(np.ones((len(model.x), 1)), np.eye(d))[:, axes]
+                rest[: len(kept)] -= maps[c].T @ force
+                rest[mine] += select.T @ force
+                floor[: len(kept)] += np.abs(maps[c].T) @ np.abs(force)
+                floor[mine] += np.abs(select).T @ np.abs(force)
+                sizes.append(np.linalg.norm(maps[c].T @ force))
+                if tangent:
+                    by_jump, by_shift = model.derivatives(jump, shifts[c], old[c])
+                    w = model.weights[:, None, None]
+                    left = np.zeros((force.size, len(z)))
+                    left[:, : len(kept)] = maps[c]
+                    left[:, mine] -= select
+                    block = scipy.linalg.block_diag(*(w * by_jump))
+                    right_side = np.zeros((force.size, len(z)))
+                    right_side[:, : len(kept)] = block @ maps[c]
+                    if mine:
+                        turned = scipy.linalg.block_diag(*(w * by_shift))
+                        right_side[:, mine] = turned @ select
+                    matrix -= left.T @ right_side
+            return rest, matrix, max(sizes), floor
+
+        def closed() -> Array:
+            """Tangent with all of Γc closed and sticking, to hold what nothing holds yet."""
+            matrix = np.zeros((len(kept) + len(free),) * 2)
+            matrix[: len(kept), : len(kept)] = schur
+            for c, model in enumerate(self.contacts):
+                left = np.zeros((model.x.size, len(matrix)))
+                left[:, : len(kept)] = maps[c]
+                for k, (o, i) in enumerate(free):
+                    if o == c:
+                        left[i :: d, len(kept) + k] -= 1.0
+                stiffness = np.where(model.k_t > 0, model.k_t, model.k_n)
+                stiffness = model.weights * np.maximum(model.k_n, stiffness)
+                matrix += left.T @ (np.repeat(stiffness, d)[:, None] * left)
+            return matrix
+
+        z = np.concatenate([u[kept], motion])
+        best, since = (np.inf, z), 0
+        for iteration in range(200):
+            rest, matrix, size, floor = evaluate(z, tangent=True)
+            norm = np.linalg.norm(rest)
+            if norm < best[0]:
+                since = iteration if norm < 0.5 * best[0] else since
+                best = (norm, z.copy())
+            if norm <= rtol * size or norm <= 1e-14 * np.linalg.norm(floor):
+                break
+            if iteration > since + 40:
+                break
+            scale = np.sqrt(np.maximum(np.abs(np.diag(closed())), 1e-300))
+            system = matrix / scale[:, None] / scale
+            if np.linalg.cond(system) > 1e13:
+                system = closed() / scale[:, None] / scale
+            step = -np.linalg.lstsq(system, rest / scale, rcond=1e-15)[0] / scale
+            share, slope = 1.0, rest @ step
+            # The paper's line search: energy falls along the step for laws that have one.
+            for _ in range(12):
+                trial = evaluate(z + share * step, tangent=False)[0]
+                if np.linalg.norm(trial / scale) < (1 - 0.1 * share) * np.linalg.norm(rest / scale):
+                    break
+                if abs(trial @ step) <= 0.5 * abs(slope):
+                    break
+                share *= 0.5
+            if iteration % 7 == 6:
+                share = 1.0 if iteration % 14 == 6 else 0.37  # out of a cycle
+            z = z + share * step
+        norm, z = best
+        _, _, size, floor = evaluate(z, tangent=False)
+        if norm > 1e3 * rtol * size and norm > 1e-12 * np.linalg.norm(floor):
+            raise Failed(f"residual {norm / max(size, 1e-300):.1e} of the forces")
+        u[kept], motion = z[: len(kept)], z[len(kept) :]
+        if len(inner):
+            u[inner] = first - recover @ u[kept]
+        return u, motion
