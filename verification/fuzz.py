@@ -54,6 +54,10 @@ CATEGORIES = {
     "too large": "too large",
     "rigid": "rigid motion",
 }
+# Whether the time was up, even if the error that came of it is another.
+_LATE: list[bool] = []
+# What is made of the fields at the points, apart from the equations.
+_REPORTED = ("reported", "energy springs", "energy dissipation", "multipliers")
 # Scenes in one process.
 _BATCH = 40
 
@@ -94,8 +98,10 @@ def _limited(seconds: float | None) -> Iterator[None]:
         return
 
     def late(*_: Any) -> None:
+        _LATE.append(True)
         raise _Slow
 
+    _LATE.clear()
     before = signal.signal(signal.SIGALRM, late)
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
@@ -157,6 +163,8 @@ def play(
     except Exception as error:
         outcome = "refused" if _is_refusal(error) else "crashed"
         kind = _category(error)
+        if _LATE:  # inside PETSc it comes out as PETSc's error
+            outcome, kind = "slow", ""
         trace = traceback.extract_tb(error.__traceback__)[-1]
         detail = [str(error)[:500]]
         if outcome == "crashed":
@@ -167,18 +175,25 @@ def play(
     try:
         with warnings.catch_warnings(), _limited(3 * limit if limit and comm.size == 1 else None):
             warnings.simplefilter("ignore")
-            judge = fuzz_judge.Judge(scene) if records else None
+            judge = fuzz_judge.Judge(scene) if records or outcome != "right" else None
             for record in records:
                 if spoiled is not None:
                     spoiled(record)
                 judge.take(record)
                 if judge.wrong:
                     break
+            ahead = _ahead(scene, records)
+            if outcome in ("refused", "slow") and judge is not None and not judge.wrong and ahead:
+                solved = judge.solvable(*ahead)
+                kind += " (solved apart)" if solved else " (not solved apart)"
         if judge is not None:
             worst = judge.worst
             if judge.wrong:
                 outcome = "wrong"
                 kind = ", ".join(sorted({w.split(":")[0] for w in judge.wrong}))
+                unpaired = any(c["unpaired"] for c in records[-1]["contacts"])
+                if unpaired and all(w.startswith(_REPORTED) for w in judge.wrong):
+                    kind = "unpaired points: " + kind
                 detail = judge.wrong[:6]
             elif outcome == "right" and judge.another:
                 outcome, detail = "another", judge.another[:3]
@@ -187,6 +202,14 @@ def play(
         outcome, kind = "unjudged", type(error).__name__
         detail = traceback.format_exc().strip().splitlines()[-6:]
     return Outcome(outcome, kind, len(records), time.perf_counter() - start, detail, worst)
+
+
+def _ahead(scene: Scene, records: list[dict[str, Any]]) -> tuple[int, float] | None:
+    """Stage and load parameter of the next increment that was asked for."""
+    import fuzz_scenes
+
+    last = (records[-1]["stage"], records[-1]["load"]) if records else (-1, 0.0)
+    return next((p for p in fuzz_scenes.path(scene) if p > (last[0], last[1] + 1e-9)), None)
 
 
 def features(scene: Scene) -> list[str]:

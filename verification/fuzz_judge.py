@@ -91,6 +91,15 @@ class Judge:
         now["springs"] = sum(c.stored(f) for c, f in zip(problem.contacts, found, strict=True))
         self._before, self._u, self._motion = now, u, motion
 
+    def solvable(self, stage: int, t: float) -> bool:
+        """Whether the reference finds a solution at the next load after those taken."""
+        u, motion = self._u, self._motion
+        try:
+            self.problem.solve(u, motion, self._load(stage, t), self._old)
+        except (reference.Failed, np.linalg.LinAlgError):
+            return False
+        return True
+
     def _check(self, where: str, what: str, value: float, allowed: float, text: str = "") -> bool:
         with np.errstate(all="ignore"):
             share = float(value / allowed) if allowed > 0 else (0.0 if value == 0 else np.inf)
@@ -285,12 +294,7 @@ class Judge:
         return found
 
     def _unique(self) -> bool:
-        laws = [c.law for c in self.problem.contacts]
-        still = all(not c.free for c in self.problem.contacts)
-        return still and all(
-            law.kind in ("frictionless", "tresca") or law.tension or (law.kind == "coulomb" and law.friction == 0)
-            for law in laws
-        )
+        return all(c.law.unique and not c.free for c in self.problem.contacts)
 
     def _check_nearest(
         self,
@@ -305,7 +309,7 @@ class Judge:
     ) -> None:
         """Distance, in forces, from the exact solution of the same equations next to it."""
         try:
-            near, moved = self.problem._newton(u, motion, load, old, 1e-12)
+            near, moved = self.problem._increment(u, motion, load, old, 1e-12)
         except reference.Failed as failure:
             self.unjudged.append(f"{name}: nearest: {failure}")
             return

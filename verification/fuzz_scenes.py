@@ -279,6 +279,8 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
         scene["method"] = pick("lbfgs", "newton", "continuation", "alternating")
     if chance(0.2):
         scene["condensation"] = False
+    if chance(0.1):
+        scene["cuts"] = 4
     if chance(0.08, "ration"):
         scene["ration"] = int(rng.integers(3, 9))
     return scene
@@ -690,7 +692,7 @@ def history(
                     problem,
                     lambda t: made.apply(stage, t),
                     steps=n,
-                    max_cuts=4,
+                    max_cuts=scene.get("cuts", 1),
                     checkpoint=file if stop is not None else None,
                 )
 

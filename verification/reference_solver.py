@@ -11,8 +11,9 @@ Arrays are those of one rank. Numbers of nodes are those of the displacement ele
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import basix
@@ -36,6 +37,7 @@ _STEP = 1e-60
 # Facets are covered if no more than this share of them is not.
 _COVERED = 1e-6
 _OVERLAP = 1e-6
+DEBUG = False
 
 
 # ---- geometry ------------------------------------------------------------------------------------
@@ -248,9 +250,9 @@ def smooth_modulus(surface: Surface, modulus: Array, facet: Array, xi: Array) ->
             stiff = length**2 * slope.T @ np.linalg.solve(metric, slope)
             left[np.ix_(own, own)] += area * (np.outer(value, value) + stiff)
             right[own] += area * value * np.log(modulus[f] / height[f])
-    smooth = np.linalg.solve(left, right)
+    smooth = np.exp(np.linalg.solve(left, right))
     at = element.tabulate(0, xi)[0, :, :, 0]
-    return np.exp(np.einsum("qk,qk->q", at, smooth[numbered[facet]]))
+    return np.einsum("qk,qk->q", at, smooth[numbered[facet]])
 
 
 # ---- pairs of surfaces ---------------------------------------------------------------------------
@@ -427,8 +429,10 @@ class Law:
 
     @property
     def unique(self) -> bool:
-        """Whether an increment has one solution, whatever the numbers."""
-        return self.kind != "coulomb"
+        """Whether the tractions follow from a convex potential: an increment has one solution."""
+        if self.kind == "foundation":
+            return self.tension
+        return self.kind != "coulomb" or self.friction == 0.0
 
     def normal(self, k_n: Array, closing: Array, pressure: Array | None) -> Array:
         """r_n from u_n - s; ``pressure``: multiplier."""
@@ -451,15 +455,17 @@ class Law:
         return first, np.cross(n, first)
 
     def tangential(
-        self, k_t: Array, n: Array, step: Array, old: Array, total: Array, r_n: Array, closing: Array
+        self, k_t: Array, n: Array, step: Array, old: Array, total: Array, r_n: Array, closing: Array, given: Array | None
     ) -> Array:
-        """τ from Δu_t, the old τ and u_t, all (n, d)."""
+        """τ from Δu_t, the old τ and u_t, all (n, d); ``given``: limit of friction."""
         if self.kind == "foundation":
             tau = -k_t[:, None] * total
             return tau if self.tension else np.where((closing.real > 0)[:, None], tau, 0)
         if not self.slips:
             return np.zeros_like(step)
         limit = -self.friction * r_n if self.kind == "coulomb" else 0 * r_n + self.friction * self.pressure
+        if given is not None:
+            limit = 0 * r_n + given
         if n.shape[1] == 2:
             tangent = np.column_stack([-n[:, 1], n[:, 0]])
             trial = np.sum((old - k_t[:, None] * step) * tangent, axis=1)
@@ -535,11 +541,13 @@ class State:
         jump: Displacement relative to the support that Δu_t counts from, (n, d) (length).
         traction: τ, or with multipliers λ_t, (n, d) (stress).
         pressure: λ_n, (n,) (stress); None without multipliers.
+        limit: Of friction, where it is taken for given, (n,) (stress).
     """
 
     jump: Array
     traction: Array
     pressure: Array | None = None
+    limit: Array | None = None
 
 
 @dataclass(eq=False)
@@ -595,7 +603,7 @@ class ContactModel:
 
         step, before = across(relative - old.jump), across(old.traction)
         r_n = self.law.normal(self.k_n, closing, old.pressure)
-        tau = self.law.tangential(self.k_t, n, step, before, across(relative), r_n, closing)
+        tau = self.law.tangential(self.k_t, n, step, before, across(relative), r_n, closing, old.limit)
         r_n, tau = np.where(self.paired, r_n, 0), np.where(self.paired[:, None], tau, 0)
         traction = r_n[:, None] * n + tau
         return {
@@ -743,9 +751,9 @@ class Problem:
             Failed: Nothing was found.
         """
         if all(c.project is None for c in self.contacts):
-            return *self._newton(u, motion, load, old, rtol), old
+            return *self._increment(u, motion, load, old, rtol), old
         for _ in range(3000):
-            u, motion = self._newton(u, motion, load, old, rtol)
+            u, motion = self._increment(u, motion, load, old, rtol)
             found = self.respond(u, motion, load, old)
             new = [
                 c.augment(f, o) if c.project is not None else o
@@ -760,6 +768,30 @@ class Problem:
             if change <= 1e-9 * scale:
                 return u, motion, old
         raise Failed("multipliers do not settle")
+
+    def _increment(
+        self, u: Array, motion: Array, load: Load, old: list[State], rtol: float
+    ) -> tuple[Array, Array]:
+        """Newton's method; where it fails, from where limits of friction have been led to rest."""
+        try:
+            return self._newton(u, motion, load, old, rtol)
+        except (Failed, np.linalg.LinAlgError) as failure:
+            if all(c.law.unique for c in self.contacts):
+                raise
+            last = failure
+        pressures = [np.zeros(len(c.x)) for c in self.contacts]
+        for attempt in range(25):
+            frozen = [
+                replace(o, limit=c.law.friction * p if c.law.kind == "coulomb" else None)
+                for c, o, p in zip(self.contacts, old, pressures, strict=True)
+            ]
+            u, motion = self._newton(u, motion, load, frozen, rtol)
+            found = self.respond(u, motion, load, frozen)
+            pressures = [-f["r_n"] for f in found]
+            if attempt in (2, 5, 10, 24):
+                with contextlib.suppress(Failed):
+                    return self._newton(u, motion, load, old, rtol)
+        raise last
 
     def _newton(
         self, u: Array, motion: Array, load: Load, old: list[State], rtol: float
@@ -840,6 +872,10 @@ class Problem:
                 matrix += left.T @ (np.repeat(stiffness, d)[:, None] * left)
             return matrix
 
+        convex = not free and all(
+            c.law.unique or (o.limit is not None and c.law.kind == "coulomb")
+            for c, o in zip(self.contacts, old, strict=True)
+        )
         z = np.concatenate([u[kept], motion])
         best, since = (np.inf, z), 0
         for iteration in range(200):
@@ -848,6 +884,8 @@ class Problem:
             if norm < best[0]:
                 since = iteration if norm < 0.5 * best[0] else since
                 best = (norm, z.copy())
+            if DEBUG:
+                print(iteration, norm, size, np.linalg.norm(floor) * 1e-14)
             if norm <= rtol * size or norm <= 1e-14 * np.linalg.norm(floor):
                 break
             if iteration > since + 40:
@@ -857,17 +895,33 @@ class Problem:
             if np.linalg.cond(system) > 1e13:
                 system = closed() / scale[:, None] / scale
             step = -np.linalg.lstsq(system, rest / scale, rcond=1e-15)[0] / scale
+            if DEBUG:
+                print("cond", np.linalg.cond(system), "eig", np.linalg.eigvals(system).real.min())
             share, slope = 1.0, rest @ step
-            # The paper's line search: energy falls along the step for laws that have one.
-            for _ in range(12):
+            low, high = (0.0, slope), None
+            # The paper's line search: the energy, of laws that have one, is least where its slope
+            # along the step is zero. Nothing holds an open body: the share is doubled until it does.
+            for _ in range(60):
                 trial = evaluate(z + share * step, tangent=False)[0]
-                if np.linalg.norm(trial / scale) < (1 - 0.1 * share) * np.linalg.norm(rest / scale):
+                lower = np.linalg.norm(trial / scale) < (1 - 0.1 * share) * np.linalg.norm(rest / scale)
+                if lower and not convex:
                     break
-                if abs(trial @ step) <= 0.5 * abs(slope):
+                along = trial @ step
+                if abs(along) <= 0.3 * abs(slope):
                     break
-                share *= 0.5
-            if iteration % 7 == 6:
-                share = 1.0 if iteration % 14 == 6 else 0.37  # out of a cycle
+                if along < 0:
+                    low = (share, along)
+                else:
+                    high = (share, along)
+                if high is None:
+                    share *= 2.0
+                else:
+                    part = low[1] / (low[1] - high[1])
+                    share = low[0] + np.clip(part, 0.1, 0.9) * (high[0] - low[0])
+            if iteration % 9 == 8 and not convex:
+                share = 1.0 if iteration % 18 == 8 else 0.37  # out of a cycle
+            if DEBUG:
+                print("share", share)
             z = z + share * step
         norm, z = best
         _, _, size, floor = evaluate(z, tangent=False)
