@@ -92,7 +92,10 @@ class _Slow(BaseException):
 
 @contextlib.contextmanager
 def _limited(seconds: float | None) -> Iterator[None]:
-    """Raise `_Slow` in the block when its time is up; of one rank only."""
+    """Raise `_Slow` in the block when its processor time is up; of one rank only.
+
+    That leaves out what compilers take.
+    """
     if not seconds:
         yield
         return
@@ -102,13 +105,13 @@ def _limited(seconds: float | None) -> Iterator[None]:
         raise _Slow
 
     _LATE.clear()
-    before = signal.signal(signal.SIGALRM, late)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    before = signal.signal(signal.SIGPROF, late)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)
 
 
 def _category(error: BaseException) -> str:
@@ -142,7 +145,7 @@ def play(
     Args:
         scene: The scene.
         comm: Ranks; by default one alone.
-        limit: Seconds for the package, on one rank.
+        limit: Processor seconds for the package, on one rank.
         changed: See `fuzz_scenes.history`.
         spoiled: Changes a record before it is judged, to show that the judge sees it.
     """
@@ -502,7 +505,7 @@ def main() -> int:
     parser.add_argument("--start", type=int, default=0, help="first seed")
     parser.add_argument("--ranks", type=int, default=1)
     parser.add_argument("--processes", type=int, default=1)
-    parser.add_argument("--limit", type=float, default=10.0, help="seconds for the package")
+    parser.add_argument("--limit", type=float, default=10.0, help="processor seconds for the package")
     parser.add_argument("--resume", default="fuzz.csv", help="file of results, added to")
     parser.add_argument("--without", action="append", default=[], help="a feature to leave out")
     parser.add_argument("--table", nargs="+", help="print the table of files of results")

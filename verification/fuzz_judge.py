@@ -144,7 +144,10 @@ class Judge:
         forces = problem.contact_force(found)
         fixed = np.zeros(len(u), dtype=bool)
         fixed[load.fixed] = True
-        rounding = np.abs(problem.body.stiffness) @ np.abs(u)
+        rounding = _ROUNDING * (np.abs(problem.body.stiffness) @ np.abs(u))
+        for c, f in zip(problem.contacts, found, strict=True):
+            each = np.abs(c.interpolation).T @ (c.weights * self._traction_rounding(c, f))
+            rounding += np.repeat(each, c.d)
         bodies = []
         for b in range(parts.max() + 1):
             own = parts == b
@@ -180,13 +183,13 @@ class Judge:
     def _check_equations(self, name: str, now: dict[str, Any], rtol: float) -> None:
         for b, body in enumerate(now["bodies"]):
             size = self._size(now, "bodies", b)
-            allowed = _RESIDUAL * rtol * size + _ROUNDING * body["rounding"]
+            allowed = _RESIDUAL * rtol * size + body["rounding"]
             text = f"; forces {size:.3g}"
             self._check(f"{name}, body {b}", "equations", body["residual"], allowed, text)
         if len(now["motion rest"]):
             size = max(self._size(now, "contacts", i) for i in range(len(now["contacts"])))
             rest = float(np.abs(now["motion rest"]).max())
-            rounding = _ROUNDING * max(b["rounding"] for b in now["bodies"])
+            rounding = max(b["rounding"] for b in now["bodies"])
             self._check(name, "support", rest, _RESIDUAL * rtol * size + rounding)
 
     def _check_results(self, name: str, contact: Any, found: dict, record: dict[str, Any]) -> None:
@@ -194,11 +197,7 @@ class Judge:
         w = contact.weights
         r_n, tau = found["r_n"], found["tau"]
         size = float(w @ np.linalg.norm(found["traction"], axis=1))
-        # Rounding of u_n - s, times the stiffness.
-        places = np.abs(found["closing"]).max() + np.abs(found["relative"]).max()
-        reach = np.abs(contact.x).max() + places
-        stiff = contact.k_n.max() + contact.k_t.max()
-        rounding = 20 * np.finfo(float).eps * stiff * reach
+        rounding = self._traction_rounding(contact, found)
         allowed = _SAME * size + rounding * w.sum()
         self._check(name, "reported force", np.abs(record["force"] - w @ found["traction"]).max(), allowed)
         self._check(name, "reported N", abs(record["normal_force"] + w @ r_n), allowed)
@@ -218,6 +217,14 @@ class Judge:
             wrong = max(wrong, np.abs(record["tangential"][row] - tau).max())
             self._check(name, "reported traction", wrong, _SAME * peak + rounding)
             self._check(name, "weights", np.abs(record["measure"][row] - w).max(), 1e-9 * w.max())
+
+    @staticmethod
+    def _traction_rounding(contact: Any, found: dict) -> float:
+        """Rounding of u_n - s and of u_t, times the stiffness (stress)."""
+        places = np.abs(found["closing"]).max() + np.abs(found["relative"]).max()
+        reach = np.abs(contact.x).max() + places
+        stiff = contact.k_n.max() + contact.k_t.max()
+        return float(8 * np.finfo(float).eps * stiff * reach)
 
     def _check_multipliers(self, name: str, contact: Any, found: dict, record: dict) -> None:
         """What the springs still bear, after projection, relative to the tractions."""
@@ -274,7 +281,9 @@ class Judge:
         scale = np.abs(outside) @ np.abs(way) + abs(springs) + abs(slid)
         if before is not None:
             scale += np.abs(before["outside"]) @ np.abs(way)
-        allowed = max(1e-6, 300 * record["rtol"]) * scale + _ROUNDING * (np.abs(stiff) @ np.abs(u)) @ np.abs(u)
+        allowed = max(1e-6, 300 * record["rtol"]) * scale
+        rounding = sum(b["rounding"] for b in now["bodies"])
+        allowed += 10 * rounding * max(np.abs(u).max(), np.abs(self._u).max(initial=0.0))
         pairs = [("work", energy.work, work), ("elastic", energy.elastic, elastic)]
         if penalty:
             pairs += [("springs", energy.springs, springs), ("dissipation", energy.dissipation, slid)]
@@ -316,7 +325,7 @@ class Judge:
         exact = self._forces(near, load, self.problem.respond(near, moved, load, old))
         for i, contact in enumerate(exact["contacts"]):
             size = self._size(now, "contacts", i)
-            rounding = _ROUNDING * max(b["rounding"] for b in now["bodies"])
+            rounding = max(b["rounding"] for b in now["bodies"])
             error = np.abs(contact["force"] - now["contacts"][i]["force"]).max()
             allowed = self._tolerance(record, _NEAREST) * size + 10 * rounding
             if error > allowed and not self._unique():
@@ -338,7 +347,7 @@ class Judge:
         found = problem.respond(u, motion, load, old)
         tolerance = self._tolerance(record, _APART)
         worst = 0.0
-        rounding = _ROUNDING * max(b["rounding"] for b in now["bodies"])
+        rounding = max(b["rounding"] for b in now["bodies"])
         for i, (c, f) in enumerate(zip(problem.contacts, found, strict=True)):
             force = (c.weights * c.paired) @ f["traction"]
             size = max(self._size(now, "contacts", i), float(np.abs(force).max()))

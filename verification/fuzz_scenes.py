@@ -166,7 +166,7 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
     def rigid() -> Scene:
         kind = pick("halfspace", "halfspace", "halfspace", *SUPPORTS[1:])
         made: Scene = {"kind": kind, "clearance": 0.0}
-        if chance(0.3):
+        if chance(0.2):
             made["clearance"] = float(f"{rng.uniform(-0.5, 3) * strain:.3g}")
         if kind == "halfspace" and chance(0.3):
             made["slope"] = pick(0.1, -0.2, 3 * strain)

@@ -1,0 +1,354 @@
+"""Random scenes against a second solution; that solution against closed answers; and its eyes.
+
+Tolerances of the comparison are those of ``verification/fuzz_judge.py``.
+"""
+
+import copy
+import csv
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from running import ROOT, environment
+
+sys.path.insert(0, str(ROOT / "verification"))
+
+import fuzz
+import fuzz_scenes
+import reference_solver as reference
+
+COMM = MPI.COMM_WORLD
+serial = pytest.mark.skipif(COMM.size > 1, reason="nothing here depends on ranks")
+SCENES = json.loads((ROOT / "verification" / "fuzz_regressions.json").read_text())
+# Found wrong, and mended since; those that are not yet say so.
+REGRESSIONS = [
+    pytest.param(entry, id=entry["name"], marks=[pytest.mark.xfail(strict=True)] * entry["open"])
+    for entry in SCENES["regressions"]
+]
+FINE = ("right", "another", "refused")
+
+
+def played(scene, **options):
+    """Outcome of a scene on all ranks, the same on each."""
+    outcome = fuzz.play(copy.deepcopy(scene), COMM if COMM.size > 1 else None, **options)
+    return COMM.bcast(outcome)
+
+
+# ---- scenes --------------------------------------------------------------------------------------
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("part", range(10))
+def test_scenes_are_not_wrong(part):
+    # All of them on one rank, a fifth on several, where a scene takes longer.
+    for scene in SCENES["scenes"][part :: 10][:: 1 if COMM.size == 1 else 5]:
+        outcome = played(scene)
+        assert outcome.outcome in FINE, f"{outcome}\n{json.dumps(scene)}"
+
+
+@serial
+def test_most_scenes_are_solved_and_compared():
+    # A machine that refuses everything, or compares nothing, would pass the test above.
+    found = [played(scene) for scene in SCENES["scenes"][::7]]
+    solved = [o for o in found if o.outcome in ("right", "another")]
+    assert len(solved) > 0.7 * len(found)
+    assert all(o.increments and {"equations", "apart", "nearest"} <= set(o.worst) for o in solved)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("entry", REGRESSIONS)
+def test_scenes_that_were_wrong(entry):
+    outcome = played(entry["scene"])
+    assert outcome.outcome in entry.get("allowed", FINE), outcome
+
+
+# ---- that the comparison sees --------------------------------------------------------------------
+
+ONE = {
+    "layout": "floor",
+    "cell": "quadrilateral",
+    "degree": 1,
+    "nu": 0.3,
+    "bodies": [{"origin": [0.0, 0.0], "size": [1.0, 1.0], "n": [3, 2], "E": 1000.0, "jitter": 5}],
+    "units": [1.0, 1.0],
+    "drive": "prescribed",
+    "contacts": [
+        {
+            "body": 0,
+            "side": "bottom",
+            "support": {"kind": "halfspace", "clearance": 0.0},
+            "law": {
+                "kind": "coulomb",
+                "friction": 0.3,
+                "k_n": ["number", 10.0],
+                "k_t": ["number", 10.0],
+            },
+        }
+    ],
+    "holds": [[0, "top", [0, 1], "moved"]],
+    "strain": 1e-3,
+    "share": 1.0,
+    "stages": [
+        {"steps": 1, "normal": 1.0, "side": 0.0, "across": 0.0},
+        {"steps": 2, "normal": 1.0, "side": 0.4, "across": 0.0},
+    ],
+}
+
+
+@serial
+def test_a_good_scene_is_right():
+    assert played(ONE).outcome == "right"
+
+
+def _move_a_node(record):
+    record["u"][4, -1] += 1e-6 * np.abs(record["u"][:, -1]).max()
+
+
+def _more_force(record):
+    record["contacts"][0]["normal_force"] *= 1 + 1e-6
+
+
+def _less_pressure(record):
+    record["contacts"][0]["pressure"][1] *= 1 - 1e-6
+
+
+def _more_work(record):
+    vars(record["energy"])["work"] *= 1.001
+
+
+@serial
+@pytest.mark.parametrize(
+    ("spoiled", "check"),
+    [
+        (_move_a_node, "equations"),
+        (_more_force, "reported N"),
+        (_less_pressure, "reported traction"),
+        (_more_work, "energy work"),
+    ],
+)
+def test_a_spoiled_result_is_found(spoiled, check):
+    outcome = played(ONE, spoiled=spoiled)
+    assert outcome.outcome == "wrong"
+    assert check in outcome.kind
+
+
+@serial
+def test_a_spoiled_history_is_found():
+    def changed(made, problem):
+        commit, history = problem.commit, problem.contacts[0].history
+
+        def forgetful():
+            commit()
+            values = {n: history.values(n) for n in history._slices}
+            history.commit(values | {"traction": 0.999 * values["traction"]})
+
+        problem.commit = forgetful
+
+    outcome = played(ONE, changed=changed)
+    assert outcome.outcome == "wrong"
+    assert "equations" in outcome.kind
+
+
+@serial
+def test_another_friction_is_found():
+    def changed(made, problem):
+        problem.contacts[0].parameters["friction"].value = 0.3003
+
+    # At the end half of the points slip.
+    outcome = played(ONE, changed=changed)
+    assert outcome.outcome == "wrong"
+
+
+@serial
+def test_a_raw_error_counts_as_a_crash_and_a_refusal_as_a_refusal():
+    def raises(made, problem):
+        raise KeyError("k_n")
+
+    assert played(ONE, changed=raises).outcome == "crashed"
+    bad = copy.deepcopy(ONE)
+    bad["holds"], bad["drive"] = [], "force"
+    bad["stages"][0]["normal"] = -1.0
+    outcome = played(bad)
+    assert outcome.outcome == "refused"
+    assert outcome.kind.startswith("ValueError: ")
+
+
+# ---- the command ---------------------------------------------------------------------------------
+
+
+@serial
+def test_seeds_reproduce_and_features_can_be_left_out():
+    one = [fuzz_scenes.draw(s) for s in range(30)]
+    assert one == [json.loads(json.dumps(fuzz_scenes.draw(s))) for s in range(30)]
+    assert any(s["units"] != [1.0, 1.0] for s in one)
+    plain = [fuzz_scenes.draw(s, without=("units", "restart")) for s in range(30)]
+    assert all(s["units"] == [1.0, 1.0] and "restart" not in s for s in plain)
+
+
+@serial
+def test_minimise_keeps_what_fails_and_nothing_else():
+    scene = copy.deepcopy(ONE) | {"method": "newton", "units": [1e3, 1e-3], "weight": 0.1}
+    scene["contacts"][0]["gap"] = -0.001
+    found = fuzz.minimise(scene, lambda s: "gap" in s["contacts"][0])
+    assert found["contacts"][0]["gap"] == -0.001
+    assert found["contacts"][0]["law"]["kind"] == "frictionless"
+    assert not {"method", "weight"} & set(found)
+    assert found["units"] == [1.0, 1.0]
+    assert len(found["stages"]) == 1
+    assert found["bodies"][0]["n"] == [1, 1]
+
+
+@serial
+def test_a_campaign_goes_on_where_it_was_ended(tmp_path):
+    path = tmp_path / "results.csv"
+    script = ROOT / "verification" / "fuzz.py"
+    base = [sys.executable, str(script), "--resume", str(path), "--without", "space"]
+
+    def seeds(n):
+        done = subprocess.run(
+            [*base, "--scenes", str(n)],
+            env=environment(),
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        assert done.returncode in (0, 1), done.stderr
+        with path.open(newline="") as file:
+            return [int(row["seed"]) for row in csv.DictReader(file)]
+
+    assert seeds(2) == [0, 1]
+    assert seeds(3) == [0, 1, 2]
+    text = fuzz.table([str(path)])
+    assert text.startswith("3 scenes")
+    assert "| all | 3 |" in text
+
+
+# ---- the reference solver ------------------------------------------------------------------------
+
+
+def point_spring():
+    """One node on unit springs above a floor: a problem with two unknowns."""
+    body = reference.Body(
+        cell="triangle",
+        degree=1,
+        x=np.zeros((1, 2)),
+        vertices=np.zeros((0, 3), dtype=int),
+        nodes=np.zeros((0, 3), dtype=int),
+        places=np.zeros((1, 2)),
+        parts=np.zeros(1, dtype=int),
+        stiffness=np.eye(2),
+    )
+    normal = np.array([[0.0, -1.0]])
+    contact = reference.ContactModel(
+        x=np.zeros((1, 2)),
+        place=lambda s: (0.5 + normal @ s, normal + 0 * s),
+        interpolation=np.ones((1, 1)),
+        weights=np.ones(1),
+        k_n=np.ones(1),
+        k_t=np.full(1, 0.5),
+        law=reference.Law("coulomb", friction=0.5),
+        paired=np.ones(1, dtype=bool),
+    )
+    return reference.Problem(body, [contact])
+
+
+@serial
+def test_reference_follows_the_history_of_a_point():
+    # Code_Aster SSND116A; displacements printed to six digits.
+    problem = point_spring()
+    u, motion, old = np.zeros(2), np.zeros(0), [problem.contacts[0].start()]
+    wanted = {
+        (0.0, -0.5): (0.0, -0.5),
+        (0.0, -1.0): (0.0, -0.75),
+        (0.2, -1.0): (0.133333, -0.75),
+        (2.0, -1.0): (1.875, -0.75),
+        (1.8, -1.0): (1.741667, -0.75),
+        (0.0, -1.0001): (0.125, -0.75),
+    }
+    for force, expected in wanted.items():
+        push = np.array([force[0], round(force[1], 2)])
+        none = np.zeros(0, dtype=int)
+        load = reference.Load(push, none, np.zeros(0), [np.zeros(2)], [np.zeros(2)])
+        u, motion, old = problem.solve(u, motion, load, old)
+        found = problem.respond(u, motion, load, old)
+        old = [problem.contacts[0].next_state(found[0], old[0])]
+        assert np.allclose(u, expected, atol=1e-6)
+
+
+@serial
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
+@pytest.mark.parametrize("degree", [1, 2])
+def test_reference_passes_the_patch_test(cell, degree):
+    # Non-matching meshes, ν = 0: the interface jump is p/k_n everywhere, the stress uniform.
+    d = 2 if cell in ("triangle", "quadrilateral") else 3
+    across = [1.0] * (d - 1)
+    scene = copy.deepcopy(ONE) | {"layout": "pair", "cell": cell, "degree": degree, "nu": 0.0}
+    lower = {"origin": [0.0] * d, "size": [*across, 0.4], "n": [1] * d, "E": 1000.0, "jitter": 0}
+    upper = lower | {"origin": [0.0] * (d - 1) + [0.4], "size": [*across, 0.6], "n": [2] * d}
+    support = {"kind": "body", "update": "never", "body": 1, "side": "bottom"}
+    law = {"kind": "frictionless", "k_n": ["number", 3.0]}
+    scene |= {
+        "bodies": [lower, upper],
+        "contacts": [{"body": 0, "side": "top", "support": support, "law": law}],
+        "holds": [[0, "bottom", list(range(d)), "still"], [1, "left", list(range(d - 1)), "still"]],
+        "drive": "force",
+        "stages": [{"steps": 1, "normal": 1.0, "side": 0.0, "across": 0.0}],
+    }
+    problem, _, loads = fuzz_scenes.model(scene)
+    load = loads(0, 1.0)
+    none = np.zeros(problem.body.places.size)
+    u, motion, old = problem.solve(none, np.zeros(0), load, [problem.contacts[0].start()])
+    found = problem.respond(u, motion, load, old)[0]
+    pressure = 1e-3 * 1000.0
+    assert np.allclose(-found["r_n"], pressure, rtol=1e-9)
+    assert np.allclose(found["closing"], pressure / 3000.0, rtol=1e-9)
+    top = problem.body.places[:, -1] > 1 - 1e-9
+    assert np.allclose(u.reshape(-1, d)[top, -1], -1e-3 - pressure / 3000.0, rtol=1e-9)
+
+
+@serial
+@pytest.mark.parametrize("modes", [3, 4, 6, 8])
+def test_reference_returns_to_the_nearest_point_of_a_polygon(modes):
+    # σ is nearest to σ* in a convex set if (σ* - σ)·(v - σ) ≤ 0 for all corners v.
+    rng = np.random.default_rng(1)
+    trial, limit = rng.normal(size=(200, 2)), rng.uniform(0.1, 2, 200)
+    sigma = reference._nearest_in_polygon(trial, limit, modes)
+    angles = np.pi * (2 * np.arange(modes) + 1) / modes
+    corners = np.column_stack([np.cos(angles), np.sin(angles)]) / np.cos(np.pi / modes)
+    for corner in corners:
+        ahead = limit[:, None] * corner - sigma
+        assert np.sum((trial - sigma) * ahead, axis=1).max() < 1e-12
+    sides = 2 * np.pi * np.arange(modes) / modes
+    outward = np.column_stack([np.cos(sides), np.sin(sides)])
+    assert (sigma @ outward.T - limit[:, None]).max() < 1e-12
+
+
+@serial
+def test_reference_derivatives_are_those_of_differences():
+    law = reference.Law("coulomb", friction=0.4, transverse=0.2, direction=(1.0, 0.3, 0.0))
+    rng = np.random.default_rng(3)
+    n = 20
+    normal = np.tile([0.1, -0.2, -1.0], (n, 1)) / np.linalg.norm([0.1, -0.2, -1.0])
+    contact = reference.ContactModel(
+        x=np.zeros((n, 3)),
+        place=lambda s: (np.full(n, 0.1) + normal @ s, normal + 0 * s),
+        interpolation=np.eye(n),
+        weights=np.ones(n),
+        k_n=np.full(n, 5.0),
+        k_t=np.full(n, 3.0),
+        law=law,
+        paired=np.ones(n, dtype=bool),
+    )
+    old = reference.State(rng.normal(size=(n, 3)), rng.normal(size=(n, 3)))
+    jump, shift = rng.normal(size=(n, 3)), rng.normal(size=3)
+    by_jump, by_shift = contact.derivatives(jump, shift, old)
+    h = 1e-6
+    for i in range(3):
+        move = h * np.eye(3)[i]
+        ends = [contact.respond(jump + s * move, shift, old)["traction"] for s in (1, -1)]
+        assert np.allclose((ends[0] - ends[1]) / (2 * h), by_jump[:, :, i], atol=1e-6)
+        ends = [contact.respond(jump, shift + s * move, old)["traction"] for s in (1, -1)]
+        assert np.allclose((ends[0] - ends[1]) / (2 * h), by_shift[:, :, i], atol=1e-6)
