@@ -58,6 +58,8 @@ CATEGORIES = {
 _LATE: list[bool] = []
 # What is made of the fields at the points, apart from the equations.
 _REPORTED = ("reported", "energy springs", "energy dissipation", "multipliers")
+# Packages that compile forms.
+_JIT = ("ffcx", "cffi", "ufl")
 # Scenes in one process.
 _BATCH = 40
 
@@ -100,7 +102,11 @@ def _limited(seconds: float | None) -> Iterator[None]:
         yield
         return
 
-    def late(*_: Any) -> None:
+    def late(_: int, frame: Any) -> None:
+        if any(f"/{name}/" in s.filename for s in traceback.extract_stack(frame) for name in _JIT):
+            # Half a compiled form would stop all later ones that want it.
+            signal.setitimer(signal.ITIMER_PROF, 0.5)
+            return
         _LATE.append(True)
         raise _Slow
 
