@@ -44,7 +44,7 @@ def played(scene, **options):
 @pytest.mark.parametrize("part", range(10))
 def test_scenes_are_not_wrong(part):
     # All of them on one rank, a fifth on several, where a scene takes longer.
-    for scene in SCENES["scenes"][part :: 10][:: 1 if COMM.size == 1 else 5]:
+    for scene in SCENES["scenes"][part::10][:: 1 if COMM.size == 1 else 5]:
         outcome = played(scene)
         assert outcome.outcome in FINE, f"{outcome}\n{json.dumps(scene)}"
 

@@ -230,9 +230,15 @@ def features(scene: Scene) -> list[str]:
         found += [f"pairs {support['update']}"] if "update" in support else []
         found += [f"moving by {support['moving']}"] if "moving" in support else []
         found += [f"prescribed {n}" for n in ("gap",) if n in contact]
-        found += [f"{n} {contact[n]}" for n in ("scheme", "enforcement", "accuracy") if n in contact]
+        found += [
+            f"{n} {contact[n]}" for n in ("scheme", "enforcement", "accuracy") if n in contact
+        ]
         found += [f"k by {contact['law'][k][0]}" for k in ("k_n", "k_t") if contact["law"].get(k)]
-    found += [n for n in ("restart", "ration", "weight") if n in scene]
+    found += [n for n in ("restart", "ration", "weight", "thickness", "bend") if n in scene]
+    found += ["friction changes"] if any("friction" in s for s in scene["stages"]) else []
+    sides = {(c["body"], c["side"]) for c in scene["contacts"]}
+    opposite = {(c["support"].get("body"), c["support"].get("side")) for c in scene["contacts"]}
+    found += ["both sides"] if sides & opposite else []
     found += [f"method {scene['method']}"] if "method" in scene else []
     found += ["units"] if scene["units"] != [1.0, 1.0] else []
     found += ["two scales"] if scene["share"] != 1.0 else []
@@ -280,7 +286,14 @@ def _batch(seeds: list[int], arguments: argparse.Namespace) -> Iterator[dict[str
     command += ["--limit", str(arguments.limit)]
     command += [v for name in arguments.without for v in ("--without", name)]
     if arguments.ranks > 1:
-        command = ["mpirun", "--allow-run-as-root", "--oversubscribe", "-n", str(arguments.ranks), *command]
+        command = [
+            "mpirun",
+            "--allow-run-as-root",
+            "--oversubscribe",
+            "-n",
+            str(arguments.ranks),
+            *command,
+        ]
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
             command,
@@ -359,7 +372,10 @@ def run(arguments: argparse.Namespace) -> Counter[str]:
             counts[found["outcome"]] += 1
             if found["outcome"] in ("wrong", "crashed", "unjudged") or arguments.verbose:
                 detail = found["detail"][0] if found["detail"] else ""
-                print(f"{found['seed']}: {found['outcome']}: {found['kind']}: {detail}"[:300], flush=True)
+                print(
+                    f"{found['seed']}: {found['outcome']}: {found['kind']}: {detail}"[:300],
+                    flush=True,
+                )
 
     def worker(own: list[int]) -> None:
         while own:
@@ -395,7 +411,16 @@ def _simpler(scene: Scene) -> Iterator[Scene]:
         if other != scene:
             yield other
 
-    for name in ("restart", "ration", "method", "condensation", "weight"):
+    for name in (
+        "restart",
+        "ration",
+        "method",
+        "condensation",
+        "weight",
+        "thickness",
+        "bend",
+        "cuts",
+    ):
         if name in scene:
             yield from changed(lambda s, n=name: s.pop(n))
     yield from changed(lambda s: s.update(units=[1.0, 1.0]))
@@ -405,6 +430,7 @@ def _simpler(scene: Scene) -> Iterator[Scene]:
         if n_stages > 1:
             yield from changed(lambda s, i=i: s["stages"].pop(i))
         yield from changed(lambda s, i=i: s["stages"][i].update(steps=1))
+        yield from changed(lambda s, i=i: s["stages"][i].pop("friction", None))
         yield from changed(lambda s, i=i: s["stages"][i].update(across=0.0))
         yield from changed(lambda s, i=i: s["stages"][i].update(side=0.0, across=0.0))
         for n in ("normal", "side"):
@@ -417,13 +443,24 @@ def _simpler(scene: Scene) -> Iterator[Scene]:
             if name in contact:
                 yield from changed(lambda s, i=i, n=name: s["contacts"][i].pop(n))
         law, support = contact["law"], contact["support"]
-        yield from changed(lambda s, i=i: s["contacts"][i].update(law={"kind": "frictionless", "k_n": ["number", 10.0]}))
+        yield from changed(
+            lambda s, i=i: s["contacts"][i].update(
+                law={"kind": "frictionless", "k_n": ["number", 10.0]}
+            )
+        )
         if law["kind"] not in ("frictionless", "coulomb"):
-            simple = {"kind": "coulomb", "friction": 0.3, "k_n": ["number", 10.0], "k_t": ["number", 10.0]}
+            simple = {
+                "kind": "coulomb",
+                "friction": 0.3,
+                "k_n": ["number", 10.0],
+                "k_t": ["number", 10.0],
+            }
             yield from changed(lambda s, i=i, x=simple: s["contacts"][i].update(law=x))
         for k in ("k_n", "k_t"):
             if law.get(k):
-                yield from changed(lambda s, i=i, k=k: s["contacts"][i]["law"].update({k: ["number", 10.0]}))
+                yield from changed(
+                    lambda s, i=i, k=k: s["contacts"][i]["law"].update({k: ["number", 10.0]})
+                )
         for name in ("slope", "moving"):
             if name in support:
                 yield from changed(lambda s, i=i, n=name: s["contacts"][i]["support"].pop(n))
@@ -440,7 +477,9 @@ def _simpler(scene: Scene) -> Iterator[Scene]:
         for i, n in enumerate(body["n"]):
             for fewer in {1, n - 1}:
                 if 0 < fewer < n:
-                    yield from changed(lambda s, b=b, i=i, f=fewer: s["bodies"][b]["n"].__setitem__(i, f))
+                    yield from changed(
+                        lambda s, b=b, i=i, f=fewer: s["bodies"][b]["n"].__setitem__(i, f)
+                    )
     for i in range(len(scene["holds"])):
         yield from changed(lambda s, i=i: s["holds"].pop(i))
     yield from changed(lambda s: s.update(degree=1))
@@ -488,7 +527,10 @@ def table(paths: list[str]) -> str:
     for row in rows:
         for name in ["all", f"ranks {row['ranks']}", *row["features"].split("; ")]:
             by_feature.setdefault(name, Counter())[row["outcome"]] += 1
-    lines = [f"{len(rows)} scenes, {sum(int(r['increments']) for r in rows)} increments judged.", ""]
+    lines = [
+        f"{len(rows)} scenes, {sum(int(r['increments']) for r in rows)} increments judged.",
+        "",
+    ]
     lines += ["| feature | scenes | " + " | ".join(OUTCOMES) + " |"]
     lines += ["|---|" + "---|" * (1 + len(OUTCOMES))]
     for name in ["all", *sorted(set(by_feature) - {"all"})]:
@@ -496,7 +538,9 @@ def table(paths: list[str]) -> str:
         cells = [str(counts[o] or "–") for o in OUTCOMES]
         lines.append(f"| {name} | {counts.total()} | " + " | ".join(cells) + " |")
     lines += ["", "| outcome | why | scenes |", "|---|---|---|"]
-    why = Counter((r["outcome"], r["kind"]) for r in rows if r["outcome"] not in ("right", "another"))
+    why = Counter(
+        (r["outcome"], r["kind"]) for r in rows if r["outcome"] not in ("right", "another")
+    )
     lines += [f"| {o} | {k or '–'} | {n} |" for (o, k), n in why.most_common()]
     return "\n".join(lines)
 
@@ -506,12 +550,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, help="play one scene and tell")
     parser.add_argument("--replay", help="play the scene in a JSON file and tell")
-    parser.add_argument("--minimise", action="store_true", help="find the shortest that fails alike")
+    parser.add_argument(
+        "--minimise", action="store_true", help="find the shortest that fails alike"
+    )
     parser.add_argument("--scenes", type=int, default=100, help="how many")
     parser.add_argument("--start", type=int, default=0, help="first seed")
     parser.add_argument("--ranks", type=int, default=1)
     parser.add_argument("--processes", type=int, default=1)
-    parser.add_argument("--limit", type=float, default=10.0, help="processor seconds for the package")
+    parser.add_argument(
+        "--limit", type=float, default=10.0, help="processor seconds for the package"
+    )
     parser.add_argument("--resume", default="fuzz.csv", help="file of results, added to")
     parser.add_argument("--without", action="append", default=[], help="a feature to leave out")
     parser.add_argument("--table", nargs="+", help="print the table of files of results")

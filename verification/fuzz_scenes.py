@@ -8,6 +8,7 @@ is made.
 
 from __future__ import annotations
 
+import copy
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +25,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 
-__all__ = ["LAWS", "SUPPORTS", "Made", "draw", "history", "make", "model", "path"]
+__all__ = ["LAWS", "SUPPORTS", "Made", "draw", "frictions", "history", "model", "path"]
 
 Array = np.ndarray
 Scene = dict[str, Any]
@@ -54,7 +55,8 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
     Args:
         seed: The same gives the same.
         without: Features to leave out: "levels", "apart", "increment" (pairs anew), "units",
-            "restart", "multipliers", "motion", "gap", "ration", "space", "method", "accuracy".
+            "restart", "bend", "both", "narrow", "changes", "multipliers", "motion", "gap",
+            "ration", "space", "method", "accuracy".
         ranks: Kept in the scene.
     """
     rng = np.random.default_rng([seed, 20])
@@ -124,7 +126,9 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
             kind = "coulomb"
         made: Scene = {"kind": kind}
         if kind not in ("frictionless", "foundation", "tension"):
-            made["friction"] = pick(0.0, 0.1, 0.3, 0.3, 0.6, 1.2) if kind not in ("ellipse",) else 0.3
+            made["friction"] = (
+                pick(0.0, 0.1, 0.3, 0.3, 0.6, 1.2) if kind not in ("ellipse",) else 0.3
+            )
         if kind in ("tresca", "prescribed"):
             made["pressure"] = float(f"{rng.uniform(0.1, 2) * strain:.3g}")
         if kind == "polygon":
@@ -184,7 +188,11 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
     if layout == "apart":
         contacts.append(contact(1, "bottom", rigid()))
     for upper in range(1, n_bodies if layout in ("pair", "tower") else 1):
-        update = "increment" if degree == 1 and cell != "hexahedron" and chance(0.3, "increment") else "never"
+        update = (
+            "increment"
+            if degree == 1 and cell != "hexahedron" and chance(0.3, "increment")
+            else "never"
+        )
         support: Scene = {"kind": "body", "update": update}
         if chance(0.6):
             contacts.append(contact(upper, "bottom", support | {"body": upper - 1, "side": "top"}))
@@ -194,6 +202,29 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
     if standing:
         contacts.append(contact(0, "bottom", rigid()))
     scene["contacts"] = contacts
+
+    rigid_alone = layout in ("floor", "corner", "apart")
+    if chance(0.15, "bend") and cell != "hexahedron" and (rigid_alone or degree == 2):
+        scale = pick(3 * strain, 3 * strain, 0.03)
+        scene["bend"] = [float(f"{rng.uniform(-1, 1) * scale:.3g}") for _ in bodies]
+        for c in contacts:
+            c["law"]["k_n"] = c["law"]["k_n"] and ["number", 20.0]
+            if "k_t" in c["law"]:
+                c["law"]["k_t"] = ["number", 10.0]
+            if c["support"].get("update") == "increment":
+                c["support"]["update"] = "never"
+    if layout == "pair" and chance(0.12, "both"):
+        first = contacts[0]
+        other = copy.deepcopy(first)
+        other |= {"body": first["support"]["body"], "side": first["support"]["side"]}
+        other["support"] |= {"body": first["body"], "side": first["side"]}
+        contacts.insert(1, other)
+    if layout == "pair" and chance(0.08, "narrow"):
+        bodies[1]["size"][0] = float(f"{rng.uniform(0.03, 0.3) * bodies[0]['size'][0]:.3g}")
+        room = bodies[0]["size"][0] - bodies[1]["size"][0]
+        bodies[1]["origin"][0] = float(f"{rng.uniform(0.02, 0.98) * room:.3g}")
+    if chance(0.1):
+        scene["thickness"] = log(-2, 2)
 
     # What holds the bodies, and what drives them.
     holds: list[list[Any]] = []
@@ -264,6 +295,7 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
                     "side": side,
                     "across": side * across,
                 }
+                | ({"friction": pick(0.5, 1.5)} if stages and chance(0.1, "changes") else {})
             )
     scene["strain"] = strain
     scene["share"] = share
@@ -295,6 +327,13 @@ def path(scene: Scene) -> list[tuple[int, float]]:
     ]
 
 
+def frictions(scene: Scene, stage: int) -> list[float | None]:
+    """Friction coefficient of every contact in a stage; None without."""
+    factor = scene["stages"][stage].get("friction", 1.0)
+    given = [c["law"].get("friction") for c in scene["contacts"]]
+    return [None if f is None else factor * f for f in given]
+
+
 # ---- meshes --------------------------------------------------------------------------------------
 
 
@@ -320,7 +359,14 @@ def _arrays(scene: Scene) -> tuple[Array, Array, Array]:
         if scene["cell"] == "triangle":
             found = np.concatenate([found[:, [0, 1, 3]], found[:, [0, 3, 2]]])
         elif scene["cell"] == "tetrahedron":
-            six = [[0, 1, 3, 7], [0, 1, 7, 5], [0, 5, 7, 4], [0, 3, 2, 7], [0, 6, 4, 7], [0, 2, 6, 7]]
+            six = [
+                [0, 1, 3, 7],
+                [0, 1, 7, 5],
+                [0, 5, 7, 4],
+                [0, 3, 2, 7],
+                [0, 6, 4, 7],
+                [0, 2, 6, 7],
+            ]
             found = np.concatenate([found[:, s] for s in six])
         points.append((np.array(body["origin"]) + grid * body["size"]) * length)
         cells.append(found + first)
@@ -329,7 +375,22 @@ def _arrays(scene: Scene) -> tuple[Array, Array, Array]:
     return np.concatenate(points), np.concatenate(cells).astype(np.int64), np.concatenate(boxes)
 
 
-_SIDES = {"bottom": (-1, 0.0), "top": (-1, 1.0), "left": (0, 0.0), "right": (0, 1.0), "front": (1, 0.0)}
+def _quadratic(cell: str, x: Array, cells: Array, boxes: Array) -> tuple[Array, Array, Array]:
+    """The same mesh with nodes of degree 2."""
+    element = basix.ufl.element("Lagrange", cell, 1, shape=(x.shape[1],))
+    straight = dolfinx.mesh.create_mesh(MPI.COMM_SELF, cells=cells, x=x, e=ufl.Mesh(element))
+    nodes = fem.functionspace(straight, ("Lagrange", 2))
+    places = nodes.tabulate_dof_coordinates()[:, : x.shape[1]]
+    return places, nodes.dofmap.list.astype(np.int64), boxes[straight.topology.original_cell_index]
+
+
+_SIDES = {
+    "bottom": (-1, 0.0),
+    "top": (-1, 1.0),
+    "left": (0, 0.0),
+    "right": (0, 1.0),
+    "front": (1, 0.0),
+}
 
 
 def _tag(scene: Scene, body: int, side: str) -> int:
@@ -337,6 +398,7 @@ def _tag(scene: Scene, body: int, side: str) -> int:
     for i, contact in enumerate(scene["contacts"]):
         if (contact["body"], contact["side"]) == (body, side):
             return 11 + i
+    for i, contact in enumerate(scene["contacts"]):
         support = contact["support"]
         if support["kind"] == "body" and (support["body"], support["side"]) == (body, side):
             return 21 + i
@@ -352,11 +414,17 @@ class Made:
         self.length, self.force = scene["units"]
         x, cells, boxes = _arrays(scene)
         self.d = d = x.shape[1]
-        element = ufl.Mesh(basix.ufl.element("Lagrange", scene["cell"], 1, shape=(d,)))
+        bent = any(scene.get("bend", ()))
+        if bent:
+            x, cells, boxes = _quadratic(scene["cell"], x, cells, boxes)
+        element = basix.ufl.element("Lagrange", scene["cell"], 1 + bent, shape=(d,))
+        element = ufl.Mesh(element)
         mine = slice(None) if comm.rank == 0 else slice(0, 0)
         self.mesh = dolfinx.mesh.create_mesh(comm, cells=cells[mine], x=x[mine], e=element)
         self.box = boxes[self.mesh.topology.original_cell_index]
         self.tags = self._tagged()
+        if bent:
+            self._bend()
         self.stress = self.force / self.length ** (d - 1)
         self.V = fem.functionspace(self.mesh, ("Lagrange", scene["degree"], (d,)))
         self.u = fem.Function(self.V, name="u")
@@ -375,8 +443,10 @@ class Made:
         lame = self.E * nu / ((1 + nu) * (1 - 2 * nu))
         stress = self.E / (1 + nu) * strain + lame * ufl.tr(strain) * ufl.Identity(d)
         ds = ufl.ds(self.mesh, subdomain_data=self.tags)
-        self.F = ufl.inner(stress, ufl.sym(ufl.grad(v))) * ufl.dx(self.mesh)
-        self.F -= ufl.dot(self.traction, v) * ds(TOP) + ufl.dot(self.weight, v) * ufl.dx(self.mesh)
+        self.thickness = fem.Constant(self.mesh, float(scene.get("thickness", 1.0)))
+        self.F = self.thickness * ufl.inner(stress, ufl.sym(ufl.grad(v))) * ufl.dx(self.mesh)
+        self.F -= self.thickness * ufl.dot(self.traction, v) * ds(TOP)
+        self.F -= self.thickness * ufl.dot(self.weight, v) * ufl.dx(self.mesh)
         self.bcs: list[fem.DirichletBC] = []
         self.moved: list[fem.Constant] = []
         for body, side, components, how in scene["holds"]:
@@ -390,9 +460,24 @@ class Made:
                 self.bcs.append(fem.dirichletbc(value, dofs, space))
                 if how == "moved":
                     self.moved.append((body, i, value))
+        self.contacts: list[fc.Contact] = []
         self.shift = fem.Constant(self.mesh, np.zeros(d))
         self.push = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
         self.pull = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
+
+    def _bend(self) -> None:
+        """Move the nodes of bodies up by a parabola over x."""
+        x = self.mesh.geometry.x
+        done = np.zeros(len(x), dtype=bool)
+        for b, (body, rise) in enumerate(
+            zip(self.scene["bodies"], self.scene["bend"], strict=True)
+        ):
+            nodes = np.unique(self.mesh.geometry.dofmap[self.box == b])
+            nodes = nodes[~done[nodes]]
+            done[nodes] = True
+            middle = (body["origin"][0] + 0.5 * body["size"][0]) * self.length
+            width = body["size"][0] * self.length
+            x[nodes, self.d - 1] += rise * width * (2 * (x[nodes, 0] - middle) / width) ** 2
 
     def _cell_of(self, facets: Array) -> Array:
         to_cell = self.mesh.topology.connectivity(self.d - 1, self.d)
@@ -427,6 +512,9 @@ class Made:
     def apply(self, stage: int, t: float) -> None:
         """Set all loads."""
         scene, d = self.scene, self.d
+        for contact, friction in zip(self.contacts, frictions(scene, stage), strict=False):
+            if friction is not None:
+                contact.parameters["friction"].value = friction
         now = self.drives(stage, t)
         way = np.zeros(d)
         way[0], way[-1] = now["side"], -now["normal"]
@@ -503,8 +591,8 @@ class Made:
         """The package's support."""
         given = contact["support"]
         if given["kind"] == "body":
-            i = self.scene["contacts"].index(contact)
-            return fc.DeformableBody(self.tags, 21 + i, update=given["update"])
+            tag = _tag(self.scene, given["body"], given["side"])
+            return fc.DeformableBody(self.tags, tag, update=given["update"])
         where = geometry(self.scene, contact)
         shift = None
         if given.get("moving") == "displacement":
@@ -528,7 +616,9 @@ class Made:
         if kind == "ball":
             return fc.Ball(where["center"], where["radius"], inside=inside, displacement=shift)
         axis = None if self.d == 2 else (0.0, 1.0, 0.0)
-        return fc.Cylinder(where["center"], where["radius"], axis, inside=inside, displacement=shift)
+        return fc.Cylinder(
+            where["center"], where["radius"], axis, inside=inside, displacement=shift
+        )
 
     def problem(self) -> fc.ContactProblem:
         """The package's problem. Collective."""
@@ -544,9 +634,11 @@ class Made:
                     gap=None if gap is None else gap * self.length,
                     enforcement=c.get("enforcement"),
                     accuracy=c.get("accuracy"),
+                    weight=self.thickness,
                     name=f"contact {i}",
                 )
             )
+        self.contacts = contacts
         options, scene = {}, self.scene
         if "ration" in scene:
             options["snes_max_it"] = scene["ration"]
@@ -619,7 +711,9 @@ def _nodes(made: Made) -> tuple[Array, Array]:
     return box[:n], made.V.tabulate_dof_coordinates()[:n, : made.d]
 
 
-def _record(made: Made, problem: fc.ContactProblem, step: Any, stage: int, t: float) -> dict[str, Any]:
+def _record(
+    made: Made, problem: fc.ContactProblem, step: Any, stage: int, t: float
+) -> dict[str, Any]:
     """What of a committed step is judged. Collective."""
     comm, d = made.comm, made.d
     box, x = _nodes(made)
@@ -687,7 +781,13 @@ def history(
         for stage, what in enumerate(scene["stages"]):
             file = Path(folder) / f"stage{stage}.npz"
 
-            def steps(made: Made, problem: Any, stage: int = stage, n: int = what["steps"], file: Any = file) -> Any:
+            def steps(
+                made: Made,
+                problem: Any,
+                stage: int = stage,
+                n: int = what["steps"],
+                file: Any = file,
+            ) -> Any:
                 return fc.increments(
                     problem,
                     lambda t: made.apply(stage, t),
@@ -741,6 +841,7 @@ def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float],
         places=V.tabulate_dof_coordinates()[:, :d].copy(),
         parts=parts,
         stiffness=0.5 * (stiffness + stiffness.T),
+        bent=made.mesh.geometry.cmap.degree,
     )
     made.mesh.topology.create_connectivity(d, d - 1)
     to_facet = made.mesh.topology.connectivity(d, d - 1)
@@ -748,11 +849,19 @@ def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float],
     def surface(tag: int) -> reference.Surface:
         facets = made.tags.find(tag)
         cells = made._cell_of(facets)
-        local = [int(np.flatnonzero(to_facet.links(c) == f)[0]) for c, f in zip(cells, facets)]
-        return reference.Surface(body, list(zip(cells.tolist(), local)))
+        local = [
+            int(np.flatnonzero(to_facet.links(c) == f)[0])
+            for c, f in zip(cells, facets, strict=False)
+        ]
+        return reference.Surface(body, list(zip(cells.tolist(), local, strict=False)))
 
     contacts = [
-        _contact(made, contact, surface(11 + i), lambda i=i: surface(21 + i))
+        _contact(
+            made,
+            contact,
+            surface(11 + i),
+            lambda c=contact["support"]: surface(_tag(scene, c["body"], c["side"])),
+        )
         for i, contact in enumerate(scene["contacts"])
     ]
     fixed = [bc.dof_indices()[0] for bc in made.bcs]
@@ -777,14 +886,16 @@ def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float],
                         shift[i] = float(made.pull[i].value)
             shifts.append(shift)
             pushes.append(push)
-        return reference.Load(fem.assemble_vector(minus).array.copy(), dofs, values[dofs], shifts, pushes)
+        return reference.Load(
+            fem.assemble_vector(minus).array.copy(), dofs, values[dofs], shifts, pushes
+        )
 
     return reference.Problem(body, contacts), made, load
 
 
 def _contact(made: Made, contact: Scene, here: reference.Surface, opposite: Any) -> Any:
     """A contact as the reference has it."""
-    scene, body, law = made.scene, here.body, contact["law"]
+    scene, _body, law = made.scene, here.body, contact["law"]
     d, degree = made.d, scene["degree"]
     rigid = contact["support"]["kind"] != "body"
     wanted = contact.get("accuracy")
@@ -798,6 +909,7 @@ def _contact(made: Made, contact: Scene, here: reference.Surface, opposite: Any)
     if scheme is None and rule is None and augmented and rigid and degree == 1:
         scheme = "vertex" if scene["cell"] != "hexahedron" else None
     facet, xi, weights = here.rule(rule or 2 * degree, scheme or "default")
+    weights = weights * scene.get("thickness", 1.0)
     x, _ = here.place(facet, xi)
     owner = made.box[here.cells]
     stress = made.moduli[owner[0]]
@@ -813,12 +925,14 @@ def _contact(made: Made, contact: Scene, here: reference.Surface, opposite: Any)
             return np.full(len(x), value * stress / made.length)
         vertices = {}
         for f, own in enumerate(here.corner_vertices):
-            for q, k in zip(np.flatnonzero(facet == f), own):
+            for q, k in zip(np.flatnonzero(facet == f), own, strict=False):
                 vertices[k] = vertices.get(k, 0.0) + weights[q]
         area = [vertices[k] for own in here.corner_vertices for k in own]
         return value * stress * made.length ** (d - 2) / np.array(area)
 
-    kind = {"prescribed": "tresca", "tension": "foundation", "polygon": "coulomb"}.get(law["kind"], law["kind"])
+    kind = {"prescribed": "tresca", "tension": "foundation", "polygon": "coulomb"}.get(
+        law["kind"], law["kind"]
+    )
     the_law = reference.Law(
         kind="coulomb" if kind == "ellipse" else kind,
         friction=law.get("friction", 0.0),
@@ -831,7 +945,11 @@ def _contact(made: Made, contact: Scene, here: reference.Surface, opposite: Any)
     )
     interpolation = here.interpolation(facet, xi)
     given = contact.get("gap")
-    free = tuple(contact["support"].get("free", ())) if contact["support"].get("moving") == "force" else ()
+    free = (
+        tuple(contact["support"].get("free", ()))
+        if contact["support"].get("moving") == "force"
+        else ()
+    )
     made_model = reference.ContactModel(
         x=x,
         place=None,
@@ -865,6 +983,9 @@ def _contact(made: Made, contact: Scene, here: reference.Surface, opposite: Any)
         made_model.place = lambda shift: (gap + normal @ shift, normal + 0 * shift)
 
     repair(None)
+    if given is None and not the_law.tension:
+        thickness = scene.get("thickness", 1.0)
+        made_model.back = lambda u: reference.penetration(there, here, u, thickness)
     if contact["support"]["update"] == "increment":
         made_model.repair = repair
     return made_model
@@ -892,7 +1013,9 @@ def _placement(kind: str, where: dict[str, Any], x: Array) -> Any:
     return place
 
 
-def _projection(here: reference.Surface, facet: Array, xi: Array, weights: Array, degree: int) -> Array:
+def _projection(
+    here: reference.Surface, facet: Array, xi: Array, weights: Array, degree: int
+) -> Array:
     """L2 projection at the points onto continuous functions of a degree on Γc."""
     import basix
 

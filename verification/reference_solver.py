@@ -37,7 +37,6 @@ _STEP = 1e-60
 # Facets are covered if no more than this share of them is not.
 _COVERED = 1e-6
 _OVERLAP = 1e-6
-DEBUG = False
 
 
 # ---- geometry ------------------------------------------------------------------------------------
@@ -50,8 +49,9 @@ class Body:
     Attributes:
         cell: Name of the cells.
         degree: Of the displacement.
-        x: Vertices of the mesh, (n_vertices, d) (length).
+        x: Geometry nodes of the mesh, the vertices among them, (n_vertices, d) (length).
         vertices: Of every cell, in DOLFINx's order, (n_cells, n).
+        bent: Degree of the cells' geometry, 1 or 2.
         nodes: Displacement nodes of every cell, (n_cells, m).
         places: Coordinates of the displacement nodes, (n_nodes, d) (length).
         parts: Number of the connected part that every node is in, (n_nodes,).
@@ -66,6 +66,7 @@ class Body:
     places: Array
     parts: Array
     stiffness: Array
+    bent: int = 1
 
     @property
     def d(self) -> int:
@@ -85,12 +86,16 @@ class Surface:
         corners, topology = basix.geometry(kind), basix.topology(kind)[self.d - 1]
         self.cells = np.array([c for c, _ in self.facets], dtype=int)
         local = [topology[i] for _, i in self.facets]
-        self.corner_vertices = np.array([body.vertices[c][v] for c, v in zip(self.cells, local)])
+        self.corner_vertices = np.array(
+            [body.vertices[c][v] for c, v in zip(self.cells, local, strict=False)]
+        )
         self._origin = np.array([corners[v[0]] for v in local])
-        self._axes = np.array([[corners[v[k]] - corners[v[0]] for k in range(1, self.d)] for v in local])
+        self._axes = np.array(
+            [[corners[v[k]] - corners[v[0]] for k in range(1, self.d)] for v in local]
+        )
         family = basix.ElementFamily.P
         variant = basix.LagrangeVariant.gll_warped
-        self._map = basix.create_element(family, kind, 1, variant)
+        self._map = basix.create_element(family, kind, body.bent, variant)
         self._element = basix.create_element(family, kind, body.degree, variant)
         middle = body.x[body.vertices[self.cells]].mean(axis=1)
         centre = self.place(*self.middles())[0]
@@ -134,7 +139,7 @@ class Surface:
         """From values at the nodes to those at places: (n, n_nodes)."""
         table = self._element.tabulate(0, self._in_cell(facet, xi))[0, :, :, 0]
         matrix = np.zeros((len(facet), len(self.body.places)))
-        for row, (f, values) in enumerate(zip(facet, table)):
+        for row, (f, values) in enumerate(zip(facet, table, strict=False)):
             matrix[row, self.body.nodes[self.cells[f]]] += values
         return matrix
 
@@ -311,6 +316,21 @@ def pair(
     return matrix, gap, paired
 
 
+def penetration(here: Surface, there: Surface, u: Array, weight: float) -> float:
+    """∫ of the penetration of ``here``, seen from it, by rays from many points."""
+    facet, xi, weights = here.rule(8, "default")
+    normal = here.normal(facet, xi)
+    hit, where = there.nearest(here.place(facet, xi)[0], normal, np.inf, None)
+    met = hit >= 0
+    facet, xi, normal, weights = facet[met], xi[met], normal[met], weights[met]
+    ends = there.place(hit[met], where[met])[0] - here.place(facet, xi)[0]
+    moved = there.place(hit[met], where[met], u)[0] - here.place(facet, xi, u)[0]
+    gap = np.sum(ends * normal, axis=1)
+    # What lies behind from the start is another surface.
+    near = gap > -0.3 * np.ptp(here.body.x, axis=0).max()
+    return float(weight * weights[near] @ np.maximum(-np.sum(moved * normal, axis=1)[near], 0.0))
+
+
 def _polynomials(surface: Surface, n_points: int) -> Any:
     """Monomials of the largest complete space of polynomials that so many points carry."""
     d = surface.d
@@ -380,7 +400,7 @@ def _anticlockwise(ring: Array) -> Array:
 
 def _clip(ring: Array, window: Array) -> Array:
     """Intersection of two convex polygons."""
-    for start, end in zip(window, np.roll(window, -1, axis=0)):
+    for start, end in zip(window, np.roll(window, -1, axis=0), strict=False):
         along, found = end - start, []
         side = [along[0] * (p[1] - start[1]) - along[1] * (p[0] - start[0]) for p in ring]
         for i, p in enumerate(ring):
@@ -455,7 +475,15 @@ class Law:
         return first, np.cross(n, first)
 
     def tangential(
-        self, k_t: Array, n: Array, step: Array, old: Array, total: Array, r_n: Array, closing: Array, given: Array | None
+        self,
+        k_t: Array,
+        n: Array,
+        step: Array,
+        old: Array,
+        total: Array,
+        r_n: Array,
+        closing: Array,
+        given: Array | None,
     ) -> Array:
         """τ from Δu_t, the old τ and u_t, all (n, d); ``given``: limit of friction."""
         if self.kind == "foundation":
@@ -463,7 +491,11 @@ class Law:
             return tau if self.tension else np.where((closing.real > 0)[:, None], tau, 0)
         if not self.slips:
             return np.zeros_like(step)
-        limit = -self.friction * r_n if self.kind == "coulomb" else 0 * r_n + self.friction * self.pressure
+        limit = (
+            -self.friction * r_n
+            if self.kind == "coulomb"
+            else 0 * r_n + self.friction * self.pressure
+        )
         if given is not None:
             limit = 0 * r_n + given
         if n.shape[1] == 2:
@@ -494,7 +526,9 @@ class Law:
             return k_t[:, None, None] * (np.eye(d) - n[:, :, None] * n[:, None, :])
         first, second = self.frame(n)
         ratio = (self.transverse / self.friction) ** 2
-        both = first[:, :, None] * first[:, None, :] + ratio * second[:, :, None] * second[:, None, :]
+        both = (
+            first[:, :, None] * first[:, None, :] + ratio * second[:, :, None] * second[:, None, :]
+        )
         return k_t[:, None, None] * both
 
     def stretch(self, k_t: Array, n: Array, tau: Array) -> Array:
@@ -564,6 +598,9 @@ class ContactModel:
         paired: Points that may carry tractions, (n,).
         free: Components of the support's motion that follow from the force on it.
         project: L2 projection of the multipliers, (n, n); None without multipliers.
+        repair: Pairs the points anew at a displacement; None where pairs stay.
+        back: ∫ of the penetration as the opposite surface sees it at a displacement; None where
+            the support is rigid.
     """
 
     x: Array
@@ -576,7 +613,8 @@ class ContactModel:
     paired: Array
     free: tuple[int, ...] = ()
     project: Array | None = None
-    repair: Any = None  # function of u: new pairs
+    repair: Any = None
+    back: Any = None
 
     @property
     def d(self) -> int:
@@ -603,7 +641,9 @@ class ContactModel:
 
         step, before = across(relative - old.jump), across(old.traction)
         r_n = self.law.normal(self.k_n, closing, old.pressure)
-        tau = self.law.tangential(self.k_t, n, step, before, across(relative), r_n, closing, old.limit)
+        tau = self.law.tangential(
+            self.k_t, n, step, before, across(relative), r_n, closing, old.limit
+        )
         r_n, tau = np.where(self.paired, r_n, 0), np.where(self.paired[:, None], tau, 0)
         traction = r_n[:, None] * n + tau
         return {
@@ -647,7 +687,10 @@ class ContactModel:
         """Energy of the springs, of penalty enforcement."""
         w, law = self.weights * self.paired, self.law
         if law.kind == "foundation":
-            across = found["relative"] - np.sum(found["relative"] * found["normal"], axis=1)[:, None] * found["normal"]
+            across = (
+                found["relative"]
+                - np.sum(found["relative"] * found["normal"], axis=1)[:, None] * found["normal"]
+            )
             energy = -found["r_n"] * found["closing"] - np.sum(found["tau"] * across, axis=1)
             return float(w @ energy / 2)
         energy = found["r_n"] ** 2 / (2 * self.k_n) if law.has_normal else 0 * found["r_n"]
@@ -661,7 +704,9 @@ class ContactModel:
         if not self.law.slips:
             return 0.0
         stretch = self.law.stretch(self.k_t, found["normal"], found["tau"] - found["before"])
-        return float(-(self.weights * self.paired) @ np.sum(found["tau"] * (found["step"] + stretch), axis=1))
+        return float(
+            -(self.weights * self.paired) @ np.sum(found["tau"] * (found["step"] + stretch), axis=1)
+        )
 
 
 # ---- the problem ---------------------------------------------------------------------------------
@@ -705,7 +750,7 @@ class Problem:
     def shifts(self, load: Load, motion: Array) -> list[Array]:
         """Displacements of the supports."""
         shifts = [np.array(s, dtype=motion.dtype) for s in load.shifts]
-        for value, (c, i) in zip(motion, self.motions()):
+        for value, (c, i) in zip(motion, self.motions(), strict=False):
             shifts[c][i] = value
         return shifts
 
@@ -762,7 +807,11 @@ class Problem:
             change = scale = 0.0
             for a, b in zip(new, old, strict=True):
                 if a.pressure is not None:
-                    change = max(change, np.abs(a.pressure - b.pressure).max(), np.abs(a.traction - b.traction).max())
+                    change = max(
+                        change,
+                        np.abs(a.pressure - b.pressure).max(),
+                        np.abs(a.traction - b.traction).max(),
+                    )
                     scale = max(scale, np.abs(a.pressure).max(), np.abs(a.traction).max())
             old = new
             if change <= 1e-9 * scale:
@@ -818,7 +867,9 @@ class Problem:
         else:
             schur, g = stiff[np.ix_(kept, kept)], right[kept]
         maps = [np.kron(c.interpolation, np.eye(d))[:, kept] for c in self.contacts]
-        rigid = [np.kron(c.interpolation, np.eye(d))[:, load.fixed] @ load.values for c in self.contacts]
+        rigid = [
+            np.kron(c.interpolation, np.eye(d))[:, load.fixed] @ load.values for c in self.contacts
+        ]
         free = self.motions()
 
         def evaluate(z: Array, *, tangent: bool) -> tuple[Array, Array | None, float, Array]:
@@ -866,7 +917,7 @@ class Problem:
                 left[:, : len(kept)] = maps[c]
                 for k, (o, i) in enumerate(free):
                     if o == c:
-                        left[i :: d, len(kept) + k] -= 1.0
+                        left[i::d, len(kept) + k] -= 1.0
                 stiffness = np.where(model.k_t > 0, model.k_t, model.k_n)
                 stiffness = model.weights * np.maximum(model.k_n, stiffness)
                 matrix += left.T @ (np.repeat(stiffness, d)[:, None] * left)
@@ -884,8 +935,6 @@ class Problem:
             if norm < best[0]:
                 since = iteration if norm < 0.5 * best[0] else since
                 best = (norm, z.copy())
-            if DEBUG:
-                print(iteration, norm, size, np.linalg.norm(floor) * 1e-14)
             if norm <= rtol * size or norm <= 1e-14 * np.linalg.norm(floor):
                 break
             if iteration > since + 40:
@@ -895,15 +944,16 @@ class Problem:
             if np.linalg.cond(system) > 1e13:
                 system = closed() / scale[:, None] / scale
             step = -np.linalg.lstsq(system, rest / scale, rcond=1e-15)[0] / scale
-            if DEBUG:
-                print("cond", np.linalg.cond(system), "eig", np.linalg.eigvals(system).real.min())
             share, slope = 1.0, rest @ step
             low, high = (0.0, slope), None
             # The paper's line search: the energy, of laws that have one, is least where its slope
-            # along the step is zero. Nothing holds an open body: the share is doubled until it does.
+            # along the step is zero. Nothing holds an open body: the share is doubled until
+            # something does.
             for _ in range(60):
                 trial = evaluate(z + share * step, tangent=False)[0]
-                lower = np.linalg.norm(trial / scale) < (1 - 0.1 * share) * np.linalg.norm(rest / scale)
+                lower = np.linalg.norm(trial / scale) < (1 - 0.1 * share) * np.linalg.norm(
+                    rest / scale
+                )
                 if lower and not convex:
                     break
                 along = trial @ step
@@ -920,8 +970,6 @@ class Problem:
                     share = low[0] + np.clip(part, 0.1, 0.9) * (high[0] - low[0])
             if iteration % 9 == 8 and not convex:
                 share = 1.0 if iteration % 18 == 8 else 0.37  # out of a cycle
-            if DEBUG:
-                print("share", share)
             z = z + share * step
         norm, z = best
         _, _, size, floor = evaluate(z, tangent=False)
