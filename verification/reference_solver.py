@@ -113,12 +113,12 @@ class Surface:
     def place(self, facet: Array, xi: Array, u: Array | None = None) -> tuple[Array, Array]:
         """Coordinates, (n, d), and tangents, (n, d - 1, d), of places, displaced by u."""
         inside = self._in_cell(facet, xi)
-        table = self._map.tabulate(1, inside)[..., 0]
+        table = _tabulate(self._map, 1, inside)
         corners = self.body.x[self.body.vertices[self.cells[facet]]]
         x = np.einsum("pk,pkd->pd", table[0], corners)
         slope = np.einsum("jpk,pkd->pjd", table[1:], corners)
         if u is not None:
-            table = self._element.tabulate(1, inside)[..., 0]
+            table = _tabulate(self._element, 1, inside)
             moved = u.reshape(-1, self.d)[self.body.nodes[self.cells[facet]]]
             x = x + np.einsum("pk,pkd->pd", table[0], moved)
             slope = slope + np.einsum("jpk,pkd->pjd", table[1:], moved)
@@ -137,7 +137,7 @@ class Surface:
 
     def interpolation(self, facet: Array, xi: Array) -> Array:
         """From values at the nodes to those at places: (n, n_nodes)."""
-        table = self._element.tabulate(0, self._in_cell(facet, xi))[0, :, :, 0]
+        table = _tabulate(self._element, 0, self._in_cell(facet, xi))[0]
         matrix = np.zeros((len(facet), len(self.body.places)))
         for row, (f, values) in enumerate(zip(facet, table, strict=False)):
             matrix[row, self.body.nodes[self.cells[f]]] += values
@@ -220,6 +220,13 @@ class Surface:
     def normal_moved(self, facet: Array, xi: Array, u: Array | None) -> Array:
         """Outward normals of the displaced facets, not of unit length."""
         return self._across(facet, xi, u) * self._sign[facet][:, None]
+
+
+def _tabulate(element: Any, derivatives: int, points: Array) -> Array:
+    """Tabulate, also at no points at all, where basix aborts: (n_tables, n_points, dim)."""
+    if len(points):
+        return element.tabulate(derivatives, points)[..., 0]
+    return np.zeros((1 + derivatives * points.shape[1], 0, element.dim))
 
 
 def smooth_modulus(surface: Surface, modulus: Array, facet: Array, xi: Array) -> Array:
