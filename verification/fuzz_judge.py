@@ -23,7 +23,7 @@ Array = np.ndarray
 # norms here are per body, so that those of all bodies together may be larger by some.
 _RESIDUAL = 30.0
 # Share of K u that rounding may leave.
-_ROUNDING = 300 * np.finfo(float).eps
+_ROUNDING = 1000 * np.finfo(float).eps
 # Results that are sums over the points, made twice from the same u.
 _SAME = 1e-9
 # Forces of the nearest exact solution, and of one found apart.
