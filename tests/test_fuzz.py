@@ -155,7 +155,8 @@ def test_a_spoiled_history_is_found():
 @serial
 def test_another_friction_is_found():
     def changed(made, problem):
-        problem.contacts[0].parameters["friction"].value = 0.3003
+        made.scene = copy.deepcopy(made.scene)
+        made.scene["contacts"][0]["law"]["friction"] = 0.3003
 
     # At the end half of the points slip.
     outcome = played(ONE, changed=changed)

@@ -319,6 +319,9 @@ class Judge:
         allowed = max(1e-6, 300 * record["rtol"]) * scale
         rounding = sum(b["rounding"] for b in now["bodies"])
         allowed += 10 * rounding * max(np.abs(u).max(), np.abs(self._u).max(initial=0.0))
+        for c, f in zip(problem.contacts, found, strict=True):
+            stiff = c.k_n[c.k_n > 0].min(initial=np.inf)
+            allowed += 10 * c.weights.sum() * self._traction_rounding(c, f) ** 2 / stiff
         pairs = [("work", energy.work, work), ("elastic", energy.elastic, elastic)]
         if penalty:
             pairs += [
