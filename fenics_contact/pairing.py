@@ -628,8 +628,18 @@ class Opposite:
         return facet, other, places, weights, share
 
     def _degree(self) -> int:
-        """Degree of the integrands on a piece: polynomial of the points times displacement."""
-        return self._quadrature.degree + self._there.space.ufl_element().degree
+        """Degree of the integrands on a piece: polynomial of the points times displacement.
+
+        And times themselves. In space pieces are triangles: there functions of a quadrilateral's
+        facet have twice the degree that they have along each of its sides.
+        """
+        degree = self._there.space.ufl_element().degree
+        found = self._quadrature.degree + degree
+        if self._d == 3 and not self._here.simplex:
+            n_points = self._quadrature.point_rows().shape[1]
+            own = _polynomials(self._d, self._here.simplex, n_points).degree
+            found = max(found, 2 * (own + max(own, degree)))
+        return int(found)
 
 
 def _interpolation_matrix(
