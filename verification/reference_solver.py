@@ -906,9 +906,10 @@ class Problem:
                     left = np.zeros((force.size, len(z)))
                     left[:, : len(kept)] = maps[c]
                     left[:, mine] -= select
-                    block = scipy.linalg.block_diag(*(w * by_jump))
+                    per_point = maps[c].reshape(-1, d, len(kept))
+                    felt_by = np.einsum("qij,qjn->qin", w * by_jump, per_point)
                     right_side = np.zeros((force.size, len(z)))
-                    right_side[:, : len(kept)] = block @ maps[c]
+                    right_side[:, : len(kept)] = felt_by.reshape(force.size, -1)
                     if mine:
                         turned = scipy.linalg.block_diag(*(w * by_shift))
                         right_side[:, mine] = turned @ select
