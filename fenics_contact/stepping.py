@@ -6,7 +6,7 @@ import dataclasses
 import logging
 import warnings
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from numbers import Real
 from pathlib import Path
 
@@ -139,12 +139,17 @@ def increments(
 class _Started(Iterator[Step]):
     """Increments that are solved as they are asked for; warns if none ever is."""
 
-    def __init__(self, steps: Iterator[Step]) -> None:
+    def __init__(self, steps: Generator[Step, None, None]) -> None:
         self._steps, self._asked = steps, False
 
     def __next__(self) -> Step:
         self._asked = True
         return next(self._steps)
+
+    def close(self) -> None:
+        """End the history here, as for a generator: the last committed increment was the last."""
+        self._asked = True
+        self._steps.close()
 
     def __del__(self) -> None:
         if not self._asked:
@@ -164,7 +169,7 @@ def _history(
     every: tuple[int, int, str | int],
     fields: Sequence[fem.Function],
     changed: str,
-) -> Iterator[Step]:
+) -> Generator[Step, None, None]:
     """What `increments` returns, its arguments checked. Collective."""
     (max_cuts, checkpoint_every, field), comm = every, problem.u.function_space.mesh.comm
     start, ends, estimate = leg.start, leg.ends, leg.estimate

@@ -906,7 +906,7 @@ class Problem:
                     left = np.zeros((force.size, len(z)))
                     left[:, : len(kept)] = maps[c]
                     left[:, mine] -= select
-                    per_point = maps[c].reshape(-1, d, len(kept))
+                    per_point = maps[c].reshape(len(maps[c]) // d, d, len(kept))
                     felt_by = np.einsum("qij,qjn->qin", w * by_jump, per_point)
                     right_side = np.zeros((force.size, len(z)))
                     right_side[:, : len(kept)] = felt_by.reshape(force.size, -1)
