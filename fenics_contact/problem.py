@@ -1240,8 +1240,6 @@ class ContactProblem:
                 ksp.getPC().setPythonContext(_Nearby(self._solvers[consistent]))
                 ksp.setTolerances(rtol=_NOTABLE**2, max_it=100)
                 ksp.solve(right, left)
-                if ksp.getConvergedReason() <= 0:
-                    left.set(np.nan)
                 return [contact.felt(left) for contact in self.contacts]
             finally:
                 space.diagonal = diagonal

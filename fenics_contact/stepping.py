@@ -237,7 +237,8 @@ def _history(
                 if not isinstance(failure, NotConverged):
                     raise
                 failed += failure.rungs
-                if at.cuts == max_cuts:
+                # What passes through between the points does so in smaller increments, too.
+                if at.cuts == max_cuts or failure.verdict.unseen:
                     failure.rungs = tuple(failed)
                     problem.complete()
                     raise

@@ -86,6 +86,11 @@ class Support:
 
     displacement: Any = None
 
+    @property
+    def is_flat(self) -> bool:
+        """Whether s - u_n is the true gap wherever the body moves, and the normal constant."""
+        return False
+
     def place(
         self, x: ufl.core.expr.Expr, shift: ufl.core.expr.Expr | None, to_ufl: ToUFL
     ) -> Placement:
@@ -144,6 +149,12 @@ class HalfSpace(Support):
     point: Sequence[float]
     normal: Sequence[float]
     displacement: Any = None
+
+    @property
+    def is_flat(self) -> bool:
+        """See `Support.is_flat`."""
+        given = (self.point, self.normal)
+        return not any(isinstance(value, ufl.core.expr.Expr) for value in given)
 
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
         """Gap (x - point - shift)·normal; see `Support.place`."""
