@@ -63,7 +63,7 @@ _FIRST_ROUND, _INNER, _NEARLY = 1e-4, 1e-2, 10.0
 _FAR = 100.0
 # Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
 _TOUCHING = 1e-12
-# Contact that bears less than this share of the load bears nothing yet.
+# Contact that bears less than this share of the load on a free motion bears nothing yet.
 _IDLE = 1e-3
 # Share by which small displacements may change forces or pressures before it is said.
 _NOTABLE = 0.01
@@ -1122,9 +1122,11 @@ class ContactProblem:
         self._cold = self.increment == 0
         if not len(self.motions.free):
             return
-        forces = [np.zeros(1), *self._whole.contact_forces()]
-        borne = global_max(self._comm, np.abs(np.concatenate(forces)))
-        if borne < _IDLE * global_max(self._comm, np.abs(self._load)):
+        borne, load = (
+            np.abs(self.motions.resultants(forces)).max()
+            for forces in (self._whole.contact_force(), self._load)
+        )
+        if borne < _IDLE * load:
             self._cold = True
             self._whole.set_state(np.where(self._constrained, self._whole.state(), self._rest))
         for contact in self.contacts:

@@ -200,6 +200,10 @@ class RigidMotions:
         sizes, vectors = np.linalg.eigh(mean)
         return agreed(self._comm, vectors[:, sizes < _FELT].T @ self.free)
 
+    def resultants(self, forces: Array) -> Array:
+        """Work of forces at this rank's unknowns on the free motions, (n_free,). Collective."""
+        return global_sum(self._comm, self._free_fields @ forces)
+
     def approach(self, load: Array, contacts: Sequence[Contact]) -> Array | None:
         """Rigid motion to first touch, where the load sets free bodies moving. Collective.
 

@@ -15,9 +15,10 @@ __all__ = ["NotConverged", "Rung", "Verdict", "check_laws"]
 
 # The laws hold point by point up to rounding of their few operations.
 _LAW_TOLERANCE = 1e-10
-# Share of the energy exchanged that friction may seem to give, by the mean of the tractions at both
-# ends of an increment in which the slip turns round.
-_CREATED = 0.05
+# Share of the energy exchanged that friction may seem to give: by the mean of the tractions at both
+# ends it does so where slip turns round within a long increment (6 % where a load aside is
+# reversed at once); in a state that smaller increments do not lead to it is half or more.
+_CREATED = 0.25
 
 
 @dataclass(frozen=True)
