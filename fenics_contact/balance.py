@@ -145,7 +145,10 @@ class Parts:
         force = np.max([loads, reaction, contact], axis=0)
         floor = _ROUND_OFF * np.maximum(terms, start)
         floor = np.where(loads > 0, np.minimum(floor, _MOST * force), floor)
+        # A body has the round-off of what it touches, too, where the other has gone far.
         floors = [floor[row].max(initial=0.0) for row in self._meets]
+        for row, shared in zip(self._meets, floors, strict=True):
+            floor = np.where(row, np.maximum(floor, shared), floor)
         # An open contact has no measure of its own: what is left there is its body's.
         own = [r if f > 0 else 0.0 for r, f in zip(own, push, strict=True)]
         return Norms(np.append(left, own), np.append(force, push), np.append(floor, floors), n)

@@ -80,17 +80,26 @@ class Linearisation:
 
     Attributes:
         force: In the contact force, by its largest change along any direction.
-        pressure: In the largest pressure.
+        pressure: In the pressure, in the mean square over Γc: single points at an edge tell
+            nothing.
+        rough: Whether the pressure is told roughly: between two meshes, whose facets meet at
+            angles that are none of the surfaces'.
     """
 
     force: float = 0.0
     pressure: float = 0.0
+    rough: bool = False
 
     @property
     def worst(self) -> float:
         """The larger of the two; infinite where one is not finite."""
         worst = max(self.force, self.pressure)
         return worst if np.isfinite(self.force) and np.isfinite(self.pressure) else np.inf
+
+    @property
+    def judged(self) -> float:
+        """What an increment fails by: the force alone where the pressure is told roughly."""
+        return self.force if self.rough and np.isfinite(self.worst) else self.worst
 
 
 @dataclass(frozen=True)
@@ -189,8 +198,10 @@ def _relative(contact: Contact, change: Array) -> Linearisation:
     comm, measure = contact.surface.mesh.comm, contact.measure
     sums = global_sum(comm, np.stack([measure @ contact.traction, measure @ change]))
     size = float(global_sum(comm, measure @ np.linalg.norm(contact.traction, axis=1)))
-    peak = global_max(comm, contact.pressure)
-    along = -np.sum(change * contact.values["normal"], axis=1)
-    after = global_max(comm, contact.pressure + along)
-    force, pressure = float(np.abs(sums[1]).max()), abs(after - peak)
-    return Linearisation(force / size if size else 0.0, pressure / peak if peak > 0 else 0.0)
+    largest = global_max(comm, np.abs(contact.pressure)) or 1.0  # squares must not overflow
+    along = np.sum(change * contact.values["normal"], axis=1) / largest
+    squares = [measure @ along**2, measure @ (contact.pressure / largest) ** 2]
+    changed, whole = np.sqrt(global_sum(comm, squares))
+    force = float(np.abs(sums[1]).max()) / size if size else 0.0
+    pressure = float(changed / whole) if whole else 0.0
+    return Linearisation(force, pressure, not contact.rigid)

@@ -249,8 +249,8 @@ class ContactProblem:
                 over both.
             prefix: Prefix of the options.
             kinematics: Displacements are taken as small; an increment fails where that changes the
-                contact force or the largest pressure by more than this share, and is warned of from
-                a hundredth on. Infinite: it never fails.
+                contact force or the pressure (between two bodies: the force) by more than this
+                share, and is warned of from a hundredth on. Infinite: it never fails.
 
         Raises:
             ValueError: Input that has no sense; the text says what and what to do. On all ranks.
@@ -1260,8 +1260,7 @@ class ContactProblem:
                     self._comm,
                     f"{name}: displacements are taken as small, with gap and normals of the "
                     "undeformed body; where it has moved to, the contact force would differ by "
-                    f"{100 * found.force:.2g} % and the largest pressure by "
-                    f"{100 * found.pressure:.2g} %",
+                    f"{100 * found.force:.2g} % and the pressure by {100 * found.pressure:.2g} %",
                 )
 
     def _force_sums(

@@ -146,11 +146,11 @@ class Verdict:
                 "the equations; use smaller ones (increments() cuts them by itself)"
             )
         for contact, change in self.kinematics.items():
-            if not change.worst <= self.kinematics_allowed:
+            if not change.judged <= self.kinematics_allowed:
                 found.append(
                     f"{contact}: displacements are too large to be taken as small: with gap and "
                     "normals where the body has moved to, the contact force would differ by "
-                    f"{100 * change.force:.2g} % and the largest pressure by "
+                    f"{100 * change.force:.2g} % and the pressure by "
                     f"{100 * change.pressure:.2g} %, above {100 * self.kinematics_allowed:.2g} %; "
                     "load in smaller steps, describe the motion as one of the support, find pairs "
                     'anew (update="increment"), or accept it: ContactProblem(kinematics=inf)'

@@ -62,10 +62,14 @@ def test_found_where_the_body_has_gone(cell):
     assert standing.contact.resultants().normal_force > 0
     a, b = carried.contact.gather(), standing.contact.gather()
     assert close(a["pressure"], b["pressure"], 1e-7)
-    # Without the update the pairs would still be those of the start.
+    # Without the update the pairs would still be those of the start: that is refused, or said.
     held = Slider(cell, law, start=0.4, n=n, update="never")
     held.step(-0.01, 1.33)
-    held.step(0.002, 1.33)
+    with pytest.raises(fc.NotConverged, match="taken as small"):
+        held.step(0.002, 1.33)
+    held.problem.kinematics = np.inf
+    with pytest.warns(UserWarning, match="taken as small"):
+        held.step(0.002, 1.33)
     assert not close(held.contact.gather()["pressure"], b["pressure"], 1e-3)
 
 
