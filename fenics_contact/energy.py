@@ -35,6 +35,7 @@ class Energy:
         friction: Work of friction on the body by the mean of the tractions at both ends, on the
             slip: negative where it brakes. Positive in one long increment where the slip turns
             round within it, or where the state is none that smaller increments lead to.
+        sliding: The most that friction could have taken, by the sizes of tractions and slip.
         imbalance: Work minus elastic minus the work of all tractions on Γc: zero by equilibrium
             at both ends, up to the solver's tolerance.
     """
@@ -45,13 +46,19 @@ class Energy:
     dissipation: float
     remainder: float
     friction: float
+    sliding: float
     imbalance: float
 
     @property
     def created(self) -> float:
-        """Share of the energy exchanged that friction has given instead of taken, 0 if none."""
+        """Share of the energy exchanged that friction has given instead of taken, 0 if none.
+
+        Where a sliding body is turned round in one increment works cancel: then by what friction
+        takes each way.
+        """
         exchanged = abs(self.work) + abs(self.elastic) + abs(self.springs)
-        return self.friction / exchanged if self.friction > 0 and exchanged > 0 else 0.0
+        scale = max(exchanged, self.sliding)
+        return self.friction / scale if self.friction > 0 and scale > 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -111,8 +118,8 @@ class EnergyState:
         mark = next(mark for mark in self.forces if mark in before.forces)
         old, new = before.forces[mark], self.forces[mark]
         way = new.unknowns - old.unknowns
-        # Work, elastic, springs, dissipation, work of the tractions, and that of friction.
-        sums = np.zeros(6)
+        # Work, elastic, springs, dissipation, work of the tractions, that of friction, its size.
+        sums = np.zeros(7)
         sums[0] = 0.5 * (old.external + new.external) @ way
         sums[1] = 0.5 * (old.internal + new.internal) @ way
         sums[2] = self.springs - before.springs
@@ -123,11 +130,15 @@ class EnergyState:
             if contact.law.has_friction:
                 sums[3] += contact.measure @ contact.values["dissipated"]
                 # Tractions before are those of the commit, not multipliers in their place.
-                normal = contact.values["normal"]
-                along = np.sum(mean * normal, axis=1)[:, None] * normal
-                sums[5] += np.sum((mean - along) * contact.slip_vector())
+                slip, normal = contact.slip_vector(), contact.values["normal"]
+                for traction in (there[0], here[0]):
+                    along = np.sum(traction * normal, axis=1)[:, None] * normal
+                    side, weight = traction - along, 0.5 * contact.measure
+                    sums[5] += np.sum(weight[:, None] * side * slip)
+                    size = np.linalg.norm(side, axis=1) * np.linalg.norm(slip, axis=1)
+                    sums[6] += weight @ size
         total = (float(v) for v in global_sum(comm, sums))
-        work, elastic, springs, dissipation, tractions, friction = total
+        work, elastic, springs, dissipation, tractions, friction, sliding = total
         remainder = work - elastic - springs - dissipation
         imbalance = work - elastic - tractions
-        return Energy(work, elastic, springs, dissipation, remainder, friction, imbalance)
+        return Energy(work, elastic, springs, dissipation, remainder, friction, sliding, imbalance)
