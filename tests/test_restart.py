@@ -37,8 +37,7 @@ from scenes import (
 from test_two_bodies import BOTTOM, LOWER, UPPER, elasticity, two_blocks
 
 import fenics_contact as fc
-from fenics_contact import compat
-from fenics_contact import checkpoint
+from fenics_contact import checkpoint, compat
 
 COMM = MPI.COMM_WORLD
 
@@ -373,7 +372,8 @@ def test_cut_increments(make, tmp_path):
 
         def choosy(**options):
             if now[0] - at[0] > 0.3:
-                verdict = fc.Verdict(1.0, 1.0, 0.0, 0.0, 1.0)
+                balance = {"the body": fc.verdict.Balance(1.0, 1.0, 0.0)}
+                verdict = fc.Verdict(balance, balance)
                 raise fc.NotConverged(problem.increment + 1, -1, verdict)
             return solve(**options)
 
