@@ -18,6 +18,9 @@ __all__ = ["Energy", "EnergyState", "Forces"]
 
 Array = npt.NDArray[np.float64]
 
+# Work, as a share of the energies that there are, that is within the solver's tolerance.
+_NOTHING = 1e-8
+
 
 @dataclass(frozen=True)
 class Energy:
@@ -119,7 +122,8 @@ class EnergyState:
         old, new = before.forces[mark], self.forces[mark]
         way = new.unknowns - old.unknowns
         # Work, elastic, springs, dissipation, work of the tractions, that of friction, its size.
-        sums = np.zeros(7)
+        sums = np.zeros(8)
+        sums[7] = np.abs(new.internal * new.unknowns).sum() + self.springs
         sums[0] = 0.5 * (old.external + new.external) @ way
         sums[1] = 0.5 * (old.internal + new.internal) @ way
         sums[2] = self.springs - before.springs
@@ -138,7 +142,9 @@ class EnergyState:
                     size = np.linalg.norm(side, axis=1) * np.linalg.norm(slip, axis=1)
                     sums[6] += weight @ size
         total = (float(v) for v in global_sum(comm, sums))
-        work, elastic, springs, dissipation, tractions, friction, sliding = total
+        work, elastic, springs, dissipation, tractions, friction, sliding, level = total
+        if abs(friction) <= _NOTHING * level:  # nothing has slipped but what the solver leaves
+            friction = 0.0
         remainder = work - elastic - springs - dissipation
         imbalance = work - elastic - tractions
         return Energy(work, elastic, springs, dissipation, remainder, friction, sliding, imbalance)

@@ -321,6 +321,7 @@ class ContactProblem:
         self._cold = True
         self.kinematics = kinematics
         self._large: set[str] = set()
+        self._converged = False
         n_nodes = self.unknowns.first_motion / len(u)
         self._cell_size = self._length / n_nodes ** (1 / len(u))
         self._watch = StatusWatch(self.contacts)
@@ -858,6 +859,7 @@ class ContactProblem:
         self._space.begin(self._load)
         reason, rungs, rounds = self._enforce(ahead, stiffness_changed)
         lags = not field and self._may_lag()
+        self._converged = reason > 0
         verdict = self._judge_kept() if lags else self._judge_all()
         if reason <= 0 or verdict.failures:
             raise NotConverged(self.increment + 1, reason, verdict, rungs)
@@ -1204,7 +1206,8 @@ class ContactProblem:
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
             # Of the opposite only what Γc meets is known before u is complete.
             unseen=passing(self.contacts) if space is self._whole else {},
-            kinematics=self._linearisation(space) if laws else {},
+            # A solver that has failed may have no factors to use.
+            kinematics=self._linearisation(space) if laws and self._converged else {},
             kinematics_allowed=self.kinematics,
         )
         return verdict, reaction

@@ -33,7 +33,7 @@ class QuasiNewton:
             problem: The `ContactProblem`.
         """
         self._problem = weakref.proxy(problem)
-        self._has_h0 = False
+        self._has_h0 = self._refreshed = False
 
     def forget(self) -> None:
         """Say that the matrix of H₀ is gone, or was used for something else."""
@@ -53,7 +53,8 @@ class QuasiNewton:
         problem._compute_residual(solution, problem._function)
         norms = problem._norms
         borne = norms.force[norms.n_bodies :].max(initial=0.0)
-        if not self._has_h0 or stiffness_changed or borne < _IDLE * norms.total:
+        idle = self._refreshed and borne < _IDLE * norms.total
+        if not self._has_h0 or stiffness_changed or idle:
             self._start()
             self._has_h0 = True
         else:
@@ -87,6 +88,7 @@ class QuasiNewton:
     def _start(self) -> None:
         """H₀ = (K + αK_n + φK_t)⁻¹, all of Γc closed and sticking (section 5). Collective."""
         problem = self._problem
+        self._refreshed = False
         problem._clear_pairs(consistent=False)
         problem._assemble_matrix(problem._matrix(False), problem._stiffnesses(everywhere=True))
 
@@ -101,6 +103,7 @@ class QuasiNewton:
         problem._update_bulk()
         if not np.isfinite(problem.bulk.scale):
             return False
+        self._refreshed = True
         for contact in problem.contacts:
             contact.evaluate()
         problem._watch.note(problem._norms.total)
