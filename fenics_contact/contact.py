@@ -23,7 +23,14 @@ from fenics_contact.augmented import Multipliers, TraceProjection
 from fenics_contact.history import History
 from fenics_contact.laws import Kinematics, Law, Response, Scaled, Springs
 from fenics_contact.pairing import REASONS, DeformableBody, LookBack, Opposite
-from fenics_contact.parallel import gather_rows, global_max, global_min, global_sum, warn
+from fenics_contact.parallel import (
+    collective_errors,
+    gather_rows,
+    global_max,
+    global_min,
+    global_sum,
+    warn,
+)
 from fenics_contact.products import PointProduct
 from fenics_contact.supports import Motion, Placement, Support, nonzero_vector
 from fenics_contact.surface import ContactSurface, PointEvaluator, VertexAreas
@@ -1295,15 +1302,15 @@ class Contact:
     def slip_vector(self) -> Array:
         """Slip Δu_t + K_t⁻¹ Δτ of the increment, as a vector, (n_points, gdim), in length.
 
-        Where the gap opens the way beyond what the springs give back counts, too.
+        Where the gap opens the way beyond what the springs give back counts, too. Collective.
         """
         values, normal = self._values, self._values["normal"]
+        # K_t has no inverse along the normal, and nothing acts there: any stiffness will do.
         along = np.einsum("q,qi,qj->qij", values["parameter k_t"], normal, normal)
         change = (values["traction"] - values["old_traction"])[:, :, None]
-        return (
-            values["increment"]
-            + np.linalg.solve(self.tangential_stiffness + along, change)[:, :, 0]
-        )
+        with collective_errors(self.surface.mesh.comm):  # singular, where k_t is next to nothing
+            stretched = np.linalg.solve(self.tangential_stiffness + along, change)[:, :, 0]
+        return values["increment"] + stretched
 
     @property
     def slip_increment(self) -> Array:

@@ -321,7 +321,6 @@ class ContactProblem:
         self._cold = True
         self.kinematics = kinematics
         self._large: set[str] = set()
-        self._converged = False
         n_nodes = self.unknowns.first_motion / len(u)
         self._cell_size = self._length / n_nodes ** (1 / len(u))
         self._watch = StatusWatch(self.contacts)
@@ -859,8 +858,8 @@ class ContactProblem:
         self._space.begin(self._load)
         reason, rungs, rounds = self._enforce(ahead, stiffness_changed)
         lags = not field and self._may_lag()
-        self._converged = reason > 0
-        verdict = self._judge_kept() if lags else self._judge_all()
+        judge = self._judge_kept if lags else self._judge_all
+        verdict = judge(kinematics=reason > 0)  # a solver that failed may have no factors for it
         if reason <= 0 or verdict.failures:
             raise NotConverged(self.increment + 1, reason, verdict, rungs)
         energy = self._energy.since(self._committed_energy, self.contacts, self._comm)
@@ -1140,28 +1139,29 @@ class ContactProblem:
         if way is not None:
             self._whole.set_state(self._whole.state() + way)
 
-    def _judge_all(self) -> Verdict:
+    def _judge_all(self, *, kinematics: bool) -> Verdict:
         """Complete u and judge by assembly, past SNES and its residual. Collective."""
         self._space.complete(self._space.behind)
         self._behind = None
         for contact in self.contacts:
             contact.evaluate()
         bulk = self._whole.with_supports(self.bulk.assemble_residual())
-        verdict, reaction = self._judge(self._whole, bulk)
+        verdict, reaction = self._judge(self._whole, bulk, kinematics=kinematics)
         forces: dict[object, Forces] = {self._whole.mark: self._whole.forces(bulk, reaction)}
         if self._condensed and self.bulk.symmetric:
             forces[self._space.mark] = self._forces_kept()
         self._energy = EnergyState.at(forces, self.contacts)
         return verdict
 
-    def _judge_kept(self) -> Verdict:
+    def _judge_kept(self, *, kinematics: bool) -> Verdict:
         """Judge the condensed equations; u stays behind. One rank only."""
         self._behind = self._space.behind
         for contact in self.contacts:
             contact.evaluate()
         self._space.enter()
         try:
-            verdict, _ = self._judge(self._space, self._space.bulk_force())
+            bulk = self._space.bulk_force()
+            verdict, _ = self._judge(self._space, bulk, kinematics=kinematics)
         finally:
             self._whole.enter()
         forces: dict[object, Forces] = {self._space.mark: self._forces_kept()}
@@ -1176,13 +1176,16 @@ class ContactProblem:
             self._whole.enter()
         return self._space.forces(bulk, np.where(self._space.constrained, bulk + contact, 0.0))
 
-    def _judge(self, space: WholeSpace, bulk: Array, *, laws: bool = True) -> tuple[Verdict, Array]:
+    def _judge(
+        self, space: WholeSpace, bulk: Array, *, laws: bool = True, kinematics: bool = False
+    ) -> tuple[Verdict, Array]:
         """Recompute residual, balance and laws at evaluated contacts. Collective.
 
         Args:
             space: The unknowns on which the residual is looked at; entered.
             bulk: Residual of the bulk on these.
             laws: Whether to check the laws, too.
+            kinematics: Whether to look at what small displacements leave out.
 
         Returns:
             The verdict, and the reactions at the unknowns.
@@ -1206,8 +1209,7 @@ class ContactProblem:
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
             # Of the opposite only what Γc meets is known before u is complete.
             unseen=passing(self.contacts) if space is self._whole else {},
-            # A solver that has failed may have no factors to use.
-            kinematics=self._linearisation(space) if laws and self._converged else {},
+            kinematics=self._linearisation(space) if kinematics else {},
             kinematics_allowed=self.kinematics,
         )
         return verdict, reaction

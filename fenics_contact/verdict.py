@@ -9,7 +9,7 @@ import numpy as np
 
 from fenics_contact.contact import Contact
 from fenics_contact.motion import Linearisation
-from fenics_contact.parallel import collective_errors, global_max
+from fenics_contact.parallel import global_max
 
 __all__ = ["NotConverged", "Rung", "Verdict", "check_laws"]
 
@@ -239,16 +239,12 @@ def check_laws(contact: Contact) -> dict[str, float]:
         found["stiffness"] = max(found.get("stiffness", 0.0), violation)
         return found
 
-    limit, beta, normal = v["limit"], v["slip_increment"], v["normal"]
+    limit, beta = v["limit"], v["slip_increment"]
     functions, gradients = (rows[paired] for rows in contact.evaluate_yield())
-    # K_t has no inverse along the normal, and nothing acts there: any stiffness will do.
-    along = np.einsum("q,qi,qj->qij", v["parameter k_t"], normal, normal)
-    change = tau - v["old_traction"]
-    with collective_errors(comm):  # singular, where k_t is next to nothing
-        change = np.linalg.solve(stiffness + along, change[:, :, None])[:, :, 0]
+    missing = contact.slip_vector()[paired]  # = -Σ Δβ_j ∂g_j/∂τ (44)
+    change = missing - v["increment"]
     # An open point keeps no traction and counts no slip, whatever it moves.
     bears = limit > 0
-    missing = v["increment"] + change  # = -Σ Δβ_j ∂g_j/∂τ (44)
     slipped = -np.einsum("qm,qmd->qd", beta, gradients)
     # Round-off in the increments is that of the displacements they are differences of.
     travel = (v["jump"], v["increment"], change)
