@@ -390,11 +390,6 @@ class CondensedSpace(WholeSpace):
         joined = (np.concatenate(part) for part in (unknowns, internal, external))
         return Forces(*joined)
 
-    @property
-    def components(self) -> Indices:
-        """Direction of every dof."""
-        return np.remainder(self._kept_dofs, len(self.u), dtype=np.int32)
-
     def forget(self) -> None:
         """Drop the solutions for earlier loads."""
         if self._condensation is not None:

@@ -1271,9 +1271,10 @@ class ContactProblem:
     def _force_sums(
         self, space: WholeSpace, internal: Array, forces: Sequence[Array]
     ) -> tuple[Array, Array]:
-        """Forces on every body that do not cancel: ∑F(u) - reactions - ∫ (r_n n + τ). Collective.
+        """What does not cancel of ∑F(u) - reactions - ∫ (r_n n + τ) on every body. Collective.
 
-        The last is the contacts' own sum over their points, not that of their nodal forces.
+        Moments, too. The last is the contacts' own sum over their points, not that of their nodal
+        forces.
 
         Args:
             space: The unknowns, entered.
@@ -1281,22 +1282,20 @@ class ContactProblem:
             forces: What tells how large all forces are, (n_local,) each.
 
         Returns:
-            The sums, (n_bodies, gdim) (force); of every body the number of its unknowns, and the
-            sum of the absolute forces, (2, n_bodies).
+            The sums, (n_bodies, n_per_body) (force), see `RigidMotions.work`; of every body the
+            number of its unknowns, and the sum of the absolute forces, (2, n_bodies).
         """
-        components, gdim = space.components, len(self.u)
-        label = space.label[: components.size]
-        n = self._whole.n_bodies - self.unknowns.n_motions
-        place = label * gdim + components
-        flat = np.bincount(place, internal[: components.size], minlength=n * gdim)
-        count = np.bincount(label, minlength=n)
-        sizes = [np.bincount(label, np.abs(f[: components.size]), minlength=n) for f in forces]
-        total = np.asarray(flat.reshape(n, gdim), dtype=np.float64)
+        motions, n = self.motions.of_bodies, self._whole.n_bodies - self.unknowns.n_motions
+        total = np.array([[space.part(mode) @ internal for mode in body] for body in motions])
         for contact in self.contacts:
-            force = contact.measure[:, None] * contact.traction
-            total = total - self._whole.shares(contact).T @ force
+            total -= self.motions.work(contact, contact.measure[:, None] * contact.traction)
+        count = np.bincount(space.label, minlength=n)[:n]
+        sizes = [np.bincount(space.label, np.abs(f), minlength=n)[:n] for f in forces]
         sums = global_sum(self._comm, np.stack([*total.T, count, np.sum(sizes, axis=0)]))
-        return sums[:gdim].T, sums[gdim:]
+        # What cannot be told is left out; a force that is no number is seen by the translations.
+        rotations = sums[len(self.u) : -2]
+        rotations[np.isnan(rotations)] = 0.0
+        return sums[:-2].T, sums[-2:]
 
     @interrupts_held()
     def commit(self) -> None:

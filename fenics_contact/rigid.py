@@ -18,6 +18,7 @@ from petsc4py import PETSc
 
 from fenics_contact.bodies import connected_bodies
 from fenics_contact.contact import Contact, Status
+from fenics_contact.facets import facet_cells
 from fenics_contact.parallel import agreed, gather_rows, global_min, global_sum
 from fenics_contact.unknowns import Unknowns
 
@@ -43,7 +44,8 @@ class RigidMotions:
 
     Attributes:
         size: Diagonal of the mesh's bounding box (length).
-        names: Name of every motion.
+        names: Name of every motion, those of the bodies first.
+        of_bodies: Their fields at this rank's unknowns, (n_bodies, n_per_body, n_local).
         free: Coefficients of the free motions, shape (n_free, n_motions).
     """
 
@@ -61,8 +63,8 @@ class RigidMotions:
         gdim = space.mesh.geometry.dim
         n_owned = space.dofmap.index_map.size_local
         x = space.tabulate_dof_coordinates()[:n_owned, :gdim]
-        n_bodies, body = connected_bodies(space)
-        body = body[:n_owned]
+        n_bodies, self._body = connected_bodies(space)
+        body = self._body[:n_owned]
         low, high = np.full((n_bodies, gdim), np.inf), np.full((n_bodies, gdim), -np.inf)
         for b in np.unique(body):
             mine = x[body == b] if n_bodies > 1 else x
@@ -70,13 +72,13 @@ class RigidMotions:
         self._comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
         self._comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
         self.size = float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
+        self._space, self._centres = space, (low + high) / 2
+        self._sizes = np.linalg.norm(high - low, axis=1)
         self.names: list[str] = []
         modes: list[Array] = []
         for b in range(n_bodies):
-            of = f" of body {b + 1}, near {np.round((low[b] + high[b]) / 2, 6).tolist()}"
-            kinds = rigid_motions(
-                x - (low[b] + high[b]) / 2, float(np.linalg.norm(high[b] - low[b]))
-            )
+            of = f" of body {b + 1}, near {np.round(self._centres[b], 6).tolist()}"
+            kinds = rigid_motions(x - self._centres[b], self._sizes[b])
             for name, mode in kinds.items():
                 self.names.append(name + (of if n_bodies > 1 else ""))
                 modes.append(np.where(body[:, None] == b, mode, 0.0).ravel())
@@ -84,6 +86,7 @@ class RigidMotions:
         none, still = np.zeros(len(supports)), np.zeros(unknowns.n_dofs)
         of_supports = [unknowns.joined(still, row) for row in np.eye(len(supports))]
         self._modes = np.array([unknowns.joined(mode, none) for mode in modes] + of_supports)
+        self.of_bodies = self._modes[: len(modes)].reshape(n_bodies, -1, unknowns.n_local)
         self.free: Array = np.zeros((0, len(modes)))
         self._free_fields: Array = np.zeros((0, unknowns.n_local))
         self._balanced: list[Array] = []
@@ -91,6 +94,8 @@ class RigidMotions:
         self._holding: tuple[list[int], list[npt.NDArray[np.bool_]]] = [], []
         self._jumps: weakref.WeakKeyDictionary[Contact, tuple[int, Array]]
         self._jumps = weakref.WeakKeyDictionary()
+        self._travels: weakref.WeakKeyDictionary[Contact, tuple[int, Array]]
+        self._travels = weakref.WeakKeyDictionary()
 
     def find_free(self, stiffness: PETSc.Mat, constrained: npt.NDArray[np.bool_]) -> None:
         """Find the motions with no bulk energy that no Dirichlet condition holds. Collective.
@@ -130,6 +135,50 @@ class RigidMotions:
             jumps = np.array(found).reshape(len(self.free), contact.quadrature.n_points, gdim)
             self._jumps[contact] = contact.pairings, jumps
         return jumps
+
+    def work(self, contact: Contact, force: Array) -> Array:
+        """Of forces at a contact's points, and of what answers them, on the motions of the bodies.
+
+        That of the body with Γc follows from where the points are, not from the map by which the
+        solver transfers forces. Collective.
+
+        Args:
+            contact: The contact.
+            force: On the body with Γc, (n_points, gdim) (force).
+
+        Returns:
+            This rank's part, (n_bodies, n_per_body) (force): translations, then rotations about
+            the body's middle by its size.
+        """
+        pairing, travels = self._travels.get(contact, (-1, np.zeros(0)))
+        if pairing != contact.pairings:
+            travels = self._travels_at(contact)
+            self._travels[contact] = contact.pairings, travels
+        return np.asarray(np.einsum("bmqd,qd->bm", travels, force), dtype=np.float64)
+
+    def _travels_at(self, contact: Contact) -> Array:
+        """What points of a contact feel of the bodies' motions, (n_bodies, n_per_body, ...)."""
+        space, (n_bodies, n_motions, _) = self._space, self.of_bodies.shape
+        points = contact.points
+        travels = np.zeros((n_bodies, n_motions, *points.shape))
+        rows = contact.quadrature.point_rows()
+        cells = facet_cells(space.mesh, contact.surface.facets)
+        own = np.zeros(len(points), dtype=np.intp)
+        own[rows.ravel()] = np.repeat(self._body[space.dofmap.list[cells, 0]], rows.shape[1])
+        for b in range(n_bodies):
+            placed = rigid_motions(points - self._centres[b], self._sizes[b])
+            travels[b] = np.where((own == b)[:, None], np.array(list(placed.values())), 0.0)
+            if contact.rigid:
+                continue
+            # The map says where the forces on the opposite act. Both sides may be one body's.
+            # A point without an opposite feels none: a traction there would be left over.
+            felt = np.array([contact.at_points(mode) for mode in self.of_bodies[b]])
+            there = contact.paired & ((own != b) | (np.abs(felt[0, :, 0]) < 0.5))
+            travels[b] = np.where(there[:, None], felt, travels[b])
+        if space.mesh.geometry.cmap.degree > space.ufl_element().degree:
+            # Straight displacements of curved cells have no rotations.
+            travels[:, space.mesh.geometry.dim :] = np.nan
+        return travels
 
     def _describe(self, coefficients: Array) -> str:
         share = np.abs(coefficients) / np.abs(coefficients).max()

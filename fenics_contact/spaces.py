@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -17,7 +16,6 @@ from fenics_contact.bodies import connected_bodies
 from fenics_contact.bulk import Bulk
 from fenics_contact.contact import Contact
 from fenics_contact.energy import Forces
-from fenics_contact.facets import facet_cells
 from fenics_contact.unknowns import Unknowns
 
 __all__ = ["WholeSpace"]
@@ -83,10 +81,8 @@ class WholeSpace:
 
     def _label_unknowns(self) -> None:
         """Tell bodies and free supports apart. Collective."""
-        n, self._body = connected_bodies(self.u.function_space)
-        self._shares: weakref.WeakKeyDictionary[Contact, tuple[int, Array]]
-        self._shares = weakref.WeakKeyDictionary()
-        dofs = np.repeat(self._body, len(self.u))[: self.unknowns.n_dofs]
+        n, body = connected_bodies(self.u.function_space)
+        dofs = np.repeat(body, len(self.u))[: self.unknowns.n_dofs]
         motions = n + np.arange(len(self.motions))
         label = self.unknowns.joined(dofs.astype(np.float64), motions.astype(np.float64))
         self.label = label.astype(np.intp)
@@ -108,31 +104,6 @@ class WholeSpace:
             )
             self._parts = pairings, parts
         return self._parts[1]
-
-    def shares(self, contact: Contact) -> Array:
-        """Share of the traction at each point that acts on each body, (n_points, n_bodies).
-
-        1 for the body that the point is of, and in sum -1 for those opposite. Collective.
-        """
-        pairings, shares = self._shares.get(contact, (-1, np.zeros((0, 0))))
-        if pairings != contact.pairings:
-            n, dofs = self.n_bodies - len(self.motions), self.label[: self.unknowns.n_dofs]
-            shares = np.zeros((contact.quadrature.n_points, n))
-            rows = contact.quadrature.point_rows()
-            space = self.u.function_space
-            cells = facet_cells(space.mesh, contact.surface.facets)
-            own = self._body[space.dofmap.list[cells, 0]]
-            shares[rows.ravel(), np.repeat(own, rows.shape[1])] = 1.0
-            if not contact.rigid:
-                # What of the bodies a point feels is what its traction acts on.
-                for b in range(n):
-                    push = np.zeros(self.unknowns.n_local)
-                    push[: dofs.size : len(self.u)] = dofs[:: len(self.u)] == b
-                    felt = contact.at_points(push)[:, 0]
-                    # A point without an opposite feels none: a traction there would be left over.
-                    shares[contact.paired, b] = felt[contact.paired]
-            self._shares[contact] = contact.pairings, shares
-        return shares
 
     def vector(self) -> PETSc.Vec:
         """A new vector over the unknowns. Collective."""
@@ -194,11 +165,6 @@ class WholeSpace:
             reaction: Forces at the constrained unknowns, zero at others, (n,) (force).
         """
         return Forces(self.state(), bulk + self.load, self.load + reaction)
-
-    @property
-    def components(self) -> npt.NDArray[np.int32]:
-        """Direction of every dof of this rank, (n_dofs,)."""
-        return np.arange(self.unknowns.n_dofs, dtype=np.int32) % len(self.u)
 
     def forget(self) -> None:
         """Drop what was kept of earlier increments and could show in the digits of the next."""

@@ -57,8 +57,9 @@ class Verdict:
     Attributes:
         equations: Norms of the free residual, recomputed by assembly, by body, free support and
             contact: each is judged by the forces that act on it in the present increment.
-        sums: Largest component of load + contact + reactions, by body, contact by its tractions at
-            the points and not by its nodal forces.
+        sums: Largest component of load + contact + reactions, by body, and of their moments about
+            its middle, by its size: contact by its tractions at the points and not by its nodal
+            forces.
         laws: Largest violations by contact and by law, relative; see `check_laws`.
         enforcement: `Contact.enforcement_error` of the contacts with multipliers, by name.
         enforcement_tolerance: What passes, by name.
@@ -124,7 +125,7 @@ class Verdict:
                 found.append(f"residual of {name} is {balance}")
         for name, balance in self.sums.items():
             if not balance.holds():
-                found.append(f"forces on {name} do not balance: {balance}")
+                found.append(f"forces on {name}, or their moments, do not balance: {balance}")
         for contact, laws in self.laws.items():
             found += [
                 f"{contact}: {law} violated by {value:.3e} (relative)"

@@ -751,6 +751,24 @@ def test_a_wrong_contact_residual_is_caught(method, factor):
     assert any("balance" in f for f in caught.value.verdict.failures)
 
 
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_forces_at_wrong_places_are_caught(cell):
+    """Forces of the right sum, each acting where another point of Γc is: moments do not balance."""
+    made = rub(cell=cell)
+    right, contact = made.contact.add_force, made.contact
+
+    def wrong(residual, traction=None):
+        contact.evaluate()
+        force = contact.measure[:, None] * contact.traction
+        right(residual, np.roll(force, 1, axis=0) / contact.measure[:, None])
+
+    contact.add_force = wrong
+    made.move(*PATH[1])
+    with pytest.raises(fc.NotConverged) as caught:
+        made.problem.solve()
+    assert any("moments" in f for f in caught.value.verdict.failures)
+
+
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_a_premature_end_is_caught(method, monkeypatch):
     """SNES that claims convergence at its first look is not believed; the state is as before."""
