@@ -14,9 +14,10 @@ import basix
 import numpy as np
 import numpy.typing as npt
 import ufl
-from dolfinx import fem
+from dolfinx import fem, la
 from petsc4py import PETSc
 
+from fenics_contact import compat
 from fenics_contact.accuracy import DEFAULT_FACTOR, Accuracy, modulus_over_height
 from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.augmented import Multipliers, TraceProjection
@@ -322,6 +323,7 @@ class Contact:
         self._acting = self._whole = _Reactions(self, law, parameters)
         self._frozen: _Reactions | None = None
         self._evaluate_yield: PointEvaluator | None = None
+        self._own_form: Any = None
         self._points: dict[str, Array] | None = None
         self._paired_at: fem.Function | None = None
         self._looking_back: LookBack | None = None
@@ -557,6 +559,32 @@ class Contact:
             traction = self._values["weight"][:, None] * traction
         self._reaction.array[:] = -(self.quadrature.weights[:, None] * traction).ravel()
         self._felt_map.multTransposeAdd(self._reaction, residual, residual)
+
+    def own_forces(self) -> tuple[Array, Array]:
+        """Nodal forces on the body with Γc at the present ``u``, by two routes. Collective.
+
+        Returns:
+            (n_owned_dofs,) each (force): as `add_force` has them, by sums over the points; and as
+            DOLFINx assembles the boundary form (46, 55), in which ``u`` itself stands where the
+            support is rigid and no motion of it is unknown, and the jump at the points otherwise.
+        """
+        mesh, space = self.surface.mesh, self.u.function_space
+        self._update_jump()
+        traction = self._whole.evaluate_traction()["traction"]
+        self._reaction.array[:] = (self.quadrature.weights[:, None] * traction).ravel()
+        vector = self._own_map.createVecRight()
+        self._own_map.multTranspose(self._reaction, vector)
+        by_points = vector.array_r.copy()
+        vector.destroy()
+        if self._own_form is None:
+            displacement = self.u if self.rigid and not self.free_motion else self._jump
+            work = ufl.dot(self._whole.traction(displacement), ufl.TestFunction(space))
+            form = self.weight * work * self.quadrature.ds
+            self._own_form = compat.compile_form(form, self.entity_maps)
+        with collective_errors(mesh.comm):
+            assembled = fem.assemble_vector(self._own_form)
+        assembled.scatter_reverse(la.InsertMode.add)
+        return by_points, assembled.array[: by_points.size].copy()
 
     def tangent_matrix(self) -> PETSc.Mat:
         """`tangent`, assembled at the present ``u``, a new matrix over the unknowns. Collective."""

@@ -67,6 +67,8 @@ _TOUCHING = 1e-12
 _IDLE = 1e-3
 # Share by which small displacements may change forces or pressures before it is said.
 _NOTABLE = 0.01
+# Round-off of displacements that two routes add up in different orders, by their size.
+_ROUND_OFF = 100 * np.finfo(float).eps
 # Increments expected where nothing is said.
 _EXPECTED = 4
 # Iterations of Newton's method without a lower residual after which another method takes over.
@@ -218,6 +220,7 @@ class ContactProblem:
         petsc_options: Mapping[str, Any] | None = None,
         prefix: str = "contact_",
         kinematics: float = 0.2,
+        second_route: bool = False,
     ) -> None:
         """Compile the forms, measure the scales and check the input. Collective.
 
@@ -251,6 +254,9 @@ class ContactProblem:
             kinematics: Displacements are taken as small; an increment fails where that changes the
                 contact force or the pressure (between two bodies: the force) by more than this
                 share, and is warned of from a hundredth on. Infinite: it never fails.
+            second_route: Whether every verdict also compares the forces on Γc with those that
+                DOLFINx assembles from the boundary form; one more form to compile for each contact,
+                and an assembly for each increment.
 
         Raises:
             ValueError: Input that has no sense; the text says what and what to do. On all ranks.
@@ -265,6 +271,11 @@ class ContactProblem:
         for name, share in (("alpha", alpha), ("phi", phi)):
             if not (is_number(share) and 0.0 <= share <= 1.0):
                 raise ValueError(f"{name} is {share!r}; it must lie between 0 and 1")
+        if not (is_number(kinematics) and kinematics > 0):
+            raise ValueError(
+                f"kinematics is {kinematics!r}; it must be a positive share, such as 0.2, or "
+                "infinite, so that no increment fails by it"
+            )
         check_instance("u", u, fem.Function)
         displacement_degree(u, u.function_space.mesh, "problem")
         check_instance("prefix", prefix, str)
@@ -319,7 +330,7 @@ class ContactProblem:
         self._rate: Array | None = None
         self._solved: _Solved | None = None
         self._cold = True
-        self.kinematics = kinematics
+        self.kinematics, self._second_route = kinematics, second_route
         self._large: set[str] = set()
         n_nodes = self.unknowns.first_motion / len(u)
         self._cell_size = self._length / n_nodes ** (1 / len(u))
@@ -861,11 +872,11 @@ class ContactProblem:
         judge = self._judge_kept if lags else self._judge_all
         verdict = judge(kinematics=reason > 0)  # a solver that failed may have no factors for it
         if reason <= 0 or verdict.failures:
-            raise NotConverged(self.increment + 1, reason, verdict, rungs)
+            raise self._not_converged(reason, verdict, rungs)
         energy = self._energy.since(self._committed_energy, self.contacts, self._comm)
         verdict = replace(verdict, created=energy.created)
         if verdict.failures:
-            raise NotConverged(self.increment + 1, reason, verdict, rungs)
+            raise self._not_converged(reason, verdict, rungs)
         self._warn_of_large_motion(verdict)
         self._solved = _Solved(self._whole.state(), [c.found() for c in self.contacts])
         return Step(
@@ -882,6 +893,9 @@ class ContactProblem:
             wall_seconds=time.perf_counter() - start,
             complete=not lags,
         )
+
+    def _not_converged(self, reason: int, verdict: Verdict, rungs: Sequence[Rung]) -> NotConverged:
+        return NotConverged(self.increment + 1, reason, verdict, rungs, prefix=self.prefix)
 
     def _may_lag(self) -> bool:
         """Whether u can stay behind: energies and pairs must be found without it. Collective."""
@@ -927,7 +941,8 @@ class ContactProblem:
             vector.destroy()
         if verdict.failures:
             number = self.increment + (not committed)
-            raise NotConverged(number, int(self.snes.getConvergedReason()), verdict, [])
+            reason = int(self.snes.getConvergedReason())
+            raise NotConverged(number, reason, verdict, prefix=self.prefix)
         return verdict
 
     def _enforce(self, ahead: float, stiffness_changed: bool) -> tuple[int, list[Rung], int]:
@@ -1211,8 +1226,31 @@ class ContactProblem:
             unseen=passing(self.contacts) if space is self._whole else {},
             kinematics=self._linearisation(space) if kinematics else {},
             kinematics_allowed=self.kinematics,
+            routes=self._compare_routes() if self._second_route and laws else {},
         )
         return verdict, reaction
+
+    def _compare_routes(self) -> dict[str, Balance]:
+        """Nodal forces on Γc as the solver has them against those of the boundary form. Collective.
+
+        Both have the round-off of the displacement, by as much as the springs are stiff.
+        """
+        found = {}
+        for contact in self.contacts:
+            mine, assembled = contact.own_forces()
+            values = contact.values
+            stiffness = np.zeros(len(values["gap"]))
+            if contact.law.has_normal_stiffness:
+                stiffness += contact.normal_stiffness
+            if contact.law.has_tangential:
+                stiffness += np.abs(contact.tangential_stiffness).max(axis=(1, 2))
+            terms = np.linalg.norm(values["jump"], axis=1) + np.abs(values["gap"])
+            blur = float(global_sum(self._comm, contact.measure @ (stiffness * terms)))
+            sizes = (global_max(self._comm, np.abs(f)) for f in (mine - assembled, mine))
+            residual, force = (float(size) for size in sizes)
+            allowed = 1e-10 * force + _ROUND_OFF * blur
+            found[contact.name] = Balance(residual, force, allowed)
+        return found
 
     def _linearisation(self, entered: WholeSpace) -> dict[str, Linearisation]:
         """What taking displacements as small changes at the state judged, by contact. Collective.

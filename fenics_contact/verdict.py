@@ -68,6 +68,9 @@ class Verdict:
         kinematics: What taking displacements as small changes, relative, by contact.
         kinematics_allowed: What passes.
         created: Share of the energy exchanged that friction has given; see `Energy.created`.
+        routes: By contact the largest difference of its nodal forces from those that DOLFINx
+            assembles from the boundary form; empty where it was not asked for, see ``second_route``
+            of `ContactProblem`.
     """
 
     equations: dict[str, Balance]
@@ -79,6 +82,7 @@ class Verdict:
     kinematics: dict[str, Linearisation] = field(default_factory=dict)
     kinematics_allowed: float = np.inf
     created: float = 0.0
+    routes: dict[str, Balance] = field(default_factory=dict)
 
     @property
     def residual(self) -> float:
@@ -126,6 +130,12 @@ class Verdict:
         for name, balance in self.sums.items():
             if not balance.holds():
                 found.append(f"forces on {name}, or their moments, do not balance: {balance}")
+        for contact, balance in self.routes.items():
+            if not balance.holds():
+                found.append(
+                    f"{contact}: forces differ from those of the boundary form as DOLFINx "
+                    f"assembles it: {balance}"
+                )
         for contact, laws in self.laws.items():
             found += [
                 f"{contact}: {law} violated by {value:.3e} (relative)"
@@ -290,9 +300,23 @@ class NotConverged(RuntimeError):
     """
 
     def __init__(
-        self, increment: int, reason: int, verdict: Verdict, rungs: Sequence[Rung] = ()
+        self,
+        increment: int,
+        reason: int,
+        verdict: Verdict,
+        rungs: Sequence[Rung] = (),
+        *,
+        prefix: str = "contact_",
     ) -> None:
-        """Compose the message: what happened, the numbers, and what to try."""
+        """Compose the message: what happened, the numbers, and what to try.
+
+        Args:
+            increment: See the attributes.
+            reason: See the attributes.
+            verdict: See the attributes.
+            rungs: See the attributes.
+            prefix: Of the problem's options.
+        """
         self.increment, self.reason, self.verdict = increment, reason, verdict
         self.rungs = tuple(rungs)
         self.iterations = sum(rung.iterations for rung in rungs)
@@ -301,6 +325,6 @@ class NotConverged(RuntimeError):
         super().__init__(
             f"increment {increment} did not converge: SNES reason {reason} after {self.iterations} "
             f"iterations; {what}; forces are of size {verdict.force:.3e}. Tried: {tried}. Try "
-            "smaller increments, a lower k_t, then a lower k_n; -contact_snes_monitor shows the "
+            f"smaller increments, a lower k_t, then a lower k_n; -{prefix}snes_monitor shows the "
             "iterations"
         )

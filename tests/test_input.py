@@ -934,6 +934,18 @@ def test_shares_out_of_range(name, value):
     )
 
 
+@pytest.mark.parametrize("value", [0, -0.1, np.nan, "20 %", True])
+def test_share_of_the_kinematics_out_of_range(value):
+    """A positive number, infinite included."""
+    scene = pressed()
+    raised_everywhere(
+        lambda: scene.problem(coulomb(), scene.rollers(), kinematics=value),
+        ValueError,
+        "kinematics",
+        "infinite",
+    )
+
+
 def test_increments_out_of_range():
     """`increments` needs a scalar constant and at least one step."""
     scene = pressed()

@@ -769,6 +769,27 @@ def test_forces_at_wrong_places_are_caught(cell):
     assert any("moments" in f for f in caught.value.verdict.failures)
 
 
+@pytest.mark.parametrize("condensation", [None, False])
+@pytest.mark.parametrize("factor", [1.0, 1.0 + 1e-9])
+def test_forces_by_a_second_route(factor, condensation):
+    """A map from u to the points that is wrong by 1e-9 differs from DOLFINx's assembly of the form.
+
+    What the solver, the laws and the sums of forces make of it agrees, within their tolerances.
+    """
+    made = rub(second_route=True, condensation=condensation if COMM.size == 1 else None)
+    made.contact._own_map.scale(factor)
+    made.move(*PATH[1])
+    if factor == 1.0:
+        steps = walk(made)
+        assert all(step.verdict.routes["contact"].holds() for step in steps)
+        assert all(step.verdict.routes["contact"].force > 0 for step in steps)
+        return
+    with pytest.raises(fc.NotConverged) as caught:
+        made.problem.solve()
+    assert [f for f in caught.value.verdict.failures if "DOLFINx assembles" in f]
+    assert len(caught.value.verdict.failures) == 1
+
+
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_a_premature_end_is_caught(method, monkeypatch):
     """SNES that claims convergence at its first look is not believed; the state is as before."""
