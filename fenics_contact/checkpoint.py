@@ -318,14 +318,22 @@ def take_up(
 
 
 def _write(path: Path, scene: dict[str, Any], arrays: dict[str, Array]) -> None:
-    """Write the archive and put it in place."""
+    """Write the archive, read it back, and put it in place.
+
+    Raises:
+        OSError: It cannot be written, or is not what was written. The file before it stays.
+    """
     words = np.frombuffer(json.dumps(scene).encode(), dtype=np.uint8)
     archive = io.BytesIO()
     np.savez(archive, allow_pickle=False, scene=words, **arrays)
-    content = archive.getbuffer()
-    with files.replacing(path) as temporary, open(temporary, "wb") as file:
-        file.write(content)
-        file.write(_MARK + hashlib.sha256(content).hexdigest().encode())
+    with archive.getbuffer() as content, files.replacing(path) as temporary:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.write(_MARK + hashlib.sha256(content).hexdigest().encode())
+        try:  # whether it can be gone on from is better known now than when it is needed
+            _read(temporary)
+        except ValueError as error:
+            raise OSError(f"{path} is not what was written: {error}") from error
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:

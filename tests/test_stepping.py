@@ -1,5 +1,6 @@
 """Load histories: loads as functions, cutting, energies, and going on after the end of a run."""
 
+import io
 import json
 import os
 import signal
@@ -16,6 +17,7 @@ from running import environment
 from scenes import TOP, at_points, block, close, nodal, owned, raised_everywhere
 
 import fenics_contact as fc
+from fenics_contact import checkpoint
 
 COMM = MPI.COMM_WORLD
 
@@ -258,8 +260,21 @@ def test_a_file_of_another_problem_is_refused(tmp_path):
     assert other.problem.increment == 0
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
-    """A full disk: every rank gets the error, the last file and the state are as they were."""
+class LossyFile(io.FileIO):
+    """A file that loses the last byte of all that it is given."""
+
+    def write(self, content):
+        """Write all but that."""
+        super().write(bytes(content)[:-1])
+        return len(content)
+
+
+@pytest.mark.parametrize("said", [True, False])
+def test_a_failed_write_leaves_the_old_file(said, tmp_path, monkeypatch):
+    """A full disk: every rank gets the error, the last file and the state are as they were.
+
+    So does a disk that says nothing and loses a byte: the file is read back.
+    """
     path = shared_folder(tmp_path) / "state.npz"
     made = Rub()
     history = fc.increments(made.problem, made.load, 0.0, 2.0, steps=4, checkpoint=path)
@@ -270,8 +285,16 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(np, "savez", full)
-    raised_everywhere(lambda: next(history), (OSError, RuntimeError), "No space left")
+    def lossy(path, mode):
+        assert mode == "wb"
+        return LossyFile(path, mode)
+
+    if said:
+        monkeypatch.setattr(np, "savez", full)
+    else:
+        monkeypatch.setattr(checkpoint, "open", lossy, raising=False)
+    words = "No space left" if said else "not what was written"
+    raised_everywhere(lambda: next(history), (OSError, RuntimeError), words)
     assert path.read_bytes() == before
     assert COMM.allgather(os.listdir(path.parent)) == [["state.npz"]] * COMM.size
     assert made.problem.increment == 2
@@ -282,6 +305,7 @@ import json, sys
 sys.path.insert(0, {tests!r})
 from test_stepping import Rub
 import fenics_contact as fc
+from fenics_contact import checkpoint
 made = Rub()
 for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=40, checkpoint={path!r}):
     print(step.increment, flush=True)
