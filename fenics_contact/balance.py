@@ -122,7 +122,7 @@ class Parts:
             residual: Forces that are left at the unknowns, reactions included, (n_local,).
             contacts: Of every contact the part that is its own, (n_local,).
             load: External forces, (n_local,).
-            product: Diagonal of the matrix times the unknowns, (n_local,).
+            product: Size of the terms of the matrix times the unknowns, (n_local,).
             constrained: Mask of the unknowns with Dirichlet conditions.
             outside: Norms of load and product at unknowns outside of the space, (2, n_bodies).
             start: Norms of the product where the increment began, (n_bodies,).

@@ -286,7 +286,7 @@ class CondensedSpace(WholeSpace):
         self.load: Array = np.zeros(unknowns.n_local)
         self.diagonal: Array = np.zeros(unknowns.n_local)
         self.label, self.n_bodies = whole.label[unknowns.kept], whole.n_bodies
-        self.outside = np.zeros((2, self.n_bodies))
+        self.outside, self.reach = np.zeros((2, self.n_bodies)), whole.reach
         self._parts = None
         self.ready = False
         self.mark = object()
@@ -345,7 +345,7 @@ class CondensedSpace(WholeSpace):
         self.condensation.set_load(load, state)
         self.load = load[self.unknowns.kept]
         self.prescribed = self.state()[self.constrained]
-        for norms, vector in zip(self.outside, (load, self._whole.diagonal * state), strict=True):
+        for norms, vector in zip(self.outside, (load, self._whole.terms(state)), strict=True):
             apart = vector.copy()
             apart[self.unknowns.kept] = 0.0
             size = np.abs(apart).max(initial=0.0) or 1.0

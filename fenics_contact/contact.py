@@ -1031,7 +1031,7 @@ class Contact:
             distance = opposite.largest(points["gap"])[back.facet]
         own = [c._values["penetration"] for c in (self, *others)]
         allowed = max(global_max(comm, depth) for depth in own)
-        allowed = max(allowed, _UNSEEN * global_max(comm, np.abs(approach)))
+        allowed = max(allowed, _UNSEEN * global_max(comm, np.abs(approach)), opposite.round_off)
         depth = approach - distance - back.slack - allowed
         if not global_max(comm, depth, empty=-1.0) > 0:
             return nowhere

@@ -33,7 +33,7 @@ from petsc4py import PETSc
 from fenics_contact.arguments import is_number
 from fenics_contact.bodies import connected_bodies
 from fenics_contact.facets import FacetSet, tabulate
-from fenics_contact.parallel import collective_errors, gather_rows
+from fenics_contact.parallel import collective_errors, gather_rows, global_max
 from fenics_contact.supports import Support
 from fenics_contact.surface import SurfaceQuadrature, tagged_facets
 
@@ -49,6 +49,8 @@ _COVERED = 1e-6
 # interference of a body with itself), and one whose cell shares a node with it (the lips of a
 # slit, meshed differently).
 _OWN, _JOINED = 0.5, 0.05
+# Of a distance, by the size of the coordinates that it is the difference of.
+_ROUND_OFF = 16 * np.finfo(float).eps
 # Angle between the normals of a facet and of the surface at its corner (radian), up to which the
 # facets stand for a smooth surface.
 _SMOOTH = 0.5
@@ -236,7 +238,11 @@ class LookBack:
 
 
 class Opposite:
-    """The surface opposite Γc, ready to be paired with the points of Γc."""
+    """The surface opposite Γc, ready to be paired with the points of Γc.
+
+    Attributes:
+        round_off: Distances no larger than this are differences of coordinates and nothing else.
+    """
 
     def __init__(
         self, support: DeformableBody, quadrature: SurfaceQuadrature, space: fem.FunctionSpace
@@ -249,6 +255,7 @@ class Opposite:
         mesh = space.mesh
         self._comm, self._d = mesh.comm, mesh.topology.dim
         self._support, self._quadrature = support, quadrature
+        self.round_off = _ROUND_OFF * global_max(mesh.comm, np.abs(mesh.geometry.x))
         facets = tagged_facets(mesh, support.facet_tags, support.tags)
         self._there = FacetSet(space, facets)
         self._here = FacetSet(space, quadrature.surface.facets)
@@ -288,6 +295,7 @@ class Opposite:
                 found = self._find(self._facet, place, normal, u, deep)
         paired = ~np.isnan(found.distance)
         gap = np.einsum("qd,qd->q", found.place - x, normal)
+        gap[np.abs(gap) <= self.round_off] = 0.0
         away = np.zeros(len(self._here.cells))
         np.maximum.at(away, self._facet[paired], np.abs(found.distance[paired]))
         facet, other, places, weights, share = self._pieces(u, away)
@@ -369,7 +377,8 @@ class Opposite:
         mean = np.zeros((number.max() + 1, self._d))
         np.add.at(mean, number, normal)
         mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300)
-        angle = np.arccos(np.clip(np.einsum("fcd,fcd->fc", mean[number], normal), -1, 1))
+        # By the chord: the cosine of an angle has lost half of its digits.
+        angle = 2 * np.arcsin(np.minimum(np.linalg.norm(mean[number] - normal, axis=2) / 2, 1))
         angle[angle > _SMOOTH] = 0.0
         slack: Array = size * angle.max(axis=1)
         return slack

@@ -67,6 +67,9 @@ _TOUCHING = 1e-12
 _IDLE = 1e-3
 # Share by which small displacements may change forces or pressures before it is said.
 _NOTABLE = 0.01
+# Displacements beyond this many sizes of the mesh excuse no round-off: a body that nothing loads
+# may go anywhere, and then anything would pass.
+_REACH = 10.0
 # Round-off of displacements that two routes add up in different orders, by their size.
 _ROUND_OFF = 100 * np.finfo(float).eps
 # Increments expected where nothing is said.
@@ -314,11 +317,12 @@ class ContactProblem:
         self.motions.check_held(self.contacts)
 
         self._length = self.motions.size
+        self._whole.reach = _REACH * self._length
         self._load: Array = np.zeros(self.unknowns.n_local)
         self._factorisations = 0
         nothing: Array = np.zeros(self._whole.n_bodies)
         self._norms = Norms(nothing, nothing, nothing, nothing.size)
-        self._start_product = nothing
+        self._start_terms = nothing
         self._committed = self._rest = self._whole.state()
         for contact in self.contacts:
             contact.evaluate()
@@ -557,7 +561,8 @@ class ContactProblem:
             )
             logger.info("condensed onto %d of %d unknowns", kept.size, self.unknowns.n_local)
         self._pairings = [c.pairings for c in self.contacts]
-        self._solution, self._function = self._space.vector(), self._space.vector()
+        self._solution: PETSc.Vec = self._space.vector()
+        self._function: PETSc.Vec = self._space.vector()
 
     def _update_space(self, stiffness_changed: bool) -> None:
         """Follow changes of the pairs and of the bulk's tangent. Collective."""
@@ -650,10 +655,10 @@ class ContactProblem:
             total,
             contacts,
             space.load,
-            space.diagonal * space.state(),
+            space.terms(space.state()),
             space.constrained,
             space.outside,
-            self._start_product,
+            self._start_terms,
         )
 
     @property
@@ -867,6 +872,7 @@ class ContactProblem:
         self._update_space(stiffness_changed)
         self._approach()
         self._space.begin(self._load)
+        self._start_terms = np.zeros_like(self._start_terms)
         reason, rungs, rounds = self._enforce(ahead, stiffness_changed)
         lags = not field and self._may_lag()
         judge = self._judge_kept if lags else self._judge_all
@@ -1097,10 +1103,12 @@ class ContactProblem:
         present: Array = self._space.state()
         starts = [present]
         # What a step from here takes away leaves the round-off of what was there.
-        terms: Array = self._space.parts.by_body(self._space.diagonal * present)[0]
+        terms: Array = self._space.parts.by_body(self._space.terms(present))[0]
         terms = np.asarray(np.hypot(terms, self._space.outside[1]), dtype=np.float64)
-        # The last matrix may be that of a step that overflowed.
-        self._start_product = np.where(np.isfinite(terms), terms, 0.0)
+        # The last matrix may be that of a step that overflowed. Later rounds of multipliers have
+        # the round-off of the first one's start, too.
+        terms = np.where(np.isfinite(terms), terms, 0.0)
+        self._start_terms = np.maximum(self._start_terms, terms)
         residuals = [self._residual_at(present)]
         # Where nothing was borne yet the last increment tells nothing of this one.
         predicts = self._predicts and not self._cold

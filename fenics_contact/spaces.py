@@ -33,8 +33,8 @@ class WholeSpace:
         prescribed: Values at them, in the present increment.
         load: External forces at them (force).
         diagonal: Diagonal of the matrix assembled last (force/length).
-        outside: Norms of load and of diagonal times state at unknowns outside of the space, by
-            body, (2, n_bodies).
+        outside: Norms of load and of `terms` at unknowns outside of the space, (2, n_bodies).
+        reach: Largest displacement whose round-off counts (length).
         label: Body or free support of every unknown of this rank, (n_local,).
         n_bodies: Their number.
         iterations_per_round: Iterations of L-BFGS after which H₀ is made anew from the status: one
@@ -64,7 +64,7 @@ class WholeSpace:
         self.load = np.zeros(unknowns.n_local)
         self.diagonal = np.zeros(unknowns.n_local)
         self._label_unknowns()
-        self.outside = np.zeros((2, self.n_bodies))
+        self.outside, self.reach = np.zeros((2, self.n_bodies)), np.inf
         self._parts: tuple[list[int], Parts] | None = None
         self.ready = True
         self._near_nullspace: PETSc.NullSpace | None = None
@@ -116,6 +116,10 @@ class WholeSpace:
     def update(self, stiffness: PETSc.Mat) -> int:
         """Take a new bulk tangent over all unknowns; number of factorisations. Collective."""
         return 0
+
+    def terms(self, state: Array) -> Array:
+        """Size of what K u sums up in each row, whose round-off is left in it (force)."""
+        return np.asarray(self.diagonal * np.clip(state, -self.reach, self.reach))
 
     def state(self) -> Array:
         """The present unknowns of this rank; a copy."""
