@@ -36,6 +36,8 @@ Array = npt.NDArray[np.float64]
 
 # Of the projection of tractions, relative.
 _ROUND_OFF = 1e-12
+# Round-off of a displacement, by its size.
+_BLUR = 100 * np.finfo(float).eps
 
 
 class TraceProjection:
@@ -127,6 +129,11 @@ class Multipliers:
         before = largest(history.values, names)
         if change <= _ROUND_OFF * max(scale, before):
             return 0.0
+        # Displacements have round-off however little is borne, and springs make a traction of it.
+        moved = np.linalg.norm(values["jump"], axis=1)
+        for name in sorted({"parameter k_n", "parameter k_t"} & set(values)):
+            if change <= _BLUR * global_max(self._comm, values[name] * moved):
+                return 0.0
         return change / scale if scale > 0 else np.inf
 
     def update(self, values: Mapping[str, Array]) -> None:

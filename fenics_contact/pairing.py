@@ -360,9 +360,10 @@ class Opposite:
         )
 
     def _slack(self, side: _Side) -> Array:
-        """How far from a smooth surface each of all facets may be (length). Collective.
+        """How far from a smooth or a flat surface each of all facets may be (length). Collective.
 
-        Twice the height of the arc over its chord, by the angles between neighbours.
+        Twice the height of the arc over its chord, by the angles between neighbours, and by those
+        between the ends of a facet that is curved itself.
         """
         facets, comm = side.facets, self._comm
         n = len(facets.cells)
@@ -371,16 +372,16 @@ class Opposite:
         normal = facets.normals(facet, place).reshape(n, corners.shape[1] + 1, self._d)[:, :-1]
         size = np.linalg.norm(corners - corners.mean(axis=1)[:, None], axis=2).max(axis=1)
         vertex = np.concatenate(comm.allgather(facets.corner_vertices()))
-        normal, size = gather_rows(comm, normal), gather_rows(comm, size)
+        flat = _angle(normal, facets.mean_normals()[:, None])
+        normal, size, flat = (gather_rows(comm, values) for values in (normal, size, flat))
         _, number = np.unique(vertex, return_inverse=True)
         number = number.reshape(vertex.shape)
         mean = np.zeros((number.max() + 1, self._d))
         np.add.at(mean, number, normal)
         mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300)
-        # By the chord: the cosine of an angle has lost half of its digits.
-        angle = 2 * np.arcsin(np.minimum(np.linalg.norm(mean[number] - normal, axis=2) / 2, 1))
+        angle = _angle(mean[number], normal)
         angle[angle > _SMOOTH] = 0.0
-        slack: Array = size * angle.max(axis=1)
+        slack: Array = size * np.maximum(angle, flat).max(axis=1)
         return slack
 
     def facets_near(self, chosen: Any) -> Any:
@@ -649,6 +650,12 @@ class Opposite:
             own = _polynomials(self._d, self._here.simplex, n_points).degree
             found = max(found, 2 * (own + max(own, degree)))
         return int(found)
+
+
+def _angle(one: Array, other: Array) -> Array:
+    """Between unit vectors, by the chord: of its cosine half of the digits are lost."""
+    chord = np.linalg.norm(one - other, axis=-1)
+    return np.asarray(2 * np.arcsin(np.minimum(chord / 2, 1)), dtype=np.float64)
 
 
 def _interpolation_matrix(

@@ -436,9 +436,9 @@ def run_script(ranks: int, **values) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     ("scene", "ranks"),
     [
-        ("Ramp()", (1, 3)),
-        ("Press(support='force', contact={'enforcement': 'augmented'})", (3, 2)),
-        ("Press(cell='tetrahedron', n=2, wall=True, support='moving')", (2, 1)),
+        ("Ramp(n=(6, 2))", (1, 3)),
+        ("Press(support='force', contact={'enforcement': 'augmented'})", (2, 1)),
+        ("Press(cell='tetrahedron', n=2, wall=True, support='moving')", (3, 2)),
     ],
 )
 def test_on_another_number_of_ranks(scene, ranks, tmp_path):
