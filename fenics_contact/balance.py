@@ -14,11 +14,13 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-__all__ = ["Norms", "Parts"]
+__all__ = ["Norms", "Parts", "by_body"]
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
+# Sums of squares from here on, and up to one over it, have lost none of their terms.
+_SMALL = 1e-200
 # Round-off of a product K u by the size of its terms, summed up row by row.
 _ROUND_OFF = 10 * np.finfo(float).eps
 # Round-off excuses a residual up to this share of the forces on a body that has a load, not more: a
@@ -94,6 +96,7 @@ class Parts:
         """
         self._comm, self.label, self._touched = comm, label, touched
         self.n_bodies = len(bodies)
+        self._bodies: Indices | int = label if len(bodies) > 1 else 0
         self.names = [*bodies, *contacts]
         self._motions = list(motions)
         meets = np.zeros((len(contacts), self.n_bodies), dtype=np.bool_)
@@ -101,10 +104,6 @@ class Parts:
             row[label[unknowns]] = True
         # Bodies that a contact touches, on any rank.
         self._meets = np.any(comm.allgather(meets), axis=0)
-
-    def by_body(self, *vectors: Array) -> Array:
-        """Norms of vectors over this rank's unknowns, (n_vectors, n_bodies). Collective."""
-        return self._norms([(v, self.label) for v in vectors], self.n_bodies)
 
     def norms(
         self,
@@ -130,11 +129,10 @@ class Parts:
         n, free = self.n_bodies, np.where(constrained, 0.0, residual)
         held = residual - free
         total = contacts[0] if len(contacts) == 1 else sum(contacts, np.zeros_like(residual))
-        rows = [(v, self.label) for v in (free, held, total, load, product)]
+        rows = [(v, self._bodies) for v in (free, held, total, load, product)]
         for number, (force, touched) in enumerate(zip(contacts, self._touched, strict=True)):
-            there = np.full(len(touched), n + number)
-            rows += [(free[touched], there), (force[touched], there)]
-        found = self._norms(rows, n + len(contacts))
+            rows += [(free[touched], n + number), (force[touched], n + number)]
+        found = _norms(self._comm, rows, n + len(contacts))
         left, reaction, contact, loads, terms = found[:5, :n]
         loads, terms = np.hypot(loads, outside[0]), np.hypot(terms, outside[1])
         own = [found[5 + 2 * c, n + c] for c in range(len(contacts))]
@@ -153,29 +151,17 @@ class Parts:
         own = [r if f > 0 else 0.0 for r, f in zip(own, push, strict=True)]
         return Norms(np.append(left, own), np.append(force, push), np.append(floor, floors), n)
 
-    def _norms(self, rows: Sequence[tuple[Array, Indices]], n: int) -> Array:
-        """Norms of vectors by label, (n_vectors, n); squares neither overflow nor vanish."""
-        mine = np.zeros((len(rows), n + 1))
-        for found, (values, label) in zip(mine, rows, strict=True):
-            largest = np.abs(values).max(initial=0.0)
-            found[n] = largest
-            if largest > 0.0 and np.isfinite(largest):
-                scaled = values / largest
-                if n == 1:
-                    found[0] = scaled @ scaled
-                else:
-                    found[:n] = np.bincount(label, scaled * scaled, minlength=n)
-        if self._comm.size > 1:
-            ranks = np.array(self._comm.allgather(mine))
-        else:
-            ranks = mine[None]
-        largest = ranks[:, :, n].max(axis=0)
-        safe = np.where(largest > 0, largest, 1.0)
-        with np.errstate(invalid="ignore"):
-            share = (ranks[:, :, n] / safe) ** 2
-            norms = largest[:, None] * np.sqrt(np.sum(share[:, :, None] * ranks[:, :, :n], axis=0))
-        # Whose entry was not finite cannot be told from here: none is trusted.
-        return np.where(np.isfinite(largest)[:, None], norms, np.nan)
+
+def by_body(comm: MPI.Comm, vectors: Sequence[Array], label: Indices, n_bodies: int) -> Array:
+    """Norms of vectors over this rank's unknowns, (n_vectors, n_bodies). Collective.
+
+    Args:
+        comm: The ranks.
+        vectors: (n_local,) each.
+        label: Body of every unknown, (n_local,).
+        n_bodies: Their number.
+    """
+    return _norms(comm, [(v, label if n_bodies > 1 else 0) for v in vectors], n_bodies)
 
 
 def _root(values: Array) -> float:
@@ -184,3 +170,36 @@ def _root(values: Array) -> float:
     if not (largest > 0 and np.isfinite(largest)):
         return largest
     return largest * float(np.sqrt(np.sum((values / largest) ** 2)))
+
+
+def _norms(comm: MPI.Comm, rows: Sequence[tuple[Array, Indices | int]], n: int) -> Array:
+    """Norms of vectors by label, one for all or of each entry, (n_vectors, n). Collective.
+
+    Squares neither overflow nor vanish.
+    """
+    mine = np.zeros((len(rows), n + 1))
+    for found, (values, label) in zip(mine, rows, strict=True):
+        if isinstance(label, int):
+            square = float(values @ values)
+            if _SMALL < square < 1 / _SMALL:
+                found[label], found[n] = square, 1.0
+                continue
+        largest = np.abs(values).max(initial=0.0)
+        found[n] = largest
+        if largest > 0.0 and np.isfinite(largest):
+            scaled = values / largest
+            if isinstance(label, int):
+                found[label] = scaled @ scaled
+            else:
+                found[:n] = np.bincount(label, scaled * scaled, minlength=n)
+    if comm.size > 1:
+        ranks = np.array(comm.allgather(mine))
+    else:
+        ranks = mine[None]
+    largest = ranks[:, :, n].max(axis=0)
+    safe = np.where(largest > 0, largest, 1.0)
+    with np.errstate(invalid="ignore"):
+        share = (ranks[:, :, n] / safe) ** 2
+        norms = largest[:, None] * np.sqrt(np.sum(share[:, :, None] * ranks[:, :, :n], axis=0))
+    # Whose entry was not finite cannot be told from here: none is trusted.
+    return np.where(np.isfinite(largest)[:, None], norms, np.nan)

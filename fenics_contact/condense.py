@@ -286,7 +286,8 @@ class CondensedSpace(WholeSpace):
         self.load: Array = np.zeros(unknowns.n_local)
         self.diagonal: Array = np.zeros(unknowns.n_local)
         self.label, self.n_bodies = whole.label[unknowns.kept], whole.n_bodies
-        self.outside, self.reach = np.zeros((2, self.n_bodies)), whole.reach
+        self.outside: Array = np.zeros((2, self.n_bodies))
+        self.reach = whole.reach
         self._parts = None
         self.ready = False
         self.mark = object()
@@ -345,12 +346,10 @@ class CondensedSpace(WholeSpace):
         self.condensation.set_load(load, state)
         self.load = load[self.unknowns.kept]
         self.prescribed = self.state()[self.constrained]
-        for norms, vector in zip(self.outside, (load, self._whole.terms(state)), strict=True):
-            apart = vector.copy()
-            apart[self.unknowns.kept] = 0.0
-            size = np.abs(apart).max(initial=0.0) or 1.0
-            squares = np.bincount(self._whole.label, (apart / size) ** 2, self.n_bodies)
-            norms[:] = size * np.sqrt(squares)
+        outside = load.copy(), self._whole.terms(state)
+        for vector in outside:
+            vector[self.unknowns.kept] = 0.0
+        self.outside = self._whole.by_body(*outside)
 
     def extended(self, change: Array) -> Array:
         """See `WholeSpace.extended`: one back-substitution."""

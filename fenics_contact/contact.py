@@ -325,6 +325,8 @@ class Contact:
         self._evaluate_yield: PointEvaluator | None = None
         self._own_form: Any = None
         self._points: dict[str, Array] | None = None
+        # Slip, and the values that it is of.
+        self._slip: tuple[Mapping[str, Array], Array] = {}, np.zeros((0, gdim))
         self._paired_at: fem.Function | None = None
         self._looking_back: LookBack | None = None
         self.n_unpaired = 0
@@ -1333,12 +1335,15 @@ class Contact:
         Where the gap opens the way beyond what the springs give back counts, too. Collective.
         """
         values, normal = self._values, self._values["normal"]
+        if self._slip[0] is values:
+            return self._slip[1]
         # K_t has no inverse along the normal, and nothing acts there: any stiffness will do.
         along = np.einsum("q,qi,qj->qij", values["parameter k_t"], normal, normal)
         change = (values["traction"] - values["old_traction"])[:, :, None]
         with collective_errors(self.surface.mesh.comm):  # singular, where k_t is next to nothing
             stretched = np.linalg.solve(self.tangential_stiffness + along, change)[:, :, 0]
-        return values["increment"] + stretched
+        self._slip = values, values["increment"] + stretched
+        return self._slip[1]
 
     @property
     def slip_increment(self) -> Array:

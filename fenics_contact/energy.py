@@ -135,12 +135,11 @@ class EnergyState:
                 sums[3] += contact.measure @ contact.values["dissipated"]
                 # Tractions before are those of the commit, not multipliers in their place.
                 slip, normal = contact.slip_vector(), contact.values["normal"]
+                weight, length = 0.5 * contact.measure, np.sqrt(_dot(slip, slip))
                 for traction in (there[0], here[0]):
-                    along = np.sum(traction * normal, axis=1)[:, None] * normal
-                    side, weight = traction - along, 0.5 * contact.measure
-                    sums[5] += np.sum(weight[:, None] * side * slip)
-                    size = np.linalg.norm(side, axis=1) * np.linalg.norm(slip, axis=1)
-                    sums[6] += weight @ size
+                    side = traction - _dot(traction, normal)[:, None] * normal
+                    sums[5] += weight @ _dot(side, slip)
+                    sums[6] += weight @ (np.sqrt(_dot(side, side)) * length)
         total = (float(v) for v in global_sum(comm, sums))
         work, elastic, springs, dissipation, tractions, friction, sliding, level = total
         if abs(friction) <= _NOTHING * level:  # nothing has slipped but what the solver leaves
@@ -148,3 +147,8 @@ class EnergyState:
         remainder = work - elastic - springs - dissipation
         imbalance = work - elastic - tractions
         return Energy(work, elastic, springs, dissipation, remainder, friction, sliding, imbalance)
+
+
+def _dot(one: Array, other: Array) -> Array:
+    """Products of vectors at points, (n_points,)."""
+    return np.asarray(np.einsum("qi,qi->q", one, other), dtype=np.float64)

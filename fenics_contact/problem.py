@@ -1103,7 +1103,7 @@ class ContactProblem:
         present: Array = self._space.state()
         starts = [present]
         # What a step from here takes away leaves the round-off of what was there.
-        terms: Array = self._space.parts.by_body(self._space.terms(present))[0]
+        terms: Array = self._space.by_body(self._space.terms(present))[0]
         terms = np.asarray(np.hypot(terms, self._space.outside[1]), dtype=np.float64)
         # The last matrix may be that of a step that overflowed. Later rounds of multipliers have
         # the round-off of the first one's start, too.

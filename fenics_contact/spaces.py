@@ -11,7 +11,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact import linear
-from fenics_contact.balance import Parts
+from fenics_contact.balance import Parts, by_body
 from fenics_contact.bodies import connected_bodies
 from fenics_contact.bulk import Bulk
 from fenics_contact.contact import Contact
@@ -64,7 +64,8 @@ class WholeSpace:
         self.load = np.zeros(unknowns.n_local)
         self.diagonal = np.zeros(unknowns.n_local)
         self._label_unknowns()
-        self.outside, self.reach = np.zeros((2, self.n_bodies)), np.inf
+        self.outside: Array = np.zeros((2, self.n_bodies))
+        self.reach = np.inf
         self._parts: tuple[list[int], Parts] | None = None
         self.ready = True
         self._near_nullspace: PETSc.NullSpace | None = None
@@ -120,6 +121,10 @@ class WholeSpace:
     def terms(self, state: Array) -> Array:
         """Size of what K u sums up in each row, whose round-off is left in it (force)."""
         return np.asarray(self.diagonal * np.clip(state, -self.reach, self.reach))
+
+    def by_body(self, *vectors: Array) -> Array:
+        """Norms of vectors over the unknowns, (n_vectors, n_bodies). Collective."""
+        return by_body(self.unknowns.comm, vectors, self.label, self.n_bodies)
 
     def state(self) -> Array:
         """The present unknowns of this rank; a copy."""
