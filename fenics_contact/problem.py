@@ -1234,9 +1234,17 @@ class ContactProblem:
             unseen=passing(self.contacts) if space is self._whole else {},
             kinematics=self._linearisation(space) if kinematics else {},
             kinematics_allowed=self.kinematics,
+            displacement=self._farthest(),
             routes=self._compare_routes() if self._second_route and laws else {},
         )
         return verdict, reaction
+
+    def _farthest(self) -> float:
+        """Largest displacement by what is imposed, or by the size of the mesh. Collective."""
+        shifts = [c.values["shift"] for c in self.contacts]
+        imposed = [global_max(self._comm, np.abs(v)) for v in (self._whole.prescribed, *shifts)]
+        moved = global_max(self._comm, np.abs(self.u.x.array))
+        return moved / max(self._length, *imposed)
 
     def _compare_routes(self) -> dict[str, Balance]:
         """Nodal forces on Γc as the solver has them against those of the boundary form. Collective.

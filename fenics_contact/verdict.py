@@ -19,6 +19,8 @@ _LAW_TOLERANCE = 1e-10
 # ends it does so where slip turns round within a long increment (6 % where a load aside is
 # reversed at once); in a state that smaller increments do not lead to it is half or more.
 _CREATED = 0.25
+# A displacement by the size of the mesh that is none of a body that anything holds.
+_FARTHEST = 10.0
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,9 @@ class Verdict:
         unseen: How deep the opposite body passes through Γc between its points (length), and where,
             by the names of the contacts where it does; see `Contact.unseen_penetration`.
         kinematics: What taking displacements as small changes, relative, by contact.
-        kinematics_allowed: What passes.
+        kinematics_allowed: What passes; where it is finite no displacement passes that is more than
+            ten times as large as the mesh and as what is imposed.
+        displacement: The largest one, relative to these.
         created: Share of the energy exchanged that friction has given; see `Energy.created`.
         routes: By contact the largest difference of its nodal forces from those that DOLFINx
             assembles from the boundary form; empty where it was not asked for, see ``second_route``
@@ -81,6 +85,7 @@ class Verdict:
     unseen: dict[str, tuple[float, list[float]]] = field(default_factory=dict)
     kinematics: dict[str, Linearisation] = field(default_factory=dict)
     kinematics_allowed: float = np.inf
+    displacement: float = 0.0
     created: float = 0.0
     routes: dict[str, Balance] = field(default_factory=dict)
 
@@ -166,6 +171,12 @@ class Verdict:
                     "load in smaller steps, describe the motion as one of the support, find pairs "
                     'anew (update="increment"), or accept it: ContactProblem(kinematics=inf)'
                 )
+        if not (self.displacement <= _FARTHEST or self.kinematics_allowed == np.inf):
+            found.append(
+                f"a displacement is {self.displacement:.2g} times as large as the mesh: nothing "
+                "holds a body there, or stiffness and loads are in other units than lengths; or "
+                "accept it: ContactProblem(kinematics=inf)"
+            )
         for contact, (depth, place) in self.unseen.items():
             found.append(
                 f"{contact}: the opposite body passes through Γc between its points, {depth:.3e} "

@@ -8,6 +8,7 @@ import warnings
 
 import numpy as np
 import pytest
+from dolfinx import fem
 from mpi4py import MPI
 from scenes import TOP, at_points, block, close, stress
 
@@ -89,6 +90,26 @@ def test_motion_that_is_not_small_fails():
     with pytest.raises(fc.NotConverged, match="too large to be taken as small"):
         problem.solve()
     assert close(contact.history.rows(), 0 * contact.history.rows(), 0.0, scale=1.0)
+
+
+@pytest.mark.parametrize("condensation", [None, False])
+def test_a_stiffness_in_other_units_fails(condensation):
+    """On a plane gap and normal are exact, but no block is pressed down by more than its size.
+
+    Who says so gets the solution; and a top that is moved by as much takes the block along.
+    """
+    condensation = condensation if COMM.size == 1 else False
+
+    def pushed(E, top=0.0, **options):
+        scene = block("quadrilateral", n=4, E=E, up=-1.0)
+        bcs = [scene.hold(TOP, 0, fem.Constant(scene.mesh, top))]
+        problem, _ = scene.problem(fc.Frictionless(), bcs, condensation=condensation, **options)
+        return problem.solve()
+
+    with pytest.raises(fc.NotConverged, match="times as large as the mesh"):
+        pushed(0.02)
+    assert pushed(0.02, kinematics=np.inf).verdict.displacement > 20
+    assert pushed(1e6, top=50.0).verdict.displacement < 2
 
 
 def test_motion_that_is_hardly_small_is_warned_of_once():
