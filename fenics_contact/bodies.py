@@ -11,6 +11,9 @@ from mpi4py import MPI
 
 __all__ = ["connected_bodies"]
 
+# Of a coordinate, by the largest one.
+_SAME_PLACE = 1e-9
+
 
 def connected_bodies(space: fem.FunctionSpace) -> tuple[int, npt.NDArray[np.intp]]:
     """Number of bodies, and the body of every node of this rank, its ghosts last. Collective.
@@ -20,7 +23,7 @@ def connected_bodies(space: fem.FunctionSpace) -> tuple[int, npt.NDArray[np.intp
 
     Returns:
         The number over all ranks, and the numbers from 0, (n_owned + n_ghosts,): the same body has
-        the same number on every rank.
+        the same number on every rank, and on any number of ranks: by their places, x first.
     """
     comm, dofmap = space.mesh.comm, space.dofmap
     n_owned = dofmap.index_map.size_local
@@ -60,4 +63,23 @@ def connected_bodies(space: fem.FunctionSpace) -> tuple[int, npt.NDArray[np.intp
     np.add.at(used, offset + part[:n_owned], 1)
     comm.Allreduce(MPI.IN_PLACE, used, op=MPI.SUM)
     bodies = np.unique(merged[used > 0])
-    return len(bodies), np.searchsorted(bodies, merged[offset + part])
+    body = np.searchsorted(bodies, merged[offset + part])
+    if len(bodies) > 1:
+        body = _ordered(space, len(bodies), body)
+    return len(bodies), body
+
+
+def _ordered(space: fem.FunctionSpace, n: int, body: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    """Numbers by the corners of the bodies' boxes, the lower ones first. Collective."""
+    x = space.tabulate_dof_coordinates()
+    corners = np.full((2, n, x.shape[1]), np.inf)
+    for corner, sign in zip(corners, (1.0, -1.0), strict=True):
+        np.minimum.at(corner, body, sign * x)
+    space.mesh.comm.Allreduce(MPI.IN_PLACE, corners, op=MPI.MIN)
+    keys = np.concatenate([corners[0], -corners[1]], axis=1)
+    # Places differ by round-off from one distribution to the other.
+    keys = np.round(keys / (_SAME_PLACE * (np.abs(keys).max() or 1.0)))
+    order = np.lexsort(keys.T[::-1])
+    number = np.empty(n, dtype=np.intp)
+    number[order] = np.arange(n)
+    return number[body]
