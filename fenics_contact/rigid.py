@@ -16,6 +16,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from fenics_contact import compat
 from fenics_contact.bodies import connected_bodies
 from fenics_contact.contact import Contact, Status
 from fenics_contact.facets import facet_cells
@@ -175,7 +176,7 @@ class RigidMotions:
             felt = np.array([contact.at_points(mode) for mode in self.of_bodies[b]])
             there = contact.paired & ((own != b) | (np.abs(felt[0, :, 0]) < 0.5))
             travels[b] = np.where(there[:, None], felt, travels[b])
-        if space.mesh.geometry.cmap.degree > space.ufl_element().degree:
+        if compat.geometry_element(space.mesh).degree > space.ufl_element().degree:
             # Straight displacements of curved cells have no rotations.
             travels[:, space.mesh.geometry.dim :] = np.nan
         return travels
