@@ -323,17 +323,22 @@ def _write(path: Path, scene: dict[str, Any], arrays: dict[str, Array]) -> None:
     Raises:
         OSError: It cannot be written, or is not what was written. The file before it stays.
     """
+    content = _pack(scene, arrays)
+    with files.replacing(path) as temporary:
+        with open(temporary, "wb") as file:
+            file.write(content)
+        # Whether it can be gone on from is better known now than when it is needed.
+        if temporary.read_bytes() != content:
+            raise OSError(f"{path} is not what was written: is the disk full, or damaged?")
+
+
+def _pack(scene: dict[str, Any], arrays: dict[str, Array]) -> bytes:
+    """The archive, and how it ends."""
     words = np.frombuffer(json.dumps(scene).encode(), dtype=np.uint8)
     archive = io.BytesIO()
     np.savez(archive, allow_pickle=False, scene=words, **arrays)
-    with archive.getbuffer() as content, files.replacing(path) as temporary:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.write(_MARK + hashlib.sha256(content).hexdigest().encode())
-        try:  # whether it can be gone on from is better known now than when it is needed
-            _read(temporary)
-        except ValueError as error:
-            raise OSError(f"{path} is not what was written: {error}") from error
+    content = archive.getvalue()
+    return content + _MARK + hashlib.sha256(content).hexdigest().encode()
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:

@@ -317,12 +317,11 @@ class ContactProblem:
         self.motions.check_held(self.contacts)
 
         self._length = self.motions.size
-        self._whole.reach = _REACH * self._length
         self._load: Array = np.zeros(self.unknowns.n_local)
         self._factorisations = 0
         nothing: Array = np.zeros(self._whole.n_bodies)
         self._norms = Norms(nothing, nothing, nothing, nothing.size)
-        self._start_terms = nothing
+        self._start_terms, self._imposed = nothing, self._length
         self._committed = self._rest = self._whole.state()
         for contact in self.contacts:
             contact.evaluate()
@@ -871,6 +870,8 @@ class ContactProblem:
         stiffness_changed = self._update_bulk()
         self._update_space(stiffness_changed)
         self._approach()
+        self._imposed = self._imposed_length()
+        self._whole.reach = self._space.reach = _REACH * self._imposed
         self._space.begin(self._load)
         self._start_terms = np.zeros_like(self._start_terms)
         reason, rungs, rounds = self._enforce(ahead, stiffness_changed)
@@ -1239,12 +1240,16 @@ class ContactProblem:
         )
         return verdict, reaction
 
+    def _imposed_length(self) -> float:
+        """Size of the mesh, or of the motions and gaps that are imposed if larger. Collective."""
+        imposed = [self._whole.state()[self._constrained]]
+        for contact in self.contacts:
+            imposed += [contact.values[name] for name in ("shift", "gap")]
+        return max(self._length, *(global_max(self._comm, np.abs(v)) for v in imposed))
+
     def _farthest(self) -> float:
-        """Largest displacement by what is imposed, or by the size of the mesh. Collective."""
-        shifts = [c.values["shift"] for c in self.contacts]
-        imposed = [global_max(self._comm, np.abs(v)) for v in (self._whole.prescribed, *shifts)]
-        moved = global_max(self._comm, np.abs(self.u.x.array))
-        return moved / max(self._length, *imposed)
+        """Largest displacement by what is imposed. Collective."""
+        return global_max(self._comm, np.abs(self.u.x.array)) / self._imposed
 
     def _compare_routes(self) -> dict[str, Balance]:
         """Nodal forces on Γc as the solver has them against those of the boundary form. Collective.

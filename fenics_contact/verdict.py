@@ -69,7 +69,7 @@ class Verdict:
             by the names of the contacts where it does; see `Contact.unseen_penetration`.
         kinematics: What taking displacements as small changes, relative, by contact.
         kinematics_allowed: What passes; where it is finite no displacement passes that is more than
-            ten times as large as the mesh and as what is imposed.
+            ten times as large as the mesh, and as the motions and gaps that are imposed.
         displacement: The largest one, relative to these.
         created: Share of the energy exchanged that friction has given; see `Energy.created`.
         routes: By contact the largest difference of its nodal forces from those that DOLFINx

@@ -89,7 +89,7 @@ def test_pressure_error_falls_with_h(tmp_path: Path) -> None:
     assert 0.7 < study["rate"] < 1.3
 
 
-@pytest.mark.parametrize("ranks", [2, 3])
+@pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_ranks_agree(tmp_path: Path, ranks: int) -> None:
     """The same numbers to 1e-6 on 2 and 3 ranks, and the same iterations."""
     options = ("--h", "0.2", "--degree", "2", "--friction", "0.2", "--increments", "3")
