@@ -87,7 +87,8 @@ class RigidMotions:
         none, still = np.zeros(len(supports)), np.zeros(unknowns.n_dofs)
         of_supports = [unknowns.joined(still, row) for row in np.eye(len(supports))]
         self._modes = np.array([unknowns.joined(mode, none) for mode in modes] + of_supports)
-        self.of_bodies = self._modes[: len(modes)].reshape(n_bodies, -1, unknowns.n_local)
+        shape = n_bodies, len(modes) // n_bodies, unknowns.n_local
+        self.of_bodies = self._modes[: len(modes)].reshape(shape)
         self.free: Array = np.zeros((0, len(modes)))
         self._free_fields: Array = np.zeros((0, unknowns.n_local))
         self._balanced: list[Array] = []

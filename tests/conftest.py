@@ -8,18 +8,31 @@ from collections.abc import Iterator
 import pytest
 from mpi4py import MPI
 
-# Where traces go: the error stream as it is before pytest captures it.
-_STDERR = os.dup(2)
+# Where traces go: the error stream as it is while pytest does not capture it.
+_stderr = 2
 # A rank that waits for another inside C++ holds the interpreter's lock, so that no other timeout
 # gets to act. Four times the longest test.
 _DEADLOCK_SECONDS = 300
+
+
+def pytest_configure() -> None:
+    """Keep the error stream."""
+    global _stderr
+    _stderr = os.dup(2)
+
+
+def pytest_exception_interact(report: pytest.TestReport) -> None:
+    """In parallel, show at once what failed: the end of the run may never come."""
+    if MPI.COMM_WORLD.size > 1:
+        text = f"\nrank {MPI.COMM_WORLD.rank}, {report.nodeid}:\n{report.longreprtext}\n"
+        os.write(_stderr, text.encode())
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol() -> Iterator[None]:
     """In parallel, show where every rank hangs and end the run, instead of waiting forever."""
     if MPI.COMM_WORLD.size > 1:
-        faulthandler.dump_traceback_later(_DEADLOCK_SECONDS, exit=True, file=_STDERR)
+        faulthandler.dump_traceback_later(_DEADLOCK_SECONDS, exit=True, file=_stderr)
     try:
         return (yield)
     finally:
