@@ -466,7 +466,11 @@ class Contact:
                 "Contact(modulus=...), give k_n and k_t in stress/length, or use ContactProblem, "
                 "which measures E in the bulk form"
             )
-        traction = self._whole.traction(self.u)
+        return self._form_at(self.u, v)
+
+    def _form_at(self, displacement: Any, v: ufl.Argument) -> ufl.Form:
+        """`form` at a displacement relative to the support."""
+        traction = self._whole.traction(displacement)
         return -self.weight * ufl.dot(traction, v) * self.quadrature.ds
 
     def potential(self) -> ufl.Form:
@@ -580,9 +584,8 @@ class Contact:
         vector.destroy()
         if self._own_form is None:
             displacement = self.u if self.rigid and not self.free_motion else self._jump
-            work = ufl.dot(self._whole.traction(displacement), ufl.TestFunction(space))
-            form = self.weight * work * self.quadrature.ds
-            self._own_form = compat.compile_form(form, self.entity_maps)
+            form = self._form_at(displacement, ufl.TestFunction(space))
+            self._own_form = compat.compile_form(-form, self.entity_maps)
         with collective_errors(mesh.comm):
             assembled = fem.assemble_vector(self._own_form)
         assembled.scatter_reverse(la.InsertMode.add)

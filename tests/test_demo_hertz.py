@@ -91,7 +91,7 @@ def test_pressure_error_falls_with_h(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_ranks_agree(tmp_path: Path, ranks: int) -> None:
-    """The same numbers to 1e-6 on 2 and 3 ranks, and the same iterations."""
+    """The same numbers to 1e-6 on 2 and 3 ranks."""
     options = ("--h", "0.2", "--degree", "2", "--friction", "0.2", "--increments", "3")
     serial = run(tmp_path / "serial", *options)
     parallel = run(tmp_path / "parallel", *options, ranks=ranks)

@@ -305,7 +305,6 @@ import json, sys
 sys.path.insert(0, {tests!r})
 from test_stepping import Rub
 import fenics_contact as fc
-from fenics_contact import checkpoint
 made = Rub()
 for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=40, checkpoint={path!r}):
     print(step.increment, flush=True)
