@@ -7,7 +7,19 @@ from fenics_contact.accuracy import Accuracy
 from fenics_contact.adaptation import Level, adapt
 from fenics_contact.contact import Contact, Resultants, Status
 from fenics_contact.errors import ErrorBudget, estimate_errors
-from fenics_contact.laws import Coulomb, Foundation, Frictionless, Scaled, Springs, Tresca
+from fenics_contact.laws import (
+    Coulomb,
+    Foundation,
+    FrictionLaw,
+    Frictionless,
+    Kinematics,
+    Law,
+    Response,
+    Scaled,
+    Springs,
+    Tresca,
+)
+from fenics_contact.operators import ContactOperator
 from fenics_contact.pairing import DeformableBody
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.stepping import increments
@@ -19,6 +31,7 @@ __all__ = [
     "Accuracy",
     "Ball",
     "Contact",
+    "ContactOperator",
     "ContactProblem",
     "ContactSurface",
     "Coulomb",
@@ -26,12 +39,16 @@ __all__ = [
     "DeformableBody",
     "ErrorBudget",
     "Foundation",
+    "FrictionLaw",
     "Frictionless",
     "HalfSpace",
+    "Kinematics",
+    "Law",
     "Level",
     "Motion",
     "NotConverged",
     "Obstacle",
+    "Response",
     "Resultants",
     "Scaled",
     "Springs",

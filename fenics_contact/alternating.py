@@ -177,9 +177,9 @@ class Alternation:
         for contact in problem.contacts:
             contact.evaluate()
         problem._watch.note(problem._norms.total)
-        if not problem.motions.held(problem.contacts):
+        if not problem.motions.held(problem.operators):
             problem._assemble_matrix(matrix, problem._stiffnesses(everywhere=True))
             return
         # Where all slips, what nothing but friction holds would be loose.
-        still = (c.stiffness_matrix(0.0, _STILL) for c in problem.contacts)
+        still = (o.springs(o.contact.springs(0.0, _STILL)) for o in problem._space.operators)
         problem._assemble_matrix(matrix, chain(problem._tangents(), still))

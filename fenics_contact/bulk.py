@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import dolfinx.fem.petsc
@@ -13,6 +13,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact import compat
+from fenics_contact.dependence import Dependence
 from fenics_contact.parallel import collective_errors, global_max
 
 __all__ = ["Bulk"]
@@ -71,7 +72,8 @@ class Bulk:
         self.scale = 0.0
         self._load = fem.Function(u.function_space)  # F(0)
         self._image = fem.Function(u.function_space)
-        self._fingerprint: Array | None = None
+        tangent = self.tangent_form
+        self._dependence = Dependence(tangent.constants(), tangent.coefficients())
 
     def check_finite(self) -> None:
         """Refuse values that are not finite in any coefficient or constant. Collective.
@@ -97,17 +99,14 @@ class Bulk:
         """Whether the tangent is that of the present data: False if it may differ. Collective."""
         if not self.linear:
             return False
-        same = self._fingerprint is not None and np.array_equal(
-            self._tangent_data(), self._fingerprint
-        )
-        return self._u.function_space.mesh.comm.allreduce(not same) == 0
+        changed = self._dependence.changed
+        return self._u.function_space.mesh.comm.allreduce(int(changed)) == 0
 
     def update(self) -> bool:
         """Assemble the tangent at ``u`` if it may have changed; True if it did. Collective."""
         if self.is_current():
             return False
-        fingerprint = self._tangent_data()
-        self._fingerprint = None  # until the matrix is complete
+        self._dependence.forget()  # until the matrix is complete
         self.stiffness.zeroEntries()
         fem.petsc.assemble_matrix(self.stiffness, self._compiled_tangent)
         self.stiffness.assemble()
@@ -115,8 +114,7 @@ class Bulk:
         self.scale = diagonal.norm(PETSc.NormType.NORM_INFINITY)
         self.symmetric = self._is_symmetric(diagonal)
         diagonal.destroy()
-        if self.linear:
-            self._fingerprint = fingerprint
+        self._dependence.note()
         return True
 
     @contextmanager
@@ -171,10 +169,6 @@ class Bulk:
         dofmap = function.function_space.dofmap
         return function.x.array[: dofmap.index_map.size_local * dofmap.index_map_bs]
 
-    def _tangent_data(self) -> Array:
-        """All numbers the tangent depends on, to see whether the user changed one."""
-        return _data(self.tangent_form.constants(), self.tangent_form.coefficients())
-
     def _is_symmetric(self, probe: PETSc.Vec) -> bool:
         """Compare products with the matrix and its transpose for one rough vector."""
         start, _ = probe.getOwnershipRange()
@@ -204,10 +198,9 @@ class _Part:
         self._vanishes = ufl.algorithms.expand_derivatives(still).empty()
         self._compiled = compat.compile_form(mine)
         self._u = u
-        self._constants = mine.constants()
-        self._coefficients = [c for c in mine.coefficients() if c is not u]
+        others = [c for c in mine.coefficients() if c is not u]
+        self._dependence = Dependence(mine.constants(), others)
         self._at_rest: Array = np.zeros(u.x.array.size)
-        self._fingerprint: Array | None = None
 
     def assemble(self, target: Array) -> None:
         """Add to ``target``, ghosts not collected."""
@@ -217,9 +210,8 @@ class _Part:
         """Values at u = 0, ghosts not collected; assembled if they may have changed."""
         if self._vanishes:
             return self._at_rest
-        fingerprint = _data(self._constants, self._coefficients)
-        if self._fingerprint is None or not np.array_equal(fingerprint, self._fingerprint):
-            self._fingerprint = None  # until the assembly is complete
+        if self._dependence.changed:
+            self._dependence.forget()  # until the assembly is complete
             u = self._u.x.array
             saved = u.copy()
             u[:] = 0.0
@@ -228,11 +220,5 @@ class _Part:
                 self.assemble(self._at_rest)
             finally:
                 u[:] = saved
-            self._fingerprint = fingerprint
+            self._dependence.note()
         return self._at_rest
-
-
-def _data(constants: Sequence[fem.Constant], coefficients: Sequence[fem.Function]) -> Array:
-    """All numbers that a form depends on, to see whether the user changed one."""
-    values = [np.ravel(c.value) for c in constants] + [f.x.array for f in coefficients]
-    return np.concatenate(values) if values else np.zeros(0)

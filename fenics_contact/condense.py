@@ -20,9 +20,9 @@ import petsc4py
 from petsc4py import PETSc
 
 from fenics_contact import compat
-from fenics_contact.contact import Contact
 from fenics_contact.dense import PartlyFactored, Sum
 from fenics_contact.energy import Forces
+from fenics_contact.operators import ContactOperator
 from fenics_contact.spaces import Mask, WholeSpace
 from fenics_contact.unknowns import Selection, Unknowns
 
@@ -59,12 +59,12 @@ def worthwhile(n: int, n_kept: int, dimension: int) -> bool:
     return 0 < n_kept <= min(_LARGEST, max(_SMALL, surface))
 
 
-def touched(contacts: Sequence[Contact], unknowns: Unknowns) -> Indices:
+def touched(operators: Sequence[ContactOperator], unknowns: Unknowns) -> Indices:
     """The unknowns that contact feels or acts on, ascending. One rank only."""
     found = np.zeros(unknowns.n_local, dtype=np.bool_)
     found[unknowns.n_dofs :] = True
-    for contact in contacts:
-        found[contact.felt_unknowns()] = True
+    for operator in operators:
+        found[operator.touched] = True
     return np.flatnonzero(found).astype(np.int32)
 
 
@@ -288,7 +288,7 @@ class CondensedSpace(WholeSpace):
         self.label, self.n_bodies = whole.label[unknowns.kept], whole.n_bodies
         self.outside: Array = np.zeros((2, self.n_bodies))
         self.reach = whole.reach
-        self._parts = None
+        self._parts = self._operators = None
         self.ready = False
         self.mark = object()
         self._fixed: Array | None = None  # the constant part of the matrices

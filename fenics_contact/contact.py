@@ -32,12 +32,19 @@ from fenics_contact.parallel import (
     global_sum,
     warn,
 )
-from fenics_contact.products import PointProduct
+from fenics_contact.point_data import PointData
 from fenics_contact.supports import Motion, Placement, Support, nonzero_vector
 from fenics_contact.surface import ContactSurface, PointEvaluator, VertexAreas
-from fenics_contact.unknowns import Selection, Unknowns
 
-__all__ = ["Contact", "Found", "Resultants", "Status", "displacement_degree", "passing"]
+__all__ = [
+    "Contact",
+    "Found",
+    "PointTangent",
+    "Resultants",
+    "Status",
+    "displacement_degree",
+    "passing",
+]
 
 Array = npt.NDArray[np.float64]
 
@@ -90,6 +97,19 @@ class Resultants:
 
 
 @dataclass(frozen=True)
+class PointTangent:
+    """Derivatives of the traction at the points, (n_points, gdim, gdim) each (stress/length).
+
+    Attributes:
+        by_jump: By the displacement of the body.
+        by_shift: By that of the support; None where no component of it is free.
+    """
+
+    by_jump: Array
+    by_shift: Array | None = None
+
+
+@dataclass(frozen=True)
 class Found:
     """A solved state of a contact, which a commit makes its history.
 
@@ -125,7 +145,9 @@ class Contact:
         paired: Which of this rank's points have an opposite, (n_points,); all of them on a rigid
             support. The others bear nothing and are open.
         n_unpaired: Points without, on all ranks.
-        pairings: How often opposites were found: the couplings change with each.
+        jump_map: Sparse map from ``u`` to its jump at the points, (n_points gdim, n_dofs); over the
+            unknowns of a problem it is a `ContactOperator`.
+        pairings: How often opposites were found: the map changes with each.
         committed_jump: Displacement relative to the support at the last commit, (n_points, gdim),
             between the places that are opposite each other from then on.
     """
@@ -250,16 +272,17 @@ class Contact:
         else:
             placement = support.place(x, shift, lambda v: self._to_ufl("support", v))
         length = ufl.sqrt(ufl.dot(placement.direction, placement.direction))
-        self._normal = placement.direction / length
-        self._placement, self._gap = placement, placement.gap
+        normal = placement.direction / length
+        self._placement = placement
         self._evaluate_placement: PointEvaluator | None = None
         self.gap_prescribed = gap is not None
+        open_gap = placement.gap
         if gap is not None:
-            self._gap = self._scalar("gap", gap)
+            open_gap = self._scalar("gap", gap)
             if shift is not None:
-                self._gap = self._gap + ufl.dot(shift, self._normal)
-        self._shift = shift
-        self._law_parameters = parameters
+                open_gap = open_gap + ufl.dot(shift, normal)
+        # As expressions for the form on Γc, and sampled at the points for all else.
+        self._given = _Seen(open_gap, normal, shift, parameters)
 
         fields = {"opening": 0, "penetration": 0, "normal_traction": 0}
         if law.has_friction:
@@ -270,32 +293,43 @@ class Contact:
 
         # All of contact is a sparse map from u to the jump at the points, and the law there.
         self._own_map = self.quadrature.interpolation_matrix(u.function_space)
-        self._map = self._own_map
-        self._unknowns = Unknowns(u.function_space)
-        self._first_motion = 0
-        self._felt_maps: weakref.WeakKeyDictionary[Unknowns, PETSc.Mat]
-        self._felt_maps = weakref.WeakKeyDictionary({self._unknowns: self._map})
-        self._products: weakref.WeakKeyDictionary[Unknowns, PointProduct]
-        self._products = weakref.WeakKeyDictionary()
+        self.jump_map: PETSc.Mat = self._own_map
         self._jump = fem.Function(self.quadrature.space(gdim), name="jump")
-        self._reaction = self._map.createVecLeft()
+        expressions = {
+            "x": x,
+            "normal": normal,
+            "direction_length": length,
+            "facing": ufl.dot(normal, ufl.FacetNormal(mesh)),
+            "weight": self.weight,
+            "gap": open_gap,
+            "shift": self._prescribed_shift(),
+        } | {f"parameter {n}": v for n, v in parameters.items()}
+        seen = ["gap", "normal", *(f"parameter {n}" for n in parameters)]
+        if shift is not None:
+            expressions["support"] = shift
+            seen.append("support")
+        for i, free in self._free_shift.items():
+            expressions |= {f"gap by {i}": ufl.diff(open_gap, free)}
+            expressions |= {f"normal by {i}": ufl.diff(normal, free)}
+        self._data = PointData(self.quadrature, expressions, seen)
+        sampled = {n: self._data.ufl(f"parameter {n}") for n in parameters}
+        self._sampled = _Seen(
+            self._data.ufl("gap"),
+            self._data.ufl("normal"),
+            None if shift is None else self._data.ufl("support"),
+            sampled,
+        )
+        parameters = sampled
         kinematics = self._kinematics(self._jump)
         response = self._response(law, kinematics, parameters)
         expressions = {
-            "x": x,
-            "normal": self._normal,
-            "direction_length": length,
-            "facing": ufl.dot(self._normal, ufl.FacetNormal(mesh)),
-            "weight": self.weight,
-            "gap": self._gap,
             "normal_displacement": kinematics.normal_displacement,
             "opening": response.opening,
             "penetration": response.penetration,
             "normal_traction": response.normal_traction,
-            "jump": self._relative(self._jump),
-            "shift": self._prescribed_shift(),
+            "jump": self._sampled.relative(self._jump),
             "stored": self._acting_there(law.stored(kinematics, response, parameters)),
-        } | {f"parameter {n}": v for n, v in parameters.items()}
+        }
         if law.has_own_normal:
             expressions |= self._own_normal(kinematics, response)
         if law.has_tangential:
@@ -319,8 +353,8 @@ class Contact:
                 borne = kinematics.traction - response.traction
                 stretched = law.elastic_displacement(kinematics, borne, parameters)
                 expressions |= {"elastic_slip": stretched}
-        self._evaluate_points = PointEvaluator(self.quadrature, expressions)
-        self._acting = self._whole = _Reactions(self, law, parameters)
+        self._evaluate_law = PointEvaluator(self.quadrature, expressions, by_points=True)
+        self._acting = self._whole = _Reactions(self, law, self._sampled)
         self._frozen: _Reactions | None = None
         self._evaluate_yield: PointEvaluator | None = None
         self._own_form: Any = None
@@ -365,21 +399,19 @@ class Contact:
         springs = (isinstance(v, Springs) for v in self.law.parameters().values())
         return not self.law.is_physical and not any(springs)
 
-    def _relative(self, jump: Any) -> Any:
-        """Displacement of the body relative to the support (UFL)."""
-        return jump if self._shift is None else jump - self._shift
-
     def _prescribed_shift(self) -> Any:
         """Displacement of the support without its free components (UFL)."""
-        none = ufl.as_vector([0.0] * self._gdim)
-        if self._shift is None:
-            return none
-        return ufl.replace(self._shift, {c: ufl.as_ufl(0.0) for c in self.free_motion.values()})
+        shift = self._given.shift
+        if shift is None:
+            return ufl.as_vector([0.0] * self._gdim)
+        return ufl.replace(shift, {c: ufl.as_ufl(0.0) for c in self.free_motion.values()})
 
-    def _kinematics(self, jump: Any, law: Law | None = None) -> Kinematics:
+    def _kinematics(
+        self, jump: Any, law: Law | None = None, seen: _Seen | None = None
+    ) -> Kinematics:
         """What a law, by default the contact's, sees of a displacement of the body (UFL)."""
-        law = law or self.law
-        normal = self._normal
+        law, seen = law or self.law, seen or self._sampled
+        normal = seen.normal
         total = increment = traction = multiplier = None
         old_traction = self.history
         if self.multipliers is not None:
@@ -390,14 +422,14 @@ class Contact:
             return vector - ufl.dot(vector, normal) * normal
 
         if law.has_tangential:
-            total = tangential(self._relative(jump))
+            total = tangential(seen.relative(jump))
         if law.has_friction:
             # The old traction and displacement are taken along the present normal: the support
             # may have moved on since the last commit.
-            increment = tangential(self._relative(jump) - self.history.ufl("jump"))
+            increment = tangential(seen.relative(jump) - self.history.ufl("jump"))
             traction = tangential(old_traction.ufl("traction"))
         u_n = ufl.dot(jump, normal)
-        return Kinematics(self._gap, u_n, normal, total, increment, traction, multiplier)
+        return Kinematics(seen.gap, u_n, normal, total, increment, traction, multiplier)
 
     def _acting_there(self, value: Any) -> Any:
         """A value at points with an opposite, 0 at the others (UFL)."""
@@ -423,12 +455,12 @@ class Contact:
 
     def _own_normal(self, kinematics: Kinematics, response: Response) -> dict[str, Any]:
         """What is known of r_n that does not follow from k_n (UFL): stiffness, and another way."""
-        law, parameters, comm = self.law, self._law_parameters, self.surface.mesh.comm
+        law, parameters, comm = self.law, self._sampled.parameters, self.surface.mesh.comm
         u_n = ufl.variable(kinematics.normal_displacement)
         at_variable = replace(kinematics, normal_displacement=u_n)
         x = self.surface.mesh.geometry.x
         barely = fem.Constant(
-            self.surface.mesh, _BARELY * (global_max(comm, x) - global_min(comm, x))
+            self.surface.submesh, _BARELY * (global_max(comm, x) - global_min(comm, x))
         )
         # Where nothing acts the stiffness is that of a point that has just closed.
         acts = ufl.ne(response.normal_traction, 0)
@@ -458,7 +490,7 @@ class Contact:
         if not self.rigid:
             raise ValueError(
                 f"{self.name}: the form on Γc cannot reach the opposite body's unknowns; use "
-                "ContactProblem, or add_force and tangent_matrix"
+                "ContactProblem, or a ContactOperator"
             )
         if self.needs_modulus:
             raise ValueError(
@@ -470,7 +502,7 @@ class Contact:
 
     def _form_at(self, displacement: Any, v: ufl.Argument) -> ufl.Form:
         """`form` at a displacement relative to the support."""
-        traction = self._whole.traction(displacement)
+        traction = _Reactions(self, self.law, self._given).traction(displacement)
         return -self.weight * ufl.dot(traction, v) * self.quadrature.ds
 
     def potential(self) -> ufl.Form:
@@ -479,92 +511,45 @@ class Contact:
         Raises:
             ValueError: The law has none (Coulomb; a foundation with k_t and without tension).
         """
-        density = self._acting_there(
-            self.law.potential(self._kinematics(self.u), self._law_parameters)
-        )
+        kinematics = self._kinematics(self.u, seen=self._given)
+        density = self._acting_there(self.law.potential(kinematics, self._given.parameters))
         return self.weight * density * self.quadrature.ds
 
     def tangent(self, v: ufl.Argument, du: ufl.Argument) -> ufl.Form:
         """Consistent tangent, the derivative of `form`; unsymmetric where Coulomb slips."""
         return ufl.derivative(self.form(v), self.u, du)
 
-    # ---- the same, point by point ----------------------------------------------------------------
-
-    def set_unknowns(self, unknowns: Unknowns, first_motion: int) -> None:
-        """Say where the unknowns lie that the vectors and matrices below are over. Collective.
-
-        By default they are the dofs of ``u`` alone.
-
-        Args:
-            unknowns: Those of the problem, or a selection of them that has all that contact
-                touches.
-            first_motion: Number of this contact's first free motion among all.
-        """
-        self._unknowns, self._first_motion = unknowns, first_motion
-        if unknowns not in self._felt_maps:
-            self._felt_maps[unknowns] = self._make_felt_map()
+    # ---- the same, point by point: see `ContactOperator` -----------------------------------------
 
     @property
-    def _felt_map(self) -> PETSc.Mat:
-        """The map from the unknowns to the body's displacement relative to the support."""
-        return self._felt_maps[self._unknowns]
+    def area(self) -> Array:
+        """Area that each point stands for, the weight as it was sampled last, (n_points,)."""
+        return self.quadrature.weights * self._data.values["weight"]
 
-    def _make_felt_map(self) -> PETSc.Mat:
-        felt = self._unknowns.widened(self._map)
-        if self.free_motion:
-            felt = felt.copy()
-            motions = self._motion_map()
-            felt.axpy(-1.0, motions, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-            motions.destroy()
-        return felt
+    def acting_traction(self) -> Array:
+        """r_n n + τ of the acting law at the present ``u``, (n_points, gdim) (stress). Collective.
 
-    def felt_unknowns(self) -> npt.NDArray[np.int32]:
-        """This rank's unknowns that contact feels or acts on, ascending. Collective."""
-        felt = self._felt_map
-        pointers, columns, values = felt.getValuesCSR()
-        csr = (pointers, columns, (values != 0.0).astype(np.float64))
-        marks = PETSc.Mat().createAIJ(felt.getSizes(), csr=csr, comm=felt.comm)
-        points, counts = marks.createVecLeft(), marks.createVecRight()
-        points.set(1.0)
-        marks.multTranspose(points, counts)
-        found = np.flatnonzero(counts.array_r > 0.0).astype(np.int32)
-        for item in (marks, points, counts):
-            item.destroy()
-        return found
-
-    def _motion_map(self) -> PETSc.Mat:
-        """The map from the unknowns to the free displacement of the support. Collective."""
-        n, d, components = self.quadrature.n_points, self._gdim, list(self.free_motion)
-        first = self._unknowns.first_motion + self._first_motion
-        counts = np.tile(np.isin(np.arange(d), components), n)
-        columns = np.tile(first + np.arange(len(components)), n)
-        return PETSc.Mat().createAIJ(
-            ((n * d, None), (self._unknowns.n_local, None)),
-            csr=(
-                np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType),
-                columns.astype(PETSc.IntType),
-                np.ones(columns.size),
-            ),
-            comm=self.surface.mesh.comm,
-        )
-
-    def add_force(self, residual: PETSc.Vec, traction: Array | None = None) -> None:
-        """Add `form`, assembled at the present ``u``, to a vector over the unknowns. Collective.
-
-        The integrals are sums over the points, -Dᵀ w t with D the map from the unknowns to the
-        points: the law is evaluated on Γc alone, whatever the element of the bulk.
-
-        Args:
-            residual: Added to (force).
-            traction: Other ones than the law's, (n_points, gdim) (stress).
+        Results stay those of the last evaluation.
         """
-        if traction is None:
-            self._update_jump()
-            traction = self._acting.evaluate_traction()["traction"]
-        else:
-            traction = self._values["weight"][:, None] * traction
-        self._reaction.array[:] = -(self.quadrature.weights[:, None] * traction).ravel()
-        self._felt_map.multTransposeAdd(self._reaction, residual, residual)
+        self._update_points()
+        return self._acting.evaluate_traction()["traction"]
+
+    def acting_tangent(self) -> PointTangent:
+        """Derivatives of `acting_traction` at the present ``u``. Collective."""
+        self._update_points()
+        rows, d = self._acting.evaluate_tangent(), self._gdim
+        by_jump = np.stack([rows[f"jump {i}"] for i in range(d)], axis=1)
+        if not self.free_motion:
+            return PointTangent(by_jump)
+        by_normal = np.stack([rows[f"normal {i}"] for i in range(d)], axis=1)
+        by_support = np.stack([rows[f"support {i}"] for i in range(d)], axis=1)
+        by_shift = np.zeros_like(by_jump)
+        for i in self.free_motion:
+            turns = self._data.values[f"normal by {i}"]
+            by_shift[:, :, i] = by_support[:, :, i]
+            by_shift[:, :, i] += rows["gap"] * self._data.values[f"gap by {i}"][:, None]
+            by_shift[:, :, i] += np.einsum("qij,qj->qi", by_normal, turns)
+        return PointTangent(by_jump, by_shift)
 
     def own_forces(self) -> tuple[Array, Array]:
         """Nodal forces on the body with Γc at the present ``u``, by two routes. Collective.
@@ -575,13 +560,13 @@ class Contact:
             support is rigid and no motion of it is unknown, and the jump at the points otherwise.
         """
         mesh, space = self.surface.mesh, self.u.function_space
-        self._update_jump()
-        traction = self._whole.evaluate_traction()["traction"]
-        self._reaction.array[:] = (self.quadrature.weights[:, None] * traction).ravel()
-        vector = self._own_map.createVecRight()
-        self._own_map.multTranspose(self._reaction, vector)
+        self._update_points()
+        vector, forces = self._own_map.createVecs()
+        forces.array[:] = (self.area[:, None] * self._whole.evaluate_traction()["traction"]).ravel()
+        self._own_map.multTranspose(forces, vector)
         by_points = vector.array_r.copy()
-        vector.destroy()
+        for item in (vector, forces):
+            item.destroy()
         if self._own_form is None:
             displacement = self.u if self.rigid and not self.free_motion else self._jump
             form = self._form_at(displacement, ufl.TestFunction(space))
@@ -591,37 +576,19 @@ class Contact:
         assembled.scatter_reverse(la.InsertMode.add)
         return by_points, assembled.array[: by_points.size].copy()
 
-    def tangent_matrix(self) -> PETSc.Mat:
-        """`tangent`, assembled at the present ``u``, a new matrix over the unknowns. Collective."""
-        self._update_jump()
-        rows = self._acting.evaluate_tangent()
-        by_jump = -np.stack([rows[f"jump {i}"] for i in range(self._gdim)], axis=1)
-        if not self.free_motion:
-            return self._matrix(by_jump)
-        # Where the support moves its normals may turn: more than the opposite of ∂/∂jump.
-        by_shift = -np.stack([rows[f"shift {i}"] for i in range(self._gdim)], axis=1)
-        wide, motions = self._unknowns.widened(self._map), self._motion_map()
-        jumps, shifts = self._block_diagonal(by_jump), self._block_diagonal(by_shift)
-        right, turned = jumps.matMult(wide), shifts.matMult(motions)
-        right.axpy(1.0, turned, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        product = self._felt_map.transposeMatMult(right)
-        for item in (wide, motions, jumps, shifts, right, turned):
-            item.destroy()
-        return product
-
     def energy(self) -> float:
         """`potential` at the present ``u``, this rank's points only. Collective.
 
         Raises:
             ValueError: The law has none.
         """
-        self._update_jump()
-        return float(self.quadrature.weights @ self._acting.evaluate_potential()["potential"])
+        self._update_points()
+        return float(self.area @ self._acting.evaluate_potential()["potential"])
 
     def freeze(self, pressure: Array) -> None:
         """Let `Law.at_pressure` act. Collective.
 
-        `add_force`, `tangent_matrix` and `energy` are those of the acting law; results are not.
+        `acting_traction`, `acting_tangent` and `energy` are those of it; results are not.
 
         Args:
             pressure: ≥ 0, shape (n_points,) (stress).
@@ -631,8 +598,8 @@ class Contact:
         if self._frozen is None:
             self._pressure = fem.Function(self.quadrature.space(), name="pressure")
             law = self.law.at_pressure(self._pressure)
-            parameters = self._law_parameters | {"pressure": self._pressure}
-            self._frozen = _Reactions(self, law, parameters)
+            parameters = {**self._sampled.parameters, "pressure": self._pressure}
+            self._frozen = _Reactions(self, law, replace(self._sampled, parameters=parameters))
         self._pressure.x.array[: self.quadrature.n_points] = pressure
         self._pressure.x.scatter_forward()
         self._acting = self._frozen
@@ -641,12 +608,15 @@ class Contact:
         """Let the law itself act again."""
         self._acting = self._whole
 
-    def stiffness_matrix(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> PETSc.Mat:
-        """Symmetric stiffness a K_n + b K_t of section 5, new, over the unknowns. Collective.
+    def springs(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> Array:
+        """Symmetric stiffness a K_n + b K_t of section 5 at the points as evaluated.
 
         Args:
             normal: a, a number or one per owned point.
             tangential: b, likewise.
+
+        Returns:
+            (n_points, gdim, gdim) (stress/length).
         """
         values, d = self._values, self._gdim
         n = self.quadrature.n_points
@@ -657,69 +627,18 @@ class Contact:
         if self.law.has_tangential:
             share = np.broadcast_to(np.asarray(tangential), (n,))
             blocks += share[:, None, None] * self.tangential_stiffness
-        return self.spring_matrix(blocks)
+        return blocks
 
-    def spring_matrix(self, blocks: Array) -> PETSc.Mat:
-        """Stiffness of springs at the points, new, over the unknowns. Collective.
-
-        Args:
-            blocks: Stiffness of every point, (n_points, gdim, gdim) (stress/length).
-        """
-        return self._matrix(self._values["weight"][:, None, None] * blocks)
-
-    def at_points(self, displacement: Array) -> Array:
-        """Displacement relative to the support: (n_local_unknowns,) to (n_points, gdim).
-
-        Collective.
-        """
-        felt = self._felt_maps[self._unknowns.whole]
-        vector = felt.createVecRight()
-        vector.array[:] = displacement
-        felt.mult(vector, self._reaction)
-        vector.destroy()
-        return self._reaction.array.reshape(-1, self._gdim).copy()
-
-    def felt(self, unknowns: PETSc.Vec) -> Array:
-        """Displacement relative to the support by a vector over the unknowns, (n_points, gdim).
-
-        Collective.
-        """
-        self._felt_map.mult(unknowns, self._reaction)
-        return self._reaction.array.reshape(-1, self._gdim).copy()
-
-    def _update_jump(self) -> None:
-        self._map.mult(self.u.x.petsc_vec, self._jump.x.petsc_vec)
+    def _update_points(self) -> None:
+        """Let the points be at the present ``u`` and data. Collective."""
+        self.jump_map.mult(self.u.x.petsc_vec, self._jump.x.petsc_vec)
         self._jump.x.scatter_forward()
+        self._data.update()
 
-    def _matrix(self, blocks: Array) -> PETSc.Mat:
-        """Dᵀ C D with C block-diagonal, one block per point: (n_points, gdim, gdim)."""
-        if isinstance(self._unknowns, Selection):
-            product = self._products.get(self._unknowns)
-            if product is None:
-                product = self._products[self._unknowns] = PointProduct(self._felt_map, self._gdim)
-            return product(self.quadrature.weights[:, None, None] * blocks)
-        matrix = self._block_diagonal(blocks)
-        product = matrix.ptap(self._felt_map)
-        matrix.destroy()
-        return product
-
-    def _block_diagonal(self, blocks: Array) -> PETSc.Mat:
-        """One block per point, (n_points, gdim, gdim), times the points' weights."""
-        n, d = self.quadrature.n_points, self._gdim
-        first, _ = self._map.getOwnershipRange()
-        blocks = self.quadrature.weights[:, None, None] * blocks
-        columns = first + d * np.arange(n)[:, None, None] + np.arange(d)[None, None, :]
-        columns = np.broadcast_to(columns, (n, d, d))
-        size = self._map.getSizes()[0]
-        return PETSc.Mat().createAIJ(
-            (size, size),
-            csr=(
-                np.arange(0, n * d * d + 1, d, dtype=PETSc.IntType),
-                columns.ravel().astype(PETSc.IntType),
-                blocks.ravel(),
-            ),
-            comm=self.surface.mesh.comm,
-        )
+    def _evaluate_points(self) -> dict[str, Array]:
+        """Everything at the points, with the jump as it was updated last. Collective."""
+        self._data.update()
+        return {**self._data.values, **self._evaluate_law()}
 
     # ---- parameters ------------------------------------------------------------------------------
 
@@ -883,10 +802,7 @@ class Contact:
         relative.axpy(-1.0, opposite, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         opposite.destroy()
         mask.destroy()
-        self._map = relative
-        self._felt_maps.clear()
-        self._products.clear()
-        self._felt_maps[self._unknowns] = self._make_felt_map()
+        self.jump_map = relative
         self.forget()
         self.pairings += 1
         lost = [np.count_nonzero(~self.paired & (why == reason)) for reason in REASONS]
@@ -942,7 +858,7 @@ class Contact:
             self._evaluate_placement = PointEvaluator(
                 self.quadrature, {"gap": gap, "normal": normal, "slope": slope}
             )
-        self._update_jump()
+        self._update_points()
         found = self._evaluate_placement()
         # A distance falls along the normal as fast as one moves.
         told = np.abs(found["slope"] + 1) < _NO_DISTANCE
@@ -1056,8 +972,8 @@ class Contact:
 
     def evaluate(self) -> None:
         """Evaluate gap, reactions and slip at the present ``u``; the history stays. Collective."""
-        self._update_jump()
-        self._points = self._evaluate_points()
+        self._update_points()
+        self._points = {**self._data.values, **self._evaluate_law()}
 
     def evaluate_yield(self) -> tuple[Array, Array]:
         """The law's yield functions at the present ``u``, and their gradients. Collective.
@@ -1066,17 +982,15 @@ class Contact:
             g_j(τ, limit) (stress), (n_points, n_modes), and ∂g_j/∂τ, (n_points, n_modes, gdim).
         """
         if self._evaluate_yield is None:
-            kinematics = self._kinematics(self._jump)
-            response = self._response(self.law, kinematics, self._law_parameters)
+            kinematics, parameters = self._kinematics(self._jump), self._sampled.parameters
+            response = self._response(self.law, kinematics, parameters)
             traction = ufl.variable(response.traction)
-            functions = self.law.yield_functions(
-                kinematics, traction, response.limit, self._law_parameters
-            )
+            functions = self.law.yield_functions(kinematics, traction, response.limit, parameters)
             rows = {f"gradient {j}": ufl.diff(g, traction) for j, g in enumerate(functions)}
             self._evaluate_yield = PointEvaluator(
-                self.quadrature, {"functions": ufl.as_vector(functions)} | rows
+                self.quadrature, {"functions": ufl.as_vector(functions)} | rows, by_points=True
             )
-        self._update_jump()
+        self._update_points()
         found = self._evaluate_yield()
         gradients = [found[name] for name in found if name != "functions"]
         return found["functions"], np.stack(gradients, axis=1)
@@ -1243,7 +1157,8 @@ class Contact:
         """
         if self._tributary is not None:
             self._tributary.update()
-        data = self._evaluate_points()
+        self._data.update()
+        data = self._data.values
         names = ["weight", "normal", "shift"]
         if self.gap_prescribed or not self.pairs_anew:  # else it is that of the latest pairs
             names.append("gap")
@@ -1483,52 +1398,77 @@ def displacement_degree(u: fem.Function, mesh: Any, name: str) -> int:
     return int(basis.degree)
 
 
+@dataclass(frozen=True)
+class _Seen:
+    """What a law sees of a point apart from displacements (UFL).
+
+    Attributes:
+        gap: Initial gap, the motion of the support included (length).
+        normal: Unit normal from body to support.
+        shift: Displacement of the support; None: it has none.
+        parameters: Of the law, by name.
+    """
+
+    gap: Any
+    normal: Any
+    shift: Any
+    parameters: Mapping[str, Any]
+
+    def relative(self, jump: Any) -> Any:
+        """Displacement of the body relative to the support (UFL)."""
+        return jump if self.shift is None else jump - self.shift
+
+
 class _Reactions:
     """What a law makes of the jump at the points: evaluators, compiled when first called."""
 
-    def __init__(self, contact: Contact, law: Law, parameters: Mapping[str, Any]) -> None:
-        self._contact, self._law, self._parameters = weakref.proxy(contact), law, parameters
+    def __init__(self, contact: Contact, law: Law, seen: _Seen) -> None:
+        self._contact, self._law, self._seen = weakref.proxy(contact), law, seen
 
-    def traction(self, jump: Any) -> Any:
+    def traction(self, jump: Any, seen: _Seen | None = None) -> Any:
         """r_n n + τ on the body (UFL)."""
-        contact = self._contact
-        kinematics = contact._kinematics(jump, self._law)
-        response = contact._response(self._law, kinematics, self._parameters)
-        total = response.normal_traction * contact._normal
+        contact, seen = self._contact, seen or self._seen
+        kinematics = contact._kinematics(jump, self._law, seen)
+        response = contact._response(self._law, kinematics, seen.parameters)
+        total = response.normal_traction * seen.normal
         return total if response.traction is None else total + response.traction
 
     @cached_property
     def evaluate_traction(self) -> PointEvaluator:
-        """Weighted "traction", (n_points, gdim)."""
-        traction = self._contact.weight * self.traction(self._contact._jump)
-        return PointEvaluator(self._contact.quadrature, {"traction": traction})
+        """The "traction", (n_points, gdim)."""
+        return self._evaluator({"traction": self.traction(self._contact._jump)})
 
     @cached_property
     def evaluate_potential(self) -> PointEvaluator:
-        """The weighted "potential" per area, (n_points,)."""
-        contact = self._contact
-        kinematics = contact._kinematics(contact._jump, self._law)
-        density = contact._acting_there(self._law.potential(kinematics, self._parameters))
-        return PointEvaluator(contact.quadrature, {"potential": contact.weight * density})
+        """The "potential" per area, (n_points,)."""
+        contact, seen = self._contact, self._seen
+        kinematics = contact._kinematics(contact._jump, self._law, seen)
+        density = contact._acting_there(self._law.potential(kinematics, seen.parameters))
+        return self._evaluator({"potential": density})
 
     @cached_property
     def evaluate_tangent(self) -> PointEvaluator:
-        """Weighted derivatives of the traction, row by row, (n_points, gdim).
+        """Derivatives of the traction, row by row, (n_points, gdim).
 
-        By the jump, "jump i", and by the free motion of the support, "shift i".
+        By the jump, "jump i"; and where the support moves freely by its displacement, "support i",
+        by the normal, "normal i", and by the "gap".
         """
-        contact = self._contact
-        d, weight = contact._gdim, contact.weight
+        contact, seen = self._contact, self._seen
         jump = ufl.variable(contact._jump)
-        derivative = ufl.diff(self.traction(jump), jump)
-        rows = {f"jump {i}": weight * derivative[i, :] for i in range(d)}
+        by = {"jump": jump}
         if contact.free_motion:
-            traction, none = self.traction(contact._jump), ufl.as_vector([0.0] * d)
-            by_shift = [
-                ufl.diff(traction, contact._free_shift[i]) if i in contact._free_shift else none
-                for i in range(d)
-            ]
-            for i in range(d):
-                row = ufl.as_vector([column[i] for column in by_shift])
-                rows[f"shift {i}"] = weight * row
-        return PointEvaluator(contact.quadrature, rows)
+            by |= {"normal": ufl.variable(seen.normal), "support": ufl.variable(seen.shift)}
+            by |= {"gap": ufl.variable(seen.gap)}
+            seen = replace(seen, gap=by["gap"], normal=by["normal"], shift=by["support"])
+        traction = self.traction(jump, seen)
+        rows: dict[str, Any] = {}
+        for name, variable in by.items():
+            derivative = ufl.diff(traction, variable)
+            if name == "gap":
+                rows[name] = derivative
+            else:
+                rows |= {f"{name} {i}": derivative[i, :] for i in range(contact._gdim)}
+        return self._evaluator(rows)
+
+    def _evaluator(self, expressions: Mapping[str, Any]) -> PointEvaluator:
+        return PointEvaluator(self._contact.quadrature, expressions, by_points=True)

@@ -245,12 +245,12 @@ def _linear_parts(
     problem: ContactProblem, values: Mapping[str, float]
 ) -> dict[str, dict[str, float]]:
     """What the springs and the residual that is left have changed in the quantities."""
-    contacts = problem.contacts
+    contacts, operators = problem.contacts, problem.operators
     springs = [LinearSprings.of(contact) for contact in contacts]
     found = {}
 
     def differences(way: Array, shifts: list[Array]) -> dict[str, float]:
-        jumps = [shift + c.at_points(way) for c, shift in zip(contacts, shifts, strict=True)]
+        jumps = [shift + o.jump(way) for o, shift in zip(operators, shifts, strict=True)]
         changes = [s.change(jump) for s, jump in zip(springs, jumps, strict=True)]
         return _differences(problem, values, changes, way)
 
@@ -265,8 +265,8 @@ def _linear_parts(
         triples = zip(deviations, contacts, springs, strict=True)
         added = [d.turned(c) + s.change(d.shift(c)) for d, c, s in triples]
         way = solve(added)
-        tractions = zip(added, contacts, springs, strict=True)
-        changes = [t + s.change(c.at_points(way)) for t, c, s in tractions]
+        tractions = zip(added, operators, springs, strict=True)
+        changes = [t + s.change(o.jump(way)) for t, o, s in tractions]
         found["kinematics"] = _differences(problem, values, changes, way)
     return found
 

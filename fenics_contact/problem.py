@@ -37,6 +37,7 @@ from fenics_contact.defaults import Defaults, take_command_line
 from fenics_contact.energy import Energy, EnergyState, Forces
 from fenics_contact.facets import facet_cells, local_facets
 from fenics_contact.motion import Linearisation, linearisation
+from fenics_contact.operators import ContactOperator
 from fenics_contact.parallel import fail_together, global_max, global_min, global_sum, warn
 from fenics_contact.quasi_newton import QuasiNewton
 from fenics_contact.rigid import RigidMotions
@@ -314,7 +315,7 @@ class ContactProblem:
         self.initial_penetration = self._check_start()
         self._bulk_matrix = self.unknowns.widened(self.bulk.stiffness, rows=True)
         self.motions.find_free(self._bulk_matrix, self._constrained)
-        self.motions.check_held(self.contacts)
+        self.motions.check_held(self.operators)
 
         self._length = self.motions.size
         self._load: Array = np.zeros(self.unknowns.n_local)
@@ -511,7 +512,7 @@ class ContactProblem:
         if self._condensation is False:
             obstacle = "the caller wants none"
         elif self._condensation is None and not obstacle:
-            n, n_touched = self.unknowns.n_local, touched(self.contacts, self.unknowns).size
+            n, n_touched = self.unknowns.n_local, touched(self.operators, self.unknowns).size
             if n_touched == n or not worthwhile(n, n_touched, len(self.u)):
                 obstacle = f"contact touches {n_touched} of {n} unknowns, too many to gain by it"
             elif not self.unknowns.n_motions and self._linear_solver is None:
@@ -554,7 +555,7 @@ class ContactProblem:
         """
         self._space = self._whole
         if self._condensed:
-            kept = touched(self.contacts, self.unknowns) if kept is None else kept
+            kept = touched(self.operators, self.unknowns) if kept is None else kept
             self._space = CondensedSpace(
                 self._whole, Selection(self.unknowns, kept), prefix=self.prefix + "interior_"
             )
@@ -571,7 +572,7 @@ class ContactProblem:
             else:
                 # A body that slides comes back to places where it was: what is kept grows only.
                 before = self._space.unknowns.kept
-                kept = np.union1d(before, touched(self.contacts, self.unknowns))
+                kept = np.union1d(before, touched(self.operators, self.unknowns))
                 if kept.size > before.size:
                     self._set_space(kept.astype(np.int32))
                 self._pairings = [c.pairings for c in self.contacts]
@@ -649,7 +650,7 @@ class ContactProblem:
         return total / (self.bulk.scale * self._length**2)
 
     def _measure_norms(self, space: WholeSpace, total: Array, contacts: Sequence[Array]) -> None:
-        """Norms of residual and forces at the present state of the space entered. Collective."""
+        """Norms of residual and forces at the present state. Collective."""
         self._norms = space.parts.norms(
             total,
             contacts,
@@ -687,7 +688,7 @@ class ContactProblem:
         self._watch.note(residual)
         # Until enough points are closed to hold the body its tangent is singular: take H₀ of the
         # whole surface, as for the start of the quasi-Newton iteration.
-        if self.motions.held(self.contacts):
+        if self.motions.held(self.operators):
             self._assemble_matrix(J, self._tangents())
         else:
             self._assemble_matrix(J, self._stiffnesses(everywhere=True))
@@ -703,7 +704,7 @@ class ContactProblem:
         self._filled |= {c for c, m in self._matrices.items() if m.handle == matrix.handle}
 
     def _tangents(self) -> Iterator[PETSc.Mat]:
-        return (contact.tangent_matrix() for contact in self.contacts)
+        return (operator.tangent() for operator in self._space.operators)
 
     def _stiffnesses(self, *, everywhere: bool) -> Iterator[PETSc.Mat]:
         """The shares αK_n + φK_t of the contacts, as evaluated.
@@ -712,12 +713,14 @@ class ContactProblem:
             everywhere: Take all of Γc as closed and sticking, as the paper does, where nothing
                 can be told from the status.
         """
-        for contact in self.contacts:
+        for operator in self._space.operators:
+            contact = operator.contact
             normal = tangential = np.ones(contact.quadrature.n_points)
             if not everywhere:
                 normal = np.where(contact.status != Status.OPEN, 1.0, _OPEN_SHARE)
                 tangential = np.where(contact.status == Status.STICK, 1.0, _OPEN_SHARE)
-            yield contact.stiffness_matrix(self._alpha * normal, self._phi * tangential)
+            springs = contact.springs(self._alpha * normal, self._phi * tangential)
+            yield operator.springs(springs)
 
     def _clear_pairs(self, *, consistent: bool | None = None) -> None:
         """Forget the pairs of L-BFGS and keep the factorisation, which reset() would drop too."""
@@ -740,6 +743,11 @@ class ContactProblem:
         """How many increments a load history takes for the accuracy; 1 if none is said."""
         friction = any(c.law.has_friction for c in self.contacts)
         return self.accuracy.increments if self.accuracy and friction else 1
+
+    @property
+    def operators(self) -> list[ContactOperator]:
+        """The contacts over all unknowns, with the pairs as they are. Collective."""
+        return self._whole.operators
 
     @property
     def load(self) -> Array:
@@ -779,16 +787,16 @@ class ContactProblem:
         self._predicts = False  # by the matrix that is about to be used
         space = self._space
         space.begin(self._load)
-        space.enter()
         right, left = space.vector(), space.vector()
+        ksp = PETSc.KSP().create(self._comm)
 
         def solve(tractions: Sequence[Array] | None) -> Array:
             right.set(0.0)
             if tractions is None:
                 right.array[:] = space.bulk_force() + space.contact_force()
             else:
-                for contact, traction in zip(self.contacts, tractions, strict=True):
-                    contact.add_force(right, traction)
+                for operator, traction in zip(space.operators, tractions, strict=True):
+                    operator.add_force(right, traction)
             right.array[space.constrained] = 0.0
             right.scale(-1.0 / self.bulk.scale)
             with interrupts_held():
@@ -797,19 +805,18 @@ class ContactProblem:
             return space.extended(left.array_r.copy())
 
         try:
-            matrices = (c.spring_matrix(s) for c, s in zip(self.contacts, springs, strict=True))
+            matrices = (o.springs(s) for o, s in zip(space.operators, springs, strict=True))
             self._assemble_matrix(self._matrix(True), matrices)
             # The tangent's own solver may be a V-cycle and no more; after a factorisation GMRES
             # ends with its first iteration.
-            ksp = PETSc.KSP().create(self._comm)
             ksp.setOperators(self._matrix(True))
             ksp.setType(PETSc.KSP.Type.GMRES)
             ksp.setPC(self._solvers[True].getPC())
             ksp.setTolerances(rtol=1e-8, max_it=1000)
             yield solve
-            ksp.destroy()
         finally:
-            self._whole.enter()
+            for item in (ksp, right, left):
+                item.destroy()
 
     # ---- solving ---------------------------------------------------------------------------------
 
@@ -1002,29 +1009,25 @@ class ContactProblem:
         """
         reason, rungs = int(PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE), []
         factored = self._predicts
-        self._space.enter()
-        try:
-            starts = [start / self._length for start in self._starts(ahead)]
-            tries = [(start, self._method) for start in starts]
-            climbs = self._may_climb()
-            cold = self._cold and ahead > 0.0  # and no later round of multipliers
-            if climbs and cold and self._automatic and self._condensed:
-                # From nothing, Newton's method on the stiff problem often gives up first.
-                tries = [(starts[0], _LAST_RESORT)]
-            elif climbs:
-                tries.append((starts[0], _LAST_RESORT))
-            for start, method in tries:
-                self._solution.array[:] = start
-                self._watch.start()
-                iterations, reason = self._solve_by(method, stiffness_changed)
-                rungs.append(Rung(method, iterations, self._outcome(reason)))
-                if reason > 0:
-                    break
-                if self._comm.rank == 0:
-                    logger.info("increment %d: %s", self.increment + 1, rungs[-1])
-            self._set_u(self._solution)
-        finally:
-            self._whole.enter()
+        starts = [start / self._length for start in self._starts(ahead)]
+        tries = [(start, self._method) for start in starts]
+        climbs = self._may_climb()
+        cold = self._cold and ahead > 0.0  # and no later round of multipliers
+        if climbs and cold and self._automatic and self._condensed:
+            # From nothing, Newton's method on the stiff problem often gives up first.
+            tries = [(starts[0], _LAST_RESORT)]
+        elif climbs:
+            tries.append((starts[0], _LAST_RESORT))
+        for start, method in tries:
+            self._solution.array[:] = start
+            self._watch.start()
+            iterations, reason = self._solve_by(method, stiffness_changed)
+            rungs.append(Rung(method, iterations, self._outcome(reason)))
+            if reason > 0:
+                break
+            if self._comm.rank == 0:
+                logger.info("increment %d: %s", self.increment + 1, rungs[-1])
+        self._set_u(self._solution)
         newton = method not in ("alternating", "continuation") and not self._quasi_newton
         made = sum(rung.iterations for rung in rungs[-1:])
         self._predicts = reason > 0 and newton and (factored or made > 0)
@@ -1065,8 +1068,8 @@ class ContactProblem:
     def _hardness(self) -> float:
         """Largest ratio of contact's stiffness to the bulk's at an unknown. Collective."""
         diagonals = []
-        for contacts in ([], self.contacts):
-            parts = (c.stiffness_matrix(1.0, 1.0) for c in contacts)
+        for operators in ([], self._space.operators):
+            parts = (o.springs(o.contact.springs(1.0, 1.0)) for o in operators)
             self._space.fill(self._matrix(True), self._bulk_matrix, parts)
             diagonals.append(self._space.diagonal.copy())
         bulk, both = diagonals
@@ -1089,7 +1092,7 @@ class ContactProblem:
                     f"Dirichlet condition number {number} has values that are not finite"
                 )
         if self.bulk.linear:
-            self.motions.check_balance(self._load, self.contacts)
+            self.motions.check_balance(self._load, self.operators)
 
     def _starts(self, ahead: float) -> list[Array]:
         """Unknowns of the space to start from, nearest to equilibrium first. Collective.
@@ -1159,7 +1162,7 @@ class ContactProblem:
         touching = [bool(np.any(c.status != Status.OPEN)) for c in self.contacts]
         if self._comm.allreduce(any(touching)):
             return
-        way = self.motions.approach(self._load, self.contacts)
+        way = self.motions.approach(self._load, self.operators)
         if way is not None:
             self._whole.set_state(self._whole.state() + way)
 
@@ -1182,22 +1185,14 @@ class ContactProblem:
         self._behind = self._space.behind
         for contact in self.contacts:
             contact.evaluate()
-        self._space.enter()
-        try:
-            bulk = self._space.bulk_force()
-            verdict, _ = self._judge(self._space, bulk, kinematics=kinematics)
-        finally:
-            self._whole.enter()
+        bulk = self._space.bulk_force()
+        verdict, _ = self._judge(self._space, bulk, kinematics=kinematics)
         forces: dict[object, Forces] = {self._space.mark: self._forces_kept()}
         self._energy = EnergyState.at(forces, self.contacts)
         return verdict
 
     def _forces_kept(self) -> Forces:
-        self._space.enter()
-        try:
-            bulk, contact = self._space.bulk_force(), self._space.contact_force()
-        finally:
-            self._whole.enter()
+        bulk, contact = self._space.bulk_force(), self._space.contact_force()
         return self._space.forces(bulk, np.where(self._space.constrained, bulk + contact, 0.0))
 
     def _judge(
@@ -1206,7 +1201,7 @@ class ContactProblem:
         """Recompute residual, balance and laws at evaluated contacts. Collective.
 
         Args:
-            space: The unknowns on which the residual is looked at; entered.
+            space: The unknowns on which the residual is looked at.
             bulk: Residual of the bulk on these.
             laws: Whether to check the laws, too.
             kinematics: Whether to look at what small displacements leave out.
@@ -1233,7 +1228,7 @@ class ContactProblem:
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
             # Of the opposite only what Γc meets is known before u is complete.
             unseen=passing(self.contacts) if space is self._whole else {},
-            kinematics=self._linearisation(space) if kinematics else {},
+            kinematics=self._linearisation() if kinematics else {},
             kinematics_allowed=self.kinematics,
             displacement=self._farthest(),
             routes=self._compare_routes() if self._second_route and laws else {},
@@ -1273,13 +1268,10 @@ class ContactProblem:
             found[contact.name] = Balance(residual, force, allowed)
         return found
 
-    def _linearisation(self, entered: WholeSpace) -> dict[str, Linearisation]:
+    def _linearisation(self) -> dict[str, Linearisation]:
         """What taking displacements as small changes at the state judged, by contact. Collective.
 
         To some digits: with the matrix factored last, which is the tangent near the solution.
-
-        Args:
-            entered: The space that the contacts speak of, now and afterwards.
         """
         if not self.contacts:
             return {}
@@ -1287,17 +1279,16 @@ class ContactProblem:
         modulus = self.bulk.scale * self._cell_size ** (2 - len(self.u))
 
         def respond(springs: Sequence[Array], tractions: Sequence[Array]) -> list[Array]:
-            space.enter()
             right, left, diagonal = space.vector(), space.vector(), space.diagonal
             matrix = space.matrix(self._bulk_matrix, symmetric=False)
             ksp = PETSc.KSP().create(self._comm)
             try:
                 if consistent not in self._filled:  # nothing was iterated yet
                     self._assemble_matrix(self._matrix(consistent), self._tangents())
-                parts = (c.spring_matrix(k) for c, k in zip(self.contacts, springs, strict=True))
+                parts = (o.springs(k) for o, k in zip(space.operators, springs, strict=True))
                 space.fill(matrix, self._bulk_matrix, parts)
-                for contact, traction in zip(self.contacts, tractions, strict=True):
-                    contact.add_force(right, traction)
+                for operator, traction in zip(space.operators, tractions, strict=True):
+                    operator.add_force(right, traction)
                 right.array[space.constrained] = 0.0
                 right.scale(-1.0 / self.bulk.scale)
                 ksp.setOperators(matrix)
@@ -1306,10 +1297,9 @@ class ContactProblem:
                 ksp.getPC().setPythonContext(_Nearby(self._solvers[consistent]))
                 ksp.setTolerances(rtol=_NOTABLE**2, max_it=100)
                 ksp.solve(right, left)
-                return [contact.felt(left) for contact in self.contacts]
+                return [operator.jump(left.array_r) for operator in space.operators]
             finally:
                 space.diagonal = diagonal
-                entered.enter()
                 for item in (ksp, matrix, right, left):
                     item.destroy()
 
@@ -1336,7 +1326,7 @@ class ContactProblem:
         forces.
 
         Args:
-            space: The unknowns, entered.
+            space: The unknowns.
             internal: Residual of the bulk without reactions, (n_local,).
             forces: What tells how large all forces are, (n_local,) each.
 
@@ -1346,8 +1336,9 @@ class ContactProblem:
         """
         motions, n = self.motions.of_bodies, self._whole.n_bodies - self.unknowns.n_motions
         total = np.array([[space.part(mode) @ internal for mode in body] for body in motions])
-        for contact in self.contacts:
-            total -= self.motions.work(contact, contact.measure[:, None] * contact.traction)
+        for operator in self.operators:
+            contact = operator.contact
+            total -= self.motions.work(operator, contact.measure[:, None] * contact.traction)
         count = np.bincount(space.label, minlength=n)[:n]
         sizes = [np.bincount(space.label, np.abs(f), minlength=n)[:n] for f in forces]
         sums = global_sum(self._comm, np.stack([*total.T, count, np.sum(sizes, axis=0)]))

@@ -107,7 +107,7 @@ class QuasiNewton:
         for contact in problem.contacts:
             contact.evaluate()
         problem._watch.note(problem._norms.total)
-        consistent = not problem.has_potential and problem.motions.held(problem.contacts)
+        consistent = not problem.has_potential and problem.motions.held(problem.operators)
         parts = problem._tangents() if consistent else problem._stiffnesses(everywhere=False)
         problem._clear_pairs(consistent=consistent)
         problem._assemble_matrix(problem._matrix(consistent), parts)

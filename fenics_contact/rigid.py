@@ -18,8 +18,9 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.bodies import connected_bodies
-from fenics_contact.contact import Contact, Status
+from fenics_contact.contact import Status
 from fenics_contact.facets import facet_cells
+from fenics_contact.operators import ContactOperator
 from fenics_contact.parallel import agreed, gather_rows, global_min, global_sum
 from fenics_contact.unknowns import Unknowns
 
@@ -92,11 +93,12 @@ class RigidMotions:
         self.free: Array = np.zeros((0, len(modes)))
         self._free_fields: Array = np.zeros((0, unknowns.n_local))
         self._balanced: list[Array] = []
-        # Counts of pairings, and masks of points that were found to hold all motions.
-        self._holding: tuple[list[int], list[npt.NDArray[np.bool_]]] = [], []
-        self._jumps: weakref.WeakKeyDictionary[Contact, tuple[int, Array]]
+        # Masks of points that were found to hold all motions, and of which contacts.
+        self._holding: list[npt.NDArray[np.bool_]] = []
+        self._holders: weakref.WeakSet[ContactOperator] = weakref.WeakSet()
+        self._jumps: weakref.WeakKeyDictionary[ContactOperator, Array]
         self._jumps = weakref.WeakKeyDictionary()
-        self._travels: weakref.WeakKeyDictionary[Contact, tuple[int, Array]]
+        self._travels: weakref.WeakKeyDictionary[ContactOperator, Array]
         self._travels = weakref.WeakKeyDictionary()
 
     def find_free(self, stiffness: PETSc.Mat, constrained: npt.NDArray[np.bool_]) -> None:
@@ -124,43 +126,41 @@ class RigidMotions:
         self.free = _plain(free.T)
         self._free_fields = self.free @ self._modes
         self._balanced = []
-        self._holding = [], []
+        self._holding = []
         for vector in (diagonal, work, image):
             vector.destroy()
 
-    def _at_points(self, contact: Contact) -> Array:
+    def _at_points(self, operator: ContactOperator) -> Array:
         """Jumps of the free motions at a contact's points: (n_free, n_points, gdim). Collective."""
-        pairing, jumps = self._jumps.get(contact, (-1, None))
-        if jumps is None or pairing != contact.pairings:
-            gdim = contact.surface.mesh.geometry.dim
-            found = [contact.at_points(c @ self._modes) for c in self.free]
-            jumps = np.array(found).reshape(len(self.free), contact.quadrature.n_points, gdim)
-            self._jumps[contact] = contact.pairings, jumps
-        return jumps
+        if operator not in self._jumps:
+            gdim, n_points = len(self._centres[0]), operator.contact.quadrature.n_points
+            found = [operator.jump(c @ self._modes) for c in self.free]
+            self._jumps[operator] = np.array(found).reshape(len(self.free), n_points, gdim)
+        return self._jumps[operator]
 
-    def work(self, contact: Contact, force: Array) -> Array:
+    def work(self, operator: ContactOperator, force: Array) -> Array:
         """Of forces at a contact's points, and of what answers them, on the motions of the bodies.
 
         That of the body with Γc follows from where the points are, not from the map by which the
         solver transfers forces. Collective.
 
         Args:
-            contact: The contact.
+            operator: Of the contact, over all unknowns.
             force: On the body with Γc, (n_points, gdim) (force).
 
         Returns:
             This rank's part, (n_bodies, n_per_body) (force): translations, then rotations about
             the body's middle by its size.
         """
-        pairing, travels = self._travels.get(contact, (-1, np.zeros(0)))
-        if pairing != contact.pairings:
-            travels = self._travels_at(contact)
-            self._travels[contact] = contact.pairings, travels
+        if operator not in self._travels:
+            self._travels[operator] = self._travels_at(operator)
+        travels = self._travels[operator]
         return np.asarray(np.einsum("bmqd,qd->bm", travels, force), dtype=np.float64)
 
-    def _travels_at(self, contact: Contact) -> Array:
+    def _travels_at(self, operator: ContactOperator) -> Array:
         """What points of a contact feel of the bodies' motions, (n_bodies, n_per_body, ...)."""
         space, (n_bodies, n_motions, _) = self._space, self.of_bodies.shape
+        contact = operator.contact
         points = contact.points
         travels = np.zeros((n_bodies, n_motions, *points.shape))
         rows = contact.quadrature.point_rows()
@@ -174,7 +174,7 @@ class RigidMotions:
                 continue
             # The map says where the forces on the opposite act. Both sides may be one body's.
             # A point without an opposite feels none: a traction there would be left over.
-            felt = np.array([contact.at_points(mode) for mode in self.of_bodies[b]])
+            felt = np.array([operator.jump(mode) for mode in self.of_bodies[b]])
             there = contact.paired & ((own != b) | (np.abs(felt[0, :, 0]) < 0.5))
             travels[b] = np.where(there[:, None], felt, travels[b])
         if compat.geometry_element(space.mesh).degree > space.ufl_element().degree:
@@ -191,37 +191,38 @@ class RigidMotions:
         ]
         return " with ".join(terms)
 
-    def held(self, contacts: Sequence[Contact]) -> bool:
+    def held(self, operators: Sequence[ContactOperator]) -> bool:
         """Whether the points that are closed now hold every free motion. Collective.
 
         Args:
-            contacts: Evaluated contacts.
+            operators: Of evaluated contacts, over all unknowns.
         """
         if not len(self.free):
             return True
-        bearing, pairings = [], [c.pairings for c in contacts]
-        for contact in contacts:
+        bearing = []
+        for contact in (operator.contact for operator in operators):
             closed = contact.status != Status.OPEN
             bearing.append(closed)
             if contact.law.has_tangential:
                 bearing.append(closed & (contact.values["grip"] > 0))
         # What holds a body still does with more of Γc closed: no need to look again.
-        known = self._holding[1] if self._holding[0] == pairings else []
+        same = bool(self._holding) and all(operator in self._holders for operator in operators)
+        known = self._holding if same else []
         lacks = [np.any(was & ~now) for was, now in zip(known, bearing, strict=bool(known))]
         if self._comm.allreduce(not known or any(lacks)) == 0:
             return True
-        held = not self._loose(contacts, closed_only=True).size
+        held = not self._loose(operators, closed_only=True).size
         if held:
-            self._holding = pairings, bearing
+            self._holding, self._holders = bearing, weakref.WeakSet(operators)
         return held
 
-    def check_held(self, contacts: Sequence[Contact]) -> None:
+    def check_held(self, operators: Sequence[ContactOperator]) -> None:
         """Refuse a free motion that no contact feels, even if all of Γc were closed. Collective.
 
         Raises:
             ValueError: It names the motion.
         """
-        loose = self._loose(contacts, closed_only=False)
+        loose = self._loose(operators, closed_only=False)
         if loose.size:
             motions = "; ".join(self._describe(row) for row in loose)
             raise ValueError(
@@ -229,13 +230,13 @@ class RigidMotions:
                 "Dirichlet condition on it, or friction"
             )
 
-    def _loose(self, contacts: Sequence[Contact], closed_only: bool) -> Array:
+    def _loose(self, operators: Sequence[ContactOperator], closed_only: bool) -> Array:
         """Free motions that no contact feels, (n_loose, n_modes). Collective."""
         n_free = len(self.free)
         gram, area = np.zeros((n_free, n_free)), 0.0
-        for contact in contacts:
-            values = contact.values
-            modes = self._at_points(contact)
+        for operator in operators:
+            contact, values = operator.contact, operator.contact.values
+            modes = self._at_points(operator)
             along = np.einsum("mqd,qd->mq", modes, values["normal"])
             weights = contact.quadrature.weights
             if closed_only:
@@ -255,12 +256,12 @@ class RigidMotions:
         """Work of forces at this rank's unknowns on the free motions, (n_free,). Collective."""
         return global_sum(self._comm, self._free_fields @ forces)
 
-    def approach(self, load: Array, contacts: Sequence[Contact]) -> Array | None:
+    def approach(self, load: Array, operators: Sequence[ContactOperator]) -> Array | None:
         """Rigid motion to first touch, where the load sets free bodies moving. Collective.
 
         Args:
             load: External forces at this rank's unknowns (force).
-            contacts: Evaluated contacts, all of them open.
+            operators: Of evaluated contacts, all of them open, over all unknowns.
 
         Returns:
             What to add to the unknowns, or None: nothing moves, or it meets nothing.
@@ -275,16 +276,16 @@ class RigidMotions:
         coefficients = agreed(self._comm, np.linalg.solve(mass, drive))
         coefficients /= np.abs(coefficients).max()
         way = np.inf
-        for contact in contacts:
-            values = contact.values
-            jump = np.tensordot(coefficients, self._at_points(contact), axes=1)
+        for operator in operators:
+            values = operator.contact.values
+            jump = np.tensordot(coefficients, self._at_points(operator), axes=1)
             closing = np.einsum("qd,qd->q", jump, values["normal"])
             nearing = closing > _FELT
             ways = values["opening"][nearing] / closing[nearing]
             way = min(way, global_min(self._comm, ways, empty=np.inf))
         return None if way == np.inf else way * coefficients @ free
 
-    def check_balance(self, load: Array, contacts: Sequence[Contact]) -> None:
+    def check_balance(self, load: Array, operators: Sequence[ContactOperator]) -> None:
         """Refuse a load whose resultant no admissible contact forces can balance. Collective.
 
         The contact may push anywhere on Γc, and rub within the friction cone: a necessary
@@ -293,7 +294,7 @@ class RigidMotions:
 
         Args:
             load: External forces at this rank's unknowns (force).
-            contacts: Evaluated contacts.
+            operators: Of evaluated contacts, over all unknowns.
 
         Raises:
             ValueError: It gives the resultant and the motion.
@@ -304,10 +305,11 @@ class RigidMotions:
         resultant = global_sum(self._comm, free @ load)
         # What the load could do at most, were all of it along the motion: the scale of "zero".
         size = float(global_sum(self._comm, np.abs(free) @ np.abs(load)).max())
-        for contact in contacts:
+        contacts = [operator.contact for operator in operators]
+        for operator, contact in zip(operators, contacts, strict=True):
             if not contact.law.has_normal_stiffness:  # a prescribed normal traction is a load
                 force = -contact.values["parameter pressure"][:, None] * contact.values["normal"]
-                work = np.einsum("mqd,qd,q->m", self._at_points(contact), force, contact.measure)
+                work = np.einsum("mqd,qd,q->m", self._at_points(operator), force, contact.measure)
                 resultant += global_sum(self._comm, work)
         if np.abs(resultant).max() <= _BALANCED * size:
             return
@@ -319,7 +321,7 @@ class RigidMotions:
         known = len(data) == len(self._balanced) and all(map(_alike, data, self._balanced))
         if self._comm.allreduce(not known) == 0:
             return
-        rays = np.concatenate([self._rays(contact) for contact in contacts], axis=0)
+        rays = np.concatenate([self._rays(operator) for operator in operators], axis=0)
         # Unit columns: a ray's length has no meaning, and badly scaled ones spoil the solution. One
         # of rounding only, such as that of tangential forces on a motion across them, is none.
         length = np.linalg.norm(rays, axis=1)
@@ -348,9 +350,9 @@ class RigidMotions:
             )
         self._balanced = data
 
-    def _rays(self, contact: Contact) -> Array:
+    def _rays(self, operator: ContactOperator) -> Array:
         """Generalised forces of every admissible direction at every point: (n_rays, n_free)."""
-        values = contact.values
+        contact, values = operator.contact, operator.contact.values
         normal = values["normal"]
         d = normal.shape[1]
         directions = []
@@ -371,7 +373,7 @@ class RigidMotions:
             directions.append(-normal)
         if law.has_tension:
             directions.append(normal)
-        modes = self._at_points(contact)
+        modes = self._at_points(operator)
         rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
         return gather_rows(self._comm, np.concatenate(rays).reshape(-1, len(self.free)))
 

@@ -16,6 +16,7 @@ from fenics_contact.bodies import connected_bodies
 from fenics_contact.bulk import Bulk
 from fenics_contact.contact import Contact
 from fenics_contact.energy import Forces
+from fenics_contact.operators import ContactOperator, contact_operators
 from fenics_contact.unknowns import Unknowns
 
 __all__ = ["WholeSpace"]
@@ -56,7 +57,7 @@ class WholeSpace:
         contacts: Sequence[Contact],
         constrained: Mask,
     ) -> None:
-        """Take over the parts of a problem; contacts speak of these unknowns from now on."""
+        """Take over the parts of a problem. Collective."""
         self.u, self.unknowns, self.bulk = u, unknowns, bulk
         self.contacts, self.constrained = contacts, constrained
         self.motions = [c for contact in contacts for c in contact.free_motion.values()]
@@ -71,14 +72,15 @@ class WholeSpace:
         self._near_nullspace: PETSc.NullSpace | None = None
         self.mark: object = WholeSpace
         self._contact_vector = unknowns.vector()
-        self.enter()
+        self._operators: tuple[list[int], list[ContactOperator]] | None = None
 
-    def enter(self) -> None:
-        """Let the contacts speak of the unknowns of this space. Collective."""
-        first = 0
-        for contact in self.contacts:
-            contact.set_unknowns(self.unknowns, first)
-            first += len(contact.free_motion)
+    @property
+    def operators(self) -> list[ContactOperator]:
+        """What the contacts are over these unknowns, with the pairs as they are. Collective."""
+        pairings = [c.pairings for c in self.contacts]
+        if self._operators is None or self._operators[0] != pairings:
+            self._operators = pairings, contact_operators(self.contacts, self.unknowns)
+        return self._operators[1]
 
     def _label_unknowns(self) -> None:
         """Tell bodies and free supports apart. Collective."""
@@ -91,14 +93,14 @@ class WholeSpace:
 
     @property
     def parts(self) -> Parts:
-        """What has to be in balance, for the present pairs; the space is entered. Collective."""
+        """What has to be in balance, for the present pairs. Collective."""
         pairings = [c.pairings for c in self.contacts]
         if self._parts is None or self._parts[0] != pairings:
             moving = [(n, i) for n, c in enumerate(self.contacts) for i in c.free_motion]
             n = self.n_bodies - len(moving)
             bodies = [f"body {b + 1}" if n > 1 else "the body" for b in range(n)]
             bodies += [f"support of {self.contacts[c].name} along {'xyz'[i]}" for c, i in moving]
-            touched = [c.felt_unknowns() for c in self.contacts]
+            touched = [operator.touched for operator in self.operators]
             names = [c.name for c in self.contacts]
             parts = Parts(
                 self.unknowns.comm, self.label, bodies, names, touched, [c for c, _ in moving]
@@ -181,9 +183,9 @@ class WholeSpace:
     def contact_forces(self) -> list[Array]:
         """Parts of the residual at the present state by contact, (n_local,) each. Collective."""
         forces = []
-        for contact in self.contacts:
+        for operator in self.operators:
             self._contact_vector.set(0.0)
-            contact.add_force(self._contact_vector)
+            operator.add_force(self._contact_vector)
             forces.append(self._contact_vector.array_r.copy())
         return forces
 
@@ -216,9 +218,9 @@ class WholeSpace:
         """
         different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
         matrix = stiffness.copy()
-        for contact in self.contacts:
-            if contact.couples:
-                part = contact.stiffness_matrix(1.0, 1.0)
+        for operator in self.operators:
+            if operator.contact.couples:
+                part = operator.springs(operator.contact.springs(1.0, 1.0))
                 matrix.axpy(1.0, part, different)
                 part.destroy()
         matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)

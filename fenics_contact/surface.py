@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from numbers import Integral
 
 import basix.ufl
@@ -180,10 +181,21 @@ class SurfaceQuadrature:
         self._cell = surface.submesh.topology.cell_name()
         self._points_and_weights = _vertex_rule(self._cell) if scheme == "vertex" else None
         space = self.space()
-        form = compat.compile_form(ufl.TestFunction(space) * self.ds, surface.entity_maps)
-        self._weights_with_ghosts = _assemble(form, la.vector(space.dofmap.index_map, 1))
+        self._weights_with_ghosts = self._weigh(self.ds)
         self.n_points = space.dofmap.index_map.size_local
         self.weights = self._weights_with_ghosts[: self.n_points]
+
+    def _weigh(self, measure: ufl.Measure) -> npt.NDArray[np.float64]:
+        """Weight times Jacobian of all points that this rank knows. Collective."""
+        space = self.space()
+        form = compat.compile_form(ufl.TestFunction(space) * measure, self.surface.entity_maps)
+        return _assemble(form, la.vector(space.dofmap.index_map, 1))
+
+    @cached_property
+    def _on_submesh(self) -> tuple[ufl.Measure, npt.NDArray[np.float64]]:
+        """The measure of Γc as a mesh of its own, and `_weigh` by it. Collective."""
+        measure = ufl.Measure("dx", self.surface.submesh, metadata=self.ds.metadata())
+        return measure, self._weigh(measure)
 
     @staticmethod
     def default_degree(element_degree: int) -> int:
@@ -296,16 +308,25 @@ class PointEvaluator:
     By assembly, ∫ e q ds / ∫ q ds with q the test function of the quadrature space: exact for any
     orientation of the facets, which the evaluation of expressions on facets is not in every
     release of DOLFINx.
+
+    Attributes:
+        form: What is assembled (UFL).
     """
 
     def __init__(
-        self, quadrature: SurfaceQuadrature, expressions: dict[str, ufl.core.expr.Expr]
+        self,
+        quadrature: SurfaceQuadrature,
+        expressions: Mapping[str, ufl.core.expr.Expr],
+        *,
+        by_points: bool = False,
     ) -> None:
         """Compile the form. Collective.
 
         Args:
             quadrature: The points.
             expressions: Scalars and vectors by name.
+            by_points: Whether they are of functions at the points and of nothing else: then the
+                form knows Γc alone, and is the same on all bodies with facets of this kind.
         """
         components: list[ufl.core.expr.Expr] = []
         self._columns: dict[str, int | slice] = {}
@@ -321,12 +342,13 @@ class PointEvaluator:
         self._size = len(components)
         space = quadrature.space(self._size)
         test = ufl.TestFunction(space)
-        self._form = compat.compile_form(
-            ufl.inner(ufl.as_vector(components), test) * quadrature.ds,
-            quadrature.surface.entity_maps,
-        )
+        measure, self._weights = quadrature.ds, quadrature._weights_with_ghosts
+        if by_points:
+            measure, self._weights = quadrature._on_submesh
+        self.form = ufl.inner(ufl.as_vector(components), test) * measure
+        maps = None if by_points else quadrature.surface.entity_maps
+        self._compiled = compat.compile_form(self.form, maps)
         self._vector = la.vector(space.dofmap.index_map, self._size)
-        self._weights = quadrature._weights_with_ghosts
         self._n_owned = quadrature.n_points
 
     def __call__(self) -> dict[str, npt.NDArray[np.float64]]:
@@ -334,7 +356,7 @@ class PointEvaluator:
 
         The arrays are copies.
         """
-        weighted = _assemble(self._form, self._vector).reshape(-1, self._size)
+        weighted = _assemble(self._compiled, self._vector).reshape(-1, self._size)
         with np.errstate(invalid="ignore", divide="ignore"):
             values = weighted / self._weights[:, None]
         return {name: values[: self._n_owned, c].copy() for name, c in self._columns.items()}

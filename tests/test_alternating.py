@@ -129,7 +129,6 @@ def test_the_residual_is_the_gradient_of_the_energy(cell, condensation):
     problem.commit()
     contact.freeze(contact.pressure)
     space = problem._space
-    space.enter()
     x = problem._solution.copy()
     f, y, z = x.duplicate(), x.duplicate(), x.duplicate()
     direction = fem.Function(scene.u.function_space)

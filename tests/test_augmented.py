@@ -284,18 +284,19 @@ def test_force_and_tangent_with_multipliers(law: str) -> None:
     base.interpolate(lambda x: size * wave(d, 1)(x))
     way.interpolate(wave(d, 2))
     n = u.function_space.dofmap.index_map.size_local * d
+    operator = fc.ContactOperator(contact)
 
     def at(t: float) -> tuple[np.ndarray, float]:
         u.x.array[:] = base.x.array + t * way.x.array
-        force = contact._unknowns.vector()
-        contact.add_force(force)
+        force = operator.unknowns.vector()
+        operator.add_force(force)
         energy = COMM.allreduce(contact.energy()) if contact.law.has_potential else 0.0
         return force.array.copy(), energy
 
     step = 1e-6 * size
     (f1, e1), (f0, e0) = at(step), at(-step)
     force, _ = at(0.0)
-    tangent = contact.tangent_matrix()
+    tangent = operator.tangent()
     right, left = tangent.createVecs()
     right.array[:] = way.x.array[:n]
     tangent.mult(right, left)

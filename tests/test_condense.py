@@ -59,11 +59,11 @@ def test_schur_complement(cell, degree, symmetric):
         scene.F += ufl.dot(fem.Constant(scene.mesh, turn) * scene.u, v) * ufl.dx(scene.mesh)
     aside = fem.Constant(scene.mesh, 0.01)
     bcs = [scene.hold(LEFT, i, aside) for i in range(scene.dim)]
-    problem, contact = scene.problem(fc.Frictionless(), bcs)
+    problem, _ = scene.problem(fc.Frictionless(), bcs)
     assert problem.bulk.symmetric == symmetric
     K = dense(problem.bulk.stiffness)
     n = len(K)
-    kept = touched([contact], problem.unknowns)
+    kept = touched(problem.operators, problem.unknowns)
     # All components of all nodes of the bottom, no others.
     y = scene.u.function_space.tabulate_dof_coordinates()[:, scene.dim - 1]
     assert np.array_equal(kept, np.flatnonzero(np.repeat(np.abs(y) < 1e-12, scene.dim)))

@@ -223,7 +223,7 @@ def check_shape(scene: Scene, state: State, law: str, r: np.ndarray, tangent: PE
     + [("tetrahedron", "coulomb, ellipse"), ("hexahedron", "coulomb, polygon")],
 )
 def test_stiffness_is_the_tangent_of_closed_and_sticking(cell, law):
-    """`stiffness_matrix` with full shares equals the consistent tangent where all points stick.
+    """The springs with full shares equal the consistent tangent where all points stick.
 
     Round-off: two ways of summing the same products.
     """
@@ -233,7 +233,7 @@ def test_stiffness_is_the_tangent_of_closed_and_sticking(cell, law):
     v, du = ufl.TestFunction(scene.space), ufl.TrialFunction(scene.space)
     tangent = assemble_matrix(compiled(scene.contact.tangent(v, du), scene.contact))
     scene.contact.evaluate()
-    stiffness = scene.contact.stiffness_matrix(1.0, 1.0)
+    stiffness = fc.ContactOperator(scene.contact).springs(scene.contact.springs(1.0, 1.0))
     size = tangent.norm()
     stiffness.axpy(-1.0, tangent, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
     assert size > 1.0 and stiffness.norm() <= 1e-13 * size

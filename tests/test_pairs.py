@@ -88,7 +88,7 @@ def nodal(contact):
     """Contact's forces at the nodes of this rank and where these are, (n, d) each."""
     space = contact.u.function_space
     force = fem.Function(space)
-    contact.add_force(force.x.petsc_vec)
+    fc.ContactOperator(contact).add_force(force.x.petsc_vec)
     d, n = len(contact.u), space.dofmap.index_map.size_local
     return -force.x.array.reshape(-1, d)[:n], space.tabulate_dof_coordinates()[:n, :d]
 

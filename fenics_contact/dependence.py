@@ -1,0 +1,45 @@
+"""What a form depends on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+__all__ = ["Dependence"]
+
+
+class Dependence:
+    """Whether any of the numbers that a form depends on was changed since they were last noted."""
+
+    def __init__(
+        self, constants: Sequence[fem.Constant], coefficients: Sequence[fem.Function]
+    ) -> None:
+        """Nothing is noted yet.
+
+        Args:
+            constants: Of the form.
+            coefficients: Of the form, without those that may change as they will.
+        """
+        # Views stay valid as long as what they are of.
+        self._owners = (tuple(constants), tuple(coefficients))
+        self._views = [np.ravel(c.value) for c in constants] + [f.x.array for f in coefficients]
+        self._noted: npt.NDArray[np.float64] | None = None
+
+    @property
+    def changed(self) -> bool:
+        """Whether a number is another one than noted, on this rank; True if none was noted."""
+        return self._noted is None or not np.array_equal(self._numbers(), self._noted)
+
+    def note(self) -> None:
+        """Note the numbers as they are now."""
+        self._noted = self._numbers()
+
+    def forget(self) -> None:
+        """Have nothing noted: for while what depends on them is not complete."""
+        self._noted = None
+
+    def _numbers(self) -> npt.NDArray[np.float64]:
+        return np.concatenate(self._views) if self._views else np.zeros(0)
