@@ -114,7 +114,8 @@ class Bulk:
         self.scale = diagonal.norm(PETSc.NormType.NORM_INFINITY)
         self.symmetric = self._is_symmetric(diagonal)
         diagonal.destroy()
-        self._dependence.note()
+        if self.linear:
+            self._dependence.note()
         return True
 
     @contextmanager

@@ -84,7 +84,10 @@ def block_mesh(
 
 
 def layers(cell: str) -> Callable:
-    """A partitioner for boxes one cell wide: the layers of cells, from the bottom, rank by rank."""
+    """A partitioner that gives every rank its share of the cells in their order.
+
+    Of boxes one cell wide these are layers, from the bottom.
+    """
     n_vertices = 4 if cell == "quadrilateral" else 8
 
     def partition(comm: MPI.Comm, n_parts: int, cell_types: Any, cells: Any) -> Any:
