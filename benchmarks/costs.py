@@ -21,8 +21,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from fenics_contact import linear
-from fenics_contact.surface import PointEvaluator
+from fenics_contact.surface.surface import PointEvaluator
+from fenics_contact.systems import linear
 
 YARDSTICK = "one linear solve"
 PLAIN = {"direct": "plain DOLFINx, LU", "multigrid": "plain DOLFINx, GMRES + GAMG"}

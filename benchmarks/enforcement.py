@@ -33,7 +33,7 @@ from problems import Body
 
 import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic
-from fenics_contact.surface import PointEvaluator
+from fenics_contact.surface.surface import PointEvaluator
 
 PENALTIES = (1.0, 10.0, 100.0, 1e3, 1e4, 1e6)
 NITSCHE = {

@@ -49,7 +49,7 @@ from tqdm import tqdm
 
 import fenics_contact as fc
 from fenics_contact import plotting
-from fenics_contact.accuracy import PRESETS
+from fenics_contact.contact.accuracy import PRESETS
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"

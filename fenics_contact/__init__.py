@@ -3,32 +3,28 @@
 import fenics_contact.compat  # noqa: F401  # first: it refuses releases that are too old
 from fenics_contact import elasticity
 from fenics_contact._version import __version__
-from fenics_contact.accuracy import Accuracy
-from fenics_contact.adaptation import Level, adapt
-from fenics_contact.contact import Contact, Resultants, Status
-from fenics_contact.errors import ErrorBudget, estimate_errors
-from fenics_contact.laws import (
-    Coulomb,
-    Foundation,
-    FrictionLaw,
-    Frictionless,
-    Kinematics,
-    Law,
-    Response,
-    Scaled,
-    Springs,
-    Tresca,
-)
-from fenics_contact.operators import ContactOperator
-from fenics_contact.pairing import DeformableBody
+from fenics_contact.checks.verdict import Balance, NotConverged, Verdict
+from fenics_contact.contact.accuracy import Accuracy
+from fenics_contact.contact.contact import Contact, Resultants, Status
+from fenics_contact.estimates.adaptation import Level, adapt
+from fenics_contact.estimates.errors import ErrorBudget, estimate_errors
+from fenics_contact.histories import checkpoint
+from fenics_contact.histories.increments import increments
+from fenics_contact.laws.base import Kinematics, Law, Response
+from fenics_contact.laws.friction import Coulomb, FrictionLaw, Tresca
+from fenics_contact.laws.stiffness import Scaled, Springs
+from fenics_contact.laws.unilateral import Foundation, Frictionless
 from fenics_contact.problem import ContactProblem, Step
-from fenics_contact.stepping import increments
-from fenics_contact.supports import Ball, Cylinder, HalfSpace, Motion, Obstacle
-from fenics_contact.surface import ContactSurface
-from fenics_contact.verdict import NotConverged, Verdict
+from fenics_contact.results import output, plotting
+from fenics_contact.supports.base import Motion, Placement, Support
+from fenics_contact.supports.deformable import DeformableBody
+from fenics_contact.supports.rigid import Ball, Cylinder, HalfSpace, Obstacle
+from fenics_contact.surface.surface import ContactSurface
+from fenics_contact.systems.operator import ContactOperator
 
 __all__ = [
     "Accuracy",
+    "Balance",
     "Ball",
     "Contact",
     "ContactOperator",
@@ -48,17 +44,22 @@ __all__ = [
     "Motion",
     "NotConverged",
     "Obstacle",
+    "Placement",
     "Response",
     "Resultants",
     "Scaled",
     "Springs",
     "Status",
     "Step",
+    "Support",
     "Tresca",
     "Verdict",
     "__version__",
     "adapt",
+    "checkpoint",
     "elasticity",
     "estimate_errors",
     "increments",
+    "output",
+    "plotting",
 ]

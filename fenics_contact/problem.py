@@ -16,15 +16,14 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact import accuracy, compat, dense, linear
-from fenics_contact.alternating import Alternation
+from fenics_contact import compat
 from fenics_contact.arguments import check_instance, is_number, listed
-from fenics_contact.balance import Norms
-from fenics_contact.bulk import Bulk
-from fenics_contact.callbacks import Callbacks, interrupts_held, release_interrupt
-from fenics_contact.chattering import StatusWatch
-from fenics_contact.condense import CondensedSpace, touched, worthwhile
-from fenics_contact.contact import (
+from fenics_contact.checks.chattering import StatusWatch
+from fenics_contact.checks.energy import Energy, EnergyState
+from fenics_contact.checks.kinematics import Linearisation, linearisation
+from fenics_contact.checks.rigid_motions import RigidMotions
+from fenics_contact.checks.verdict import Attempt, Balance, NotConverged, Verdict, check_laws
+from fenics_contact.contact.contact import (
     Contact,
     Found,
     Resultants,
@@ -32,18 +31,22 @@ from fenics_contact.contact import (
     displacement_degree,
     passing,
 )
-from fenics_contact.continuation import Continuation
-from fenics_contact.defaults import Defaults, take_command_line
-from fenics_contact.energy import Energy, EnergyState, Forces
-from fenics_contact.facets import facet_cells, local_facets
-from fenics_contact.motion import Linearisation, linearisation
-from fenics_contact.operators import ContactOperator
+from fenics_contact.methods.alternating import Alternation
+from fenics_contact.methods.callbacks import Callbacks, interrupts_held, release_interrupt
+from fenics_contact.methods.continuation import Continuation
+from fenics_contact.methods.options import Defaults, take_command_line
+from fenics_contact.methods.quasi_newton import QuasiNewton
 from fenics_contact.parallel import fail_together, global_max, global_min, global_sum, warn
-from fenics_contact.quasi_newton import QuasiNewton
-from fenics_contact.rigid import RigidMotions
-from fenics_contact.spaces import WholeSpace
-from fenics_contact.unknowns import Selection, Unknowns
-from fenics_contact.verdict import Balance, NotConverged, Rung, Verdict, check_laws
+from fenics_contact.surface.facets import facet_cells, local_facets
+from fenics_contact.surface.modulus import cell_modulus
+from fenics_contact.systems import dense, linear
+from fenics_contact.systems.balance import Norms
+from fenics_contact.systems.bulk import Bulk
+from fenics_contact.systems.condensed import CondensedSystem, touched, worthwhile
+from fenics_contact.systems.forces import Forces
+from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.systems.unknowns import Selection, Unknowns
 
 __all__ = ["ContactProblem", "Step"]
 
@@ -133,7 +136,7 @@ class Step:
         verdict: The independent check.
         contacts: Resultants of every contact, by name.
         energy: Works and energies of the increment.
-        rungs: Everything that was tried, in its order; the last is what found the solution.
+        attempts: Everything that was tried, in its order; the last is what found the solution.
         wall_seconds: Time of the solve on this rank.
         load: Load parameter, where `increments` set one.
         increment_error: Errors by the size of the increments so far, by quantity, where
@@ -151,7 +154,7 @@ class Step:
     verdict: Verdict
     contacts: dict[str, Resultants]
     energy: Energy
-    rungs: tuple[Rung, ...]
+    attempts: tuple[Attempt, ...]
     wall_seconds: float
     load: float | None = None
     increment_error: dict[str, float] | None = None
@@ -301,14 +304,14 @@ class ContactProblem:
         self._n_owned = self.unknowns.n_dofs
         self._constrained = self._constrained_unknowns()
         self._check_contacts()
-        self._whole = WholeSpace(u, self.unknowns, self.bulk, self.contacts, self._constrained)
+        self._whole = FullSystem(u, self.unknowns, self.bulk, self.contacts, self._constrained)
 
         self.bulk.check_finite()
         self.bulk.update()
         self.bulk.check_elastic()
         waiting = [c for c in self.contacts if c.needs_modulus]
         if waiting:
-            modulus = accuracy.cell_modulus(self.bulk.tangent_form, u, waiting[0].weight)
+            modulus = cell_modulus(self.bulk.tangent_form, u, waiting[0].weight)
             for contact in waiting:
                 contact.set_modulus(modulus)
         self.motions = RigidMotions(u.function_space, self.unknowns, self._motion_names())
@@ -329,7 +332,7 @@ class ContactProblem:
         forces: dict[object, Forces] = {self._whole.mark: Forces.none(self._committed)}
         self._energy = self._committed_energy = EnergyState.unloaded(forces, self.contacts)
         # What the present and the committed state need to be completed, and their loads.
-        self._behind: Array | None = None
+        self._pending_field: Array | None = None
         self._committed_lag: tuple[Array | None, Array] = None, self._load
         self._rate: Array | None = None
         self._solved: _Solved | None = None
@@ -556,7 +559,7 @@ class ContactProblem:
         self._space = self._whole
         if self._condensed:
             kept = touched(self.operators, self.unknowns) if kept is None else kept
-            self._space = CondensedSpace(
+            self._space = CondensedSystem(
                 self._whole, Selection(self.unknowns, kept), prefix=self.prefix + "interior_"
             )
             logger.info("condensed onto %d of %d unknowns", kept.size, self.unknowns.n_local)
@@ -649,7 +652,7 @@ class ContactProblem:
         total = float(global_sum(self._comm, energy))
         return total / (self.bulk.scale * self._length**2)
 
-    def _measure_norms(self, space: WholeSpace, total: Array, contacts: Sequence[Array]) -> None:
+    def _measure_norms(self, space: FullSystem, total: Array, contacts: Sequence[Array]) -> None:
         """Norms of residual and forces at the present state. Collective."""
         self._norms = space.parts.norms(
             total,
@@ -844,7 +847,7 @@ class ContactProblem:
         """
         start = time.perf_counter()
         self._fresh = False
-        saved = self._whole.state(), self._load, self._behind, self._energy
+        saved = self._whole.state(), self._load, self._pending_field, self._energy
         try:
             # A trial of a line search may overflow, and the convergence test and the verdict see
             # it: a warning, on the rank that has the point, must not become an error there alone.
@@ -853,7 +856,7 @@ class ContactProblem:
                 release_interrupt()
         except BaseException as error:
             fail_together(self._comm, error)
-            state, self._load, self._behind, self._energy = saved
+            state, self._load, self._pending_field, self._energy = saved
             self._whole.set_state(state)
             for contact in self.contacts:
                 contact.restore()
@@ -867,7 +870,9 @@ class ContactProblem:
 
     def _solve(self, start: float, ahead: float, field: bool) -> Step:
         pairings = [c.pairings for c in self.contacts]
-        if self._behind is not None and not (self.bulk.is_current() and pairings == self._pairings):
+        if self._pending_field is not None and not (
+            self.bulk.is_current() and pairings == self._pairings
+        ):
             self.complete()  # what it takes is about to go
         self._check_before()
         for bc in self._bcs:
@@ -881,35 +886,37 @@ class ContactProblem:
         self._whole.reach = self._space.reach = _REACH * self._imposed
         self._space.begin(self._load)
         self._start_terms = np.zeros_like(self._start_terms)
-        reason, rungs, rounds = self._enforce(ahead, stiffness_changed)
+        reason, attempts, rounds = self._enforce(ahead, stiffness_changed)
         lags = not field and self._may_lag()
         judge = self._judge_kept if lags else self._judge_all
         verdict = judge(kinematics=reason > 0)  # a solver that failed may have no factors for it
         if reason <= 0 or verdict.failures:
-            raise self._not_converged(reason, verdict, rungs)
+            raise self._not_converged(reason, verdict, attempts)
         energy = self._energy.since(self._committed_energy, self.contacts, self._comm)
         verdict = replace(verdict, created=energy.created)
         if verdict.failures:
-            raise self._not_converged(reason, verdict, rungs)
+            raise self._not_converged(reason, verdict, attempts)
         self._warn_of_large_motion(verdict)
         self._solved = _Solved(self._whole.state(), [c.found() for c in self.contacts])
         return Step(
             increment=self.increment + 1,
             reason=reason,
-            iterations=sum(rung.iterations for rung in rungs),
+            iterations=sum(attempt.iterations for attempt in attempts),
             rounds=rounds,
-            method=rungs[-1].method,
+            method=attempts[-1].method,
             factorisations=self._factorisations,
             verdict=verdict,
             contacts={c.name: c.resultants() for c in self.contacts},
             energy=energy,
-            rungs=tuple(rungs),
+            attempts=tuple(attempts),
             wall_seconds=time.perf_counter() - start,
             complete=not lags,
         )
 
-    def _not_converged(self, reason: int, verdict: Verdict, rungs: Sequence[Rung]) -> NotConverged:
-        return NotConverged(self.increment + 1, reason, verdict, rungs, prefix=self.prefix)
+    def _not_converged(
+        self, reason: int, verdict: Verdict, attempts: Sequence[Attempt]
+    ) -> NotConverged:
+        return NotConverged(self.increment + 1, reason, verdict, attempts, prefix=self.prefix)
 
     def _may_lag(self) -> bool:
         """Whether u can stay behind: energies and pairs must be found without it. Collective."""
@@ -933,11 +940,11 @@ class ContactProblem:
         Raises:
             NotConverged: The equations do not hold on all of u.
         """
-        if self._behind is None:
+        if self._pending_field is None:
             return None
-        committed = self._committed_lag[0] is self._behind
-        self._space.complete(self._behind)
-        self._behind = None
+        committed = self._committed_lag[0] is self._pending_field
+        self._space.complete(self._pending_field)
+        self._pending_field = None
         state, image = self.unknowns.vector(), self.unknowns.vector()
         state.array[:] = self._whole.state()
         self._bulk_matrix.mult(state, image)
@@ -959,7 +966,7 @@ class ContactProblem:
             raise NotConverged(number, reason, verdict, prefix=self.prefix)
         return verdict
 
-    def _enforce(self, ahead: float, stiffness_changed: bool) -> tuple[int, list[Rung], int]:
+    def _enforce(self, ahead: float, stiffness_changed: bool) -> tuple[int, list[Attempt], int]:
         """Solve, let multipliers take over what the springs bear, and again. Collective.
 
         Returns:
@@ -968,19 +975,21 @@ class ContactProblem:
         augmented = [c for c in self.contacts if c.multipliers is not None]
         if not augmented:
             return *self._iterate(ahead, stiffness_changed), 1
-        rungs: list[Rung] = []
+        attempts: list[Attempt] = []
         exact = False
         # The first solutions need not be better than the multipliers they are found with.
         self._round_rtol = _FIRST_ROUND
         try:
             for number in range(1, _MAX_ROUNDS + 1):
                 reason, tried = self._iterate(ahead, stiffness_changed)
-                for rung in tried:
-                    last = rungs[-1] if rungs else None
-                    if last and (last.method, last.outcome) == (rung.method, rung.outcome):
-                        rungs[-1] = replace(rung, iterations=last.iterations + rung.iterations)
+                for attempt in tried:
+                    last = attempts[-1] if attempts else None
+                    if last and (last.method, last.outcome) == (attempt.method, attempt.outcome):
+                        attempts[-1] = replace(
+                            attempt, iterations=last.iterations + attempt.iterations
+                        )
                     else:
-                        rungs.append(rung)
+                        attempts.append(attempt)
                 if reason <= 0:
                     break
                 for contact in augmented:
@@ -999,15 +1008,15 @@ class ContactProblem:
                         contact.augment()
         finally:
             self._round_rtol = 0.0
-        return reason, rungs, number
+        return reason, attempts, number
 
-    def _iterate(self, ahead: float, stiffness_changed: bool) -> tuple[int, list[Rung]]:
+    def _iterate(self, ahead: float, stiffness_changed: bool) -> tuple[int, list[Attempt]]:
         """Iterate from one start after another, then by continuation. Collective.
 
         Returns:
             Reason, and what was tried.
         """
-        reason, rungs = int(PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE), []
+        reason, attempts = int(PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE), []
         factored = self._predicts
         starts = [start / self._length for start in self._starts(ahead)]
         tries = [(start, self._method) for start in starts]
@@ -1022,16 +1031,16 @@ class ContactProblem:
             self._solution.array[:] = start
             self._watch.start()
             iterations, reason = self._solve_by(method, stiffness_changed)
-            rungs.append(Rung(method, iterations, self._outcome(reason)))
+            attempts.append(Attempt(method, iterations, self._outcome(reason)))
             if reason > 0:
                 break
             if self._comm.rank == 0:
-                logger.info("increment %d: %s", self.increment + 1, rungs[-1])
+                logger.info("increment %d: %s", self.increment + 1, attempts[-1])
         self._set_u(self._solution)
         newton = method not in ("alternating", "continuation") and not self._quasi_newton
-        made = sum(rung.iterations for rung in rungs[-1:])
+        made = sum(attempt.iterations for attempt in attempts[-1:])
         self._predicts = reason > 0 and newton and (factored or made > 0)
-        return int(reason), rungs
+        return int(reason), attempts
 
     def _solve_by(self, method: str, stiffness_changed: bool) -> tuple[int, int]:
         """Iterations and reason of one method, from ``_solution``. Collective."""
@@ -1050,7 +1059,7 @@ class ContactProblem:
         self._make_matrices()
 
     def _outcome(self, reason: int) -> str:
-        """What became of a rung, in words. Collective."""
+        """What became of a attempt, in words. Collective."""
         if reason > 0:
             return "converged"
         words = _OUTCOMES.get(reason, f"SNES reason {reason}")
@@ -1168,8 +1177,8 @@ class ContactProblem:
 
     def _judge_all(self, *, kinematics: bool) -> Verdict:
         """Complete u and judge by assembly, past SNES and its residual. Collective."""
-        self._space.complete(self._space.behind)
-        self._behind = None
+        self._space.complete(self._space.pending_field)
+        self._pending_field = None
         for contact in self.contacts:
             contact.evaluate()
         bulk = self._whole.with_supports(self.bulk.assemble_residual())
@@ -1182,7 +1191,7 @@ class ContactProblem:
 
     def _judge_kept(self, *, kinematics: bool) -> Verdict:
         """Judge the condensed equations; u stays behind. One rank only."""
-        self._behind = self._space.behind
+        self._pending_field = self._space.pending_field
         for contact in self.contacts:
             contact.evaluate()
         bulk = self._space.bulk_force()
@@ -1196,7 +1205,7 @@ class ContactProblem:
         return self._space.forces(bulk, np.where(self._space.constrained, bulk + contact, 0.0))
 
     def _judge(
-        self, space: WholeSpace, bulk: Array, *, laws: bool = True, kinematics: bool = False
+        self, space: FullSystem, bulk: Array, *, laws: bool = True, kinematics: bool = False
     ) -> tuple[Verdict, Array]:
         """Recompute residual, balance and laws at evaluated contacts. Collective.
 
@@ -1318,7 +1327,7 @@ class ContactProblem:
                 )
 
     def _force_sums(
-        self, space: WholeSpace, internal: Array, forces: Sequence[Array]
+        self, space: FullSystem, internal: Array, forces: Sequence[Array]
     ) -> tuple[Array, Array]:
         """What does not cancel of ∑F(u) - reactions - ∫ (r_n n + τ) on every body. Collective.
 
@@ -1371,7 +1380,7 @@ class ContactProblem:
         state = self._whole.state()
         self._rate = state - self._committed
         self._committed = state
-        self._committed_lag = self._behind, self._load
+        self._committed_lag = self._pending_field, self._load
         self._committed_energy = self._energy.between([c.committed_jump for c in self.contacts])
         self.increment += 1
 
@@ -1382,7 +1391,7 @@ class ContactProblem:
         """
         self._solved = None
         self._whole.set_state(self._committed)
-        self._behind, self._load = self._committed_lag
+        self._pending_field, self._load = self._committed_lag
         for contact in self.contacts:
             contact.restore()
 
@@ -1403,7 +1412,7 @@ class ContactProblem:
             ValueError: The state is not that of the last commit.
         """
         now = self._whole.state()
-        differs = self._behind is not self._committed_lag[0] or not np.array_equal(
+        differs = self._pending_field is not self._committed_lag[0] or not np.array_equal(
             now, self._committed
         )
         if self._comm.allreduce(int(differs)):
@@ -1465,7 +1474,7 @@ class ContactProblem:
         self.increment = increment
         self._committed, self._rate = state.copy(), rate.copy() if increment else None
         self._whole.set_state(state)
-        self._behind, self._load = None, self.present_load()
+        self._pending_field, self._load = None, self.present_load()
         self._committed_lag = None, self._load
         self._whole.begin(self._load)
         for contact, (history, values) in zip(self.contacts, points, strict=True):

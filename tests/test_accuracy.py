@@ -9,8 +9,8 @@ from mpi4py import MPI
 from scenes import TOP, block, raised_everywhere, stress
 
 import fenics_contact as fc
-from fenics_contact.accuracy import DEFAULT_FACTOR, PRESETS
-from fenics_contact.errors import quantities
+from fenics_contact.contact.accuracy import DEFAULT_FACTOR, PRESETS
+from fenics_contact.estimates.errors import quantities
 
 COMM = MPI.COMM_WORLD
 

@@ -13,7 +13,7 @@ from test_sliding import Slider
 from test_solver import PATH, kirchhoff, rub, walk
 
 import fenics_contact as fc
-from fenics_contact.condense import Condensation, touched, worthwhile
+from fenics_contact.systems.condensed import Condensation, touched, worthwhile
 
 pytestmark = pytest.mark.timeout(240)
 COMM = MPI.COMM_WORLD

@@ -25,8 +25,8 @@ def test_the_same_solution(cell, degree):
     for method in ("continuation", "newton"):
         scene, problem, contact = pressed(cell, law, method, degree=degree, n=3, side=0.06)
         step = problem.solve()
-        assert [rung.method for rung in step.rungs] == [method]
-        assert contact.softening.value == 1.0
+        assert [attempt.method for attempt in step.attempts] == [method]
+        assert contact.stiffness_factor.value == 1.0
         states.append(nodal(scene.u))
     assert close(*states, 1e-6)
 
@@ -47,10 +47,10 @@ def test_stiff_contact_from_a_cold_start(method, factor, friction):
         forces.append(step.contacts["contact"].normal_force)
     assert close(forces[1], forces[0], 2e-2 if friction else 1e-3)
     assert step.contacts["contact"].max_penetration < 1e-1 / factor
-    assert [rung.method for rung in step.rungs] == [method, "continuation"]
-    assert step.method == "continuation" and step.rungs[-1].outcome == "converged"
-    assert step.rungs[0].outcome != "converged"
-    assert step.iterations == sum(rung.iterations for rung in step.rungs)
+    assert [attempt.method for attempt in step.attempts] == [method, "continuation"]
+    assert step.method == "continuation" and step.attempts[-1].outcome == "converged"
+    assert step.attempts[0].outcome != "converged"
+    assert step.iterations == sum(attempt.iterations for attempt in step.attempts)
 
 
 def test_without_a_fallback_it_fails_and_says_why(caplog):
@@ -66,13 +66,13 @@ def test_without_a_fallback_it_fails_and_says_why(caplog):
     )
     with caplog.at_level(logging.INFO, "fenics_contact"), pytest.raises(fc.NotConverged) as caught:
         problem.solve()
-    (rung,) = caught.value.rungs
-    assert rung.method == "newton" and rung.iterations == caught.value.iterations == 100
-    for text in (rung.outcome, str(caught.value)):
+    (attempt,) = caught.value.attempts
+    assert attempt.method == "newton" and attempt.iterations == caught.value.iterations == 100
+    for text in (attempt.outcome, str(caught.value)):
         assert "contact chatters" in text and "16 points keep changing between" in text
-    x = float(rung.outcome.split("at (")[1].split(",")[0])
+    x = float(attempt.outcome.split("at (")[1].split(",")[0])
     assert 0.25 < x < 0.75
-    assert contact.softening.value == 1.0
+    assert contact.stiffness_factor.value == 1.0
 
 
 def test_every_rung_is_logged(caplog):
@@ -84,8 +84,8 @@ def test_every_rung_is_logged(caplog):
         step = problem.solve()
     texts = [record.getMessage() for record in caplog.records]
     (first, *_) = COMM.allgather(texts)  # rank 0 speaks
-    assert len(step.rungs) == 2
-    assert any(str(step.rungs[0]) in text for text in first)
+    assert len(step.attempts) == 2
+    assert any(str(step.attempts[0]) in text for text in first)
 
 
 def test_where_newton_is_stuck_the_alternation_goes_on():
@@ -141,7 +141,7 @@ def test_cut_increments_tell_what_was_tried():
 
     problem.solve = failing
     first, *rest = fc.increments(problem, push, 0.0, -0.01)
-    names = [rung.method for rung in first.rungs]
+    names = [attempt.method for attempt in first.attempts]
     assert names == ["lbfgs", "cut", "lbfgs", "cut", "lbfgs"]
-    assert [rung.outcome for rung in first.rungs[1::2]] == ["to 0.005", "to 0.0025"]
-    assert first.load == -0.0025 and all(len(step.rungs) == 1 for step in rest)
+    assert [attempt.outcome for attempt in first.attempts[1::2]] == ["to 0.005", "to 0.0025"]
+    assert first.load == -0.0025 and all(len(step.attempts) == 1 for step in rest)

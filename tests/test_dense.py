@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from fenics_contact.dense import PartlyFactored, Sum
+from fenics_contact.systems.dense import PartlyFactored, Sum
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="dense matrices of one rank")
 N = 40

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from scenes import GRID, TOP, block, close, nodal, raised_everywhere, stress
 
 import fenics_contact as fc
-from fenics_contact.errors import quantities
+from fenics_contact.estimates.errors import quantities
 
 COMM = MPI.COMM_WORLD
 # Effectivity that is asked of an estimate: estimated over true error.

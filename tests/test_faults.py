@@ -24,7 +24,9 @@ from scenes import close, nodal, raised_everywhere, stress
 from test_solver import PATH, identical, rub, snapshot, walk
 
 import fenics_contact as fc
-from fenics_contact import dense, output, parallel, plotting, surface
+from fenics_contact import output, parallel, plotting
+from fenics_contact.surface import surface
+from fenics_contact.systems import dense
 
 COMM = MPI.COMM_WORLD
 LAST = COMM.size - 1
@@ -62,7 +64,7 @@ def survives(made, call, kind, *words):
     raised_everywhere(call, kind, *words)
     assert identical(snapshot(made), before)
     assert made.problem.increment == increment
-    assert made.contact.softening.value == 1.0
+    assert made.contact.stiffness_factor.value == 1.0
 
 
 def goes_on(made, twin):

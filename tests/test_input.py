@@ -551,7 +551,11 @@ def test_arguments_of_a_surface():
     for body, word in (((TOP, tags), "facet_tags is a int"), ((tags, "top"), "tags is 'top'")):
         support = fc.DeformableBody(*body)
         raised_everywhere(lambda s=support: scene.contact(coulomb(), support=s), ValueError, word)
-    raised_everywhere(lambda: fc.DeformableBody(tags, TOP, reach="far"), ValueError, "reach is 'f")
+    raised_everywhere(
+        lambda: fc.DeformableBody(tags, TOP, search_distance="far"),
+        ValueError,
+        "search_distance is 'f",
+    )
 
 
 @pytest.mark.parametrize("degree", [2.5, 2.0, "2", True, 0, -1])

@@ -18,8 +18,9 @@ from mpi4py import MPI
 from scenes import BOTTOM, block_mesh
 
 import fenics_contact as fc
-from fenics_contact.laws import FrictionLaw, Kinematics, Law
-from fenics_contact.surface import PointEvaluator
+from fenics_contact.laws.base import Kinematics, Law
+from fenics_contact.laws.friction import FrictionLaw
+from fenics_contact.surface.surface import PointEvaluator
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(200)]
 COMM = MPI.COMM_WORLD

@@ -85,7 +85,7 @@ STATES = [
 class Scene:
     """An oblique obstacle over two sides of a shuffled mesh, and one law."""
 
-    def __init__(self, cell: str, degree: int, law: fc.laws.Law) -> None:
+    def __init__(self, cell: str, degree: int, law: fc.Law) -> None:
         """Make the contact; u is zero."""
         self.d = dimension(cell)
         self.degree = degree

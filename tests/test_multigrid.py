@@ -14,7 +14,7 @@ from test_two_bodies import BOTTOM, LOWER, UPPER, elasticity, two_blocks
 from test_two_bodies import TOP as LID
 
 import fenics_contact as fc
-from fenics_contact import linear
+from fenics_contact.systems import linear
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD

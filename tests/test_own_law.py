@@ -12,7 +12,9 @@ from mpi4py import MPI
 from scenes import TOP, block, close, gathered, raised_everywhere
 
 import fenics_contact as fc
-from fenics_contact.laws import FrictionLaw, Law, Response, positive_part
+from fenics_contact.laws.base import Law, Response
+from fenics_contact.laws.friction import FrictionLaw
+from fenics_contact.laws.return_maps import positive_part
 
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]

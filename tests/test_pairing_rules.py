@@ -25,7 +25,7 @@ from bodies import Bodies, _tagged, boxes
 
 import fenics_contact as fc
 from fenics_contact import output
-from fenics_contact.verdict import check_laws
+from fenics_contact.checks.verdict import check_laws
 
 COMM = MPI.COMM_WORLD
 BOTH = 40
@@ -356,7 +356,7 @@ def test_the_warning_says_how_many_and_why():
     with _told(False):
         assert made(UPPER, LOWER).n_unpaired == 0
     for here, there, options, word in (
-        (UPPER, LOWER, {"reach": 0.05}, "reach"),
+        (UPPER, LOWER, {"search_distance": 0.05}, "search_distance"),
         (UPPER, ROOF, {}, "own body"),
         (LOWER, ROOF, {}, "nothing"),
         (ROOF, FLOOR, {}, "behind"),

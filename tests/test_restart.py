@@ -372,7 +372,7 @@ def test_cut_increments(make, tmp_path):
 
         def choosy(**options):
             if now[0] - at[0] > 0.3:
-                balance = {"the body": fc.verdict.Balance(1.0, 1.0, 0.0)}
+                balance = {"the body": fc.Balance(1.0, 1.0, 0.0)}
                 verdict = fc.Verdict(balance, balance)
                 raise fc.NotConverged(problem.increment + 1, -1, verdict)
             return solve(**options)

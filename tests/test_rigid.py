@@ -5,7 +5,7 @@ import pytest
 from scenes import block, raised_everywhere
 
 import fenics_contact as fc
-from fenics_contact.rigid import _unbalanced
+from fenics_contact.checks.rigid_motions import _unbalanced
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 6])

@@ -705,7 +705,7 @@ class Changed(fc.Coulomb):
             parts["slip"] = tuple(2 * s for s in r.slip)
         elif self.what == "direction":
             parts["traction"] = -r.traction
-        return fc.laws.Response(**parts)
+        return fc.Response(**parts)
 
 
 def test_the_changed_law_is_sound_when_nothing_is_changed():

@@ -463,7 +463,7 @@ def test_a_field_that_is_wrong_is_refused(monkeypatch):
     made.load(1.0)
     made.problem.solve(field=False)
     made.problem.commit()
-    made.problem._behind[made.problem._behind != 0.0] *= 1.001
+    made.problem._pending_field[made.problem._pending_field != 0.0] *= 1.001
     with pytest.raises(fc.NotConverged, match="residual"):
         made.problem.complete()
 

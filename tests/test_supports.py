@@ -275,7 +275,7 @@ def test_a_body_that_touches_does_not_penetrate(caplog):
         (fc.HalfSpace((0, 0), (0, 1), displacement=(0, 0, 0)), ("displacement",)),
         (fc.HalfSpace((0, 0), (0, 1), displacement=1.0), ("displacement",)),
     ],
-    ids=lambda value: type(value).__name__ if isinstance(value, fc.supports.Support) else None,
+    ids=lambda value: type(value).__name__ if isinstance(value, fc.Support) else None,
 )
 def test_bad_support_in_the_plane(support, words):
     """Data of the wrong dimension, without length or not finite: the message names them."""

@@ -15,7 +15,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import trade
 
-from fenics_contact.accuracy import PRESETS
+from fenics_contact.contact.accuracy import PRESETS
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="of one process")
 

@@ -208,15 +208,17 @@ def test_points_that_look_past_the_other_body() -> None:
 
 
 def test_reach() -> None:
-    """Opposites farther than ``reach`` are none."""
+    """Opposites farther than ``search_distance`` are none."""
     mesh, tags = two_blocks("quadrilateral", (4, 3))
     u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (2,))))
     surface = fc.ContactSurface(mesh, tags, BOTTOM)
     # From the bottom outwards nothing is met within 0.1; the rays of LOWER meet UPPER at once.
-    far = fc.Contact(u, surface, fc.DeformableBody(tags, TOP, reach=0.1), fc.Frictionless(1e6))
+    far = fc.Contact(
+        u, surface, fc.DeformableBody(tags, TOP, search_distance=0.1), fc.Frictionless(1e6)
+    )
     assert far.n_unpaired == 8
-    with pytest.raises(ValueError, match="reach"):
-        fc.DeformableBody(tags, TOP, reach=-1.0)
+    with pytest.raises(ValueError, match="search_distance"):
+        fc.DeformableBody(tags, TOP, search_distance=-1.0)
 
 
 def test_form_alone_says_what_it_lacks() -> None:

@@ -31,7 +31,7 @@ from cases import CASES, Case, Outcome
 from demonstrations import DEMOS, ROOT, run, runs
 
 import fenics_contact as fc
-from fenics_contact.errors import quantities
+from fenics_contact.estimates.errors import quantities
 
 PAGE = ROOT / "docs" / "effectivity.md"
 USEFUL = (0.3, 3.0)

@@ -29,7 +29,7 @@ import fenics_contact as fc
 BOTTOM, TOP, LEFT, FRONT, OPPOSITE = 1, 2, 3, 4, 5
 E, NU, PRESSURE = 1000.0, 0.3, 1.0
 Array = np.ndarray
-Solve = Callable[[str], tuple[list[fc.problem.Step], float | None]]
+Solve = Callable[[str], tuple[list[fc.Step], float | None]]
 
 
 class Block:
@@ -160,7 +160,7 @@ def pressed(
 ) -> Solve:
     """A block pressed on a floor by a uniform load; held aside unless by friction alone."""
 
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+    def solve(method: str) -> tuple[list[fc.Step], float]:
         body = Block(**block)
         h = body.size[-1] / block.get("n", (8, 8))[-1]
         k_n = kappa * body.modulus / h
@@ -182,8 +182,8 @@ def pressed(
 
 
 def compared(
-    state: Callable[[str], tuple[list[fc.problem.Step], Any]],
-    reference: Callable[[], tuple[list[fc.problem.Step], Any]],
+    state: Callable[[str], tuple[list[fc.Step], Any]],
+    reference: Callable[[], tuple[list[fc.Step], Any]],
 ) -> Solve:
     """Solve by a method; error of the body's u against the reference, found once, if it is."""
 
@@ -194,7 +194,7 @@ def compared(
         except fc.NotConverged:
             return None
 
-    def solve(method: str) -> tuple[list[fc.problem.Step], float | None]:
+    def solve(method: str) -> tuple[list[fc.Step], float | None]:
         steps, body = state(method)
         return steps, None if other() is None else difference(body.u, other())
 
@@ -217,9 +217,7 @@ def dragged(
     The latter for the stiffness ``known``, by default the same.
     """
 
-    def state(
-        method: str, kappa: float = kappa, **options: Any
-    ) -> tuple[list[fc.problem.Step], Block]:
+    def state(method: str, kappa: float = kappa, **options: Any) -> tuple[list[fc.Step], Block]:
         body = Block(**block)
         length = body.size[0]
         bcs = body.moved(aside * length, down * length)
@@ -230,7 +228,7 @@ def dragged(
     return compared(state, lambda: state(against, known or kappa, fallback=False))
 
 
-State = tuple[fc.problem.Step, Array]
+State = tuple[fc.Step, Array]
 
 
 def block_in_units(method: str, modulus: float, length: float, n: Sequence[int]) -> State:
@@ -246,7 +244,7 @@ def in_units(
 ) -> Solve:
     """A scene in other units: the iterations and digits of the first ones."""
 
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+    def solve(method: str) -> tuple[list[fc.Step], float]:
         step, u = scene(method, modulus, length, n)
         first, v = scene(method, E, 1.0, n)
         same = step.iterations == first.iterations
@@ -259,7 +257,7 @@ def poisson(nu: float, degree: int, d: int = 2) -> Solve:
     """The force of the pressed cushion against that of a mesh twice as fine, in the plane cubic."""
     n, cell, best = (16, "triangle", 3) if d == 2 else (3, "hexahedron", 2)
 
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+    def solve(method: str) -> tuple[list[fc.Step], float]:
         step = _force(method, nu, degree, (n,) * d, cell)
         fine = _force("newton", nu, best, (2 * n,) * d, cell)
         ours, theirs = (s.contacts["contact"].normal_force for s in (step, fine))
@@ -269,7 +267,7 @@ def poisson(nu: float, degree: int, d: int = 2) -> Solve:
 
 
 @functools.lru_cache(maxsize=64)
-def _force(method: str, nu: float, degree: int, n: tuple[int, ...], cell: str) -> fc.problem.Step:
+def _force(method: str, nu: float, degree: int, n: tuple[int, ...], cell: str) -> fc.Step:
     body = Block(degree, n=n, nu=nu, cell=cell)
     problem = body.problem(fc.Frictionless(), body.cushion(), body.moved(0.0, 0.03), method=method)
     return problem.solve()
@@ -278,7 +276,7 @@ def _force(method: str, nu: float, degree: int, n: tuple[int, ...], cell: str) -
 def proportional(steps: int) -> Solve:
     """Load aside and down in proportion, no gap: any number of increments has one state."""
 
-    def state(method: str, steps: int) -> tuple[list[fc.problem.Step], Block]:
+    def state(method: str, steps: int) -> tuple[list[fc.Step], Block]:
         body = Block(n=(4, 4))
         problem = body.problem(fc.Coulomb(0.5), body.floor(), [], method=method)
 
@@ -287,7 +285,7 @@ def proportional(steps: int) -> Solve:
 
         return list(fc.increments(problem, load, steps=steps)), body
 
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+    def solve(method: str) -> tuple[list[fc.Step], float]:
         made, body = state(method, steps)
         _, once = state(method, 1)
         return made, difference(body.u, once.u)
@@ -301,7 +299,7 @@ def cycle(path: list[tuple[float, float]], mu: float = 0.3) -> Solve:
     Reference: the force at the first place, found again after the last.
     """
 
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+    def solve(method: str) -> tuple[list[fc.Step], float]:
         body = Block()
         move = [fem.Constant(body.mesh, 0.0) for _ in range(2)]
         bcs = [body.hold(TOP, i, c) for i, c in enumerate(move)]
@@ -323,7 +321,7 @@ def cycle(path: list[tuple[float, float]], mu: float = 0.3) -> Solve:
 def loaded(side: float, up: float, mu: float, bcs: str, n: Sequence[int] = (8, 8)) -> Solve:
     """A load on a block on its floor, with what holds it; the force is that of the load."""
 
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+    def solve(method: str) -> tuple[list[fc.Step], float]:
         body = Block(n=n)
         held = {"free": [], "sides": body.rollers()}[bcs]
         problem = body.problem(friction_law(mu, fc.Scaled(10)), body.floor(), held, method=method)
@@ -461,7 +459,7 @@ class Pair:
 def pressed_pair(kappa: float, **pair: Any) -> Solve:
     """One block pressed on the other by a uniform load; k_n is that of the softer one."""
 
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+    def solve(method: str) -> tuple[list[fc.Step], float]:
         both = Pair(**pair)
         k_n = kappa * min(both.moduli) * 6 / both.length
         pressure = both.press()
@@ -474,7 +472,7 @@ def pressed_pair(kappa: float, **pair: Any) -> Solve:
 def dragged_pair(kappa: float, mu: float, **pair: Any) -> Solve:
     """One rounded block pressed on the other and dragged; against the alternation's solution."""
 
-    def state(method: str, **options: Any) -> tuple[list[fc.problem.Step], Pair]:
+    def state(method: str, **options: Any) -> tuple[list[fc.Step], Pair]:
         both = Pair(**pair)
         both.drag()
         k = kappa * min(both.moduli) * 6 / both.length
@@ -515,7 +513,7 @@ def hertz(kappa: float, *, enforcement: str = "penalty") -> tuple[Solve, float]:
     if enforcement != "penalty":
         share = 0.0
 
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+    def solve(method: str) -> tuple[list[fc.Step], float]:
         x = graded(0.15, 15, far * 0.1, 1.3)
         y = -graded(0.15, 15, far * 0.1, 1.3)[::-1]
         sides = {BOTTOM: near(1, y[0]), LEFT: near(0, 0.0), FRONT: near(1, 0.0)}
@@ -551,7 +549,7 @@ def lower_block_apart(comm: MPI.Comm, n_parts: int, cell_types: Any, cells: Any)
 
 def ranked(
     kind: str, kappa: float, mu: float, method: str, *, apart: bool = True
-) -> tuple[fc.problem.Step, Array, list[int]]:
+) -> tuple[fc.Step, Array, list[int]]:
     """One block dragged on the other or, alone, on a cushion; nodes' places with displacements.
 
     On several ranks all of Γc is on the last one, if ``apart``. Collective.
@@ -587,7 +585,7 @@ def ranked(
 def on_one_rank(ranks: int, kind: str, kappa: float, mu: float) -> Solve:
     """`ranked` in processes of its own, against the same on one rank."""
 
-    def solve(method: str) -> tuple[list[fc.problem.Step], float]:
+    def solve(method: str) -> tuple[list[fc.Step], float]:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "state"
             command = ["mpirun", "--oversubscribe", "-n", str(ranks), sys.executable, __file__]

@@ -54,7 +54,7 @@ class Row:
         case: How much.
         method: The method asked for.
         outcome: "verified", or "refused:" and the error.
-        rungs: What was tried and its iterations.
+        attempts: What was tried and its iterations.
         iterations: SNES iterations of all increments.
         error: Against the reference, relative; NaN where nothing is compared.
         reference: What it was compared with.
@@ -66,7 +66,7 @@ class Row:
     case: str
     method: str
     outcome: str
-    rungs: str
+    attempts: str
     iterations: int
     error: float
     reference: str
@@ -104,23 +104,23 @@ class Trial:
                 outcome = "verified"
                 if any(step.verdict.failures or step.reason <= 0 for step in steps):
                     outcome = "NOT VERIFIED"
-                tried = tuple(rung for step in steps for rung in step.rungs)
+                tried = tuple(attempt for step in steps for attempt in step.attempts)
             except (fc.NotConverged, ValueError) as caught:
                 outcome = f"refused: {caught}"
-                tried = getattr(caught, "rungs", ())
+                tried = getattr(caught, "attempts", ())
             except Exception as caught:  # what is seen here is to be mended
                 outcome = f"{type(caught).__name__}: {caught}"
-            names = list(dict.fromkeys(rung.method for rung in tried))
+            names = list(dict.fromkeys(attempt.method for attempt in tried))
             sums = [(n, sum(r.iterations for r in tried if r.method == n)) for n in names]
             iterations = sum(n for _, n in sums)
-            rungs = ", ".join(f"{name} {n}" if name != "cut" else "cut" for name, n in sums)
+            attempts = ", ".join(f"{name} {n}" if name != "cut" else "cut" for name, n in sums)
             seconds = time.perf_counter() - start
             yield Row(
                 self.group,
                 self.case,
                 method,
                 " ".join(outcome.split()),
-                rungs,
+                attempts,
                 iterations,
                 error,
                 reference,
@@ -290,14 +290,14 @@ def page(rows: list[Row]) -> str:
         "the plane or in space, one block on another, a roller on a half-plane; E = 1000, cold, in "
         "one increment where nothing else is said. A solution is *verified* "
         "when it passed the package's own checks; its error is that of the displacement (or force) "
-        "against the reference, relative. Behind every rung its iterations; “cut” is a halved "
+        "against the reference, relative. Behind every attempt its iterations; “cut” is a halved "
         "increment.",
         "",
         f"**{len(rows)} runs: {verified} verified, {len(rows) - verified - len(wrong)} refused "
         f"with a reason, {len(wrong)} wrong.**",
         "",
     ]
-    head = ["case", "method", "outcome", "rungs", "error", "tolerance", "reference"]
+    head = ["case", "method", "outcome", "attempts", "error", "tolerance", "reference"]
     group = ""
     for row in rows:
         if row.group != group:
@@ -308,7 +308,7 @@ def page(rows: list[Row]) -> str:
             row.case,
             row.method,
             ("**WRONG** " if row.wrong else "") + row.outcome[:300],
-            row.rungs,
+            row.attempts,
             ("–" if np.isnan(row.error) else f"{row.error:.1e}") if compared else "",
             f"{row.tolerance:.0e}" if compared and np.isfinite(row.tolerance) else "",
             row.reference if compared else "",
@@ -334,7 +334,7 @@ def main() -> int:
                 mark = "WRONG " if row.wrong else ""
                 print(
                     f"{mark}{row.group}; {row.case}; {row.method}: {row.outcome[:150]}; "
-                    f"{row.rungs}; error {row.error:.1e}; {row.seconds:.1f} s",
+                    f"{row.attempts}; error {row.error:.1e}; {row.seconds:.1f} s",
                     flush=True,
                 )
     path = arguments.output or PAGE

@@ -753,7 +753,7 @@ def _record(
         "contacts": contacts,
         "energy": step.energy,
         "rtol": problem.accuracy.rtol if problem.accuracy else 1e-9,
-        "rungs": [str(r) for r in step.rungs],
+        "attempts": [str(r) for r in step.attempts],
         "method": step.method,
         "iterations": step.iterations,
         "summary": step.summary() if step.verdict.force > 0 else "",

@@ -1,0 +1,1 @@
+"""What is looked at before, while and after an increment is solved."""

@@ -1,0 +1,136 @@
+"""Where the work of the loads goes: elastic energy, contact springs, friction."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from fenics_contact.contact.contact import Contact
+from fenics_contact.parallel import global_sum
+from fenics_contact.systems.forces import Forces
+
+__all__ = ["Energy", "EnergyState"]
+
+Array = npt.NDArray[np.float64]
+
+# Work, as a share of the energies that there are, that is within the solver's tolerance.
+_NOTHING = 1e-8
+
+
+@dataclass(frozen=True)
+class Energy:
+    """Energies of one increment (force times length; in 2D per thickness), equal on every rank.
+
+    Works are means of the forces at both ends of the increment times the way between them.
+
+    Attributes:
+        work: Work of the loads, of Dirichlet values and of moving supports.
+        elastic: Work of the internal forces: the change of elastic energy, exact for a linear bulk.
+        springs: Change of the energy in the contact's springs, r_n²/2k_n + |τ|²/2k_t.
+        dissipation: Work of friction on the slip, ≥ 0.
+        remainder: What of the work is in none of them: contact that changes within the increment
+            (gets less with smaller increments), and springs let go where contact opens.
+        friction: Work of friction on the body by the mean of the tractions at both ends, on the
+            slip: negative where it brakes. Positive in one long increment where the slip turns
+            round within it, or where the state is none that smaller increments lead to.
+        sliding: The most that friction could have taken, by the sizes of tractions and slip.
+        imbalance: Work minus elastic minus the work of all tractions on Γc: zero by equilibrium
+            at both ends, up to the solver's tolerance.
+    """
+
+    work: float
+    elastic: float
+    springs: float
+    dissipation: float
+    remainder: float
+    friction: float
+    sliding: float
+    imbalance: float
+
+    @property
+    def created(self) -> float:
+        """Share of the energy exchanged that friction has given instead of taken, 0 if none.
+
+        Where a sliding body is turned round in one increment works cancel: then by what friction
+        takes each way.
+        """
+        exchanged = abs(self.work) + abs(self.elastic) + abs(self.springs)
+        scale = max(exchanged, self.sliding)
+        return self.friction / scale if self.friction > 0 and scale > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class EnergyState:
+    """Forces and places at one state, on this rank; what lies between two is an `Energy`.
+
+    Attributes:
+        forces: At the unknowns, by the mark of the coordinates they are in.
+        contacts: Of each contact the tractions on the body, its displacement relative to the
+            support, and that of the support as far as it is prescribed: (3, n_points, gdim).
+        springs: Energy in the contact's springs on this rank.
+    """
+
+    forces: dict[Any, Forces]
+    contacts: list[Array]
+    springs: float
+
+    @classmethod
+    def unloaded(cls, forces: dict[Any, Forces], contacts: Sequence[Contact]) -> EnergyState:
+        """No forces on Γc."""
+        ways = [np.stack([0 * c.points, c.values["jump"], c.values["shift"]]) for c in contacts]
+        return cls(forces, ways, 0.0)
+
+    @classmethod
+    def at(cls, forces: dict[Any, Forces], contacts: Sequence[Contact]) -> EnergyState:
+        """The state that ``contacts`` have evaluated."""
+        ways = [np.stack([c.traction, c.values["jump"], c.values["shift"]]) for c in contacts]
+        springs = sum(float(c.measure @ c.values["stored"]) for c in contacts)
+        return cls(forces, ways, springs)
+
+    def between(self, jumps: Sequence[Array]) -> EnergyState:
+        """The same state with the displacements relative to supports taken between new pairs."""
+        ways = [np.stack([w[0], jump, w[2]]) for w, jump in zip(self.contacts, jumps, strict=True)]
+        return dataclasses.replace(self, contacts=ways)
+
+    def since(self, before: EnergyState, contacts: Sequence[Contact], comm: MPI.Comm) -> Energy:
+        """Energies on the way from ``before`` to here, in coordinates both have. Collective."""
+        mark = next(mark for mark in self.forces if mark in before.forces)
+        old, new = before.forces[mark], self.forces[mark]
+        way = new.unknowns - old.unknowns
+        # Work, elastic, springs, dissipation, work of the tractions, that of friction, its size.
+        sums = np.zeros(8)
+        sums[7] = np.abs(new.internal * new.unknowns).sum() + self.springs
+        sums[0] = 0.5 * (old.external + new.external) @ way
+        sums[1] = 0.5 * (old.internal + new.internal) @ way
+        sums[2] = self.springs - before.springs
+        for contact, there, here in zip(contacts, before.contacts, self.contacts, strict=True):
+            mean = contact.measure[:, None] * 0.5 * (there[0] + here[0])
+            sums[0] += np.sum(mean * (here[2] - there[2]))
+            sums[4] -= np.sum(mean * (here[1] - there[1]))
+            if contact.law.has_friction:
+                sums[3] += contact.measure @ contact.values["dissipated"]
+                # Tractions before are those of the commit, not multipliers in their place.
+                slip, normal = contact.slip_vector(), contact.values["normal"]
+                weight, length = 0.5 * contact.measure, np.sqrt(_dot(slip, slip))
+                for traction in (there[0], here[0]):
+                    side = traction - _dot(traction, normal)[:, None] * normal
+                    sums[5] += weight @ _dot(side, slip)
+                    sums[6] += weight @ (np.sqrt(_dot(side, side)) * length)
+        total = (float(v) for v in global_sum(comm, sums))
+        work, elastic, springs, dissipation, tractions, friction, sliding, level = total
+        if abs(friction) <= _NOTHING * level:  # nothing has slipped but what the solver leaves
+            friction = 0.0
+        remainder = work - elastic - springs - dissipation
+        imbalance = work - elastic - tractions
+        return Energy(work, elastic, springs, dissipation, remainder, friction, sliding, imbalance)
+
+
+def _dot(one: Array, other: Array) -> Array:
+    """Products of vectors at points, (n_points,)."""
+    return np.asarray(np.einsum("qi,qi->q", one, other), dtype=np.float64)

@@ -1,0 +1,207 @@
+"""What small displacements leave out: gap and normal where the body has moved to.
+
+The gap is taken as s - u_n with s and n of the undeformed body. Where the body has moved by u both
+are others, by the curvature of the support or because the bodies have turned. What that changes in
+the forces follows from one linear solve with the tangent at hand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from fenics_contact.contact.contact import Contact, Status
+from fenics_contact.parallel import global_max, global_min, global_sum
+
+__all__ = ["Deviation", "LinearSprings", "Linearisation", "linearisation"]
+
+Array = npt.NDArray[np.float64]
+
+# Share of the largest pressure, or of the force, below which what is left out needs no solve.
+_NEGLIGIBLE = 1e-3
+# Slide, as a share of the smallest facet, and difference of the displacements on Γc, as a share of
+# its size, below which pairs in the deformed bodies are those of before.
+_SLID, _TURNED = 1e-2, 1e-3
+
+
+@dataclass(frozen=True)
+class LinearSprings:
+    """A contact's springs at the present state, linearised with their status as it is.
+
+    Attributes:
+        stiffness: What the traction loses per displacement, (n_points, gdim, gdim).
+        stretch: Displacement that is in the springs because their stiffness stands for none at
+            all, as far as displacements of Γc can answer it, (n_points, gdim) (length).
+    """
+
+    stiffness: Array
+    stretch: Array
+
+    @classmethod
+    def of(cls, contact: Contact) -> LinearSprings:
+        """Of an evaluated contact. Collective."""
+        law, values, status = contact.law, contact.values, contact.status
+        normal = values["normal"]
+        tangential, pressure = contact.tangential_traction, contact.pressure
+        closed = status != Status.OPEN
+        d = normal.shape[1]
+        stiffness = np.zeros((len(normal), d, d))
+        stretch = np.zeros_like(normal)
+        borne = contact.borne_by_springs()
+        if law.has_normal_stiffness:
+            # A slipping point's friction follows the pressure, unless its limit is given.
+            follows = closed & (status == Status.SLIP) & (pressure > 0) & (not law.has_potential)
+            ratio = np.where(follows, 1.0, 0.0) / np.where(pressure > 0, pressure, 1.0)
+            direction = normal - ratio[:, None] * tangential
+            k_n = np.where(closed, contact.normal_stiffness, 0.0)
+            stiffness += k_n[:, None, None] * np.einsum("qi,qj->qij", direction, normal)
+            along = -np.sum(borne * normal, axis=1)
+            stretch += (along / contact.normal_stiffness)[:, None] * normal
+        if law.has_tangential:
+            k_t, stick = contact.tangential_stiffness, status == Status.STICK
+            stiffness += np.where(stick[:, None, None], k_t, 0.0)
+            # K_t has no inverse along the normal, where nothing acts: any stiffness will do.
+            along = np.einsum("q,qi,qj->qij", values["parameter k_t"], normal, normal)
+            side = borne - np.sum(borne * normal, axis=1)[:, None] * normal
+            stretch -= np.linalg.solve(k_t + along, side[:, :, None])[:, :, 0]
+        return cls(stiffness, stretch)
+
+    def change(self, jump: Array) -> Array:
+        """Of the traction, by a change of the relative displacement, (n_points, gdim)."""
+        return -np.einsum("qij,qj->qi", self.stiffness, jump)
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """What the linearised kinematics change in a contact, relative, equal on every rank.
+
+    Attributes:
+        force: In the contact force, by its largest change along any direction.
+        pressure: In the pressure, in the mean square over Γc: single points at an edge tell
+            nothing.
+        rough: Whether the pressure is told roughly: between two meshes, whose facets meet at
+            angles that are none of the surfaces'.
+    """
+
+    force: float = 0.0
+    pressure: float = 0.0
+    rough: bool = False
+
+    @property
+    def worst(self) -> float:
+        """The larger of the two; infinite where one is not finite."""
+        worst = max(self.force, self.pressure)
+        return worst if np.isfinite(self.force) and np.isfinite(self.pressure) else np.inf
+
+    @property
+    def judged(self) -> float:
+        """What an increment fails by: the force alone where the pressure is told roughly."""
+        return self.force if self.rough and np.isfinite(self.worst) else self.worst
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """How gap and normal differ from the linearised ones at the bearing points of a contact.
+
+    Attributes:
+        gap: True gap minus s - u_n where points are closed, 0 elsewhere, (n_points,) (length).
+        turn: Change of the unit normal there, (n_points, gdim).
+    """
+
+    gap: Array
+    turn: Array
+
+    @classmethod
+    def of(cls, contact: Contact) -> Deviation:
+        """At the evaluated state of a contact; nothing where it could not be told. Collective."""
+        values, closed = contact.values, contact.status != Status.OPEN
+        none = cls(np.zeros(len(closed)), np.zeros_like(values["normal"]))
+        if contact.support.is_flat or not (contact.rigid or _moves(contact)):
+            return none
+        change, normal = contact.gap_deviation()
+        told = closed & np.isfinite(normal).all(axis=1)
+        turn = np.where(told[:, None], normal - values["normal"], 0.0)
+        if contact.gap_prescribed:
+            return cls(none.gap, turn)
+        # A point that has left the opposite bears nothing in truth.
+        change = np.where(np.isnan(change), values["penetration"], change)
+        return cls(np.where(told, change, 0.0), turn)
+
+    def shift(self, contact: Contact) -> Array:
+        """Displacement at the points that closes the linearised gap as much, (n_points, gdim)."""
+        return -self.gap[:, None] * contact.values["normal"]
+
+    def turned(self, contact: Contact) -> Array:
+        """Change of the traction by the turn of the normal, (n_points, gdim) (stress)."""
+        return contact.values["normal_traction"][:, None] * self.turn
+
+
+def _moves(contact: Contact) -> bool:
+    """Whether bodies slide or turn by enough for a search anew to find anything. Collective."""
+    comm, values = contact.surface.mesh.comm, contact.values
+    rows = contact.quadrature.point_rows()
+    d = values["normal"].shape[1]
+    facets = contact.quadrature.weights[rows].sum(axis=1) ** (1 / (d - 1))
+    smallest = global_min(comm, facets, empty=np.inf)
+    slid = global_max(comm, np.linalg.norm(contact.relative_slide(), axis=1))
+    x, u = values["x"], contact.own_displacement()
+    spread = np.zeros((2, d))
+    for i in range(d):
+        for row, field in zip(spread, (x[:, i], u[:, i]), strict=True):
+            row[i] = global_max(comm, field, empty=-np.inf) - global_min(comm, field, empty=np.inf)
+    turned = np.abs(spread[1]).max() / max(spread[0].max(), 1e-300)
+    return not (slid <= _SLID * smallest and turned <= _TURNED)
+
+
+def linearisation(
+    contacts: Sequence[Contact],
+    modulus: float,
+    respond: Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]],
+) -> dict[str, Linearisation]:
+    """What the linearised kinematics change in every contact, by name. Collective.
+
+    Args:
+        contacts: Evaluated contacts, at a solution.
+        modulus: Of the bulk, about (stress): to see whether there is anything to solve for.
+        respond: The change of the relative displacements at the points of every contact, with
+            springs there, by tractions that are added on the bodies.
+    """
+    deviations = [Deviation.of(c) for c in contacts]
+    matters = False
+    for contact, deviation in zip(contacts, deviations, strict=True):
+        comm, measure = contact.surface.mesh.comm, contact.measure
+        d = contact.points.shape[1]
+        sums = global_sum(comm, [measure @ (contact.pressure > 0)])
+        size = float(sums[0]) ** (1 / (d - 1)) or 1.0
+        largest = global_max(comm, np.abs(contact.traction))
+        if not largest > 0:
+            continue
+        turn = global_max(comm, np.abs(deviation.turn))
+        push = modulus / size * global_max(comm, np.abs(deviation.gap))
+        matters |= not (turn <= _NEGLIGIBLE and push <= _NEGLIGIBLE * largest)
+    if not matters:
+        return {c.name: Linearisation() for c in contacts}
+    springs = [LinearSprings.of(c) for c in contacts]
+    triples = zip(deviations, contacts, springs, strict=True)
+    added = [d.turned(c) + s.change(d.shift(c)) for d, c, s in triples]
+    jumps = respond([s.stiffness for s in springs], added)
+    return {
+        c.name: _relative(c, traction + s.change(jump))
+        for c, s, traction, jump in zip(contacts, springs, added, jumps, strict=True)
+    }
+
+
+def _relative(contact: Contact, change: Array) -> Linearisation:
+    comm, measure = contact.surface.mesh.comm, contact.measure
+    sums = global_sum(comm, np.stack([measure @ contact.traction, measure @ change]))
+    size = float(global_sum(comm, measure @ np.linalg.norm(contact.traction, axis=1)))
+    largest = global_max(comm, np.abs(contact.pressure)) or 1.0  # squares must not overflow
+    along = np.sum(change * contact.values["normal"], axis=1) / largest
+    squares = [measure @ along**2, measure @ (contact.pressure / largest) ** 2]
+    changed, whole = np.sqrt(global_sum(comm, squares))
+    force = float(np.abs(sums[1]).max()) / size if size else 0.0
+    pressure = float(changed / whole) if whole else 0.0
+    return Linearisation(force, pressure, not contact.rigid)

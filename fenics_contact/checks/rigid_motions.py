@@ -1,0 +1,457 @@
+"""Rigid motions that the Dirichlet conditions leave free: who holds them, can the load be balanced.
+
+A body held by contact alone is ordinary. One that nothing holds, or a load that pulls it off its
+support, has no solution: both are found here, before any iteration.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import scipy.optimize
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from fenics_contact import compat
+from fenics_contact.contact.contact import Status
+from fenics_contact.parallel import agreed, gather_rows, global_min, global_sum
+from fenics_contact.surface.bodies import connected_bodies
+from fenics_contact.surface.facets import facet_cells
+from fenics_contact.systems.modes import rigid_motions
+from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.systems.unknowns import Unknowns
+
+__all__ = ["RigidMotions"]
+
+Array = npt.NDArray[np.float64]
+
+# Relative sizes below which an energy, a work or a share of a mode counts as zero. One clamped dof
+# among N gives 1/N, so that the first must lie below any 1/N; the others are far above round-off.
+_FREE = 1e-12
+_FELT = 1e-10
+_BALANCED = 1e-8
+# Directions by which the friction cone is enclosed in space: a polygon around the circle, so that a
+# balance that exists is never denied.
+_CONE_SIDES = 64
+
+
+class RigidMotions:
+    """The rigid motions of every body of a mesh, and those of them that are free.
+
+    A body is a part of the mesh connected by its displacements. Rotations are about the body's
+    middle and scaled by its size, so that every motion is a displacement of order one.
+
+    Attributes:
+        size: Diagonal of the mesh's bounding box (length).
+        names: Name of every motion, those of the bodies first.
+        of_bodies: Their fields at this rank's unknowns, (n_bodies, n_per_body, n_local).
+        free: Coefficients of the free motions, shape (n_free, n_motions).
+    """
+
+    def __init__(
+        self, space: fem.FunctionSpace, unknowns: Unknowns, supports: Sequence[str] = ()
+    ) -> None:
+        """Make the motions at this rank's unknowns. Collective.
+
+        Args:
+            space: Of the displacement.
+            unknowns: Its dofs and the free motions of supports, each a rigid motion of its own.
+            supports: Names of the latter.
+        """
+        self._comm = space.mesh.comm
+        gdim = space.mesh.geometry.dim
+        n_owned = space.dofmap.index_map.size_local
+        x = space.tabulate_dof_coordinates()[:n_owned, :gdim]
+        n_bodies, self._body = connected_bodies(space)
+        body = self._body[:n_owned]
+        low, high = np.full((n_bodies, gdim), np.inf), np.full((n_bodies, gdim), -np.inf)
+        for b in np.unique(body):
+            mine = x[body == b] if n_bodies > 1 else x
+            low[b], high[b] = mine.min(axis=0), mine.max(axis=0)
+        self._comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
+        self._comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
+        self.size = float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
+        self._space, self._centres = space, (low + high) / 2
+        self._sizes = np.linalg.norm(high - low, axis=1)
+        self.names: list[str] = []
+        modes: list[Array] = []
+        for b in range(n_bodies):
+            of = f" of body {b + 1}, near {np.round(self._centres[b], 6).tolist()}"
+            kinds = rigid_motions(x - self._centres[b], self._sizes[b])
+            for name, mode in kinds.items():
+                self.names.append(name + (of if n_bodies > 1 else ""))
+                modes.append(np.where(body[:, None] == b, mode, 0.0).ravel())
+        self.names += supports
+        none, still = np.zeros(len(supports)), np.zeros(unknowns.n_dofs)
+        of_supports = [unknowns.joined(still, row) for row in np.eye(len(supports))]
+        self._modes = np.array([unknowns.joined(mode, none) for mode in modes] + of_supports)
+        shape = n_bodies, len(modes) // n_bodies, unknowns.n_local
+        self.of_bodies = self._modes[: len(modes)].reshape(shape)
+        self.free: Array = np.zeros((0, len(modes)))
+        self._free_fields: Array = np.zeros((0, unknowns.n_local))
+        self._balanced: list[Array] = []
+        # Masks of points that were found to hold all motions, and of which contacts.
+        self._holding: list[npt.NDArray[np.bool_]] = []
+        self._holders: weakref.WeakSet[ContactOperator] = weakref.WeakSet()
+        self._jumps: weakref.WeakKeyDictionary[ContactOperator, Array]
+        self._jumps = weakref.WeakKeyDictionary()
+        self._travels: weakref.WeakKeyDictionary[ContactOperator, Array]
+        self._travels = weakref.WeakKeyDictionary()
+
+    def find_free(self, stiffness: PETSc.Mat, constrained: npt.NDArray[np.bool_]) -> None:
+        """Find the motions with no bulk energy that no Dirichlet condition holds. Collective.
+
+        Args:
+            stiffness: Bulk tangent without conditions.
+            constrained: Mask over this rank's unknowns.
+        """
+        diagonal = stiffness.getDiagonal()
+        top = diagonal.norm(PETSc.NormType.NORM_INFINITY)
+        gram = np.zeros((2, len(self._modes), len(self._modes)))
+        work, image = stiffness.createVecs()
+        for j, mode in enumerate(self._modes):
+            work.array[:] = mode
+            stiffness.mult(work, image)
+            held = np.where(constrained, mode, 0.0)
+            gram[0, :, j] = self._modes @ (image.array / top + held)
+            gram[1, :, j] = self._modes @ mode
+        energy, mass = global_sum(self._comm, gram)
+        scale = 1 / np.sqrt(np.diag(mass))
+        values, vectors = np.linalg.eigh((energy + energy.T) / 2 * np.outer(scale, scale))
+        free = agreed(self._comm, (vectors * scale[:, None])[:, values < _FREE])
+        self._jumps.clear()
+        self.free = _plain(free.T)
+        self._free_fields = self.free @ self._modes
+        self._balanced = []
+        self._holding = []
+        for vector in (diagonal, work, image):
+            vector.destroy()
+
+    def _at_points(self, operator: ContactOperator) -> Array:
+        """Jumps of the free motions at a contact's points: (n_free, n_points, gdim). Collective."""
+        if operator not in self._jumps:
+            gdim, n_points = len(self._centres[0]), operator.contact.quadrature.n_points
+            found = [operator.jump(c @ self._modes) for c in self.free]
+            self._jumps[operator] = np.array(found).reshape(len(self.free), n_points, gdim)
+        return self._jumps[operator]
+
+    def work(self, operator: ContactOperator, force: Array) -> Array:
+        """Of forces at a contact's points, and of what answers them, on the motions of the bodies.
+
+        That of the body with Γc follows from where the points are, not from the map by which the
+        solver transfers forces. Collective.
+
+        Args:
+            operator: Of the contact, over all unknowns.
+            force: On the body with Γc, (n_points, gdim) (force).
+
+        Returns:
+            This rank's part, (n_bodies, n_per_body) (force): translations, then rotations about
+            the body's middle by its size.
+        """
+        if operator not in self._travels:
+            self._travels[operator] = self._travels_at(operator)
+        travels = self._travels[operator]
+        return np.asarray(np.einsum("bmqd,qd->bm", travels, force), dtype=np.float64)
+
+    def _travels_at(self, operator: ContactOperator) -> Array:
+        """What points of a contact feel of the bodies' motions, (n_bodies, n_per_body, ...)."""
+        space, (n_bodies, n_motions, _) = self._space, self.of_bodies.shape
+        contact = operator.contact
+        points = contact.points
+        travels = np.zeros((n_bodies, n_motions, *points.shape))
+        rows = contact.quadrature.point_rows()
+        cells = facet_cells(space.mesh, contact.surface.facets)
+        own = np.zeros(len(points), dtype=np.intp)
+        own[rows.ravel()] = np.repeat(self._body[space.dofmap.list[cells, 0]], rows.shape[1])
+        for b in range(n_bodies):
+            placed = rigid_motions(points - self._centres[b], self._sizes[b])
+            travels[b] = np.where((own == b)[:, None], np.array(list(placed.values())), 0.0)
+            if contact.rigid:
+                continue
+            # The map says where the forces on the opposite act. Both sides may be one body's.
+            # A point without an opposite feels none: a traction there would be left over.
+            felt = np.array([operator.jump(mode) for mode in self.of_bodies[b]])
+            there = contact.paired & ((own != b) | (np.abs(felt[0, :, 0]) < 0.5))
+            travels[b] = np.where(there[:, None], felt, travels[b])
+        if compat.geometry_element(space.mesh).degree > space.ufl_element().degree:
+            # Straight displacements of curved cells have no rotations.
+            travels[:, space.mesh.geometry.dim :] = np.nan
+        return travels
+
+    def _describe(self, coefficients: Array) -> str:
+        share = np.abs(coefficients) / np.abs(coefficients).max()
+        terms = [
+            name if s > 1 - 1e-6 else f"{s:.2g} of {name}"
+            for name, s in zip(self.names, share, strict=True)
+            if s > 1e-6
+        ]
+        return " with ".join(terms)
+
+    def held(self, operators: Sequence[ContactOperator]) -> bool:
+        """Whether the points that are closed now hold every free motion. Collective.
+
+        Args:
+            operators: Of evaluated contacts, over all unknowns.
+        """
+        if not len(self.free):
+            return True
+        bearing = []
+        for contact in (operator.contact for operator in operators):
+            closed = contact.status != Status.OPEN
+            bearing.append(closed)
+            if contact.law.has_tangential:
+                bearing.append(closed & (contact.values["grip"] > 0))
+        # What holds a body still does with more of Γc closed: no need to look again.
+        same = bool(self._holding) and all(operator in self._holders for operator in operators)
+        known = self._holding if same else []
+        lacks = [np.any(was & ~now) for was, now in zip(known, bearing, strict=bool(known))]
+        if self._comm.allreduce(not known or any(lacks)) == 0:
+            return True
+        held = not self._loose(operators, closed_only=True).size
+        if held:
+            self._holding, self._holders = bearing, weakref.WeakSet(operators)
+        return held
+
+    def check_held(self, operators: Sequence[ContactOperator]) -> None:
+        """Refuse a free motion that no contact feels, even if all of Γc were closed. Collective.
+
+        Raises:
+            ValueError: It names the motion.
+        """
+        loose = self._loose(operators, closed_only=False)
+        if loose.size:
+            motions = "; ".join(self._describe(row) for row in loose)
+            raise ValueError(
+                f"nothing will ever hold the body against this rigid motion: {motions}. Add a "
+                "Dirichlet condition on it, or friction"
+            )
+
+    def _loose(self, operators: Sequence[ContactOperator], closed_only: bool) -> Array:
+        """Free motions that no contact feels, (n_loose, n_modes). Collective."""
+        n_free = len(self.free)
+        gram, area = np.zeros((n_free, n_free)), 0.0
+        for operator in operators:
+            contact, values = operator.contact, operator.contact.values
+            modes = self._at_points(operator)
+            along = np.einsum("mqd,qd->mq", modes, values["normal"])
+            weights = contact.quadrature.weights
+            if closed_only:
+                weights = weights * (contact.status != Status.OPEN)
+            area += contact.quadrature.weights.sum()
+            if contact.law.has_normal_stiffness:
+                gram += (along * weights) @ along.T
+            if contact.law.has_tangential:
+                grip = weights * (values["grip"] > 0)
+                across = modes - along[:, :, None] * values["normal"][None]
+                gram += np.einsum("mqd,q,nqd->mn", across, grip, across)
+        mean = global_sum(self._comm, gram) / max(float(global_sum(self._comm, area)), 1e-300)
+        sizes, vectors = np.linalg.eigh(mean)
+        return agreed(self._comm, vectors[:, sizes < _FELT].T @ self.free)
+
+    def resultants(self, forces: Array) -> Array:
+        """Work of forces at this rank's unknowns on the free motions, (n_free,). Collective."""
+        return global_sum(self._comm, self._free_fields @ forces)
+
+    def approach(self, load: Array, operators: Sequence[ContactOperator]) -> Array | None:
+        """Rigid motion to first touch, where the load sets free bodies moving. Collective.
+
+        Args:
+            load: External forces at this rank's unknowns (force).
+            operators: Of evaluated contacts, all of them open, over all unknowns.
+
+        Returns:
+            What to add to the unknowns, or None: nothing moves, or it meets nothing.
+        """
+        if not len(self.free):
+            return None
+        free = self._free_fields
+        drive = global_sum(self._comm, free @ load)
+        mass = global_sum(self._comm, free @ free.T)
+        if not np.abs(drive).max() > 0:
+            return None
+        coefficients = agreed(self._comm, np.linalg.solve(mass, drive))
+        coefficients /= np.abs(coefficients).max()
+        way = np.inf
+        for operator in operators:
+            values = operator.contact.values
+            jump = np.tensordot(coefficients, self._at_points(operator), axes=1)
+            closing = np.einsum("qd,qd->q", jump, values["normal"])
+            nearing = closing > _FELT
+            ways = values["opening"][nearing] / closing[nearing]
+            way = min(way, global_min(self._comm, ways, empty=np.inf))
+        return None if way == np.inf else way * coefficients @ free
+
+    def check_balance(self, load: Array, operators: Sequence[ContactOperator]) -> None:
+        """Refuse a load whose resultant no admissible contact forces can balance. Collective.
+
+        The contact may push anywhere on Γc, and rub within the friction cone: a necessary
+        condition only, but it finds a body pulled off its support, tipped over its edge or pushed
+        along it.
+
+        Args:
+            load: External forces at this rank's unknowns (force).
+            operators: Of evaluated contacts, over all unknowns.
+
+        Raises:
+            ValueError: It gives the resultant and the motion.
+        """
+        if not len(self.free):
+            return
+        free = self._free_fields
+        resultant = global_sum(self._comm, free @ load)
+        # What the load could do at most, were all of it along the motion: the scale of "zero".
+        size = float(global_sum(self._comm, np.abs(free) @ np.abs(load)).max())
+        contacts = [operator.contact for operator in operators]
+        for operator, contact in zip(operators, contacts, strict=True):
+            if not contact.law.has_normal_stiffness:  # a prescribed normal traction is a load
+                force = -contact.values["parameter pressure"][:, None] * contact.values["normal"]
+                work = np.einsum("mqd,qd,q->m", self._at_points(operator), force, contact.measure)
+                resultant += global_sum(self._comm, work)
+        if np.abs(resultant).max() <= _BALANCED * size:
+            return
+        # A history often has one direction of load and one support: what balanced it does again.
+        data = [resultant / np.abs(resultant).max()]
+        for contact in contacts:
+            data += [contact.values["normal"], contact.values.get("grip", np.zeros(0))]
+            data += [np.array([contact.pairings])]
+        known = len(data) == len(self._balanced) and all(map(_alike, data, self._balanced))
+        if self._comm.allreduce(not known) == 0:
+            return
+        rays = np.concatenate([self._rays(operator) for operator in operators], axis=0)
+        # Unit columns: a ray's length has no meaning, and badly scaled ones spoil the solution. One
+        # of rounding only, such as that of tangential forces on a motion across them, is none.
+        length = np.linalg.norm(rays, axis=1)
+        felt = length > _FELT
+        rays = rays[felt] / length[felt, None]
+        rest = np.abs(resultant).max()
+        if len(rays):
+            rest *= agreed(self._comm, _unbalanced(rays.T, -resultant / rest))
+        if rest > _BALANCED * max(size, np.abs(resultant).max()):
+            scale = np.abs(resultant).max()
+            limits = scale * agreed(self._comm, _borne(rays.T, -resultant / scale))
+            size = max(size, scale)
+            beyond = [i for i, r in enumerate(resultant) if abs(r) > limits[i] + _BALANCED * size]
+            said = [
+                f"({self._describe(self.free[i])}) is {resultant[i]:.6g}, of which contact can "
+                f"bear at most {limits[i]:.6g} with the rest as it is"
+                for i in beyond
+            ]
+            worst = int(np.argmax(np.abs(resultant)))
+            said = said or [f"({self._describe(self.free[worst])}) is {resultant[worst]:.6g}"]
+            raise ValueError(
+                "no contact force can balance the load: its resultant along the free motion "
+                f"{', and along '.join(said)}. Contact can only push along its normals and rub "
+                "within the friction cone. Check the sign and size of the load, and the normals, "
+                "or add a Dirichlet condition"
+            )
+        self._balanced = data
+
+    def _rays(self, operator: ContactOperator) -> Array:
+        """Generalised forces of every admissible direction at every point: (n_rays, n_free)."""
+        contact, values = operator.contact, operator.contact.values
+        normal = values["normal"]
+        d = normal.shape[1]
+        directions = []
+        law = contact.law
+        if law.has_tangential:
+            if d == 2:
+                around = [np.column_stack([-normal[:, 1], normal[:, 0]])]
+                around.append(-around[0])
+            else:
+                around = _around(normal)
+            friction = values["grip"][:, None]
+            if law.has_friction and not law.has_potential:
+                enlarge = 1.0 if d == 2 else 1 / np.cos(np.pi / _CONE_SIDES)
+                directions = [-normal + enlarge * friction * t for t in around]
+            else:  # Tresca, foundation: the tangential force does not need the normal one
+                directions = [np.where(friction > 0, t, 0.0) for t in around]
+        if law.has_normal_stiffness:
+            directions.append(-normal)
+        if law.has_tension:
+            directions.append(normal)
+        modes = self._at_points(operator)
+        rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
+        return gather_rows(self._comm, np.concatenate(rays).reshape(-1, len(self.free)))
+
+
+def _alike(one: Array, other: Array) -> bool:
+    return one.shape == other.shape and np.allclose(one, other, rtol=0.0, atol=1e-12)
+
+
+def _unbalanced(rays: Array, resultant: Array) -> float:
+    """The least Σ|resultant - rays·x| over x ≥ 0; rays (n_free, n_rays) of unit length.
+
+    Least squares without negatives find at once that there is nothing left, but where there is they
+    may end far from their optimum: then a linear programme, which takes ten times as long.
+    """
+    m, n = rays.shape
+    try:
+        if np.abs(rays @ scipy.optimize.nnls(rays, resultant)[0] - resultant).sum() < _BALANCED:
+            return 0.0
+    except RuntimeError:
+        pass  # too many iterations; so the linear programme
+    tolerance = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+    found = scipy.optimize.linprog(
+        np.concatenate([np.zeros(n), np.ones(2 * m)]),
+        A_eq=np.hstack([rays, np.eye(m), -np.eye(m)]),
+        b_eq=resultant,
+        options=tolerance,
+    )
+    # What the programme cannot tell is left to the solution itself to show.
+    return float(found.fun) if found.status == 0 else 0.0
+
+
+def _borne(rays: Array, wanted: Array) -> Array:
+    """How much of each component of a force rays can make, all others as wanted, (n_free,).
+
+    Of the sign that is wanted; NaN where the others alone cannot be made.
+
+    Args:
+        rays: (n_free, n_rays) of unit length.
+        wanted: The force, (n_free,).
+    """
+    found = np.full(len(wanted), np.nan)
+    if not rays.size:
+        return found
+    for i, value in enumerate(wanted):
+        rest = np.where(np.arange(len(wanted)) == i, 0.0, wanted)
+        along = np.zeros((len(wanted), 1))
+        along[i] = -1.0 if value >= 0 else 1.0
+        cost = np.append(np.zeros(rays.shape[1]), -1.0)
+        made = scipy.optimize.linprog(cost, A_eq=np.hstack([rays, along]), b_eq=rest)
+        if made.status == 0:
+            found[i] = made.x[-1]
+    return found
+
+
+def _plain(rows: Array) -> Array:
+    """The same space, each row with a 1 where all others have none: as few names as can be."""
+    rows = rows.copy()
+    done: list[int] = []
+    for _ in range(len(rows)):
+        open_rows = [i for i in range(len(rows)) if i not in done]
+        part = np.abs(rows[open_rows])
+        i, j = np.unravel_index(np.argmax(part), part.shape)
+        pivot = open_rows[int(i)]
+        rows[pivot] /= rows[pivot, j]
+        for other in range(len(rows)):
+            if other != pivot:
+                rows[other] -= rows[other, j] * rows[pivot]
+        done.append(pivot)
+    rows[np.abs(rows) < _FELT] = 0.0
+    return rows / np.abs(rows).max(axis=1, initial=1.0)[:, None] if rows.size else rows
+
+
+def _around(normal: Array) -> list[Array]:
+    """Unit vectors around each normal in space, `_CONE_SIDES` of them."""
+    least = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
+    first = np.cross(normal, least)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(normal, first)
+    angles = 2 * np.pi * np.arange(_CONE_SIDES) / _CONE_SIDES
+    return [np.cos(a) * first + np.sin(a) * second for a in angles]

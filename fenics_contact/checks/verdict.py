@@ -1,0 +1,341 @@
+"""The verdict on a solution: what it must satisfy, checked apart from the solver and the forms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fenics_contact.checks.kinematics import Linearisation
+from fenics_contact.contact.contact import Contact
+from fenics_contact.parallel import global_max
+
+__all__ = ["Attempt", "NotConverged", "Verdict", "check_laws"]
+
+# The laws hold point by point up to rounding of their few operations.
+_LAW_TOLERANCE = 1e-10
+# Share of the energy exchanged that friction may seem to give: by the mean of the tractions at both
+# ends it does so where slip turns round within a long increment (6 % where a load aside is
+# reversed at once); in a state that smaller increments do not lead to it is half or more.
+_CREATED = 0.25
+# A displacement by the size of the mesh that is none of a body that anything holds.
+_FARTHEST = 10.0
+
+
+@dataclass(frozen=True)
+class Balance:
+    """What is left of forces that should balance, and what it is judged by.
+
+    Attributes:
+        residual: What is left (force).
+        force: Size of the forces of the present increment (force).
+        tolerance: Largest residual that passes (force).
+    """
+
+    residual: float
+    force: float
+    tolerance: float
+
+    def holds(self, times: float = 1.0) -> bool:
+        """Whether the residual passes, and all is finite."""
+        finite = np.isfinite([self.residual, self.force, self.tolerance]).all()
+        return bool(finite and self.residual <= times * self.tolerance)
+
+    def _excess(self) -> float:
+        if not self.holds(np.inf):
+            return np.inf
+        return self.residual / self.tolerance if self.residual > 0 else 0.0
+
+    def __str__(self) -> str:
+        """What is left, and what would pass."""
+        return f"{self.residual:.3e} above {self.tolerance:.3e}, of forces of {self.force:.3e}"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was checked after a solve, the same on every rank.
+
+    Attributes:
+        equations: Norms of the free residual, recomputed by assembly, by body, free support and
+            contact: each is judged by the forces that act on it in the present increment.
+        sums: Largest component of load + contact + reactions, by body, and of their moments about
+            its middle, by its size: contact by its tractions at the points and not by its nodal
+            forces.
+        laws: Largest violations by contact and by law, relative; see `check_laws`.
+        enforcement: `Contact.enforcement_error` of the contacts with multipliers, by name.
+        enforcement_tolerance: What passes, by name.
+        unseen: How deep the opposite body passes through Γc between its points (length), and where,
+            by the names of the contacts where it does; see `Contact.unseen_penetration`.
+        kinematics: What taking displacements as small changes, relative, by contact.
+        kinematics_allowed: What passes; where it is finite no displacement passes that is more than
+            ten times as large as the mesh, and as the motions and gaps that are imposed.
+        displacement: The largest one, relative to these.
+        created: Share of the energy exchanged that friction has given; see `Energy.created`.
+        routes: By contact the largest difference of its nodal forces from those that DOLFINx
+            assembles from the boundary form; empty where it was not asked for, see ``second_route``
+            of `ContactProblem`.
+    """
+
+    equations: dict[str, Balance]
+    sums: dict[str, Balance]
+    laws: dict[str, dict[str, float]] = field(default_factory=dict)
+    enforcement: dict[str, float] = field(default_factory=dict)
+    enforcement_tolerance: dict[str, float] = field(default_factory=dict)
+    unseen: dict[str, tuple[float, list[float]]] = field(default_factory=dict)
+    kinematics: dict[str, Linearisation] = field(default_factory=dict)
+    kinematics_allowed: float = np.inf
+    displacement: float = 0.0
+    created: float = 0.0
+    routes: dict[str, Balance] = field(default_factory=dict)
+
+    @property
+    def residual(self) -> float:
+        """That of the equations which hold least well (force)."""
+        return self._worst(self.equations).residual
+
+    @property
+    def force(self) -> float:
+        """What that residual is judged by (force)."""
+        return self._worst(self.equations).force
+
+    @property
+    def tolerance(self) -> float:
+        """Largest residual that passes there (force)."""
+        return self._worst(self.equations).tolerance
+
+    @property
+    def imbalance(self) -> float:
+        """Of the sums of forces the one that is balanced least well (force)."""
+        return self._worst(self.sums).residual
+
+    @property
+    def imbalance_tolerance(self) -> float:
+        """Largest imbalance that passes there (force)."""
+        return self._worst(self.sums).tolerance
+
+    @property
+    def relative_residual(self) -> float:
+        """The residual by the forces it is judged by; 0 where there are none."""
+        worst = self._worst(self.equations)
+        return worst.residual / worst.force if worst.force else 0.0
+
+    @staticmethod
+    def _worst(balances: dict[str, Balance]) -> Balance:
+        return max(balances.values(), key=Balance._excess)
+
+    @property
+    def failures(self) -> list[str]:
+        """What does not hold, in words; empty for a solution."""
+        found = []
+        # Twice: the solver's residual is a product with K, this one an assembly.
+        for name, balance in self.equations.items():
+            if not balance.holds(2.0):
+                found.append(f"residual of {name} is {balance}")
+        for name, balance in self.sums.items():
+            if not balance.holds():
+                found.append(f"forces on {name}, or their moments, do not balance: {balance}")
+        for contact, balance in self.routes.items():
+            if not balance.holds():
+                found.append(
+                    f"{contact}: forces differ from those of the boundary form as DOLFINx "
+                    f"assembles it: {balance}"
+                )
+        for contact, laws in self.laws.items():
+            found += [
+                f"{contact}: {law} violated by {value:.3e} (relative)"
+                for law, value in laws.items()
+                if not value <= _LAW_TOLERANCE
+            ]
+        for contact, error in self.enforcement.items():
+            allowed = self.enforcement_tolerance[contact]
+            if not error <= allowed:
+                found.append(
+                    f"{contact}: penetration or elastic slip left, {error:.3e} of the largest "
+                    f"traction in the springs, above {allowed:.3e}; a larger tolerance, or "
+                    "k_n and k_t nearer to 10 E/h, take fewer rounds"
+                )
+        if not self.created <= _CREATED:
+            found.append(
+                f"friction would drive the slip, by {100 * self.created:.2g} % of the energy "
+                "exchanged: another state than smaller increments lead to, where several satisfy "
+                "the equations; use smaller ones (increments() cuts them by itself)"
+            )
+        for contact, change in self.kinematics.items():
+            if not change.judged <= self.kinematics_allowed:
+                found.append(
+                    f"{contact}: displacements are too large to be taken as small: with gap and "
+                    "normals where the body has moved to, the contact force would differ by "
+                    f"{100 * change.force:.2g} % and the pressure by "
+                    f"{100 * change.pressure:.2g} %, above {100 * self.kinematics_allowed:.2g} %; "
+                    "load in smaller steps, describe the motion as one of the support, find pairs "
+                    'anew (update="increment"), or accept it: ContactProblem(kinematics=inf)'
+                )
+        if not (self.displacement <= _FARTHEST or self.kinematics_allowed == np.inf):
+            found.append(
+                f"a displacement is {self.displacement:.2g} times as large as the mesh: nothing "
+                "holds a body there, or stiffness and loads are in other units than lengths; or "
+                "accept it: ContactProblem(kinematics=inf)"
+            )
+        for contact, (depth, place) in self.unseen.items():
+            found.append(
+                f"{contact}: the opposite body passes through Γc between its points, {depth:.3e} "
+                f"deep near {np.round(place, 6).tolist()}; let the finer surface be Γc, refine Γc "
+                "there, or add a second contact with the surfaces swapped"
+            )
+        return found
+
+
+def check_laws(contact: Contact) -> dict[str, float]:
+    """Check the laws at every quadrature point by inequalities, not by the return map. Collective.
+
+    Args:
+        contact: An evaluated contact.
+
+    Returns:
+        Largest violations, relative to the largest value concerned. "complementarity"
+        (eq. 6-11: r_n ≤ 0, δ± ≥ 0, δ₊δ₋ = 0, r_n δ₊ = 0, s - u_n = δ₊ - δ₋, r_n = -k_n δ₋;
+        with multipliers r_n = -k_n (u_n - s) - λ_n where that is < 0; of a law with its own
+        `normal_potential` r_n is minus the derivative of it by u_n instead), or
+        where the law bears tension "stiffness" (r_n = -k_n (u_n - s)). With friction, by the law's
+        yield functions g_j: "cone" (g_j ≤ 0), "slip" (eq. 44: Δβ ≥ 0, the change of the traction
+        is that of adherence and associated slip, Δτ = -K_t (Δu_t + Σ Δβ_j ∂g_j/∂τ)) and
+        "dissipation" (Δβ_j g_j = 0, slip against τ). With tangential tractions but no friction
+        "stiffness" holds τ = -K_t u_t too, or τ = 0 where open. NaN where something is not finite.
+    """
+    comm = contact.surface.mesh.comm
+    # Points without an opposite bear nothing, whatever they do.
+    law, paired, v = contact.law, contact.paired, contact.values
+    if not paired.all():
+        v = {name: values[paired] for name, values in v.items()}
+
+    def worst(*violations: np.ndarray) -> float:
+        return max(global_max(comm, np.abs(x)) for x in violations)
+
+    def relative(value: float, *scales: np.ndarray) -> float:
+        scale = worst(*scales)
+        return value / scale if scale > 0 or not np.isfinite(scale) else value
+
+    opening, penetration, r_n = v["opening"], v["penetration"], v["normal_traction"]
+    length = (opening, penetration, v["gap"], v["normal_displacement"])
+    violations = [
+        relative(
+            worst(
+                np.minimum(opening, 0),
+                np.minimum(penetration, 0),
+                np.minimum(opening, penetration),
+                v["gap"] - v["normal_displacement"] - opening + penetration,
+            ),
+            *length,
+        )
+    ]
+    if law.has_own_normal:
+        k = np.where(r_n != 0, contact.normal_stiffness, 0.0)
+        parts = (k * v["normal_displacement"], k * v["gap"])  # whose round-off is in r_n
+        pull = np.maximum(r_n, 0) if not law.has_tension else np.zeros_like(r_n)
+        violations.append(relative(worst(pull, r_n - v["normal_reaction"]), r_n, *parts))
+    elif law.has_tension:
+        k_n = v["parameter k_n"]
+        elastic = k_n * (v["normal_displacement"] - v["gap"])
+        parts = (k_n * v["normal_displacement"], k_n * v["gap"])  # whose round-off is in r_n
+        violations.append(relative(worst(r_n + elastic), r_n, *parts))
+    elif law.has_normal_stiffness and contact.multipliers is not None:
+        slack = -r_n - v["multiplier"] - v["parameter k_n"] * (penetration - opening)
+        violations.append(relative(worst(np.minimum(-r_n, slack)), r_n, v["multiplier"]))
+    elif law.has_normal_stiffness:
+        elastic = v["parameter k_n"] * penetration
+        violations.append(relative(worst(np.maximum(r_n, 0), r_n + elastic), r_n))
+    violations.append(relative(worst(contact.traction[~paired]), contact.traction))
+    found = {"stiffness" if law.has_tension else "complementarity": max(violations)}
+    if not law.has_tangential:
+        return found
+
+    tau, stiffness = v["traction"], contact.tangential_stiffness[paired]
+    if not law.has_friction:
+        elastic = np.einsum("qij,qj->qi", stiffness, contact.tangential_displacement[paired])
+        if not law.has_tension:
+            elastic[penetration <= 0] = 0.0
+        # Round-off in u_t is that of the displacement it is a part of.
+        whole = np.abs(stiffness).max(axis=(1, 2))[:, None] * v["jump"]
+        violation = relative(worst(tau + elastic), tau, whole)
+        found["stiffness"] = max(found.get("stiffness", 0.0), violation)
+        return found
+
+    limit, beta = v["limit"], v["slip_increment"]
+    functions, gradients = (rows[paired] for rows in contact.evaluate_yield())
+    missing = contact.slip_vector()[paired]  # = -Σ Δβ_j ∂g_j/∂τ (44)
+    change = missing - v["increment"]
+    # An open point keeps no traction and counts no slip, whatever it moves.
+    bears = limit > 0
+    slipped = -np.einsum("qm,qmd->qd", beta, gradients)
+    # Round-off in the increments is that of the displacements they are differences of.
+    travel = (v["jump"], v["increment"], change)
+    found["cone"] = relative(worst(np.maximum(functions, 0)), limit)
+    found["slip"] = relative(worst(np.minimum(beta, 0), (missing - slipped)[bears]), *travel)
+    found["dissipation"] = relative(
+        worst((beta * functions)[bears], np.maximum(np.sum(tau * missing, axis=1) * bears, 0)),
+        np.array([worst(limit) * worst(*travel)]),
+    )
+    return found
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One thing that was tried to solve an increment.
+
+    Attributes:
+        method: A method of `ContactProblem`; or "cut", where `increments` halved the increment.
+        iterations: SNES iterations.
+        outcome: "converged", or what went wrong, in words.
+    """
+
+    method: str
+    iterations: int
+    outcome: str
+
+    def __str__(self) -> str:
+        """For logs and messages."""
+        return f"{self.method}: {self.outcome} ({self.iterations} iterations)"
+
+
+class NotConverged(RuntimeError):
+    """No solution of an increment was found. u and history are as before the increment.
+
+    Attributes:
+        increment: Its number, from 1.
+        reason: SNES reason of what was tried last (negative: diverged; positive: it claimed
+            convergence).
+        iterations: SNES iterations made.
+        verdict: The last state, as checked.
+        attempts: What was tried, in its order.
+    """
+
+    def __init__(
+        self,
+        increment: int,
+        reason: int,
+        verdict: Verdict,
+        attempts: Sequence[Attempt] = (),
+        *,
+        prefix: str = "contact_",
+    ) -> None:
+        """Compose the message: what happened, the numbers, and what to try.
+
+        Args:
+            increment: See the attributes.
+            reason: See the attributes.
+            verdict: See the attributes.
+            attempts: See the attributes.
+            prefix: Of the problem's options.
+        """
+        self.increment, self.reason, self.verdict = increment, reason, verdict
+        self.attempts = tuple(attempts)
+        self.iterations = sum(attempt.iterations for attempt in attempts)
+        what = "; ".join(verdict.failures) or "the last state passes the checks"
+        tried = ". ".join(str(attempt) for attempt in attempts)
+        super().__init__(
+            f"increment {increment} did not converge: SNES reason {reason} after {self.iterations} "
+            f"iterations; {what}; forces are of size {verdict.force:.3e}. Tried: {tried}. Try "
+            f"smaller increments, a lower k_t, then a lower k_n; -{prefix}snes_monitor shows the "
+            "iterations"
+        )

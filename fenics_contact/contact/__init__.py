@@ -1,0 +1,1 @@
+"""Contact: displacement, surface, support and law bound together."""

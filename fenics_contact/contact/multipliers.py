@@ -1,0 +1,161 @@
+"""Augmented Lagrangian: multipliers take over what the springs of the penalty bear.
+
+With λ_n and λ_t at the points of Γc the laws read r_n = -⟨λ_n + k_n (u_n - s)⟩₊, and the return map
+starts from λ_t in place of the committed traction. Where λ_n = -r_n and λ_t = τ nothing penetrates,
+and nothing creeps before it slips, however soft the springs are. After every solution the
+multipliers are taken from the tractions found, and the next one starts from there (Uzawa): each
+round leaves a share of about 1/(1 + k_n/k) of the penetration, k the stiffness of the body against
+it.
+
+There are more points on Γc than displacements can answer: 3 to an edge of quadratic cells, which
+has 2 nodes of its own. Multipliers of every point would pile up what nothing answers, and those
+that hold a displacement by a corner would take hundreds of rounds. So λ is the L2 projection Π of
+the tractions onto continuous functions of one degree less than the displacement (at least 1), with
+the quadrature of Γc: stationary point of the augmented Lagrangian with multipliers in that space,
+Π(u_n - s) = 0 where all of a neighbourhood is closed. What the projection leaves to the springs
+falls with the mesh as the rest of the error does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
+
+from fenics_contact.laws.base import Law
+from fenics_contact.parallel import global_max
+from fenics_contact.surface.fields import PointFields
+from fenics_contact.surface.surface import SurfaceQuadrature
+
+__all__ = ["Multipliers", "TraceProjection"]
+
+Array = npt.NDArray[np.float64]
+
+# Of the projection of tractions, relative.
+_ROUND_OFF = 1e-12
+# Round-off of a displacement, by its size.
+_BLUR = 100 * np.finfo(float).eps
+
+
+class TraceProjection:
+    """The function of a degree on Γc that is closest to values at the points, at these points.
+
+    Closest in the mean square over Γc by its quadrature; continuous. Where the points are too few
+    to tell the functions apart it is one of the closest, which have the same values there.
+    """
+
+    def __init__(self, quadrature: SurfaceQuadrature, degree: int) -> None:
+        """Tabulate the functions. Collective.
+
+        Args:
+            quadrature: The points.
+            degree: Of the displacement element; that of the functions is one less, and at least 1.
+        """
+        trace = ("Lagrange", max(1, degree - 1))
+        space = fem.functionspace(quadrature.surface.submesh, trace)
+        self._basis = quadrature.interpolation_matrix(space)
+        self._values = self._basis.createVecLeft()
+        self._weights = self._basis.createVecLeft()
+        self._weights.array[:] = quadrature.weights
+        weighted = self._basis.copy()
+        weighted.diagonalScale(self._weights, None)
+        gram = self._basis.transposeMatMult(weighted)
+        weighted.destroy()
+        self._right, self._solution = gram.createVecs()
+        self._ksp = PETSc.KSP().create(quadrature.surface.mesh.comm)
+        self._ksp.setOperators(gram)
+        self._ksp.setType(PETSc.KSP.Type.CG)
+        self._ksp.getPC().setType(PETSc.PC.Type.JACOBI)
+        self._ksp.setTolerances(rtol=1e-13, atol=1e-300, max_it=500)
+
+    def __call__(self, values: Array) -> Array:
+        """Project, (n_points,) or a column at a time (n_points, n). Collective."""
+        columns = values if values.ndim > 1 else values[:, None]
+        result = np.zeros_like(columns)
+        for i in range(columns.shape[1]):
+            self._values.array[:] = columns[:, i]
+            self._values.pointwiseMult(self._weights, self._values)
+            self._basis.multTranspose(self._values, self._right)
+            self._ksp.solve(self._right, self._solution)
+            self._basis.mult(self._solution, self._values)
+            result[:, i] = self._values.array_r
+        return result.reshape(values.shape)
+
+
+class Multipliers:
+    """λ_n and λ_t at the points of a contact.
+
+    Attributes:
+        fields: "pressure" λ_n and, with friction, "traction" λ_t (stress).
+    """
+
+    def __init__(self, quadrature: SurfaceQuadrature, degree: int, law: Law) -> None:
+        """Zeros. Collective.
+
+        Args:
+            quadrature: The points.
+            degree: Of the displacement element.
+            law: Of the contact.
+        """
+        self._comm = quadrature.surface.mesh.comm
+        self._law = law
+        friction = {"traction": quadrature.surface.mesh.geometry.dim} if law.has_friction else {}
+        self.fields = PointFields(quadrature, {"pressure": 0} | friction)
+        self._project = TraceProjection(quadrature, degree)
+
+    def _next(self, values: Mapping[str, Array]) -> dict[str, Array]:
+        """The multipliers that the tractions of an evaluated contact make."""
+        found: dict[str, Array] = {"pressure": np.zeros(len(values["normal_traction"]))}
+        if self._law.has_normal_stiffness:
+            found["pressure"] = self._project(-values["normal_traction"])
+        if self._law.has_friction:
+            found["traction"] = self._project(values["traction"])
+        return found
+
+    def error(self, values: Mapping[str, Array], history: PointFields) -> float:
+        """Largest change that `update` would make, see `Contact.enforcement_error`. Collective."""
+        found = self._next(values)
+        names = [n for n in ("normal_traction", "traction") if n in history]
+
+        def largest(of: Callable[[str], Array], names: Iterable[str]) -> float:
+            return max(global_max(self._comm, np.abs(of(n))) for n in names)
+
+        change = largest(lambda n: found[n] - self.fields.values(n), found)
+        # By the tractions of this increment: those before it leave round-off and no more.
+        scale = largest(lambda n: values[n], names)
+        before = largest(history.values, names)
+        if change <= _ROUND_OFF * max(scale, before):
+            return 0.0
+        # Displacements have round-off however little is borne, and springs make a traction of it.
+        moved = np.linalg.norm(values["jump"], axis=1)
+        for name in sorted({"parameter k_n", "parameter k_t"} & set(values)):
+            if change <= _BLUR * global_max(self._comm, values[name] * moved):
+                return 0.0
+        return change / scale if scale > 0 else np.inf
+
+    def update(self, values: Mapping[str, Array]) -> None:
+        """Make the tractions of an evaluated contact the multipliers. Collective."""
+        self.fields.commit(self._next(values))
+
+    def committed(self, values: Mapping[str, Array]) -> dict[str, Array]:
+        """What of the state of an evaluated contact becomes history, by name.
+
+        The next increment counts Δu_t from where its return map, which starts from λ_t, gives the
+        present τ: else a sticking point would creep by what is left within the tolerance, increment
+        by increment.
+        """
+        found = {"multiplier": self.fields.values("pressure")}
+        if self._law.has_friction:
+            found["traction"] = self.fields.values("traction")
+            found["jump"] = values["jump"] - values["elastic_slip"]
+        return found
+
+    def restore(self, history: PointFields) -> None:
+        """Take those of the last commit. Collective."""
+        values = {"pressure": history.values("multiplier")}
+        if self._law.has_friction:
+            values["traction"] = history.values("traction")
+        self.fields.commit(values)

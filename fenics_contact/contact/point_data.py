@@ -1,0 +1,67 @@
+"""What was given of a contact, sampled at its points.
+
+A law sees numbers at the points and not the expressions they come from, so that what is compiled
+for a law serves every support, gap and body. The numbers follow the constants and functions in the
+expressions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+
+from fenics_contact.surface.dependence import Dependence
+from fenics_contact.surface.fields import PointFields
+from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
+
+__all__ = ["PointData"]
+
+Array = npt.NDArray[np.float64]
+
+
+class PointData:
+    """Named expressions at the points of Γc, and some of them as functions for the laws.
+
+    Attributes:
+        values: All of them, (n_points,) or (n_points, d), as sampled by the last `update`.
+    """
+
+    def __init__(
+        self,
+        quadrature: SurfaceQuadrature,
+        expressions: Mapping[str, ufl.core.expr.Expr],
+        seen: Iterable[str],
+    ) -> None:
+        """Compile. Collective.
+
+        Args:
+            quadrature: The points.
+            expressions: Scalars and vectors by name.
+            seen: Names of those that laws see.
+        """
+        self._comm = quadrature.surface.mesh.comm
+        self._evaluate = PointEvaluator(quadrature, expressions)
+        form = self._evaluate.form
+        self._dependence = Dependence(form.constants(), form.coefficients())
+        shapes = {name: ufl.as_ufl(expressions[name]).ufl_shape for name in seen}
+        sizes = {name: shape[0] if shape else 0 for name, shape in shapes.items()}
+        self._fields = PointFields(quadrature, sizes)
+        self.values: Mapping[str, Array] = {}
+
+    def ufl(self, name: str) -> ufl.core.expr.Expr:
+        """One of those that laws see, as a function at the points (UFL)."""
+        return self._fields.ufl(name)
+
+    def update(self) -> None:
+        """Sample again if a constant or a function has changed. Collective."""
+        changed = self._dependence.changed
+        if self._comm.size > 1:
+            changed = self._comm.allreduce(int(changed)) > 0
+        if changed:
+            self._dependence.forget()  # until all is sampled
+            self.values = self._evaluate()
+            self._fields.commit(self.values)
+            self._dependence.note()

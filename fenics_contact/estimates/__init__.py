@@ -1,0 +1,1 @@
+"""Errors of a solution, and meshes that make them small."""

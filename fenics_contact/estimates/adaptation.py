@@ -1,0 +1,137 @@
+"""Meshes that are fine where the error is made: the ends of contact and of the stick zone.
+
+Solve, tell cell by cell by how much smooth stresses differ, split the cells that make most of it,
+and solve again from the start of the load history. For simplex meshes of straight cells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import dolfinx
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from fenics_contact import compat
+from fenics_contact.estimates.errors import ErrorBudget, estimate_errors
+from fenics_contact.parallel import gather_rows
+from fenics_contact.problem import ContactProblem
+
+__all__ = ["Level", "adapt"]
+
+Array = npt.NDArray[np.float64]
+_SIMPLICES = (dolfinx.mesh.CellType.triangle, dolfinx.mesh.CellType.tetrahedron)
+
+
+@dataclass(frozen=True)
+class Level:
+    """One solution on the way.
+
+    Attributes:
+        mesh, facet_tags: What it was found on.
+        problem: The problem, solved.
+        budget: Its estimated errors.
+        dofs: Displacements, of all ranks.
+    """
+
+    mesh: dolfinx.mesh.Mesh
+    facet_tags: dolfinx.mesh.MeshTags
+    problem: ContactProblem
+    budget: ErrorBudget
+    dofs: int
+
+
+def adapt(
+    mesh: dolfinx.mesh.Mesh,
+    facet_tags: dolfinx.mesh.MeshTags,
+    solve: Callable[[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags], tuple[Any, ...]],
+    *,
+    levels: int = 8,
+    share: float = 0.5,
+    snap: Mapping[int, Callable[[Array], Array]] | None = None,
+) -> Iterator[Level]:
+    """Solve on finer and finer meshes. Collective.
+
+    Args:
+        mesh: The first one: triangles or tetrahedra with straight edges, no
+            ghost cells.
+        facet_tags: Of its boundary; every mesh gets them.
+        solve: Makes the problem on a mesh with tags and leads it through its loads; returns the
+            problem, the stress σ(u) (UFL), and where that is (3, 3) the strain.
+        levels: Number of solutions.
+        share: Of the squared error, which the cells that are split make together, 0 to 1; 1 splits
+            all cells.
+        snap: By tag, where new nodes of curved sides belong: a map of coordinates, (n, gdim).
+
+    Yields:
+        A `Level` after every solution.
+
+    Raises:
+        ValueError: Cells that cannot be split, or arguments without sense.
+        NotConverged: As ``solve`` does.
+    """
+    degree = compat.geometry_element(mesh).degree
+    if mesh.topology.cell_type not in _SIMPLICES or degree != 1:
+        raise ValueError(
+            f"the mesh has cells {mesh.topology.cell_type.name} of degree "
+            f"{degree}; only triangles and tetrahedra with straight edges "
+            "can be split: take such a mesh, and snap= for curved sides"
+        )
+    if mesh.comm.allreduce(mesh.topology.index_map(mesh.topology.dim).num_ghosts):
+        raise ValueError(
+            "the mesh has ghost cells, through which DOLFINx hands down no tags: make it with "
+            "ghost_mode=dolfinx.mesh.GhostMode.none"
+        )
+    if not 0.0 < share <= 1.0 or levels < 1:
+        raise ValueError(f"share is {share!r}, levels {levels!r}; use 0 < share <= 1, levels >= 1")
+    budget: ErrorBudget | None = None
+    for _ in range(levels):
+        if budget is not None:
+            assert budget.cells is not None
+            cells = _worst(mesh.comm, budget.cells, share)
+            mesh, facet_tags = _split(mesh, facet_tags, cells, snap or {})
+        problem, stress, *strain = solve(mesh, facet_tags)
+        budget = estimate_errors(problem, stress, strain=strain[0] if strain else None)
+        dofmap = problem.u.function_space.dofmap
+        dofs = dofmap.index_map.size_global * dofmap.index_map_bs
+        yield Level(mesh, facet_tags, problem, budget, dofs)
+
+
+def _worst(comm: MPI.Comm, squares: Array, share: float) -> npt.NDArray[np.int32]:
+    """This rank's cells among those that make a share of the sum, largest first. Collective."""
+    everywhere = np.sort(gather_rows(comm, squares))[::-1]
+    sums = np.cumsum(everywhere)
+    last = int(np.searchsorted(sums, share * sums[-1])) if sums.size else 0
+    least = everywhere[min(last, len(everywhere) - 1)]
+    return np.flatnonzero(squares >= least).astype(np.int32)
+
+
+def _split(
+    mesh: dolfinx.mesh.Mesh,
+    tags: dolfinx.mesh.MeshTags,
+    cells: npt.NDArray[np.int32],
+    snap: Mapping[int, Callable[[Array], Array]],
+) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
+    """Split the edges of cells, and what must be split with them. Collective."""
+    d = mesh.topology.dim
+    mesh.topology.create_entities(1)
+    mesh.topology.create_connectivity(d - 1, d)
+    edges = dolfinx.mesh.compute_incident_entities(mesh.topology, cells, d, 1)
+    # Cells stay with their rank: tags can only be handed down there.
+    finer, parents, facets = dolfinx.mesh.refine(
+        mesh, edges, partitioner=None, option=dolfinx.mesh.RefinementOption.parent_cell_and_facet
+    )
+    for dim in (d - 1, d):
+        finer.topology.create_entities(dim)
+    finer.topology.create_connectivity(d - 1, d)
+    finer_tags = dolfinx.mesh.transfer_meshtag(tags, finer, parents, facets)
+    for tag, place in snap.items():
+        sides = finer_tags.find(tag)
+        if not sides.size:
+            continue  # DOLFINx 0.9 crashes without any
+        nodes = np.unique(dolfinx.mesh.entities_to_geometry(finer, d - 1, sides))
+        finer.geometry.x[nodes, :d] = place(finer.geometry.x[nodes, :d])
+    return finer, finer_tags

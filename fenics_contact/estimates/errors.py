@@ -1,0 +1,460 @@
+"""How wrong a solution is, by parts: enforcement, mesh, increments, kinematics, solver.
+
+Each part is estimated apart, in the unit that a user looks at: contact force, peak pressure and
+displacement. Enforcement and solver are what one more step would change, from a linear solve with
+the tangent of the state; discretisation is told from the jump of the stresses between cells; the
+increments from halves of themselves (`increments`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import dolfinx.fem.petsc
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem, la
+from petsc4py import PETSc
+
+from fenics_contact import compat
+from fenics_contact.checks.kinematics import Deviation, LinearSprings
+from fenics_contact.contact.contact import Contact, Status
+from fenics_contact.parallel import global_max, global_sum
+from fenics_contact.problem import ContactProblem
+from fenics_contact.surface.surface import PointEvaluator
+
+__all__ = ["ErrorBudget", "estimate_errors", "quantities"]
+
+Array = npt.NDArray[np.float64]
+
+DISPLACEMENT = "displacement"
+# What to change where a part dominates.
+_REMEDIES = {
+    "enforcement": "a higher k_n and k_t",
+    "discretisation": "a finer mesh at the contact, or a higher degree",
+    "increments": "more increments",
+    "kinematics": "a motion of the support instead of the body, or pairs found anew,",
+    "solver": "a smaller snes_rtol",
+}
+
+
+# Facets in a row under pressure from which on discretisation is estimated reliably.
+_FEW = 5
+
+
+@dataclass(frozen=True)
+class ErrorBudget:
+    """Estimated errors of a solution, the same on every rank.
+
+    Attributes:
+        values: The quantities: of every contact "normal force" (force), "friction force" (force)
+            and "peak pressure" (stress), after the contact's name where there are several; and
+            "displacement", that of the loads along themselves (length), or without loads the
+            largest one.
+        parts: Estimates "enforcement", "discretisation", "increments", "kinematics" (what taking
+            displacements as small leaves out) and "solver": absolute errors by quantity, signed as
+            value minus truth where a sign is known. A part that could not be told has no entry.
+        wanted: The relative error that the contacts' ``accuracy`` stands for, if it was said.
+        h: Mean size of the facets of the contacts that bear pressure (length).
+        across: How many of these facets there are in a row, about: their number in two dimensions,
+            its root in three; 0 where none bears. Fewer than five make the estimate of
+            discretisation unreliable.
+        degree: Of the displacement.
+        energy: Error of discretisation in the energy norm, relative.
+        cells: Squares of that error, of every cell that this rank owns (force times length).
+    """
+
+    values: dict[str, float]
+    parts: dict[str, dict[str, float]]
+    wanted: float | None = None
+    h: float = 0.0
+    across: float = 0.0
+    degree: int = 1
+    energy: float = 0.0
+    cells: Array | None = field(default=None, repr=False, compare=False)
+
+    def numbers(self) -> dict[str, Any]:
+        """All but the cells, for files; ``ErrorBudget(**numbers)`` has them again."""
+        names = ("values", "parts", "wanted", "h", "across", "degree", "energy")
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def h_wanted(self) -> float:
+        """Size of facets that discretisation needs for the accuracy wanted; at most the present.
+
+        The pressure ends like a square root: whatever the degree, energies, and forces with them,
+        come closer as h³ at most, and pressures as h^(3/2).
+        """
+        if self.wanted is None:
+            return self.h
+        needed = self.h
+        for name, error in self.relative("discretisation").items():
+            rate = min(self.degree, 1.5) * (1 if name.endswith("pressure") else 2)
+            if error > self.wanted:
+                needed = min(needed, self.h * (self.wanted / error) ** (1 / rate))
+        return needed
+
+    def relative(self, part: str) -> dict[str, float]:
+        """A part's errors without sign, relative to the quantities."""
+        return {
+            name: abs(error) / (abs(self.values[name]) or 1.0)
+            for name, error in self.parts[part].items()
+        }
+
+    @property
+    def total(self) -> dict[str, float]:
+        """All parts together, relative to the quantities: the root of the sum of their squares.
+
+        The parts have causes of their own, and whether two of them add up or cancel is chance where
+        the sign of one is not known: their sum without signs is too large, with signs too small.
+        """
+        squares = dict.fromkeys(self.values, 0.0)
+        for part in self.parts:
+            for name, error in self.relative(part).items():
+                squares[name] += error**2
+        return {name: float(np.sqrt(square)) for name, square in squares.items()}
+
+    @property
+    def dominant(self) -> str:
+        """The part with the largest relative error in any quantity."""
+        return max(self.parts, key=lambda part: max(self.relative(part).values(), default=0.0))
+
+    def __str__(self) -> str:
+        """The table of parts and quantities, in per cent, and what to change."""
+        names = list(self.values)
+        width = max(14, *(len(name) + 2 for name in names))
+        lines = [f"{'error in %':<16}" + "".join(f"{name:>{width}}" for name in names)]
+        for part in _REMEDIES:
+            found = self.relative(part) if part in self.parts else {}
+            cells = [f"{100 * found[n]:.2g}" if n in found else "not told" for n in names]
+            lines.append(f"{part:<16}" + "".join(f"{cell:>{width}}" for cell in cells))
+        lines.append(f"{self.dominant} dominates: {_REMEDIES[self.dominant]} would help most")
+        if 0 < self.across < _FEW:
+            lines.append(
+                f"only some {self.across:.0f} facets in a row bear pressure: discretisation is not "
+                f"told reliably by fewer than {_FEW}"
+            )
+        if self.wanted is not None:
+            size = f"facets of {self.h_wanted:.2g} at the contact, now {self.h:.2g}"
+            enough = "the mesh is fine enough" if self.h_wanted >= self.h else f"it takes {size}"
+            lines.append(f"for the accuracy of {self.wanted:.2g} {enough}")
+        return "\n".join(lines)
+
+
+def quantities(problem: ContactProblem) -> dict[str, float]:
+    """The quantities of an `ErrorBudget` at the problem's present state. Collective."""
+    found: dict[str, float] = {}
+    for contact in problem.contacts:
+        r = contact.resultants()
+        found |= _named(problem, contact, r.normal_force, r.tangential_force, r.max_pressure)
+    return found | {DISPLACEMENT: _displacement(problem, problem.present_state())}
+
+
+def estimate_errors(
+    problem: ContactProblem,
+    stress: Any,
+    *,
+    strain: Any = None,
+    increments: Mapping[str, float] | None = None,
+) -> ErrorBudget:
+    """Estimate the errors of the last solution, before or after its commit. Collective.
+
+    Costs a factorisation of the tangent (a dense one where the problem is condensed) and a
+    smoothing of stress and strain.
+
+    Args:
+        problem: A problem that has been solved; it stays as it is.
+        stress: σ(u) of the bulk (UFL), shape (d, d) or (3, 3).
+        strain: ε(u), of the shape of the stress; by default the symmetric gradient.
+        increments: Errors of the increments, as ``Step.increment_error`` has them.
+
+    Raises:
+        ValueError: Shapes that do not fit.
+    """
+    problem.complete()
+    u = problem.u
+    stress = ufl.as_ufl(stress)
+    strain = ufl.sym(ufl.grad(u)) if strain is None else ufl.as_ufl(strain)
+    if stress.ufl_shape != strain.ufl_shape or len(stress.ufl_shape) != 2:
+        raise ValueError(
+            f"stress has shape {stress.ufl_shape}, strain {strain.ufl_shape}; both must be (d, d), "
+            "or (3, 3) with a strain given"
+        )
+    values = quantities(problem)
+    parts = _linear_parts(problem, values)
+    smooth = _Smoothed(problem, stress, strain)
+    parts["discretisation"] = _discretisation(problem, smooth, values)
+    if increments is not None:
+        parts["increments"] = dict(increments)
+    h, across = _bearing_facets(problem)
+    return ErrorBudget(
+        values,
+        {name: parts[name] for name in _REMEDIES if name in parts},
+        wanted=problem.accuracy.error if problem.accuracy else None,
+        h=h,
+        across=across,
+        degree=u.function_space.ufl_element().degree,
+        energy=float(np.sqrt(smooth.share)),
+        cells=smooth.squares,
+    )
+
+
+def _bearing_facets(problem: ContactProblem) -> tuple[float, float]:
+    """Mean size area^(1/(d-1)) of the facets under pressure, and how many are in a row. Collective.
+
+    Of all contacts together; size (length).
+    """
+    d = problem.u.function_space.mesh.geometry.dim
+    sums = np.zeros(2)
+    for contact in problem.contacts:
+        quadrature = contact.quadrature
+        rows = quadrature.point_rows()
+        area = quadrature.weights[rows].sum(axis=1)
+        bears = np.any(contact.pressure[rows] > 0, axis=1)
+        sums += [np.sum(bears * area ** (1 / (d - 1))), np.count_nonzero(bears)]
+    size, count = global_sum(problem.u.function_space.mesh.comm, sums)
+    return (float(size / count), float(count ** (1 / (d - 1)))) if count else (0.0, 0.0)
+
+
+def _named(
+    problem: ContactProblem, contact: Contact, normal: float, friction: float, peak: float
+) -> dict[str, float]:
+    before = f"{contact.name}: " if len(problem.contacts) > 1 else ""
+    found = {f"{before}normal force": normal}
+    if contact.law.has_tangential:
+        found[f"{before}friction force"] = friction
+    return found | {f"{before}peak pressure": peak}
+
+
+def _displacement(problem: ContactProblem, state: Array) -> float:
+    """Displacement of the loads along themselves; without loads the largest one."""
+    comm, load = problem.u.function_space.mesh.comm, problem.load
+    size, work = global_sum(comm, [np.abs(load).sum(), load @ state])
+    if size > 0:
+        return float(work / size)
+    return global_max(comm, np.abs(state[: problem.unknowns.n_dofs]))
+
+
+# ---- enforcement and solver ----------------------------------------------------------------------
+
+
+def _linear_parts(
+    problem: ContactProblem, values: Mapping[str, float]
+) -> dict[str, dict[str, float]]:
+    """What the springs and the residual that is left have changed in the quantities."""
+    contacts, operators = problem.contacts, problem.operators
+    springs = [LinearSprings.of(contact) for contact in contacts]
+    found = {}
+
+    def differences(way: Array, shifts: list[Array]) -> dict[str, float]:
+        jumps = [shift + o.jump(way) for o, shift in zip(operators, shifts, strict=True)]
+        changes = [s.change(jump) for s, jump in zip(springs, jumps, strict=True)]
+        return _differences(problem, values, changes, way)
+
+    with problem.linearised([s.stiffness for s in springs]) as solve:
+        found["solver"] = differences(solve(None), [np.zeros_like(s.stretch) for s in springs])
+        # The springs' rest lengths follow what they carry: a round of augmented enforcement.
+        # It leaves 1/(1 + k_n h/E) of the error in the shortest waves and far less in the long ones
+        # that forces are made of.
+        way = solve([s.change(s.stretch) for s in springs])
+        found["enforcement"] = differences(way, [s.stretch for s in springs])
+        deviations = [Deviation.of(contact) for contact in contacts]
+        triples = zip(deviations, contacts, springs, strict=True)
+        added = [d.turned(c) + s.change(d.shift(c)) for d, c, s in triples]
+        way = solve(added)
+        tractions = zip(added, operators, springs, strict=True)
+        changes = [t + s.change(o.jump(way)) for t, o, s in tractions]
+        found["kinematics"] = _differences(problem, values, changes, way)
+    return found
+
+
+def _differences(
+    problem: ContactProblem, values: Mapping[str, float], changes: list[Array], way: Array
+) -> dict[str, float]:
+    """Present quantities minus those after a change of tractions and displacements."""
+    comm = problem.u.function_space.mesh.comm
+    after: dict[str, float] = {}
+    for contact, change in zip(problem.contacts, changes, strict=True):
+        normal, measure = contact.values["normal"], contact.measure
+        along = np.sum(change * normal, axis=1)
+        pressure, side = contact.pressure - along, change - along[:, None] * normal
+        friction = np.linalg.norm(contact.tangential_traction + side, axis=1)
+        if contact.law.has_friction:
+            friction = np.minimum(friction, _limit(contact, pressure))
+        sums = global_sum(comm, [measure @ pressure, measure @ friction])
+        peak = global_max(comm, pressure)
+        after |= _named(problem, contact, float(sums[0]), float(sums[1]), peak)
+    after[DISPLACEMENT] = _displacement(problem, problem.present_state() + way)
+    return {name: values[name] - after[name] for name in values}
+
+
+def _limit(contact: Contact, pressure: Array) -> Array:
+    """Largest friction at the points under another pressure (stress)."""
+    limit, present = contact.values["limit"], contact.pressure
+    if contact.law.has_potential:
+        return limit  # given
+    return limit * np.clip(pressure, 0, None) / np.where(present > 0, present, 1.0)
+
+
+# ---- discretisation ------------------------------------------------------------------------------
+
+
+class _Smoothed:
+    """Stresses and strains beside smooth ones (Zienkiewicz and Zhu).
+
+    Attributes:
+        stress: Smooth σ* (UFL).
+        squares: η² = ∫ (σ* - σ):(ε* - ε) of every owned cell (force times length).
+        twice_energy: ∫ σ:ε (force times length).
+        share: Sum of the squares over that.
+    """
+
+    def __init__(self, problem: ContactProblem, stress: Any, strain: Any) -> None:
+        """Smooth. Collective."""
+        u = problem.u
+        mesh = u.function_space.mesh
+        weight = problem.contacts[0].weight if problem.contacts else 1.0
+        degree = u.function_space.ufl_element().degree
+        dx = ufl.dx(mesh, metadata={"quadrature_degree": 2 * degree})
+        self.stress, smooth_strain = _smoothed(mesh, [stress, strain], degree, weight, dx)
+        gap = ufl.inner(self.stress - stress, smooth_strain - strain)
+        q = ufl.TestFunction(fem.functionspace(mesh, ("DG", 0)))
+        both = [weight * q * density * dx for density in (gap, ufl.inner(stress, strain))]
+        n = mesh.topology.index_map(mesh.topology.dim).size_local
+        # Every cell has one value, by its own number.
+        self.squares, energies = (
+            fem.assemble_vector(compat.compile_form(form)).array[:n].copy() for form in both
+        )
+        total, self.twice_energy = global_sum(mesh.comm, [self.squares.sum(), energies.sum()])
+        self.share = abs(total / self.twice_energy) if self.twice_energy else 0.0
+
+
+def _discretisation(
+    problem: ContactProblem, smooth: _Smoothed, values: Mapping[str, float]
+) -> dict[str, float]:
+    """The potential energy is off by η²/2.
+
+    Per elastic energy that is the relative error of what a prescribed displacement needs as force,
+    or of how far a force goes. Friction is told from its share in the normal force that the smooth
+    stress has on Γc, the peak from the pressure smoothed on Γc itself.
+    """
+    contacts, mesh = problem.contacts, problem.u.function_space.mesh
+    state, twice, share = problem.present_state(), smooth.twice_energy, smooth.share
+    work = float(global_sum(mesh.comm, problem.load @ state))
+    loaded = float(np.clip(work / twice, 0.0, 1.0)) if twice else 0.0
+    driven = 1.0 - loaded
+    found: dict[str, float] = {}
+    for contact in contacts:
+        d, values_at = mesh.geometry.dim, contact.values
+        plane = ufl.as_tensor([[smooth.stress[i, j] for j in range(d)] for i in range(d)])
+        outward = ufl.dot(plane, ufl.FacetNormal(mesh))
+        traction = PointEvaluator(contact.quadrature, {"traction": outward})()["traction"]
+        normal = np.sum(traction * values_at["normal"], axis=1)
+        side = np.linalg.norm(traction - normal[:, None] * values_at["normal"], axis=1)
+        closed = contact.status != Status.OPEN
+        measure = contact.measure * closed
+        smooth_normal, smooth_friction = global_sum(mesh.comm, [-measure @ normal, measure @ side])
+        r = contact.resultants()
+        error = share * driven * r.normal_force
+        # Smoothing carries traction beyond the end of contact: normal and tangential alike, so that
+        # their ratio stays.
+        kept = (r.normal_force - error) / smooth_normal if smooth_normal > 0 else 1.0
+        friction = r.tangential_force - kept * smooth_friction
+        if contact.law.has_friction and not contact.law.has_potential and not r.stick:
+            # All of it is the law's share of the pressure.
+            friction = error * r.tangential_force / (r.normal_force or 1.0)
+        found |= _named(
+            problem,
+            contact,
+            error,
+            friction,
+            r.max_pressure - _smooth_peak(contact),
+        )
+    if not np.any(global_sum(mesh.comm, np.abs(problem.load).sum())):
+        loaded = 0.0 if _largest_is_prescribed(problem, state) else 1.0
+    found[DISPLACEMENT] = -share * loaded * values[DISPLACEMENT]
+    return found
+
+
+def _smooth_peak(contact: Contact) -> float:
+    """Largest pressure when its means over the facets are smoothed. Collective.
+
+    Smooth stresses of the bulk would not do: at a boundary they are of less than the pressure's own
+    accuracy. Means and linear functions serve any degree and rule, for the pressure ends like a
+    square root and is nowhere of more than the order h² that they have.
+    """
+    quadrature, submesh = contact.quadrature, contact.surface.submesh
+    n_cells = submesh.topology.index_map(submesh.topology.dim).size_local
+    points = quadrature.space().dofmap.list[:n_cells]
+    weights, pressure = quadrature.weights[points], contact.pressure[points]
+    space = fem.functionspace(submesh, ("DG", 0))
+    mean, bears = fem.Function(space), fem.Function(space)
+    cells = space.dofmap.list[:n_cells, 0]
+    mean.x.array[cells] = np.sum(weights * pressure, axis=1) / np.sum(weights, axis=1)
+    bears.x.array[cells] = np.any(pressure > 0, axis=1)
+    for function in (mean, bears):
+        function.x.scatter_forward()
+    smooth = _projected(submesh, [mean], 1, bears, ufl.dx(submesh))
+    at_points = PointEvaluator(quadrature, {"pressure": smooth[0]})()["pressure"]
+    return global_max(submesh.comm, at_points)
+
+
+def _largest_is_prescribed(problem: ContactProblem, state: Array) -> bool:
+    n = problem.unknowns.n_dofs
+    held, size = problem.constrained[:n], np.abs(state[:n])
+    comm = problem.u.function_space.mesh.comm
+    return global_max(comm, size[held]) >= global_max(comm, size[~held])
+
+
+def _smoothed(
+    mesh: dolfinx.mesh.Mesh, tensors: list[Any], degree: int, weight: Any, dx: ufl.Measure
+) -> list[Any]:
+    """L2 projections of symmetric tensors onto continuous functions of a degree. Collective."""
+    pairs = [(t, i, j) for t in tensors for i in range(t.ufl_shape[0]) for j in range(i + 1)]
+    found = _projected(mesh, [t[i, j] for t, i, j in pairs], degree, weight, dx)
+    place = {(id(t), i, j): c for c, (t, i, j) in enumerate(pairs)}
+    return [
+        ufl.as_tensor(
+            [
+                [found[place[id(t), max(i, j), min(i, j)]] for j in range(t.ufl_shape[0])]
+                for i in range(t.ufl_shape[0])
+            ]
+        )
+        for t in tensors
+    ]
+
+
+def _projected(
+    mesh: dolfinx.mesh.Mesh, scalars: list[Any], degree: int, weight: Any, dx: ufl.Measure
+) -> fem.Function:
+    """L2 projections onto continuous functions of a degree, as one vector. Collective.
+
+    They vanish at nodes around which the weight is zero.
+    """
+    space = fem.functionspace(mesh, ("Lagrange", degree))
+    p, q = ufl.TrialFunction(space), ufl.TestFunction(space)
+    mass = fem.petsc.assemble_matrix(compat.compile_form(weight * p * q * dx))
+    mass.assemble()
+    all_at_once = fem.functionspace(mesh, ("Lagrange", degree, (len(scalars),)))
+    right = fem.Function(all_at_once)
+    form = weight * ufl.dot(ufl.as_vector(scalars), ufl.TestFunction(all_at_once)) * dx
+    fem.assemble_vector(right.x.array, compat.compile_form(form))
+    right.x.scatter_reverse(la.InsertMode.add)
+    ksp = PETSc.KSP().create(mesh.comm)
+    ksp.setOperators(mass)
+    ksp.setType(PETSc.KSP.Type.CG)
+    ksp.getPC().setType(PETSc.PC.Type.JACOBI)
+    ksp.setTolerances(rtol=1e-8)
+    known, found = fem.Function(space), fem.Function(all_at_once)
+    for c in range(len(scalars)):
+        known.x.array[:] = right.x.array[c :: len(scalars)]
+        solution = fem.Function(space)
+        ksp.solve(known.x.petsc_vec, solution.x.petsc_vec)
+        solution.x.scatter_forward()
+        found.x.array[c :: len(scalars)] = solution.x.array
+    ksp.destroy()
+    mass.destroy()
+    return found

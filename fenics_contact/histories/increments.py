@@ -1,0 +1,514 @@
+"""Load histories: loads led through their values, one committed increment after another."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import warnings
+import weakref
+from collections.abc import Callable, Generator, Iterator, Sequence
+from numbers import Real
+from pathlib import Path
+
+import numpy as np
+from dolfinx import fem
+
+from fenics_contact.checks.verdict import Attempt, NotConverged
+from fenics_contact.estimates.errors import quantities
+from fenics_contact.histories import checkpoint as states
+from fenics_contact.parallel import collective_errors
+from fenics_contact.problem import ContactProblem, Step
+
+__all__ = ["increments"]
+
+logger = logging.getLogger("fenics_contact")
+
+# Increments in a row without failure after which a cut one may grow again.
+_PATIENCE = 2
+# Load parameters that differ by no more than this, relative to the way, are the same.
+_SAME = 1e-9
+
+
+def increments(
+    problem: ContactProblem,
+    load: fem.Constant | Callable[[float], None],
+    start: float = 0.0,
+    end: float = 1.0,
+    *,
+    steps: int | Sequence[float] | None = None,
+    max_cuts: int = 6,
+    estimate: bool = False,
+    checkpoint: str | Path | None = None,
+    checkpoint_every: int = 1,
+    field: str | int = "every",
+    fields: Sequence[fem.Function] = (),
+    changed: str = "refuse",
+) -> Iterator[Step]:
+    """Lead the load parameter from ``start`` to ``end``; solve and commit increments. Collective.
+
+    An increment that does not converge is halved, and halved again; after two that do it is doubled
+    until it has its size again. All of the parameter's values that were asked for are met. What is
+    returned is to be iterated over: increments are solved as they are asked for.
+
+    Args:
+        problem: The problem.
+        load: A scalar constant in the bulk form, a boundary condition or a support, which takes
+            the value of the load parameter; or a function that sets whatever depends on it:
+            constants, functions, the forces on supports.
+        start: The load parameter now; not solved for.
+        end: Its value at the last increment.
+        steps: Number of equal increments, by default what the contacts' ``accuracy`` takes, or 1;
+            or the ends of the increments themselves, monotonic from ``start`` to ``end``.
+        max_cuts: How often an increment may be halved.
+        estimate: Whether to tell the error that the size of the increments makes: every one is
+            solved twice, whole, which is not committed, and in two halves, which are. The steps at
+            the ends of whole ones have ``increment_error``.
+        checkpoint: File to keep the last committed state in (``.npz``). If it is there when the
+            history starts, the history goes on behind it; see `checkpoint.save`. Several calls one
+            after another, there and back, may share a file: it knows which are done. A program that
+            is started again makes the same calls; those that are done set their last load and
+            solve nothing (u stays as it is until the call that goes on). The last call of a file
+            may lead further than before, or by other increments from there on; what is done must be
+            what the call asks for.
+        checkpoint_every: Write it after every so many increments, and after the last.
+        field: When all of u is found: "every" increment; at the "last" only; or a number: every so
+            many increments, and at the last. Where the problem is condensed, increments in between
+            save the larger part of their cost; there only the contacts' results are those of the
+            increment, u is behind except on Γc until `ContactProblem.complete`, and
+            ``Step.complete`` says so. Before a checkpoint is written u is completed, and in the
+            increment after it.
+        fields: Functions of one's own that belong to the state, such as plastic strains, kept in
+            the checkpoint; see `checkpoint.check_fields`. With them it is written when the next
+            increment is asked for, so that it has what the loop has made of them (and, after the
+            last, when the loop ends by itself). Increments that fail or are cut leave them alone:
+            what ``load`` has made of them it makes anew when it is called again, with the last
+            load that was committed.
+        changed: What to do with a checkpoint of other data (stiffness, laws and their parameters,
+            supports, conditions, loads): "refuse" it, or "continue" from its state with the data as
+            they are now.
+
+    Yields:
+        The step, after its commit; ``load`` is its load parameter, and ``attempts`` has what was
+        tried before the increment was cut, too.
+
+    Raises:
+        ValueError: An argument has no sense, at the call; or, at the first increment, the
+            checkpoint is damaged, of another problem or history, or of one without ``estimate``:
+            problem and file are as before.
+        OSError: The checkpoint cannot be read or written.
+        NotConverged: An increment failed even when cut; u, history and load are those of the last
+            committed one.
+    """
+    for name, place in (("start", start), ("end", end)):
+        if not (isinstance(place, Real) and np.isfinite(place)):
+            raise ValueError(f"{name} is {place!r}; it must be a finite number")
+    if start == end:
+        raise ValueError(f"start and end are both {start!r}, and there is no way between them")
+    ends = _ends(start, end, problem.increments_wanted if steps is None else steps)
+    if field not in ("every", "last") and not (isinstance(field, int | np.integer) and field >= 1):
+        raise ValueError(f'field is {field!r}; it must be "every", "last", or a number from 1')
+    for name, number, least in (
+        ("max_cuts", max_cuts, 0),
+        ("checkpoint_every", checkpoint_every, 1),
+    ):
+        if not isinstance(number, int | np.integer) or number < least:
+            raise ValueError(f"{name} is {number!r}; it must be a whole number from {least}")
+    states.check_changed(changed)
+    if not isinstance(fields, Sequence):
+        raise ValueError(f"fields is a {type(fields).__name__}; it must be a list of fem.Functions")
+    states.check_fields(problem, fields)
+    if fields and checkpoint is None:
+        raise ValueError("fields are kept in a checkpoint, and there is none; give checkpoint=")
+    if not isinstance(checkpoint, str | Path | None):
+        raise ValueError(f"checkpoint is {checkpoint!r}; it must be the name of a file")
+    comm, set_load = problem.u.function_space.mesh.comm, _setter(load)
+    file = None if checkpoint is None else Path(checkpoint)
+    with collective_errors(comm):
+        if file is not None and comm.rank == 0 and not file.parent.is_dir():
+            raise ValueError(f"checkpoint is {file}, and there is no folder {file.parent}; make it")
+
+    def apply(value: float) -> None:
+        with collective_errors(comm):
+            set_load(value)
+
+    leg = _Leg(float(start), ends, float(start), estimate)
+    every = max_cuts, checkpoint_every, field
+    return _Started(_history(problem, apply, leg, file, every, list(fields), changed))
+
+
+class _Started(Iterator[Step]):
+    """Increments that are solved as they are asked for; warns if none ever is."""
+
+    def __init__(self, steps: Generator[Step, None, None]) -> None:
+        self._steps, self._asked = steps, False
+
+    def __next__(self) -> Step:
+        self._asked = True
+        return next(self._steps)
+
+    def close(self) -> None:
+        """End the history here, as for a generator: the last committed increment was the last."""
+        self._asked = True
+        self._steps.close()
+
+    def __del__(self) -> None:
+        if not self._asked:
+            warnings.warn(
+                "increments(...) was called, and nothing was solved: iterate over what it returns, "
+                "for step in increments(...)",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+
+
+def _history(
+    problem: ContactProblem,
+    apply: Callable[[float], None],
+    leg: _Leg,
+    checkpoint: Path | None,
+    every: tuple[int, int, str | int],
+    fields: Sequence[fem.Function],
+    changed: str,
+) -> Generator[Step, None, None]:
+    """What `increments` returns, its arguments checked. Collective."""
+    (max_cuts, checkpoint_every, field), comm = every, problem.u.function_space.mesh.comm
+    start, ends, estimate = leg.start, leg.ends, leg.estimate
+    end = ends[-1]
+    at = _Progress(start)
+    error = dict.fromkeys(quantities(problem), 0.0) if estimate else {}
+    calls, stored = _Calls([leg], True), None
+    if checkpoint is not None:
+        calls, stored = _place(problem, checkpoint, leg)
+    if not calls.begun:
+        logger.info("%s: increments %s are done", checkpoint, leg)
+        apply(leg.reached)
+        return
+    if stored is None:
+        problem.expect(len(ends) * (3 if estimate else 1))
+        apply(start)
+    else:
+        n = len(dataclasses.fields(_Progress))
+        if len(stored.numbers) != n + len(error):
+            raise ValueError(f"{checkpoint} is of no such history; remove it to start anew")
+        at = _Progress(*stored.numbers[:n])
+        error = dict(zip(error, stored.numbers[n:], strict=True))
+        try:
+            states.take_up(
+                problem, stored, loads=lambda: apply(at.load), fields=fields, changed=changed
+            )
+        except BaseException:
+            apply(start)
+            raise
+        ends = ends[leg.passed() :]
+        logger.info("going on from %s, at load %g", checkpoint, at.load)
+    if checkpoint is not None:
+        _calls[problem][checkpoint.absolute()] = calls
+    watch = _Watch(problem, fields) if checkpoint is not None else None
+
+    def write() -> None:
+        leg.reached = at.load
+        numbers = [*dataclasses.astuple(at), *error.values()]
+        assert checkpoint is not None
+        notes = [dataclasses.asdict(each) for each in calls.legs]
+        states.save(problem, checkpoint, numbers, fields=fields, notes=notes)
+
+    direction = 1.0 if end >= start else -1.0
+    unsaved = behind = 0
+    failed: list[Attempt] = []
+    halves: list[float] = []  # of an increment that was solved whole, with these results
+    whole: dict[str, float] = {}
+    for target in ends:
+        while direction * (target - at.load) > 0:
+            # A remainder that is next to nothing is taken along.
+            within = abs(target - at.load) <= 1.01 * at.largest
+            goal = target if within else at.load + direction * at.largest
+            try:
+                if estimate and not halves:
+                    _solve_to(goal, problem, apply, at)
+                    whole = quantities(problem)
+                    problem.restore()
+                    halves = [0.5 * (at.load + goal), goal]
+                goal = halves[0] if halves else goal
+                wanted = goal == end or field == "every" or estimate or behind + 1 == field
+                step = _solve_to(goal, problem, apply, at, field=wanted)
+            except BaseException as failure:
+                apply(at.load)
+                halves = []
+                if not isinstance(failure, NotConverged):
+                    raise
+                failed += failure.attempts
+                # What passes through between the points does so in smaller increments, too.
+                if at.cuts == max_cuts or failure.verdict.unseen:
+                    failure.attempts = tuple(failed)
+                    problem.complete()
+                    raise
+                at.cut(abs(goal - at.load))
+                failed.append(Attempt("cut", 0, f"to {at.largest:g}"))
+                if comm.rank == 0:
+                    logger.warning(
+                        "increment %d, to load %g, did not converge: cut to %g",
+                        failure.increment,
+                        goal,
+                        at.largest,
+                    )
+                continue
+            problem.commit()
+            at.advance(goal)
+            halves = halves[1:]
+            found = None
+            if estimate and not halves:
+                # Of first order in the size of the increments: half of the error of the whole one,
+                # which is as much as the difference, is left in the halves.
+                now = quantities(problem)
+                error = {name: error[name] + whole[name] - now[name] for name in now}
+                found = dict(error)
+            behind = 0 if step.complete else behind + 1
+            unsaved += 1
+            # Halves belong together: between them the whole one's results would be lost.
+            due = checkpoint is not None and (
+                goal == end or (unsaved >= checkpoint_every and not halves)
+            )
+            if due:
+                unsaved = behind = 0
+            if due and not fields:
+                write()
+            leg.reached = goal
+            tried, failed = (*failed, *step.attempts), []
+            if watch is not None:
+                watch.look()
+            yield dataclasses.replace(step, load=goal, attempts=tried, increment_error=found)
+            if watch is not None:
+                watch.compare()
+            if due and fields:
+                apply(goal)  # what the loop may have set otherwise
+                write()
+
+
+def _solve_to(
+    goal: float,
+    problem: ContactProblem,
+    apply: Callable[[float], None],
+    at: _Progress,
+    *,
+    field: bool = True,
+) -> Step:
+    """Solve for a load parameter from the last committed one. Collective."""
+    apply(goal)
+    return problem.solve(ahead=(goal - at.load) / at.last if at.last else 1.0, field=field)
+
+
+@dataclasses.dataclass
+class _Leg:
+    """What one call of `increments` asks for.
+
+    Attributes:
+        start: Load parameter at its start.
+        ends: Those at the ends of its increments.
+        reached: Where it stands.
+        estimate: Whether errors are estimated.
+    """
+
+    start: float
+    ends: list[float]
+    reached: float
+    estimate: bool
+
+    def passed(self, reached: float | None = None) -> int:
+        """How many of its ends lie behind a load parameter, by default where it stands."""
+        reached = self.reached if reached is None else reached
+        return sum(self._way(end - reached) <= self._round_off() for end in self.ends)
+
+    def _way(self, difference: float) -> float:
+        return difference if self.ends[-1] >= self.start else -difference
+
+    def _round_off(self) -> float:
+        return _SAME * abs(self.ends[-1] - self.start)
+
+    def is_done(self) -> bool:
+        return self.passed() == len(self.ends)
+
+    def same(self, other: _Leg, *, up_to: float | None = None) -> bool:
+        """Whether another one asks for the same; if given, up to a load parameter."""
+        n, m = len(self.ends), len(other.ends)
+        if up_to is not None:
+            within = -self._round_off() <= self._way(up_to - self.start)
+            within &= self._way(up_to - self.ends[-1]) <= self._round_off()
+            if not within:
+                return False
+            n, m = self.passed(up_to), other.passed(up_to)
+        mine, theirs = [self.start, *self.ends[:n]], [other.start, *other.ends[:m]]
+        return n == m and np.allclose(mine, theirs, rtol=0.0, atol=self._round_off())
+
+    def __str__(self) -> str:
+        """What it asks for, in words."""
+        ends = ", ".join(f"{end:g}" for end in self.ends[:6])
+        more = ", …" if len(self.ends) > 6 else ""
+        return f"from {self.start:g} to {self.ends[-1]:g} by {len(self.ends)} ({ends}{more})"
+
+
+@dataclasses.dataclass
+class _Calls:
+    """The calls of `increments` for a problem and a file.
+
+    Attributes:
+        legs: What they asked for.
+        begun: Whether the problem has a state of this path; else all of them were done in the file.
+    """
+
+    legs: list[_Leg]
+    begun: bool
+
+
+_calls: weakref.WeakKeyDictionary[ContactProblem, dict[Path, _Calls]]
+_calls = weakref.WeakKeyDictionary()
+
+
+def _place(
+    problem: ContactProblem, checkpoint: Path, leg: _Leg
+) -> tuple[_Calls, states.Stored | None]:
+    """Where in the load path of a file a call stands. Collective.
+
+    Returns:
+        The calls, this one included; and what is to be taken up, None where there is nothing. If
+        the file has later ones, this one is done, and nothing is begun.
+
+    Raises:
+        ValueError: The file is of another path.
+    """
+    known = _calls.setdefault(problem, {}).setdefault(checkpoint.absolute(), _Calls([], False))
+    legs = known.legs
+    # A loop that was left, or an increment that failed: the same call goes on.
+    again = known.begun and not legs[-1].is_done() and leg.same(legs[-1], up_to=legs[-1].reached)
+    earlier = legs[:-1] if again else legs
+    there = (again or not known.begun) and states.exists(problem, checkpoint)
+    if not there and (known.begun or not legs):
+        return _Calls([*earlier, leg], True), None
+    stored = states.read(problem, checkpoint) if there else None
+    try:
+        theirs = [_Leg(**each) for each in stored.notes or ()] if stored else []
+    except TypeError:  # notes of a caller of `checkpoint.save`
+        theirs = []
+    if again and len(theirs) <= len(earlier):  # nothing of it was saved
+        return _Calls([*earlier, leg], True), None
+    if len(theirs) <= len(earlier):
+        raise ValueError(
+            f"{checkpoint} has {len(theirs)} calls of increments, and this is number "
+            f"{len(earlier) + 1}: it was written by something else; remove it to start anew"
+        )
+    there_leg = theirs[len(earlier)]
+    if leg.estimate != there_leg.estimate:
+        raise ValueError(
+            f"{checkpoint} is of a history {'with' if there_leg.estimate else 'without'} estimate; "
+            "go on in the same way, or remove it to start anew"
+        )
+    is_last = len(theirs) == len(earlier) + 1
+    if not leg.same(there_leg, up_to=there_leg.reached if is_last else None):
+        raise ValueError(
+            f"{checkpoint} is of another load path: its increments number {len(earlier) + 1} lead "
+            f"{there_leg}, and are done up to {there_leg.reached:g}; here they lead {leg}. Make "
+            "the same calls in the same order (those that are done solve nothing), or remove it "
+            "to start anew"
+        )
+    leg.reached = there_leg.reached
+    if is_last:
+        return _Calls([*earlier, leg], True), stored
+    known.legs.append(leg)
+    return _Calls([*earlier, leg], False), None
+
+
+class _Watch:
+    """Looks for functions in the bulk form that the loop changes, and no checkpoint has."""
+
+    def __init__(self, problem: ContactProblem, fields: Sequence[fem.Function]) -> None:
+        kept = {id(problem.u), *(id(field) for field in fields)}
+        coefficients = problem.bulk.form.coefficients()
+        self._functions = [f for f in coefficients if id(f) not in kept]
+        self._comm = problem.u.function_space.mesh.comm
+
+    def look(self) -> None:
+        """Note the values."""
+        self._values = [f.x.array.copy() for f in self._functions]
+
+    def compare(self) -> None:
+        """Warn, once, of those that have changed since. Collective."""
+        if not self._functions:
+            return
+        pairs = zip(self._functions, self._values, strict=True)
+        changed = [not np.array_equal(f.x.array, values, equal_nan=True) for f, values in pairs]
+        changed = np.any(self._comm.allgather(changed), axis=0)
+        if np.any(changed):
+            names = [
+                f.name for f, is_changed in zip(self._functions, changed, strict=True) if is_changed
+            ]
+            self._functions = []
+            warnings.warn(
+                f"{', '.join(names)} in the bulk form is changed between increments, and is not in "
+                "the checkpoint: a history that goes on from it will not have the values; give "
+                "fields=[...]",
+                UserWarning,
+                stacklevel=3,
+            )
+
+
+@dataclasses.dataclass
+class _Progress:
+    """Where a history stands; numbers only, so that a checkpoint can hold it.
+
+    Attributes:
+        load: Load parameter of the last committed increment.
+        last: Size of that increment; 0 before the first.
+        largest: Largest size of the next one, infinite where none was cut.
+        cuts: How often increments have been halved and not doubled since.
+        successes: Increments since the last halving or doubling.
+    """
+
+    load: float
+    last: float = 0.0
+    largest: float = np.inf
+    cuts: float = 0
+    successes: float = 0
+
+    def cut(self, tried: float) -> None:
+        self.largest, self.cuts, self.successes = tried / 2, self.cuts + 1, 0
+
+    def advance(self, goal: float) -> None:
+        self.last, self.load = goal - self.load, goal
+        self.successes += 1
+        if self.cuts and self.successes >= _PATIENCE:
+            self.cuts, self.successes = self.cuts - 1, 0
+            self.largest = 2 * self.largest if self.cuts else np.inf
+
+
+def _setter(load: fem.Constant | Callable[[float], None]) -> Callable[[float], None]:
+    if isinstance(load, fem.Constant):
+        if load.value.ndim:
+            raise ValueError(f"load has shape {load.value.shape}; it must be a scalar fem.Constant")
+
+        def assign(value: float) -> None:
+            load.value = value
+
+        return assign
+    if not callable(load):
+        raise ValueError(
+            f"load is a {type(load).__name__}; it must be a scalar fem.Constant, or a function of "
+            "the load parameter that sets the loads"
+        )
+    return load
+
+
+def _ends(start: float, end: float, steps: int | Sequence[float]) -> list[float]:
+    """Ends of the increments that are asked for."""
+    if isinstance(steps, int | np.integer):
+        if steps < 1:
+            raise ValueError(f"steps is {steps}; it must be at least 1")
+        return [start + (end - start) * (i / steps) for i in range(1, steps)] + [float(end)]
+    if not np.ndim(steps):
+        raise ValueError(f"steps is {steps!r}; it must be a whole number, or ends of increments")
+    ends = [float(value) for value in steps]
+    ways = np.diff([start, *ends])
+    if not ends or ends[-1] != end or not (np.all(ways > 0) or np.all(ways < 0)):
+        raise ValueError(
+            f"steps is {ends}; it must be a number, or the ends of the increments, rising or "
+            f"falling from start = {start:g} to end = {end:g}"
+        )
+    return ends

@@ -1,0 +1,1 @@
+"""Contact laws: what a point of Γc answers to its gap and slip."""

@@ -1,0 +1,265 @@
+"""Contact laws: pure UFL return maps and potentials. No mesh, no state.
+
+A law maps the kinematics of a point of Γc (`Kinematics`) to the reactions there (`Response`). One
+definition serves two and three dimensions and every support. Signs are the paper's: the traction on
+the body is r_n n + τ, with n from the body to the support and r_n ≤ 0 (but for `Foundation`, which
+may pull).
+
+A law of one's own is a subclass of `Law`, or of `FrictionLaw` with friction, and a dataclass of its
+parameters. It says `Law.response`; where r_n is not -k_n δ₋ of a parameter "k_n", also its
+`normal_potential`, against which the verdict checks r_n; and the parameters that must not vanish,
+`positive`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import ufl
+
+from fenics_contact.laws.return_maps import positive_part
+
+__all__ = ["Kinematics", "Law", "Response", "signorini", "signorini_potential"]
+
+Expr: TypeAlias = ufl.core.expr.Expr
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """What a law sees at a point (UFL).
+
+    Attributes:
+        gap: Initial gap s (length), the motion of the support included.
+        normal_displacement: u_n of eq. (2).
+        normal: Unit normal n from body to support, shape (gdim,).
+        tangential_displacement: u_t of eq. (21), relative to the support, shape (gdim,); None if
+            the law gives no tangential traction.
+        tangential_increment: Δu_t since the last commit, shape (gdim,); None without friction.
+        traction: Tangential traction τ at the last commit, or the multiplier λ_t that replaces it,
+            shape (gdim,); None without friction.
+        multiplier: Pressure λ_n ≥ 0 that acts where the gap is closed and not penetrated; None
+            under penalty enforcement, where there is none.
+    """
+
+    gap: Expr
+    normal_displacement: Expr
+    normal: Expr
+    tangential_displacement: Expr | None = None
+    tangential_increment: Expr | None = None
+    traction: Expr | None = None
+    multiplier: Expr | None = None
+
+
+@dataclass(frozen=True)
+class Response:
+    """The reactions at a point (UFL).
+
+    Attributes:
+        normal_traction: r_n (stress).
+        opening: δ₊ ≥ 0 (length), eq. (6).
+        penetration: δ₋ ≥ 0 (length), eq. (6).
+        traction: τ (stress), shape (gdim,); None if the law gives none.
+        limit: μ p, the size of the yield surface (stress); None without friction.
+        slip: Δβ ≥ 0 of each slip mode (length), eq. (44).
+    """
+
+    normal_traction: Expr
+    opening: Expr
+    penetration: Expr
+    traction: Expr | None = None
+    limit: Expr | None = None
+    slip: tuple[Expr, ...] = ()
+
+
+class Law:
+    """A contact law. What a subclass does not say is as for unilateral contact without friction."""
+
+    @property
+    def has_tangential(self) -> bool:
+        """Whether there are tangential tractions."""
+        return self.has_friction
+
+    @property
+    def has_friction(self) -> bool:
+        """Whether points slip, so that tangential state is needed."""
+        return False
+
+    @property
+    def has_potential(self) -> bool:
+        """Whether the reactions are the gradient of a potential (symmetric tangent)."""
+        return True
+
+    @property
+    def has_normal_stiffness(self) -> bool:
+        """Whether r_n answers the gap by k_n; False where the normal traction is prescribed."""
+        return True
+
+    @property
+    def has_own_normal(self) -> bool:
+        """Whether r_n follows from a `normal_potential` of the subclass, and not from k_n."""
+        own = type(self).normal_potential is not Law.normal_potential
+        return self.has_normal_stiffness and (own or "k_n" not in self.parameters())
+
+    @property
+    def has_tension(self) -> bool:
+        """Whether r_n pulls where the gap is open: such points are never open."""
+        return False
+
+    @property
+    def is_physical(self) -> bool:
+        """Whether the stiffness is that of a layer that is there, and stands for no constraint."""
+        return self.has_own_normal
+
+    @property
+    def positive(self) -> frozenset[str]:
+        """Names of the parameters that must be greater than zero; the others may be zero."""
+        return frozenset({"k_n", "k_t"})
+
+    def parameters(self) -> dict[str, Any]:
+        """The law's parameters by name, as the user gave them."""
+        return dict(vars(self))
+
+    def check_dimension(self, gdim: int) -> None:
+        """Refuse what makes no sense in ``gdim`` dimensions.
+
+        Raises:
+            ValueError: It says what was given, and what is expected.
+        """
+
+    def check_complete(self) -> None:
+        """Refuse a subclass that does not say what the solver and the verdict ask of it.
+
+        Raises:
+            ValueError: It says what is missing.
+        """
+        name, parameters = type(self).__name__, self.parameters()
+        if type(self).response is Law.response:
+            raise ValueError(f"{name} is no law: a subclass of Law must say its response")
+        if self.has_own_normal and type(self).normal_potential is Law.normal_potential:
+            raise ValueError(
+                f"{name} has no parameter k_n; it must say its own normal_potential(kinematics, "
+                "parameters), minus whose derivative by the normal displacement is the normal "
+                "traction: energies, solver and verdict need it"
+            )
+        if self.has_tangential and "k_t" not in parameters:
+            raise ValueError(
+                f"{name} has tangential tractions, but no parameter k_t, the stiffness of points "
+                "that stick (stress/length); add one"
+            )
+
+    def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
+        """The reactions; ``parameters`` are those of `parameters`, as UFL."""
+        raise NotImplementedError
+
+    def normal_potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+        """Energy per area of r_n, which is minus its derivative by u_n; by default eq. (19)."""
+        return signorini_potential(kinematics, parameters["k_n"])
+
+    def normal_stiffness(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+        """-∂r_n/∂u_n where the gap is closed (stress/length)."""
+        if not self.has_own_normal:
+            return parameters["k_n"]
+        u_n = ufl.variable(kinematics.normal_displacement)
+        density = self.normal_potential(replace(kinematics, normal_displacement=u_n), parameters)
+        return ufl.diff(ufl.diff(density, u_n), u_n)
+
+    def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+        """Potential per area whose derivative by the displacement is minus the traction.
+
+        Raises:
+            ValueError: There is none.
+        """
+        if self.has_potential and not self.has_tangential:
+            return self.normal_potential(kinematics, parameters)
+        raise ValueError(
+            f"{type(self).__name__} has no potential: its slip is not associated (eq. 46)"
+        )
+
+    def at_pressure(self, pressure: Expr) -> Law:
+        """A law with a potential that is this one where ``pressure`` is the contact pressure.
+
+        Args:
+            pressure: Taken for given where this law has no potential, ≥ 0 (stress).
+        """
+        return self
+
+    def n_modes(self, gdim: int) -> int:
+        """Number of slip modes."""
+        return 0
+
+    def grip(self, parameters: Mapping[str, Expr]) -> Expr:
+        """Bound of |τ|/p over all directions; not zero wherever motion along Γc is resisted."""
+        return ufl.as_ufl(0.0)
+
+    def tangential_stiffness(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+        """K_t of a sticking point (stress/length), shape (gdim, gdim), with K_t n = 0."""
+        n = kinematics.normal
+        return parameters["k_t"] * (ufl.Identity(len(n)) - ufl.outer(n, n))
+
+    def elastic_displacement(
+        self, kinematics: Kinematics, traction: Expr, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """K_t⁻¹ τ (length), shape (gdim,): minus the displacement v_e of eq. (24) without slip."""
+        return traction / parameters["k_t"]
+
+    def yield_functions(
+        self, kinematics: Kinematics, traction: Expr, limit: Expr, parameters: Mapping[str, Expr]
+    ) -> tuple[Expr, ...]:
+        """g_j(τ, limit) ≤ 0 of each slip mode (stress), eq. (29), apart from the return map.
+
+        Slip is associated with them: K_t⁻¹ Δτ = -(Δu_t + Σ Δβ_j ∂g_j/∂τ), eq. (44).
+        """
+        return ()
+
+    def stored(
+        self, kinematics: Kinematics, response: Response, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """Energy per area in the springs, r_n²/2k_n or `normal_potential`, and τ·K_t⁻¹τ/2.
+
+        With multipliers the springs bear what these do not, in the end nothing.
+        """
+        stored = ufl.as_ufl(0.0)
+        r_n, tau = response.normal_traction, response.traction
+        if kinematics.multiplier is not None:
+            r_n = r_n + kinematics.multiplier
+            tau = None if tau is None else tau - kinematics.traction
+        if self.has_own_normal:
+            stored += self.normal_potential(kinematics, parameters)
+        elif self.has_normal_stiffness:
+            stored += r_n**2 / (2 * parameters["k_n"])
+        if tau is not None:
+            stored += ufl.dot(tau, self.elastic_displacement(kinematics, tau, parameters)) / 2
+        return stored
+
+    def dissipated(
+        self, kinematics: Kinematics, response: Response, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """Work per area of friction on the slip of the increment, -τ·(Δu_t + K_t⁻¹ Δτ) ≥ 0."""
+        assert response.traction is not None
+        assert kinematics.traction is not None and kinematics.tangential_increment is not None
+        change = response.traction - kinematics.traction
+        stretched = self.elastic_displacement(kinematics, change, parameters)
+        return -ufl.dot(response.traction, kinematics.tangential_increment + stretched)
+
+
+def signorini(kinematics: Kinematics, k_n: Expr) -> tuple[Expr, Expr, Expr]:
+    """Regularised normal law, eq. (6-11): r_n, δ₊, δ₋ in closed form, point by point.
+
+    With a multiplier r_n = -⟨λ_n + k_n (u_n - s)⟩₊: where λ_n = -r_n the law is exact.
+    """
+    closing = kinematics.normal_displacement - kinematics.gap
+    opening = positive_part(kinematics.gap - kinematics.normal_displacement)
+    penetration = positive_part(closing)
+    if kinematics.multiplier is None:
+        return -k_n * penetration, opening, penetration
+    return -positive_part(kinematics.multiplier + k_n * closing), opening, penetration
+
+
+def signorini_potential(kinematics: Kinematics, k_n: Expr) -> Expr:
+    """½ k_n ⟨u_n - s⟩₊², eq. (19); with a multiplier ⟨λ_n + k_n (u_n - s)⟩₊²/(2 k_n)."""
+    closing = kinematics.normal_displacement - kinematics.gap
+    if kinematics.multiplier is None:
+        return k_n / 2 * positive_part(closing) ** 2
+    return positive_part(kinematics.multiplier + k_n * closing) ** 2 / (2 * k_n)

@@ -1,0 +1,185 @@
+"""Minimum problems one after another: contact with friction of given limit, then a new limit.
+
+Coulomb's law has no potential. Given the pressure that sets the limit of friction, unilateral
+contact with friction has one (Signorini with Tresca or Duvaut-Lions, section 3): Newton's method
+with a line search on the energy solves it however stiff it is. The pressure that comes out sets the
+next limit, until the whole law holds. Each cycle gains a constant factor, the less the larger the
+friction is.
+
+The paper's conclusion takes the normal and the tangential reaction apart, one given while the other
+is sought. A body that contact alone holds is loose in either of these problems, and each has to
+wait for the other where both change; here only the limit of friction waits.
+"""
+
+from __future__ import annotations
+
+import logging
+import weakref
+from itertools import chain
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from fenics_contact.methods.callbacks import Callbacks
+from fenics_contact.methods.options import Defaults
+
+__all__ = ["OPTIONS", "Alternation"]
+
+Array = npt.NDArray[np.float64]
+logger = logging.getLogger("fenics_contact")
+
+OPTIONS = {
+    "snes_type": "newtonls",
+    "snes_rtol": 0.0,
+    "snes_stol": 0.0,
+    "snes_atol": 0.0,
+    "snes_max_it": 200,
+    "snes_linesearch_type": "bt",
+    "snes_linesearch_max_it": 40,
+}
+# Newton steps without line search finish where the energy has no digits left.
+_FINISH = OPTIONS | {"snes_max_it": 5, "snes_linesearch_type": "basic"}
+# Cycles, and Newton iterations in all, before it is given up; and cycles in a row that may pass
+# without a lower residual.
+_MAX_CYCLES = 200
+_MAX_ITERATIONS = 1000
+_MAX_STALLS = 20
+# Cycles without a lower residual after which only half of the change of the limit is taken, and the
+# least share: two cycles may undo one another.
+_PATIENCE = 2
+_LEAST = 1 / 8
+# Share of the whole law's residual to which a subproblem is solved: more would be lost again.
+_INNER = 1e-2
+# Share of k_t that keeps a slipping body in place in the matrix (not in the equations).
+_STILL = 1e-6
+
+
+class Alternation:
+    """The method, on the unknowns, matrices and measures of a problem.
+
+    Attributes:
+        snes: Newton's method for the subproblems, prefix "alternating_" behind the problem's.
+    """
+
+    def __init__(self, problem: Any, defaults: Defaults, solver: dict[str, Any]) -> None:
+        """Set up SNES; the matrices are those of H₀. Collective.
+
+        Args:
+            problem: The `ContactProblem`.
+            defaults: What takes the options.
+            solver: Options of the linear solver; none: it is that of H₀.
+        """
+        self._problem = weakref.proxy(problem)
+        self._function: PETSc.Vec | None = None
+        self._shares_solver = not solver
+        comm, prefix = problem.u.function_space.mesh.comm, problem.prefix
+        self.snes = defaults.make_snes(comm, prefix, "alternating_", OPTIONS | solver)
+        self._finish = defaults.make_snes(comm, prefix, "finishing_", _FINISH | solver)
+        self._callbacks = Callbacks(comm)
+        self._goal = 0.0
+
+    def _attach(self) -> None:
+        """Take the vectors, matrices and solver of H₀ of the problem's present space."""
+        problem = self._problem
+        new = self._function is not problem._function
+        self._function = problem._function
+        this: Alternation = weakref.proxy(self)
+        for snes in (self.snes, self._finish):
+            if new:
+                snes.reset()
+            if self._shares_solver:
+                snes.setKSP(problem._solvers[False])
+            self._callbacks.attach(
+                snes,
+                lambda x, f: this._problem._compute_residual(x, f),
+                self._function,
+                lambda x, J: this._assemble(x, J),
+                problem._matrix(False),
+                lambda: this._test(),
+            )
+        if problem.bulk.linear:
+            self._callbacks.set_objective(self.snes, lambda x: this._problem._energy_at(x))
+
+    def solve(self, solution: PETSc.Vec) -> tuple[int, int]:
+        """Solve the problem from ``solution`` on. Collective.
+
+        Returns:
+            Newton iterations in all, and the reason as SNES has them.
+        """
+        problem, reasons = self._problem, PETSc.SNES.ConvergedReason
+        self._attach()
+        iterations = stalls = 0
+        best = np.inf
+        relaxation = 1.0
+        try:
+            residual = self._residual(solution)
+            pressure: Array = self._pressure()
+            for cycle in range(_MAX_CYCLES):
+                ends = np.cumsum([c.quadrature.n_points for c in problem.contacts])[:-1]
+                for contact, part in zip(problem.contacts, np.split(pressure, ends), strict=True):
+                    contact.freeze(part)
+                share = 0.0 if problem.has_potential else _INNER
+                self._goal = share * residual
+                iterations += self._minimise(solution)
+                residual = self._residual(solution)
+                if problem._norms.within(problem.rtol):
+                    logger.debug("%d cycles, %d Newton iterations", cycle + 1, iterations)
+                    return iterations, int(reasons.CONVERGED_FNORM_RELATIVE)
+                stalls = 0 if residual < best else stalls + 1
+                best = min(best, residual)
+                if not np.isfinite(residual) or stalls > _MAX_STALLS or problem.has_potential:
+                    return iterations, int(reasons.DIVERGED_LINE_SEARCH)
+                if iterations > _MAX_ITERATIONS:
+                    return iterations, int(reasons.DIVERGED_MAX_IT)
+                if stalls and stalls % _PATIENCE == 0:
+                    relaxation = max(relaxation / 2, _LEAST)
+                pressure = pressure + relaxation * (self._pressure() - pressure)
+            return iterations, int(reasons.DIVERGED_MAX_IT)
+        finally:
+            problem._rounds.forget()
+            for contact in problem.contacts:
+                contact.thaw()
+
+    def _pressure(self) -> Array:
+        """Of all contacts at this rank's points."""
+        contacts = self._problem.contacts
+        for contact in contacts:
+            contact.evaluate()
+        return np.concatenate([contact.pressure for contact in contacts])
+
+    def _residual(self, solution: PETSc.Vec) -> float:
+        """That of the whole law."""
+        for contact in self._problem.contacts:
+            contact.thaw()
+        self._problem._compute_residual(solution, self._function)
+        return float(self._problem._norms.total)
+
+    def _minimise(self, solution: PETSc.Vec) -> int:
+        """Newton's method with the line search on the energy, then without any."""
+        made, reason = self._callbacks.solve(self.snes, solution)
+        if reason <= 0:
+            # The last digits of the residual are below the rounding of the energy.
+            made += self._callbacks.solve(self._finish, solution)[0]
+        return made
+
+    def _test(self) -> int:
+        reasons = PETSc.SNES.ConvergedReason
+        norms = self._problem._norms
+        converged = norms.total <= self._goal or norms.within(self._problem.rtol)
+        return int(reasons.CONVERGED_FNORM_RELATIVE if converged else reasons.ITERATING)
+
+    def _assemble(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
+        problem = self._problem
+        problem._set_u(x)
+        problem._update_bulk()
+        for contact in problem.contacts:
+            contact.evaluate()
+        problem._watch.note(problem._norms.total)
+        if not problem.motions.held(problem.operators):
+            problem._assemble_matrix(matrix, problem._stiffnesses(everywhere=True))
+            return
+        # Where all slips, what nothing but friction holds would be loose.
+        still = (o.springs(o.contact.springs(0.0, _STILL)) for o in problem._space.operators)
+        problem._assemble_matrix(matrix, chain(problem._tangents(), still))

@@ -1,0 +1,141 @@
+"""Continuation in the stiffness of contact: softer problems first, each the start of the next.
+
+Newton's method finds the solution of soft contact from far away, and that of stiff contact from the
+solution of one that is a little softer: the points that are closed, stick and slip are nearly those
+of the next one, and for a given status the equations are linear, or nearly so. Where a step of the
+stiffness does not succeed, a smaller one may. Where none does, the branch of solutions may end, as
+it can with friction, and the alternation finds another.
+"""
+
+from __future__ import annotations
+
+import logging
+import weakref
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+from fenics_contact import compat
+from fenics_contact.methods.callbacks import Callbacks
+from fenics_contact.methods.options import Defaults
+
+__all__ = ["OPTIONS", "Continuation"]
+
+logger = logging.getLogger("fenics_contact")
+
+OPTIONS = {
+    "snes_type": "newtonls",
+    "snes_rtol": 0.0,
+    "snes_stol": 0.0,
+    "snes_atol": 0.0,
+    "snes_max_it": 25,
+    # One secant step towards the least residual: with none Newton's method cycles earlier, and cp
+    # or bt, which go on until the residual falls, take steps too short for a change of status.
+    "snes_linesearch_type": compat.LEAST_RESIDUAL,
+    "snes_linesearch_max_it": 1,
+}
+# Factor of the stiffness from one problem to the next, and the least that is tried.
+_FACTOR = 10.0
+_LEAST_FACTOR = 1.2
+# Newton iterations in all before it is given up; what it solves takes 600 at most.
+_MAX_ITERATIONS = 1000
+# Residual of the softer problems, as a share of the forces: they are starts, not results.
+_COARSE = 1e-3
+
+
+class Continuation:
+    """The method, on the unknowns, matrices and measures of a problem.
+
+    Attributes:
+        snes: Newton's method for one stiffness, prefix "continuation_" behind the problem's.
+    """
+
+    def __init__(self, problem: Any, defaults: Defaults, solver: dict[str, Any]) -> None:
+        """Set up SNES; the matrix is that of the consistent tangent. Collective.
+
+        Args:
+            problem: The `ContactProblem`.
+            defaults: What takes the options.
+            solver: Options of the linear solver; none: it is that of the consistent tangent.
+        """
+        self._problem = weakref.proxy(problem)
+        self._function: PETSc.Vec | None = None
+        comm = problem.u.function_space.mesh.comm
+        self.snes = defaults.make_snes(comm, problem.prefix, "continuation_", OPTIONS | solver)
+        self._shares_solver = not solver
+        self._callbacks = Callbacks(comm)
+        self._coarse = 0.0
+
+    def _attach(self) -> None:
+        """Take the vectors, matrices and solver of the problem's present space."""
+        problem, snes = self._problem, self.snes
+        if self._function is not problem._function:
+            snes.reset()
+        self._function = problem._function
+        if self._shares_solver:
+            snes.setKSP(problem._solvers[True])
+        this: Continuation = weakref.proxy(self)
+        self._callbacks.attach(
+            snes,
+            lambda x, f: this._problem._compute_residual(x, f),
+            self._function,
+            lambda x, J: this._problem._assemble_tangent(x, J),
+            problem._matrix(True),
+            lambda: this._test(),
+        )
+
+    def solve(self) -> tuple[int, int]:
+        """Solve the problem from its ``_solution`` on. Collective.
+
+        Returns:
+            Newton iterations in all, and the reason as SNES has them.
+        """
+        problem = self._problem
+        self._attach()
+        share = min(1.0, 1.0 / max(problem._hardness(), 1.0))
+        iterations, solved, factor, kept = 0, 0.0, _FACTOR, problem._solution.copy()
+        try:
+            while True:
+                self._soften(share)
+                made, reason = self._solve_one()
+                iterations += made
+                if reason <= 0:
+                    kept.copy(problem._solution)
+                    if solved and factor > _LEAST_FACTOR:
+                        factor = np.sqrt(factor)
+                        share = min(1.0, factor * solved)
+                        continue
+                    factor = _FACTOR
+                    share = min(1.0, factor * solved) if solved else share
+                    self._soften(share)
+                    made, reason = problem._alternation.solve(problem._solution)
+                    iterations += made
+                    logger.debug("alternated at %.3g of the stiffness: reason %d", share, reason)
+                if reason <= 0 or share == 1.0:
+                    return iterations, reason
+                if iterations > _MAX_ITERATIONS:
+                    return iterations, int(PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT)
+                logger.debug("%.3g of the stiffness, %d iterations so far", share, iterations)
+                solved = share
+                problem._solution.copy(kept)
+                share = min(1.0, factor * solved)
+        finally:
+            self._soften(1.0)
+            problem._rounds.forget()
+
+    def _soften(self, share: float) -> None:
+        """Let the contacts have a share of their stiffness."""
+        for contact in self._problem.contacts:
+            contact.stiffness_factor.value = share
+        self._coarse = _COARSE if share < 1.0 else 0.0
+
+    def _solve_one(self) -> tuple[int, int]:
+        """Iterations and reason of Newton's method for the present stiffness. Collective."""
+        self._problem._watch.start()
+        return self._callbacks.solve(self.snes, self._problem._solution)
+
+    def _test(self) -> int:
+        problem, reasons = self._problem, PETSc.SNES.ConvergedReason
+        converged = problem._norms.within(max(problem.rtol, self._coarse))
+        return int(reasons.CONVERGED_FNORM_RELATIVE if converged else reasons.ITERATING)

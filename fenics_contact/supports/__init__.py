@@ -1,0 +1,1 @@
+"""What the body presses on: rigid shapes, obstacles, another body."""

@@ -1,0 +1,139 @@
+"""What Γc presses on. A support says, by UFL alone, the gap s and the normal n at a point of Γc.
+
+n points **from the body to the support**; s ≥ 0 is the distance along n that is still open. A
+support knows no mesh: numbers become constants of the mesh through the function that is passed in,
+so that a new value never compiles a new form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import ufl
+
+from fenics_contact.arguments import is_number
+
+__all__ = ["Motion", "Placement", "Support", "ToUFL", "as_positive", "as_vector", "nonzero_vector"]
+
+ToUFL = Callable[[Any], ufl.core.expr.Expr]
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a support is, seen from a point of Γc (UFL expressions).
+
+    Attributes:
+        gap: Distance along the normal, with the support moved: s of eq. (3), in length.
+        direction: From body to support, of any length greater than zero.
+    """
+
+    gap: ufl.core.expr.Expr
+    direction: ufl.core.expr.Expr
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A rigid translation of a support of which some components follow from the force on it.
+
+    Per component of space one of the two is given, the other is None. ``Motion(force=(None, -5),
+    displacement=(pull, None))`` is pressed down by 5 and pulled along as ``pull`` says.
+
+    Args to the constructor:
+        force: External force on the support (force; in 2D force per thickness), numbers or scalar
+            ``fem.Constant``; of a symmetric model the modelled part's share.
+        displacement: Prescribed components (length), likewise; none: zero where no force is given.
+    """
+
+    force: Sequence[Any]
+    displacement: Sequence[Any] | None = None
+
+    def components(self, gdim: int) -> tuple[dict[int, Any], dict[int, Any]]:
+        """Forces and prescribed displacements by component.
+
+        Raises:
+            ValueError: A component has both or is missing.
+        """
+        given = self.displacement if self.displacement is not None else (None,) * gdim
+        lists = (v if isinstance(v, Sequence | np.ndarray) else () for v in (self.force, given))
+        sizes = [len(v) for v in lists]
+        if sizes != [gdim, gdim]:
+            raise ValueError(
+                f"Motion has {sizes[0]} forces and {sizes[1]} displacements; it must have "
+                f"{gdim} of each on this mesh, None where the other one is given"
+            )
+        both = [i for i in range(gdim) if self.force[i] is not None and given[i] is not None]
+        if both:
+            raise ValueError(
+                f"Motion gives force and displacement of component {both[0]}; give one of them, "
+                "and None for the other"
+            )
+        forces = {i: f for i, f in enumerate(self.force) if f is not None}
+        return forces, {
+            i: 0.0 if given[i] is None else given[i] for i in range(gdim) if i not in forces
+        }
+
+
+class Support:
+    """A rigid support: subclasses say where it is.
+
+    Args to all of them: ``displacement``, the prescribed rigid translation (gdim numbers, a
+    ``fem.Constant`` to be changed between increments, or a UFL vector), or a `Motion` where the
+    force on the support is given; none means fixed.
+    """
+
+    displacement: Any = None
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether s - u_n is the true gap wherever the body moves, and the normal constant."""
+        return False
+
+    def place(
+        self, x: ufl.core.expr.Expr, shift: ufl.core.expr.Expr | None, to_ufl: ToUFL
+    ) -> Placement:
+        """Gap and direction at ``x`` with the support translated by ``shift`` (None: not at all).
+
+        Args:
+            x: Coordinates of the point of Γc, shape (gdim,).
+            shift: The displacement of the support, shape (gdim,).
+            to_ufl: Turns numbers, constants and expressions into UFL.
+
+        Raises:
+            ValueError: Data that are not of the mesh's dimension or out of range.
+        """
+        raise NotImplementedError
+
+
+def as_vector(name: str, value: Any, gdim: int) -> Any:
+    """Check a point or direction given by numbers: ``gdim`` finite entries."""
+    if isinstance(value, ufl.core.expr.Expr):
+        if value.ufl_shape != (gdim,):
+            raise ValueError(f"{name} has shape {value.ufl_shape}; the mesh needs ({gdim},)")
+        return value
+    entries = value if isinstance(value, Sequence | np.ndarray) else ()
+    if len(entries) != gdim or not all(is_number(v) and np.isfinite(v) for v in entries):
+        raise ValueError(f"{name} is {value!r}; it must be {gdim} finite numbers on this mesh")
+    return np.asarray(value, dtype=np.float64)
+
+
+def nonzero_vector(name: str, value: Any, gdim: int) -> Any:
+    """Check a direction given by numbers: not of length zero. Its length does not matter."""
+    value = as_vector(name, value, gdim)
+    if isinstance(value, np.ndarray):
+        length = np.linalg.norm(value)
+        if length == 0.0:
+            raise ValueError(f"{name} is {value.tolist()}; a direction of length zero has no sense")
+        return value / length
+    return value
+
+
+def as_positive(name: str, value: Any) -> Any:
+    """Check a length given by a number."""
+    if isinstance(value, ufl.core.expr.Expr):
+        return value
+    if not (is_number(value) and np.isfinite(value) and value > 0):
+        raise ValueError(f"{name} is {value!r}; it must be a number greater than zero")
+    return value

@@ -1,0 +1,55 @@
+"""A deformable body as the support: which it is, and how it is looked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import dolfinx
+import dolfinx.geometry
+import numpy as np
+
+from fenics_contact.arguments import is_number
+from fenics_contact.supports.base import Support
+
+__all__ = ["DeformableBody"]
+
+
+@dataclass(frozen=True)
+class DeformableBody(Support):
+    """The support is another part of the same mesh and displacement space.
+
+    Γc should be the surface of the softer or more finely meshed body. Forces on both are equal and
+    opposite to round-off.
+
+    Args to the constructor:
+        facet_tags: Tags on the facets of the mesh.
+        tags: Tag, or tags, of the opposite surface.
+        search_distance: Points whose opposite lies farther (length) than this have none; no limit
+            by default.
+        update: "never": the pairs are those of the undeformed bodies; "increment": they are found
+            anew in the deformed bodies at every commit, for slip over many facets. Normals stay
+            those of the undeformed Γc (small rotations).
+        release: How far behind a point (length) its opposite may lie, where the bodies penetrate
+            each other from the start. By default as far as they do, if they are two; in one and the
+            same body half the height of the point's cell. In deformed bodies always twice as far
+            as they penetrate there.
+    """
+
+    facet_tags: dolfinx.mesh.MeshTags
+    tags: int | Sequence[int]
+    search_distance: float = np.inf
+    update: str = "never"
+    release: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what has no sense."""
+        if not (is_number(self.search_distance) and self.search_distance > 0):
+            raise ValueError(
+                f"search_distance is {self.search_distance!r}; it must be a length greater "
+                "than zero"
+            )
+        if self.update not in ("never", "increment"):
+            raise ValueError(f"update is {self.update!r}; use 'never' or 'increment'")
+        if self.release is not None and not self.release >= 0:
+            raise ValueError(f"release is {self.release!r}; it must be a length, zero or greater")

@@ -1,0 +1,1 @@
+"""Γc: its facets, points and fields, and what lies opposite."""

@@ -1,0 +1,154 @@
+"""Young's modulus by the height of the cells at Γc, the measure of contact's stiffness."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import basix
+import dolfinx.fem.petsc
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem, la
+from petsc4py import PETSc
+
+from fenics_contact import compat
+from fenics_contact.parallel import global_min
+from fenics_contact.surface.facets import facet_cells
+from fenics_contact.surface.surface import ContactSurface
+
+__all__ = ["cell_modulus", "modulus_over_height"]
+
+# Length over which E/h is smoothed, in facets.
+_SMOOTHING_FACETS = 4.0
+
+
+def cell_modulus(
+    bulk_tangent: ufl.Form, u: fem.Function, weight: ufl.core.expr.Expr
+) -> fem.Function:
+    """Young's modulus of every cell as the bulk form itself has it. Collective.
+
+    The energy of two homogeneous strains is measured cell by cell: simple shear u = (0, x, 0)
+    gives G, stretch u = (0, y, 0) gives M = λ + 2G; then E = G (3M - 4G)/(M - G). Exact for
+    isotropic solids and plane strain; within some per cent for plane stress; the stiffness along
+    y for others.
+    Both fields have no radial part, so that they serve axisymmetric forms too.
+
+    Args:
+        bulk_tangent: Bilinear form of the bulk, by (trial, test) of ``u``'s space.
+        u: The displacement, where a nonlinear bulk is linearised.
+        weight: Factor of the volume measure that the bulk form carries (thickness, 2πr).
+
+    Returns:
+        A function, one value per cell (stress).
+    """
+    space = u.function_space
+    cells = [i for i in bulk_tangent.integrals() if i.integral_type() == "cell"]
+    test, trial = bulk_tangent.arguments()
+    # Both energies and the volume as the components of one form: compiled and assembled at once.
+    three = fem.functionspace(space.mesh, ("DG", 0, (3,)))
+    q = ufl.TestFunction(three)
+    form = weight * q[2] * ufl.dx(space.mesh)
+    x = space.tabulate_dof_coordinates()
+    for direction in range(2):
+        field = fem.Function(space)
+        field.x.array[1 :: len(u)] = x[:, direction]
+        form += ufl.replace(ufl.Form(cells), {test: q[direction] * field, trial: field})
+    shear, stretch, volume = _assemble(compat.compile_form(form)).reshape(-1, 3).T
+    shear, stretch = shear / volume, stretch / volume
+    isotropic = stretch > 1.2 * shear  # λ > -0.8 G: else no isotropic solid, and E is the stretch's
+    modulus = fem.Function(fem.functionspace(space.mesh, ("DG", 0)), name="modulus")
+    modulus.x.array[:] = stretch
+    G, M = shear[isotropic], stretch[isotropic]
+    modulus.x.array[isotropic] = G * ((3 * M - 4 * G) / (M - G))
+    return modulus
+
+
+def modulus_over_height(surface: ContactSurface, modulus: fem.Function) -> fem.Function:
+    """E/h over Γc, h the height of the cell over the facet, smoothed over a few facets. Collective.
+
+    The smoothing matters: where a penalty jumps from facet to facet, so does the penetration, and
+    the body answers with pressure oscillations (10 % on an unstructured mesh of the half-cylinder,
+    whatever the penalty). It acts on the logarithm, so that the result is positive and a change of
+    units changes nothing else.
+
+    Args:
+        surface: Γc.
+        modulus: Young's modulus, one value per cell of the mesh (stress).
+
+    Returns:
+        A continuous function of degree 1 on the submesh of Γc (stress/length).
+
+    Raises:
+        ValueError: The modulus is not positive at some facet: the bulk form has no stiffness there.
+    """
+    mesh, submesh = surface.mesh, surface.submesh
+    behind = facet_cells(mesh, surface.parent_facets())
+    area = _sizes(submesh, np.arange(behind.size, dtype=np.int32))
+    # A simplex of height h over a facet of area A has the volume A h / d, a brick A h.
+    simplex = mesh.topology.cell_type in (
+        dolfinx.mesh.CellType.triangle,
+        dolfinx.mesh.CellType.tetrahedron,
+    )
+    height = (mesh.topology.dim if simplex else 1) * _sizes(mesh, behind) / area
+    ratio = modulus.x.array[modulus.function_space.dofmap.list[behind, 0]] / height
+    smallest = global_min(mesh.comm, ratio, empty=1.0)
+    if not smallest > 0.0:
+        raise ValueError(
+            f"Young's modulus next to Γc is not positive (smallest E/h: {smallest:g}): check the "
+            "modulus, or the bulk form it was measured in; or give k_n and k_t in stress/length"
+        )
+    facets = fem.functionspace(submesh, ("DG", 0))
+    logarithm, length = fem.Function(facets), fem.Function(facets)
+    own = facets.dofmap.list[: behind.size, 0]
+    logarithm.x.array[own] = np.log(ratio)
+    length.x.array[own] = _SMOOTHING_FACETS * area ** (1 / submesh.topology.dim)
+    for function in (logarithm, length):
+        function.x.scatter_forward()
+    result = _smooth(logarithm, length)
+    result.x.array[:] = np.exp(result.x.array)
+    return result
+
+
+def _sizes(mesh: dolfinx.mesh.Mesh, cells: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.float64]:
+    """Area or volume of cells, that of their midpoints' Jacobian: exact for straight simplices."""
+    kind = basix.CellType[mesh.topology.cell_name()]
+    middle = basix.geometry(kind).mean(axis=0, keepdims=True)
+    slopes = compat.geometry_element(mesh).tabulate(1, middle)[1:, 0, :, 0]
+    x = mesh.geometry.x[compat.geometry_dofmap(mesh)[cells]][:, :, : mesh.geometry.dim]
+    jacobian = np.einsum("kn,cnd->ckd", slopes, x)
+    squared = np.linalg.det(jacobian @ jacobian.transpose(0, 2, 1))
+    return np.asarray(np.sqrt(squared) * basix.cell.volume(kind), dtype=np.float64)
+
+
+def _smooth(values: fem.Function, length: fem.Function) -> fem.Function:
+    """Solve w - ∇·(length² ∇w) = values with free edges, w continuous of degree 1. Collective."""
+    mesh = values.function_space.mesh
+    space = fem.functionspace(mesh, ("Lagrange", 1))
+    w, v = ufl.TrialFunction(space), ufl.TestFunction(space)
+    dx = ufl.dx(mesh)
+    form = w * v * dx + length**2 * ufl.dot(ufl.grad(w), ufl.grad(v)) * dx
+    matrix = fem.petsc.assemble_matrix(compat.compile_form(form))
+    matrix.assemble()
+    result = fem.Function(space, name="modulus_over_height")
+    rhs = fem.Function(space)
+    fem.assemble_vector(rhs.x.array, compat.compile_form(values * v * dx))
+    rhs.x.scatter_reverse(la.InsertMode.add)
+    ksp = PETSc.KSP().create(mesh.comm)
+    ksp.setOperators(matrix)
+    ksp.setType(PETSc.KSP.Type.CG)
+    ksp.getPC().setType(PETSc.PC.Type.JACOBI)
+    ksp.setTolerances(rtol=1e-14, max_it=10_000)
+    ksp.solve(rhs.x.petsc_vec, result.x.petsc_vec)
+    result.x.scatter_forward()
+    ksp.destroy()
+    matrix.destroy()
+    return result
+
+
+def _assemble(form: fem.Form) -> np.ndarray:
+    """Assembled linear form, ghosts included. Collective."""
+    vector = fem.assemble_vector(form)
+    vector.scatter_reverse(la.InsertMode.add)
+    vector.scatter_forward()
+    return vector.array.copy()

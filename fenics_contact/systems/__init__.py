@@ -1,0 +1,1 @@
+"""The equations on all unknowns, or condensed onto those that contact touches."""

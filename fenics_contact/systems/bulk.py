@@ -1,0 +1,225 @@
+"""The user's bulk form as a map u -> F(u) with a tangent, treated once where it is linear."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import dolfinx.fem.petsc
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from fenics_contact import compat
+from fenics_contact.parallel import collective_errors, global_max
+from fenics_contact.surface.dependence import Dependence
+
+__all__ = ["Bulk"]
+
+Array = npt.NDArray[np.float64]
+
+
+class Bulk:
+    """The bulk residual F(u; v), without contact.
+
+    Attributes:
+        form: The residual, UFL.
+        tangent_form: Its derivative by ``u``, UFL.
+        linear: Whether F is affine in ``u``: then its tangent is assembled once, a residual is a
+            product with it, and loads are assembled once an increment.
+        symmetric: Whether the assembled tangent is symmetric.
+        stiffness: The tangent without Dirichlet conditions, valid after `update`.
+        scale: Largest entry on the tangent's diagonal, the unit of stiffness (force/length).
+    """
+
+    def __init__(self, form: ufl.Form, u: fem.Function) -> None:
+        """Differentiate and compile. Collective.
+
+        Raises:
+            ValueError: ``form`` is no residual in the space of ``u``.
+        """
+        if not isinstance(form, ufl.Form):
+            raise ValueError(
+                f"F is a {type(form).__name__}; it must be the UFL residual of the bulk, such as "
+                "inner(sigma(u), epsilon(v))*dx - inner(load, v)*ds"
+            )
+        arguments = form.arguments()
+        if len(arguments) != 1:
+            raise ValueError(
+                f"F has {len(arguments)} arguments; it must be a residual in one TestFunction and "
+                "the Function u: replace a TrialFunction by u"
+            )
+        space = arguments[0].ufl_function_space()
+        if space != u.function_space:
+            raise ValueError("the TestFunction of F and u are of different function spaces")
+        if u not in form.coefficients():
+            raise ValueError(
+                "F does not depend on u: write the residual with the Function u itself"
+            )
+        self._u = u
+        self.form = form
+        derivative = ufl.derivative(form, u, ufl.TrialFunction(u.function_space))
+        self.tangent_form = ufl.algorithms.expand_derivatives(derivative)
+        self.linear = u not in self.tangent_form.coefficients()
+        kinds = dict.fromkeys(integral.integral_type() for integral in form.integrals())
+        parts = (_Part(form, kind, u) for kind in kinds)
+        self._parts = [part for part in parts if not part.empty]
+        self._compiled_tangent = compat.compile_form(self.tangent_form)
+        self.stiffness: PETSc.Mat = fem.petsc.create_matrix(self._compiled_tangent)
+        self.symmetric = True
+        self.scale = 0.0
+        self._load = fem.Function(u.function_space)  # F(0)
+        self._image = fem.Function(u.function_space)
+        tangent = self.tangent_form
+        self._dependence = Dependence(tangent.constants(), tangent.coefficients())
+
+    def check_finite(self) -> None:
+        """Refuse values that are not finite in any coefficient or constant. Collective.
+
+        Raises:
+            ValueError: It names the coefficient.
+        """
+        comm = self._u.function_space.mesh.comm
+        for kind, items in (
+            ("function", self.form.coefficients()),
+            ("constant", self.form.constants()),
+        ):
+            for position, item in enumerate(items):
+                array = item.x.array if kind == "function" else np.ravel(item.value)
+                if not np.isfinite(global_max(comm, np.abs(array))):
+                    name = "u" if item is self._u else getattr(item, "name", f"number {position}")
+                    raise ValueError(
+                        f"the {kind} {name!r} in F has values that are not finite (NaN or inf); "
+                        "check what set it"
+                    )
+
+    def is_current(self) -> bool:
+        """Whether the tangent is that of the present data: False if it may differ. Collective."""
+        if not self.linear:
+            return False
+        changed = self._dependence.changed
+        return self._u.function_space.mesh.comm.allreduce(int(changed)) == 0
+
+    def update(self) -> bool:
+        """Assemble the tangent at ``u`` if it may have changed; True if it did. Collective."""
+        if self.is_current():
+            return False
+        self._dependence.forget()  # until the matrix is complete
+        self.stiffness.zeroEntries()
+        fem.petsc.assemble_matrix(self.stiffness, self._compiled_tangent)
+        self.stiffness.assemble()
+        diagonal = self.stiffness.getDiagonal()
+        self.scale = diagonal.norm(PETSc.NormType.NORM_INFINITY)
+        self.symmetric = self._is_symmetric(diagonal)
+        diagonal.destroy()
+        if self.linear:
+            self._dependence.note()
+        return True
+
+    @contextmanager
+    def present_stiffness(self) -> Iterator[PETSc.Mat]:
+        """The tangent at the present ``u`` and data; `stiffness` stays as it is. Collective."""
+        if self.is_current():
+            yield self.stiffness
+            return
+        matrix = fem.petsc.assemble_matrix(self._compiled_tangent)
+        matrix.assemble()
+        try:
+            yield matrix
+        finally:
+            matrix.destroy()
+
+    def check_elastic(self) -> None:
+        """Refuse a tangent without stiffness, after `update`.
+
+        Raises:
+            ValueError: It says what was found.
+        """
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise ValueError(
+                f"the largest entry on the diagonal of the bulk stiffness is {self.scale:g}: F has "
+                "no elastic part, or a modulus is zero or not finite"
+            )
+
+    def update_load(self) -> Array:
+        """F(0), minus the external forces, at this rank's owned dofs. Collective."""
+        with collective_errors(self._u.function_space.mesh.comm):
+            self._load.x.array[:] = sum(part.at_rest() for part in self._parts)
+        self._load.x.scatter_reverse(dolfinx.la.InsertMode.add)
+        return self._owned(self._load)
+
+    def residual(self) -> Array:
+        """F(u) at this rank's owned dofs; a linear bulk needs `update_load` before. Collective."""
+        if not self.linear:
+            return self.assemble_residual()
+        self.stiffness.mult(self._u.x.petsc_vec, self._image.x.petsc_vec)
+        return self._owned(self._image) + self._owned(self._load)
+
+    def assemble_residual(self) -> Array:
+        """F(u) by assembly, whatever the bulk. Collective."""
+        self._image.x.array[:] = 0.0
+        with collective_errors(self._u.function_space.mesh.comm):
+            for part in self._parts:
+                part.assemble(self._image.x.array)
+        self._image.x.scatter_reverse(dolfinx.la.InsertMode.add)
+        return self._owned(self._image).copy()
+
+    def _owned(self, function: fem.Function) -> Array:
+        dofmap = function.function_space.dofmap
+        return function.x.array[: dofmap.index_map.size_local * dofmap.index_map_bs]
+
+    def _is_symmetric(self, probe: PETSc.Vec) -> bool:
+        """Compare products with the matrix and its transpose for one rough vector."""
+        start, _ = probe.getOwnershipRange()
+        probe.array[:] = np.cos(1.0 + 3.0 * (start + np.arange(probe.getLocalSize())) ** 1.5)
+        image, mirrored = probe.duplicate(), probe.duplicate()
+        self.stiffness.mult(probe, image)
+        self.stiffness.multTranspose(probe, mirrored)
+        size = image.norm()
+        image.axpy(-1.0, mirrored)
+        symmetric = image.norm() <= 1e-10 * size
+        image.destroy()
+        mirrored.destroy()
+        return bool(symmetric)
+
+
+class _Part:
+    """The integrals of F of one kind: over cells, over exterior facets ...
+
+    Taken apart no further, so that every integral keeps the quadrature rule it has in F.
+    """
+
+    def __init__(self, form: ufl.Form, kind: str, u: fem.Function) -> None:
+        """Compile. Collective."""
+        mine = ufl.Form([i for i in form.integrals() if i.integral_type() == kind])
+        self.empty = ufl.algorithms.expand_derivatives(mine).empty()  # a load that is 0 in UFL
+        still = ufl.replace(mine, {u: ufl.zero(u.ufl_shape)})
+        self._vanishes = ufl.algorithms.expand_derivatives(still).empty()
+        self._compiled = compat.compile_form(mine)
+        self._u = u
+        others = [c for c in mine.coefficients() if c is not u]
+        self._dependence = Dependence(mine.constants(), others)
+        self._at_rest: Array = np.zeros(u.x.array.size)
+
+    def assemble(self, target: Array) -> None:
+        """Add to ``target``, ghosts not collected."""
+        fem.assemble_vector(target, self._compiled)
+
+    def at_rest(self) -> Array:
+        """Values at u = 0, ghosts not collected; assembled if they may have changed."""
+        if self._vanishes:
+            return self._at_rest
+        if self._dependence.changed:
+            self._dependence.forget()  # until the assembly is complete
+            u = self._u.x.array
+            saved = u.copy()
+            u[:] = 0.0
+            self._at_rest[:] = 0.0
+            try:
+                self.assemble(self._at_rest)
+            finally:
+                u[:] = saved
+            self._dependence.note()
+        return self._at_rest

@@ -1,0 +1,31 @@
+"""Forces at one state, from which energies follow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["Forces"]
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Forces:
+    """Forces at one state, in coordinates of which the unknowns of all states are.
+
+    Attributes:
+        unknowns: Displacements and free motions on this rank.
+        internal, external: Forces of the bulk, and loads with reactions, at the unknowns.
+    """
+
+    unknowns: Array
+    internal: Array
+    external: Array
+
+    @classmethod
+    def none(cls, unknowns: Array) -> Forces:
+        """No forces."""
+        return cls(unknowns, np.zeros_like(unknowns), np.zeros_like(unknowns))

@@ -1,0 +1,25 @@
+"""Rigid motions as displacements."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["rigid_motions"]
+
+Array = npt.NDArray[np.float64]
+
+
+def rigid_motions(arm: Array, size: float) -> dict[str, Array]:
+    """Rigid motions of points at ``arm`` from the centre, (n, gdim), by name."""
+    n, d = arm.shape
+    motions = {}
+    for i, axis in enumerate("xyz"[:d]):
+        motions[f"translation along {axis}"] = np.broadcast_to(np.eye(d)[i], (n, d))
+    for i, axis in enumerate("xyz"):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        if max(j, k) < d:
+            turn = np.zeros((n, d))
+            turn[:, j], turn[:, k] = -arm[:, k] / size, arm[:, j] / size
+            motions[f"rotation about {axis}"] = turn
+    return motions

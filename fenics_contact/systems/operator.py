@@ -1,0 +1,180 @@
+"""Contact over the unknowns of a system: a sparse map from these to the points of Γc, and back.
+
+All of contact acts at points: the map D takes unknowns to the displacement that a point feels
+relative to its support, the law makes tractions of it there, and -Dᵀ takes these, times the area of
+their points, to forces. The law is evaluated on Γc alone, whatever the element of the bulk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from fenics_contact.contact.contact import Contact, PointTangent
+from fenics_contact.systems.products import PointProduct
+from fenics_contact.systems.unknowns import Selection, Unknowns
+
+__all__ = ["ContactOperator", "contact_operators"]
+
+Array = npt.NDArray[np.float64]
+
+
+class ContactOperator:
+    """How the points of a contact feel unknowns, and act on them. It does not change.
+
+    Pairs found anew, or other unknowns, take another one.
+
+    Attributes:
+        contact: The contact; what acts at its points is that of its present state.
+        unknowns: What the vectors and matrices are over.
+    """
+
+    def __init__(
+        self, contact: Contact, unknowns: Unknowns | None = None, first_motion: int = 0
+    ) -> None:
+        """Take the pairs as they are. Collective.
+
+        Args:
+            contact: The contact.
+            unknowns: Those of a problem, or a selection that has all that contact touches; none:
+                the dofs of ``contact.u`` alone.
+            first_motion: Number of this contact's first free motion among all of the unknowns.
+        """
+        self.contact = contact
+        self.unknowns = unknowns or Unknowns(contact.u.function_space)
+        self._gdim = contact.surface.mesh.geometry.dim
+        self._first = self.unknowns.first_motion + first_motion
+        self._of_bodies = self.unknowns.widened(contact.jump_map)
+        self._motions: PETSc.Mat | None = None
+        self._map = self._of_bodies
+        if contact.free_motion:
+            self._motions = self._motion_map()
+            self._map = self._of_bodies.copy()
+            different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
+            self._map.axpy(-1.0, self._motions, different)
+        self._at_points = self._map.createVecLeft()
+
+    def _motion_map(self) -> PETSc.Mat:
+        """The map from the unknowns to the free displacement of the support. Collective."""
+        contact, d = self.contact, self._gdim
+        n, components = contact.quadrature.n_points, list(contact.free_motion)
+        counts = np.tile(np.isin(np.arange(d), components), n)
+        columns = np.tile(self._first + np.arange(len(components)), n)
+        return PETSc.Mat().createAIJ(
+            ((n * d, None), (self.unknowns.n_local, None)),
+            csr=(
+                np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType),
+                columns.astype(PETSc.IntType),
+                np.ones(columns.size),
+            ),
+            comm=contact.surface.mesh.comm,
+        )
+
+    @cached_property
+    def touched(self) -> npt.NDArray[np.int32]:
+        """This rank's unknowns that the points feel or act on, ascending. Collective."""
+        pointers, columns, values = self._map.getValuesCSR()
+        csr = (pointers, columns, (values != 0.0).astype(np.float64))
+        marks = PETSc.Mat().createAIJ(self._map.getSizes(), csr=csr, comm=self._map.comm)
+        points, counts = marks.createVecLeft(), marks.createVecRight()
+        points.set(1.0)
+        marks.multTranspose(points, counts)
+        found = np.flatnonzero(counts.array_r > 0.0).astype(np.int32)
+        for item in (marks, points, counts):
+            item.destroy()
+        return found
+
+    def jump(self, values: Array) -> Array:
+        """Displacement relative to the support: of unknowns (n_local,), (n_points, gdim).
+
+        Collective.
+        """
+        vector = self._map.createVecRight()
+        vector.array[:] = values
+        self._map.mult(vector, self._at_points)
+        vector.destroy()
+        return self._at_points.array_r.reshape(-1, self._gdim).copy()
+
+    def add_force(self, residual: PETSc.Vec, traction: Array | None = None) -> None:
+        """Add what tractions do to a residual, minus their forces. Collective.
+
+        Args:
+            residual: Over the unknowns, added to (force).
+            traction: On the body, (n_points, gdim) (stress); by default the law's at the present
+                ``u``: then `Contact.form` is added, assembled.
+        """
+        if traction is None:
+            traction = self.contact.acting_traction()
+        self._at_points.array[:] = -(self.contact.area[:, None] * traction).ravel()
+        self._map.multTransposeAdd(self._at_points, residual, residual)
+
+    def springs(self, stiffness: Array) -> PETSc.Mat:
+        """Stiffness of springs at the points, (n_points, gdim, gdim) (stress/length). Collective.
+
+        Returns:
+            A new matrix over the unknowns (force/length).
+        """
+        blocks = self.contact.area[:, None, None] * stiffness
+        if isinstance(self.unknowns, Selection):
+            return self._product(blocks)
+        matrix = self._block_diagonal(blocks)
+        product = matrix.ptap(self._map)
+        matrix.destroy()
+        return product
+
+    def tangent(self, tangent: PointTangent | None = None) -> PETSc.Mat:
+        """The derivative of what `add_force` adds. Collective.
+
+        Args:
+            tangent: Derivatives of the tractions; by default the law's at the present ``u``.
+
+        Returns:
+            A new matrix over the unknowns (force/length).
+        """
+        tangent = tangent or self.contact.acting_tangent()
+        if tangent.by_shift is None:
+            return self.springs(-tangent.by_jump)
+        # Where the support moves its normals may turn: more than the opposite of ∂/∂jump.
+        area = -self.contact.area[:, None, None]
+        jumps = self._block_diagonal(area * tangent.by_jump)
+        shifts = self._block_diagonal(area * tangent.by_shift)
+        right, turned = jumps.matMult(self._of_bodies), shifts.matMult(self._motions)
+        right.axpy(1.0, turned, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        product = self._map.transposeMatMult(right)
+        for item in (jumps, shifts, right, turned):
+            item.destroy()
+        return product
+
+    @cached_property
+    def _product(self) -> PointProduct:
+        return PointProduct(self._map, self._gdim)
+
+    def _block_diagonal(self, blocks: Array) -> PETSc.Mat:
+        """One block per point, (n_points, gdim, gdim)."""
+        n, d = self.contact.quadrature.n_points, self._gdim
+        first, _ = self._map.getOwnershipRange()
+        columns = first + d * np.arange(n)[:, None, None] + np.arange(d)[None, None, :]
+        columns = np.broadcast_to(columns, (n, d, d))
+        size = self._map.getSizes()[0]
+        return PETSc.Mat().createAIJ(
+            (size, size),
+            csr=(
+                np.arange(0, n * d * d + 1, d, dtype=PETSc.IntType),
+                columns.ravel().astype(PETSc.IntType),
+                blocks.ravel(),
+            ),
+            comm=self.contact.surface.mesh.comm,
+        )
+
+
+def contact_operators(contacts: Sequence[Contact], unknowns: Unknowns) -> list[ContactOperator]:
+    """One of every contact of a problem, over its unknowns. Collective."""
+    firsts = np.cumsum([0, *(len(contact.free_motion) for contact in contacts)])
+    return [
+        ContactOperator(contact, unknowns, int(first))
+        for contact, first in zip(contacts, firsts, strict=False)
+    ]
