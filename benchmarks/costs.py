@@ -105,7 +105,7 @@ class Case:
             )
         except fc.NotConverged:
             return {"iterations": "none", "factorisations": ""}
-        way = "condensed" if problem._condensed else problem._whole.linear_kind
+        way = "condensed" if problem.solver.condensed else problem.full.linear_kind
         found = contact.resultants()
         results = {
             "u": body.displacement(u),

@@ -128,20 +128,21 @@ def test_the_residual_is_the_gradient_of_the_energy(cell, condensation):
     problem.solve()
     problem.commit()
     contact.freeze(contact.pressure)
-    space = problem._space
-    x = problem._solution.copy()
+    space = problem.solver.system
+    equations = problem.solver.equations
+    x = equations.solution.copy()
     f, y, z = x.duplicate(), x.duplicate(), x.duplicate()
     direction = fem.Function(scene.u.function_space)
     direction.interpolate(wave(scene.dim, 3))
     y.array[:] = np.where(space.constrained, 0.0, space.part(owned(direction)))
     x.axpy(0.02, y)  # away from the solution, where slopes are not zero
-    problem._compute_residual(x, f)
+    equations.residual(x, f)
     slope, step = f.dot(y), 1e-5
     energies = []
     for sign in (1, -1):
         x.copy(z)
         z.axpy(sign * step, y)
-        energies.append(problem._energy_at(z))
+        energies.append(equations.energy(z))
     assert slope != 0.0
     assert close((energies[0] - energies[1]) / (2 * step), slope, 1e-6)
     contact.thaw()
@@ -179,7 +180,7 @@ def test_its_options_are_reached():
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
     options = {"alternating_snes_max_it": 7}
     _, problem, _ = pressed("triangle", law, "alternating", petsc_options=options)
-    assert problem._alternation.snes.getTolerances()[3] == 7
+    assert problem.solver.methods["alternating"].snes.getTolerances()[3] == 7
 
 
 def test_a_nonlinear_bulk():

@@ -16,7 +16,7 @@ from scenes import GRID, TOP, Block, at_points, block, close, gathered, raised_e
 
 import fenics_contact as fc
 from fenics_contact import checkpoint, output
-from fenics_contact import problem as module
+from fenics_contact.methods import solver as module
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
 import hertz
@@ -427,8 +427,8 @@ def test_failure_leaves_no_trace(what: str, monkeypatch: pytest.MonkeyPatch) -> 
         monkeypatch.setattr(module, "_MAX_ROUNDS", 2)
     else:
         problem.snes.setTolerances(max_it=0)
-        problem._max_it = 0
-        problem._predicts = False  # that guess can be the solution
+        problem.solver.main.max_it = 0
+        problem.solver.predicts = False  # that guess can be the solution
     scene.load(up=-30.0, side=5.0)
     words = ("elastic slip",) if what == "rounds" else ("increment 2",)
     raised_everywhere(problem.solve, fc.NotConverged, *words)

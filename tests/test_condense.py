@@ -138,8 +138,8 @@ def test_path(cell, degree, law, method):
 
     def run(made):
         steps = walk(made)
-        iterations[made.problem._condensed] = sum(s.iterations for s in steps)
-        if made.problem._condensed:
+        iterations[made.problem.solver.condensed] = sum(s.iterations for s in steps)
+        if made.problem.solver.condensed:
             assert [s.factorisations for s in steps] == [1, 0, 0, 0, 0, 0]
         return fields(made, steps)
 
@@ -245,7 +245,7 @@ def test_several_contacts_and_loads():
             found.append([r.force for r in step.contacts.values()])
         # Both loads are two fields times numbers: factored once, and solved for once each.
         if condensed:
-            assert len(problem._space.condensation._directions) == 2
+            assert len(problem.solver.system.condensation._directions) == 2
         results.append({"u": owned(scene.u).copy(), "forces": np.array(found)})
     assert_same(*results)
 
@@ -259,7 +259,7 @@ def test_modulus_changed():
         for E, move in zip((1000.0, 2000.0, 2000.0, 500.0), PATH[:4], strict=True):
             made.scene.E.value = E
             steps += walk(made, path=[move])
-        if made.problem._condensed:
+        if made.problem.solver.condensed:
             assert [s.factorisations for s in steps] == [1, 1, 0, 1]
         return fields(made, steps)
 
@@ -293,12 +293,12 @@ def test_failure_leaves_no_trace(method):
         walk(m, path=PATH[:2])
     before = made.scene.u.x.array.copy(), made.contact.history.function.x.array.copy()
     made.move(*PATH[2])
-    kept = made.problem._max_it
-    made.problem._max_it = 0
+    kept = made.problem.solver.main.max_it
+    made.problem.solver.main.max_it = 0
     made.problem.snes.setTolerances(max_it=0)
     with pytest.raises(fc.NotConverged):
         made.problem.solve()
-    made.problem._max_it = kept
+    made.problem.solver.main.max_it = kept
     made.problem.snes.setTolerances(max_it=kept)
     after = made.scene.u.x.array, made.contact.history.function.x.array
     assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
@@ -333,11 +333,11 @@ def test_the_choice(caplog):
     law = fc.Frictionless(k_n=5e3)
     with caplog.at_level(logging.INFO, logger="fenics_contact"):
         problem, contact = scene.problem(law, scene.rollers())
-    assert problem._condensed == (COMM.size == 1)
+    assert problem.solver.condensed == (COMM.size == 1)
     if COMM.rank == 0:
         said = "condensed onto 10 of 50" if COMM.size == 1 else "takes one rank"
         assert any(said in record.getMessage() for record in caplog.records)
-    assert not scene.problem(law, scene.rollers(), condensation=False)[0]._condensed
+    assert not scene.problem(law, scene.rollers(), condensation=False)[0].solver.condensed
 
     def condensed(F, contacts, **options):
         return fc.ContactProblem(
@@ -378,5 +378,5 @@ def test_a_nonlinear_bulk_is_not_condensed():
     scene = block("quadrilateral", up=-1.0)
     scene.F = kirchhoff(scene, scene.E)
     problem, _ = scene.problem(fc.Frictionless(k_n=5e4), scene.rollers())
-    assert not problem._condensed
+    assert not problem.solver.condensed
     problem.solve()

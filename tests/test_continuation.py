@@ -132,11 +132,14 @@ def test_cut_increments_tell_what_was_tried():
     solve, fail = problem.solve, [True, True, False]
 
     def failing(**kwargs):
-        problem._max_it, kept = (0 if fail.pop(0) else problem._max_it), problem._max_it
+        problem.solver.main.max_it, kept = (
+            (0 if fail.pop(0) else problem.solver.main.max_it),
+            problem.solver.main.max_it,
+        )
         try:
             return solve(**kwargs)
         finally:
-            problem._max_it = kept
+            problem.solver.main.max_it = kept
             fail.append(False)
 
     problem.solve = failing

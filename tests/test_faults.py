@@ -93,11 +93,12 @@ def test_an_exception_in_a_callback(method, condensation, monkeypatch):
     if COMM.size > 1 and condensation is None:
         pytest.skip("condensation is for one rank")
     made, twin = pair(method, condensation=condensation)
-    names = {"newton": "_assemble_tangent", "continuation": "_assemble_tangent"}
-    for name in filter(None, ("_measure_norms", names.get(method))):
-        for after in (1, 3) if name == "_measure_norms" else (0,):
+    equations = made.problem.solver.equations
+    names = {"newton": "assemble_tangent", "continuation": "assemble_tangent"}
+    for name in filter(None, ("residual", names.get(method))):
+        for after in (1, 3) if name == "residual" else (0,):
             with monkeypatch.context() as patch:
-                patch.setattr(made.problem, name, failing(getattr(made.problem, name), after))
+                patch.setattr(equations, name, failing(getattr(equations, name), after))
                 survives(made, made.problem.solve, Fault, "on purpose")
     goes_on(made, twin)
 
@@ -118,23 +119,21 @@ def test_one_rank_raises(method, monkeypatch):
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_snes_is_stopped(method):
+def test_snes_is_stopped(method, monkeypatch):
     """By a limit that somebody set, in whichever iteration; and by an interrupt from outside."""
     made, twin = pair(method)
-    limit = made.problem._max_it
+    limit = made.problem.solver.main.max_it
     for allowed in (0, 1):
-        made.problem._max_it = allowed
-        made.problem.snes.setTolerances(max_it=allowed)
+        made.problem.solver.main.max_it = allowed
         survives(made, made.problem.solve, fc.NotConverged, "iterations used up")
-    made.problem._max_it = limit
-    made.problem.snes.setTolerances(max_it=limit)
-    kept = made.problem._test_convergence
-    made.problem._test_convergence = failing(kept, 1, KeyboardInterrupt)
+    made.problem.solver.main.max_it = limit
+    equations = made.problem.solver.equations
+    monkeypatch.setattr(equations, "solved", failing(equations.solved, 1, KeyboardInterrupt))
     before = snapshot(made)
     with pytest.raises(KeyboardInterrupt):
         made.problem.solve()
     assert identical(snapshot(made), before)
-    made.problem._test_convergence = kept
+    monkeypatch.undo()
     goes_on(made, twin)
 
 
@@ -261,14 +260,15 @@ parallel.PATIENCE = 0.2
 made = rub()
 made.move(*PATH[0])
 name, rank = "{name}", made.problem.u.function_space.mesh.comm.rank
-kept = getattr(made.problem, name)
-setattr(made.problem, name, lambda: kept() if rank == 0 else 1 / 0)
+equations = made.problem.solver.equations
+kept = getattr(equations, name)
+setattr(equations, name, lambda *args: kept(*args) if rank == 0 else 1 / 0)
 made.problem.solve()
 """
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="starts ranks of its own")
-@pytest.mark.parametrize("name", ["_check_before", "_test_convergence"])
+@pytest.mark.parametrize("name", ["residual_at", "solved"])
 def test_one_rank_fails_alone(name):
     """Where nothing tells the other ranks, which wait: all are ended, with the error shown."""
     script = ["mpirun", "--oversubscribe", "-n", "2", sys.executable, "-c", ALONE.format(name=name)]

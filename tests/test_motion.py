@@ -84,10 +84,10 @@ def test_two_forces_and_their_history():
     problem.solve()
     problem.commit()
     assert close(contact.resultants().force, [1.0, 5.0], 1e-8)
-    before = problem._whole.state()
+    before = problem.full.state()
     pull.value = 3.0
     raised_everywhere(problem.solve, (ValueError, fc.NotConverged))
-    assert np.array_equal(problem._whole.state(), before)
+    assert np.array_equal(problem.full.state(), before)
 
 
 def test_a_block_between_the_floor_and_a_weight():

@@ -137,13 +137,13 @@ def krylov_iterations(n: int, *, rotations: bool) -> int:
     scene = block("hexahedron", n=(10 * n, n, n), size=(10.0, 1.0, 1.0))
     bcs = [scene.hold(LEFT, i) for i in range(3)]
     problem, _ = scene.problem(fc.Frictionless(), bcs, method="newton", linear_solver="multigrid")
-    matrix, solver = problem._matrix(False), problem._solvers[False]
-    problem._space.fill(matrix, problem._bulk_matrix, [])
+    matrix, solver = problem.solver.equations.matrix(False), problem.solver.equations.solvers[False]
+    problem.solver.system.fill(matrix, [])
     if not rotations:
         matrix.setNearNullSpace(PETSc.NullSpace())
     force, found = matrix.createVecs()
-    force.array[:] = np.where(problem._constrained, 0.0, 1.0)
-    with problem._options.present():
+    force.array[:] = np.where(problem.constrained, 0.0, 1.0)
+    with problem.solver.options.present():
         solver.solve(force, found)
     assert solver.getConvergedReason() > 0
     return solver.getIterationNumber()
@@ -189,15 +189,15 @@ def test_chosen_where_factors_do_not_fit(caplog, monkeypatch):
     scene = block("quadrilateral", n=8, up=-1.0)
     with caplog.at_level(logging.INFO, logger="fenics_contact"):
         problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
-        assert problem._whole.linear_kind == "direct"
+        assert problem.full.linear_kind == "direct"
         monkeypatch.setattr(linear, "memory", lambda comm: 1e4)
         problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
-    assert not problem._condensed
-    assert problem._whole.linear_kind == "multigrid"
+    assert not problem.solver.condensed
+    assert problem.full.linear_kind == "multigrid"
     assert "GiB of memory" in said(caplog) and "multigrid" in said(caplog)
     assert problem.solve().factorisations == 0
     wanted, _ = scene.problem(fc.Frictionless(), scene.rollers(), linear_solver="direct")
-    assert wanted._whole.linear_kind == "direct"
+    assert wanted.full.linear_kind == "direct"
 
 
 def test_chosen_where_it_is_quicker():
@@ -217,23 +217,23 @@ def test_chosen_by_the_number_of_increments(monkeypatch):
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
     monkeypatch.setattr(linear, "_MANY", 0)
     monkeypatch.setattr(linear, "_MANY_PER_INCREMENT", problem.unknowns.n_local / 2.5)
-    assert problem._condensed
+    assert problem.solver.condensed
     problem.expect(2)
-    assert not problem._condensed and problem._whole.linear_kind == "multigrid"
+    assert not problem.solver.condensed and problem.full.linear_kind == "multigrid"
     with pytest.raises(ValueError, match="at least 1"):
         problem.expect(0)
     few = problem.solve().contacts["contact"].normal_force
     problem.expect(40)
-    assert not problem._condensed
+    assert not problem.solver.condensed
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers(), condensation=True)
     problem.expect(2)
-    assert problem._condensed
+    assert problem.solver.condensed
     assert problem.solve().contacts["contact"].normal_force == pytest.approx(few, rel=1e-8)
     # `increments` knows the number.
     for steps, condensed in ((1, False), (3, True)):
         problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
         list(fc.increments(problem, lambda share: None, steps=steps))
-        assert problem._condensed == condensed
+        assert problem.solver.condensed == condensed
 
 
 def test_a_support_that_moves_freely(caplog):
@@ -248,7 +248,7 @@ def test_a_support_that_moves_freely(caplog):
             contact={"support": ball},
             linear_solver="multigrid",
         )
-    assert problem._whole.linear_kind == "direct"
+    assert problem.full.linear_kind == "direct"
     assert "move freely" in said(caplog)
     problem.solve()
     assert close(contact.resultants().force[1], 5.0, 1e-8)
@@ -263,7 +263,7 @@ def test_options_reach_the_levels():
         mesh={"n": 16},
     )
     walk(made, path=PATH[:1])
-    smoother = made.problem._solvers[False].getPC().getMGSmoother(1)
+    smoother = made.problem.solver.equations.solvers[False].getPC().getMGSmoother(1)
     assert smoother.getPC().getType() == "jacobi"
     assert smoother.getTolerances()[3] == 3
     assert PETSc.Options().getAll() == before
@@ -279,8 +279,8 @@ def test_memory_of_factors(cell, n, symmetric):
     """The estimate against what MUMPS says it took, within a factor of 1.5."""
     scene = block(cell, n=n)
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers(), condensation=False)
-    matrix = problem._bulk_matrix.copy()
-    held = np.flatnonzero(problem._constrained).astype(np.int32)
+    matrix = problem.full.stiffness.copy()
+    held = np.flatnonzero(problem.constrained).astype(np.int32)
     matrix.zeroRowsColumns(held, diag=problem.bulk.scale)
     matrix.shift(problem.bulk.scale * 1e-6)  # nothing holds the height
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)

@@ -22,7 +22,7 @@ made = rub({arguments})
 made.move(*PATH[0])
 made.problem.solve()
 if made.problem.u.function_space.mesh.comm.rank == 0:
-    print("at most", made.problem._max_it)
+    print("at most", made.problem.solver.main.max_it)
 """
 
 

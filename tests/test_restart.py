@@ -193,13 +193,13 @@ def picture(made: Scene) -> dict[str, np.ndarray]:
         found[name] = nodal(rate)
         found[f"{name} of supports"] = problem.unknowns.motions(values)
     energy = problem._committed_energy
-    forces = energy.forces[problem._whole.mark]
+    forces = energy.forces[problem.full.mark]
     for name in ("internal", "external"):
         owned(rate)[:] = getattr(forces, name)[: problem.unknowns.n_dofs]
         found[f"forces {name}"] = nodal(rate)
     found["springs"] = np.array([COMM.allreduce(energy.springs)])
-    if problem._condensed:
-        found["kept"] = problem._space.unknowns.kept
+    if problem.solver.condensed:
+        found["kept"] = problem.solver.system.unknowns.kept
     for c, ways in zip(problem.contacts, energy.contacts, strict=True):
         found[f"{c.name} history"] = at_points(c, c.history.rows())
         found[f"{c.name} jump"] = at_points(c, c.committed_jump)
@@ -530,7 +530,7 @@ def test_other_loads_and_conditions_are_refused(saved):
     raised_everywhere(call, ValueError, "a value prescribed by a Dirichlet condition")
     made = Press(wall=True)
     del made.problem._bcs[0]
-    made.problem._constrained[:] = made.problem._constrained_unknowns()
+    made.problem.constrained[:] = made.problem._constrained_unknowns()
     raised_everywhere(call, ValueError, "Dirichlet conditions", "components of nodes")
 
 

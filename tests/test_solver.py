@@ -798,7 +798,7 @@ def test_a_premature_end_is_caught(method, monkeypatch):
     before = snapshot(made)
     made.move(*PATH[2])
     claimed = PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
-    monkeypatch.setattr(made.problem, "_test_convergence", lambda *args: claimed)
+    monkeypatch.setattr(made.problem.solver.main, "converged", lambda: claimed)
     with pytest.raises(fc.NotConverged) as caught:
         made.problem.solve()
     assert any("residual" in f for f in caught.value.verdict.failures)
@@ -1353,7 +1353,7 @@ def test_newton_starts_where_the_right_points_slip(condensation):
         for i in range(1, 13):
             made.move(0.004 * i, 0.05)
             if not helped:
-                made.problem._predicts = False
+                made.problem.solver.predicts = False
             taken[-1] += made.problem.solve().iterations
             made.problem.commit()
         assert made.contact.resultants().slip > 0

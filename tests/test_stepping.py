@@ -119,13 +119,13 @@ def limited(made: Rub, largest: float) -> list[float]:
     def choosy(**kwargs):
         tried.append(now[0])
         if now[0] - at[0] > largest:
-            made.problem._max_it, kept = 0, made.problem._max_it
+            made.problem.solver.main.max_it, kept = 0, made.problem.solver.main.max_it
             made.problem.snes.setTolerances(max_it=0)
-            made.problem._predicts = False  # that guess can be the solution
+            made.problem.solver.predicts = False  # that guess can be the solution
             try:
                 return solve(**kwargs)
             finally:
-                made.problem._max_it = kept
+                made.problem.solver.main.max_it = kept
                 made.problem.snes.setTolerances(max_it=kept)
         return solve(**kwargs)
 

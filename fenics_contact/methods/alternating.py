@@ -23,6 +23,7 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from fenics_contact.methods.callbacks import Callbacks
+from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.options import Defaults
 
 __all__ = ["OPTIONS", "Alternation"]
@@ -57,79 +58,78 @@ _STILL = 1e-6
 
 
 class Alternation:
-    """The method, on the unknowns, matrices and measures of a problem.
+    """The method.
 
     Attributes:
         snes: Newton's method for the subproblems, prefix "alternating_" behind the problem's.
     """
 
-    def __init__(self, problem: Any, defaults: Defaults, solver: dict[str, Any]) -> None:
+    def __init__(
+        self, equations: Equations, defaults: Defaults, prefix: str, solver: dict[str, Any]
+    ) -> None:
         """Set up SNES; the matrices are those of H₀. Collective.
 
         Args:
-            problem: The `ContactProblem`.
+            equations: What to solve.
             defaults: What takes the options.
+            prefix: Of the problem's options.
             solver: Options of the linear solver; none: it is that of H₀.
         """
-        self._problem = weakref.proxy(problem)
+        self._equations = equations
         self._function: PETSc.Vec | None = None
         self._shares_solver = not solver
-        comm, prefix = problem.u.function_space.mesh.comm, problem.prefix
+        comm = equations.full.unknowns.comm
         self.snes = defaults.make_snes(comm, prefix, "alternating_", OPTIONS | solver)
         self._finish = defaults.make_snes(comm, prefix, "finishing_", _FINISH | solver)
         self._callbacks = Callbacks(comm)
         self._goal = 0.0
 
     def _attach(self) -> None:
-        """Take the vectors, matrices and solver of H₀ of the problem's present space."""
-        problem = self._problem
-        new = self._function is not problem._function
-        self._function = problem._function
+        """Take the vectors, matrices and solver of H₀ of the present system."""
+        equations = self._equations
+        new = self._function is not equations.function
+        self._function = equations.function
         this: Alternation = weakref.proxy(self)
         for snes in (self.snes, self._finish):
             if new:
                 snes.reset()
             if self._shares_solver:
-                snes.setKSP(problem._solvers[False])
+                snes.setKSP(equations.solvers[False])
             self._callbacks.attach(
                 snes,
-                lambda x, f: this._problem._compute_residual(x, f),
+                lambda x, f: this._compute_residual(x, f),
                 self._function,
                 lambda x, J: this._assemble(x, J),
-                problem._matrix(False),
+                equations.matrix(False),
                 lambda: this._test(),
             )
-        if problem.bulk.linear:
-            self._callbacks.set_objective(self.snes, lambda x: this._problem._energy_at(x))
+        if equations.full.bulk.linear:
+            self._callbacks.set_objective(self.snes, lambda x: this._equations.energy(x))
 
-    def solve(self, solution: PETSc.Vec) -> tuple[int, int]:
-        """Solve the problem from ``solution`` on. Collective.
-
-        Returns:
-            Newton iterations in all, and the reason as SNES has them.
-        """
-        problem, reasons = self._problem, PETSc.SNES.ConvergedReason
+    def solve(self) -> tuple[int, int]:
+        """Solve; see `Method`. Iterations are Newton's, in all."""
+        equations, reasons = self._equations, PETSc.SNES.ConvergedReason
         self._attach()
         iterations = stalls = 0
         best = np.inf
         relaxation = 1.0
         try:
-            residual = self._residual(solution)
+            residual = self._residual()
             pressure: Array = self._pressure()
             for cycle in range(_MAX_CYCLES):
-                ends = np.cumsum([c.quadrature.n_points for c in problem.contacts])[:-1]
-                for contact, part in zip(problem.contacts, np.split(pressure, ends), strict=True):
+                ends = np.cumsum([c.quadrature.n_points for c in equations.contacts])[:-1]
+                for contact, part in zip(equations.contacts, np.split(pressure, ends), strict=True):
                     contact.freeze(part)
-                share = 0.0 if problem.has_potential else _INNER
+                share = 0.0 if equations.has_potential else _INNER
                 self._goal = share * residual
-                iterations += self._minimise(solution)
-                residual = self._residual(solution)
-                if problem._norms.within(problem.rtol):
+                iterations += self._minimise()
+                residual = self._residual()
+                if equations.solved():
                     logger.debug("%d cycles, %d Newton iterations", cycle + 1, iterations)
                     return iterations, int(reasons.CONVERGED_FNORM_RELATIVE)
                 stalls = 0 if residual < best else stalls + 1
                 best = min(best, residual)
-                if not np.isfinite(residual) or stalls > _MAX_STALLS or problem.has_potential:
+                if not np.isfinite(residual) or stalls > _MAX_STALLS or equations.has_potential:
                     return iterations, int(reasons.DIVERGED_LINE_SEARCH)
                 if iterations > _MAX_ITERATIONS:
                     return iterations, int(reasons.DIVERGED_MAX_IT)
@@ -138,48 +138,47 @@ class Alternation:
                 pressure = pressure + relaxation * (self._pressure() - pressure)
             return iterations, int(reasons.DIVERGED_MAX_IT)
         finally:
-            problem._rounds.forget()
-            for contact in problem.contacts:
+            equations.h0_is_made = False
+            for contact in equations.contacts:
                 contact.thaw()
 
     def _pressure(self) -> Array:
         """Of all contacts at this rank's points."""
-        contacts = self._problem.contacts
+        contacts = self._equations.contacts
         for contact in contacts:
             contact.evaluate()
         return np.concatenate([contact.pressure for contact in contacts])
 
-    def _residual(self, solution: PETSc.Vec) -> float:
+    def _residual(self) -> float:
         """That of the whole law."""
-        for contact in self._problem.contacts:
+        equations = self._equations
+        for contact in equations.contacts:
             contact.thaw()
-        self._problem._compute_residual(solution, self._function)
-        return float(self._problem._norms.total)
+        return float(equations.residual(equations.solution, equations.function).total)
 
-    def _minimise(self, solution: PETSc.Vec) -> int:
+    def _minimise(self) -> int:
         """Newton's method with the line search on the energy, then without any."""
+        solution = self._equations.solution
         made, reason = self._callbacks.solve(self.snes, solution)
         if reason <= 0:
             # The last digits of the residual are below the rounding of the energy.
             made += self._callbacks.solve(self._finish, solution)[0]
         return made
 
+    def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        self._equations.residual(x, f)
+
     def _test(self) -> int:
-        reasons = PETSc.SNES.ConvergedReason
-        norms = self._problem._norms
-        converged = norms.total <= self._goal or norms.within(self._problem.rtol)
+        reasons, equations = PETSc.SNES.ConvergedReason, self._equations
+        converged = equations.norms.total <= self._goal or equations.solved()
         return int(reasons.CONVERGED_FNORM_RELATIVE if converged else reasons.ITERATING)
 
     def _assemble(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
-        problem = self._problem
-        problem._set_u(x)
-        problem._update_bulk()
-        for contact in problem.contacts:
-            contact.evaluate()
-        problem._watch.note(problem._norms.total)
-        if not problem.motions.held(problem.operators):
-            problem._assemble_matrix(matrix, problem._stiffnesses(everywhere=True))
+        equations = self._equations
+        equations.evaluate(x)
+        if not equations.held():
+            equations.assemble(matrix, equations.stiffnesses(everywhere=True))
             return
         # Where all slips, what nothing but friction holds would be loose.
-        still = (o.springs(o.contact.springs(0.0, _STILL)) for o in problem._space.operators)
-        problem._assemble_matrix(matrix, chain(problem._tangents(), still))
+        still = (o.springs(o.contact.springs(0.0, _STILL)) for o in equations.system.operators)
+        equations.assemble(matrix, chain(equations.tangents(), still))

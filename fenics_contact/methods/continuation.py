@@ -18,6 +18,8 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.methods.callbacks import Callbacks
+from fenics_contact.methods.equations import Equations
+from fenics_contact.methods.method import Method
 from fenics_contact.methods.options import Defaults
 
 __all__ = ["OPTIONS", "Continuation"]
@@ -45,63 +47,68 @@ _COARSE = 1e-3
 
 
 class Continuation:
-    """The method, on the unknowns, matrices and measures of a problem.
+    """The method.
 
     Attributes:
         snes: Newton's method for one stiffness, prefix "continuation_" behind the problem's.
     """
 
-    def __init__(self, problem: Any, defaults: Defaults, solver: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        equations: Equations,
+        otherwise: Method,
+        defaults: Defaults,
+        prefix: str,
+        solver: dict[str, Any],
+    ) -> None:
         """Set up SNES; the matrix is that of the consistent tangent. Collective.
 
         Args:
-            problem: The `ContactProblem`.
+            equations: What to solve.
+            otherwise: What takes over where no step of the stiffness succeeds.
             defaults: What takes the options.
+            prefix: Of the problem's options.
             solver: Options of the linear solver; none: it is that of the consistent tangent.
         """
-        self._problem = weakref.proxy(problem)
+        self._equations, self._otherwise = equations, otherwise
         self._function: PETSc.Vec | None = None
-        comm = problem.u.function_space.mesh.comm
-        self.snes = defaults.make_snes(comm, problem.prefix, "continuation_", OPTIONS | solver)
+        comm = equations.full.unknowns.comm
+        self.snes = defaults.make_snes(comm, prefix, "continuation_", OPTIONS | solver)
         self._shares_solver = not solver
         self._callbacks = Callbacks(comm)
         self._coarse = 0.0
 
     def _attach(self) -> None:
-        """Take the vectors, matrices and solver of the problem's present space."""
-        problem, snes = self._problem, self.snes
-        if self._function is not problem._function:
+        """Take the vectors, matrices and solver of the present system."""
+        equations, snes = self._equations, self.snes
+        if self._function is not equations.function:
             snes.reset()
-        self._function = problem._function
+        self._function = equations.function
         if self._shares_solver:
-            snes.setKSP(problem._solvers[True])
+            snes.setKSP(equations.solvers[True])
         this: Continuation = weakref.proxy(self)
         self._callbacks.attach(
             snes,
-            lambda x, f: this._problem._compute_residual(x, f),
+            lambda x, f: this._compute_residual(x, f),
             self._function,
-            lambda x, J: this._problem._assemble_tangent(x, J),
-            problem._matrix(True),
+            lambda x, J: this._equations.assemble_tangent(x, J),
+            equations.matrix(True),
             lambda: this._test(),
         )
 
     def solve(self) -> tuple[int, int]:
-        """Solve the problem from its ``_solution`` on. Collective.
-
-        Returns:
-            Newton iterations in all, and the reason as SNES has them.
-        """
-        problem = self._problem
+        """Solve; see `Method`. Iterations are Newton's, in all."""
+        equations = self._equations
         self._attach()
-        share = min(1.0, 1.0 / max(problem._hardness(), 1.0))
-        iterations, solved, factor, kept = 0, 0.0, _FACTOR, problem._solution.copy()
+        share = min(1.0, 1.0 / max(equations.hardness(), 1.0))
+        iterations, solved, factor, kept = 0, 0.0, _FACTOR, equations.solution.copy()
         try:
             while True:
                 self._soften(share)
                 made, reason = self._solve_one()
                 iterations += made
                 if reason <= 0:
-                    kept.copy(problem._solution)
+                    kept.copy(equations.solution)
                     if solved and factor > _LEAST_FACTOR:
                         factor = np.sqrt(factor)
                         share = min(1.0, factor * solved)
@@ -109,7 +116,7 @@ class Continuation:
                     factor = _FACTOR
                     share = min(1.0, factor * solved) if solved else share
                     self._soften(share)
-                    made, reason = problem._alternation.solve(problem._solution)
+                    made, reason = self._otherwise.solve()
                     iterations += made
                     logger.debug("alternated at %.3g of the stiffness: reason %d", share, reason)
                 if reason <= 0 or share == 1.0:
@@ -118,24 +125,27 @@ class Continuation:
                     return iterations, int(PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT)
                 logger.debug("%.3g of the stiffness, %d iterations so far", share, iterations)
                 solved = share
-                problem._solution.copy(kept)
+                equations.solution.copy(kept)
                 share = min(1.0, factor * solved)
         finally:
             self._soften(1.0)
-            problem._rounds.forget()
+            equations.h0_is_made = False
 
     def _soften(self, share: float) -> None:
         """Let the contacts have a share of their stiffness."""
-        for contact in self._problem.contacts:
+        for contact in self._equations.contacts:
             contact.stiffness_factor.value = share
         self._coarse = _COARSE if share < 1.0 else 0.0
 
     def _solve_one(self) -> tuple[int, int]:
         """Iterations and reason of Newton's method for the present stiffness. Collective."""
-        self._problem._watch.start()
-        return self._callbacks.solve(self.snes, self._problem._solution)
+        self._equations.watch.start()
+        return self._callbacks.solve(self.snes, self._equations.solution)
+
+    def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        self._equations.residual(x, f)
 
     def _test(self) -> int:
-        problem, reasons = self._problem, PETSc.SNES.ConvergedReason
-        converged = problem._norms.within(max(problem.rtol, self._coarse))
+        reasons = PETSc.SNES.ConvergedReason
+        converged = self._equations.solved(self._coarse)
         return int(reasons.CONVERGED_FNORM_RELATIVE if converged else reasons.ITERATING)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import weakref
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact import compat
+from fenics_contact.methods.equations import Equations
+from fenics_contact.methods.method import SnesMethod
 
 __all__ = ["QuasiNewton"]
 
@@ -22,55 +23,56 @@ _IDLE = 1e-3
 # next one starts where that was.
 _ASTRAY = 1e3
 
+_REASONS = PETSc.SNES.ConvergedReason
 
-class QuasiNewton:
-    """The method, on the SNES, matrices and measures of a problem."""
 
-    def __init__(self, problem: Any) -> None:
-        """No H₀ yet.
+class QuasiNewton(SnesMethod):
+    """The method; SNES makes a round, whose limit of iterations is its own."""
 
-        Args:
-            problem: The `ContactProblem`.
-        """
-        self._problem = weakref.proxy(problem)
-        self._has_h0 = self._refreshed = False
+    def __init__(
+        self, equations: Equations, snes: PETSc.SNES, gives_up: Callable[[], bool]
+    ) -> None:
+        """No H₀ yet; see `SnesMethod`."""
+        super().__init__(equations, snes, gives_up)
+        self._limit: int | None = None
+        self._refreshed = False
 
-    def forget(self) -> None:
-        """Say that the matrix of H₀ is gone, or was used for something else."""
-        self._has_h0 = False
+    @property
+    def max_it(self) -> int:
+        """Iterations in all before it is given up."""
+        return super().max_it if self._limit is None else self._limit
 
-    def solve(self, stiffness_changed: bool) -> tuple[int, int]:
-        """Solve the problem from its ``_solution`` on. Collective.
+    @max_it.setter
+    def max_it(self, limit: int) -> None:
+        self._limit = limit
 
-        Args:
-            stiffness_changed: Whether the bulk's tangent is another one than in the last increment.
+    def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
+        """H₀ is made between the rounds, and kept during one."""
 
-        Returns:
-            Iterations, and the reason as SNES has them after a look at the residual itself.
-        """
-        problem, reasons = self._problem, PETSc.SNES.ConvergedReason
-        snes, solution = problem.snes, problem._solution
-        problem._compute_residual(solution, problem._function)
-        norms = problem._norms
+    def solve(self) -> tuple[int, int]:
+        """Solve; see `Method`. The reason is after a look at the residual itself."""
+        equations, snes = self._equations, self.snes
+        limit = self._limit = self.max_it  # SNES has that of a round from now on
+        solution = equations.solution
+        norms = equations.residual(solution, equations.function)
         borne = norms.force[norms.n_bodies :].max(initial=0.0)
         idle = self._refreshed and borne < _IDLE * norms.total
-        if not self._has_h0 or stiffness_changed or idle:
+        if not equations.h0_is_made or idle:
             self._start()
-            self._has_h0 = True
+            equations.h0_is_made = True
         else:
-            problem._clear_pairs()
+            self._clear_pairs(consistent=self.consistent)
         iterations = stalls = 0
         best, kept = np.inf, solution.copy()
         while True:
-            left = problem._max_it - iterations
-            snes.setTolerances(max_it=min(problem._space.iterations_per_round, left))
-            iterations += problem._callbacks.solve(snes, solution)[0]
-            problem._compute_residual(solution, problem._function)
-            residual = problem._norms.total
-            if problem._norms.within(problem.rtol):
-                return iterations, int(reasons.CONVERGED_FNORM_RELATIVE)
-            if iterations >= problem._max_it:
-                return iterations, int(reasons.DIVERGED_MAX_IT)
+            left = limit - iterations
+            snes.setTolerances(max_it=min(equations.system.iterations_per_round, left))
+            iterations += self._callbacks.solve(snes, solution)[0]
+            residual = equations.residual(solution, equations.function).total
+            if equations.solved():
+                return iterations, int(_REASONS.CONVERGED_FNORM_RELATIVE)
+            if iterations >= limit:
+                return iterations, int(_REASONS.DIVERGED_MAX_IT)
             if residual < best:
                 stalls, best = 0, residual
                 solution.copy(kept)
@@ -80,17 +82,17 @@ class QuasiNewton:
                     kept.copy(solution)
             if stalls >= _MAX_STALLS:
                 lost = not np.isfinite(residual)
-                failure = compat.NOT_FINITE if lost else int(reasons.DIVERGED_LINE_SEARCH)
+                failure = compat.NOT_FINITE if lost else int(_REASONS.DIVERGED_LINE_SEARCH)
                 return iterations, failure
             if not self._refresh():
                 return iterations, compat.NOT_FINITE
 
     def _start(self) -> None:
         """H₀ = (K + αK_n + φK_t)⁻¹, all of Γc closed and sticking (section 5). Collective."""
-        problem = self._problem
+        equations = self._equations
         self._refreshed = False
-        problem._clear_pairs(consistent=False)
-        problem._assemble_matrix(problem._matrix(False), problem._stiffnesses(everywhere=True))
+        self._clear_pairs(consistent=False)
+        equations.assemble(equations.matrix(False), equations.stiffnesses(everywhere=True))
 
     def _refresh(self) -> bool:
         """Make H₀ anew from the status that the last round reached; False if none. Collective.
@@ -98,17 +100,19 @@ class QuasiNewton:
         With Coulomb friction it is the consistent tangent: what L-BFGS cannot build from pairs is
         the unsymmetric coupling of slip to pressure, and without it the residual wanders.
         """
-        problem = self._problem
-        problem._set_u(problem._solution)
-        problem._update_bulk()
-        if not np.isfinite(problem.bulk.scale):
+        equations = self._equations
+        equations.evaluate(equations.solution)
+        if not np.isfinite(equations.full.bulk.scale):
             return False
         self._refreshed = True
-        for contact in problem.contacts:
-            contact.evaluate()
-        problem._watch.note(problem._norms.total)
-        consistent = not problem.has_potential and problem.motions.held(problem.operators)
-        parts = problem._tangents() if consistent else problem._stiffnesses(everywhere=False)
-        problem._clear_pairs(consistent=consistent)
-        problem._assemble_matrix(problem._matrix(consistent), parts)
+        consistent = not equations.has_potential and equations.held()
+        parts = equations.tangents() if consistent else equations.stiffnesses(everywhere=False)
+        self._clear_pairs(consistent=consistent)
+        equations.assemble(equations.matrix(consistent), parts)
         return True
+
+    def _clear_pairs(self, *, consistent: bool) -> None:
+        """Forget the pairs of L-BFGS and keep the factorisation, which reset() would drop too."""
+        self.snes.setKSP(PETSc.KSP().create(self.snes.comm))
+        self.snes.reset()
+        self.attach(consistent=consistent)

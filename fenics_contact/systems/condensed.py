@@ -1,4 +1,4 @@
-"""The problem on the unknowns that contact touches, where the bulk is linear.
+"""The system on the unknowns that contact touches, where the bulk is linear.
 
 Contact acts on few unknowns, Γc's and those opposite. With the others eliminated, which takes one
 factorisation, the bulk is a dense matrix S on these (its Schur complement), whatever the loads and
@@ -8,25 +8,23 @@ one back-substitution at its end gives the field.
 
 from __future__ import annotations
 
-import ctypes
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import petsc4py
 from petsc4py import PETSc
 
-from fenics_contact import compat
+from fenics_contact.systems.condensation import Condensation
 from fenics_contact.systems.dense import PartlyFactored, Sum
 from fenics_contact.systems.forces import Forces
-from fenics_contact.systems.full import FullSystem, Mask
+from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Selection, Unknowns
 
-__all__ = ["Condensation", "CondensedSystem", "touched", "worthwhile"]
+__all__ = ["CondensedSystem", "touched", "worthwhile"]
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int32]
@@ -41,10 +39,6 @@ _SMALL = 500
 # 4 n² in three. Up to this share of n^((d-1)/d), the size of a surface of all of the mesh, the
 # dense one costs a quarter of the sparse one.
 _SURFACE_SHARE = {2: 3.0, 3: 1.2}
-# Directions of loads whose particular solutions are kept, and the remainder, relative to the load,
-# below which a load is a combination of them.
-_DIRECTIONS = 4
-_SAME = 1e-14
 
 
 def worthwhile(n: int, n_kept: int, dimension: int) -> bool:
@@ -68,246 +62,50 @@ def touched(operators: Sequence[ContactOperator], unknowns: Unknowns) -> Indices
     return np.flatnonzero(found).astype(np.int32)
 
 
-class Condensation:
-    """A stiffness with all but some of its unknowns eliminated. One rank only.
-
-    Prescribed unknowns that are not kept are held at the values they have.
-
-    Attributes:
-        schur: The condensed stiffness, (n_kept, n_kept), Fortran order (force/length).
-        response: What the load of `set_load` makes of the body with the unknowns kept at rest.
-    """
-
-    def __init__(
-        self,
-        stiffness: PETSc.Mat,
-        constrained: Mask,
-        kept: Indices,
-        *,
-        symmetric: bool,
-        prefix: str = "",
-    ) -> None:
-        """Factor.
-
-        Args:
-            stiffness: Over all unknowns, without conditions, (n, n).
-            constrained: Mask of the prescribed unknowns, (n,).
-            kept: The unknowns to keep, ascending, (n_kept,).
-            symmetric: Whether the stiffness is.
-            prefix: Of the options of the factorisation.
-
-        Raises:
-            RuntimeError: The stiffness is singular even with the kept unknowns held.
-            MemoryError: There is not enough.
-        """
-        self._stiffness, self._kept = stiffness, kept
-        outside = np.ones(constrained.size, dtype=np.bool_)
-        outside[kept] = False
-        self._held = np.flatnonzero(outside & constrained).astype(np.int32)
-        self._eliminated = np.flatnonzero(outside & ~constrained).astype(np.int32)
-        self._right, self._left = stiffness.createVecs()
-        self._directions: list[tuple[Array, Response]] = []
-        matrix = stiffness.copy()
-        diagonal = matrix.getDiagonal()
-        self._scale = scale = diagonal.norm(PETSc.NormType.NORM_INFINITY)
-        matrix.zeroRowsColumns(self._held, diag=scale)
-        matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
-        self._pc = PETSc.PC().create(stiffness.comm)
-        self._pc.setOptionsPrefix(prefix)
-        self._pc.setOperators(matrix)
-        self._pc.setType("cholesky" if symmetric else "lu")
-        self._pc.setFactorSolverType("mumps")
-        self._pc.setFromOptions()
-        self._pc.setFactorSetUpSolverType()
-        self._factor = self._pc.getFactorMatrix()
-        # MUMPS' estimate of its workspace is short where the Schur complement is most of it.
-        self._factor.setMumpsIcntl(14, 400)
-        chosen = PETSc.IS().createGeneral(kept, comm=PETSc.COMM_SELF)
-        _call("MatFactorSetSchurIS", _object(self._factor), _object(chosen))
-        self._pc.setUp()
-        error = self._factor.getMumpsInfog(1)
-        if compat.refused_memory(self._pc):
-            raise MemoryError(
-                f"condensing {constrained.size} unknowns onto {kept.size} was refused its memory "
-                f"(MUMPS error {error}): use condensation=False, or several ranks"
-            )
-        self.schur = self._schur_complement()
-        if error < 0 or not np.all(np.isfinite(self.schur)):
-            raise RuntimeError(
-                f"the bulk stiffness cannot be condensed onto the {kept.size} unknowns that "
-                f"contact touches (MUMPS error {error}): with these held it is still singular. A "
-                "part of the body may be held by nothing; or use condensation=False"
-            )
-        # Solutions with the kept unknowns at rest, and not of the whole.
-        self._factor.setMumpsIcntl(26, 0)
-        self.response = Response.none(constrained.size, kept.size)
-
-    def _schur_complement(self) -> Array:
-        n = self._kept.size
-        result = PETSc.Mat().createDense((n, n), comm=PETSc.COMM_SELF)
-        result.assemble()
-        found, status = ctypes.c_void_p(), ctypes.c_int()
-        factor = _object(self._factor)
-        _call("MatFactorCreateSchurComplement", factor, ctypes.byref(found), ctypes.byref(status))
-        _call("MatCopy", found, _object(result), ctypes.c_int(0))
-        _call("MatDestroy", ctypes.byref(found))
-        array = np.array(result.getDenseArray(readonly=True), order="F")
-        result.destroy()
-        return array
-
-    def _product(self, state: Array) -> Array:
-        self._right.array[:] = state
-        self._stiffness.mult(self._right, self._left)
-        return self._left.array_r.copy()
-
-    def _solve(self, force: Array) -> Array:
-        """Displacement of the unknowns eliminated under a force on them; zero at the others."""
-        self._left.array[:] = 0.0
-        self._left.array[self._eliminated] = force[self._eliminated]
-        self._factor.solve(self._left, self._right)
-        result = np.zeros_like(force)
-        result[self._eliminated] = self._right.array_r[self._eliminated]
-        return result
-
-    def set_load(self, force: Array, state: Array) -> None:
-        """Condense a load and the values prescribed.
-
-        Args:
-            force: External force on all unknowns, (n,) (force).
-            state: Displacements, of which those prescribed outside of the kept count, (n,).
-        """
-        # The loads of a history are a few fields, each times a number: what was found for earlier
-        # ones serves as far as the new one is a combination of them.
-        rest: Array = np.concatenate([force, self._scale * state[self._held]])
-        size = float(np.linalg.norm(rest))
-        shares: list[float] = []
-        for direction, _ in self._directions:
-            shares.append(float(direction @ rest))
-            rest -= shares[-1] * direction
-        responses = [response for _, response in self._directions]
-        remainder = float(np.linalg.norm(rest))
-        if remainder > _SAME * size:
-            known = bool(np.isfinite(remainder))
-            shares.append(remainder if known else 1.0)
-            scaled = np.asarray(rest / shares[-1], dtype=np.float64)
-            responses.append(self._respond(scaled))
-            if known:
-                self._directions.append((scaled, responses[-1]))
-                del self._directions[:-_DIRECTIONS]
-        self.response = Response.none(force.size, self._kept.size).plus(shares, responses)
-
-    def _respond(self, given: Array) -> Response:
-        """By one back-substitution, and one more if values are prescribed and the force is none."""
-        force, values = np.split(given, [self._right.getSize()])
-        prescribed: Array = np.zeros_like(force)
-        prescribed[self._held] = values / self._scale
-        lift = self._product(prescribed) if values.any() else np.zeros_like(force)
-        field = prescribed + self._solve(force - lift)
-        image = self._product(field)
-        load = (force - image)[self._kept]
-        # Apart: the share of the prescribed values in the condensed load.
-        by_values = np.zeros_like(load)
-        if values.any():
-            still = field if not force.any() else prescribed - self._solve(lift)
-            by_values = -self._product(still)[self._kept]
-        at_field = force.copy()
-        at_field[self._held] = image[self._held]
-        at_field[self._kept] = 0.0
-        return Response(field, at_field, load, by_values)
-
-    def forget(self) -> None:
-        """Drop the solutions for earlier loads."""
-        self._directions = []
-
-    def recover(self, kept: Array, particular: Array) -> Array:
-        """All unknowns, (n,).
-
-        Args:
-            kept: Those kept, (n_kept,).
-            particular: The displacement with these at rest, (n,); see `Response`.
-        """
-        return particular + self.extended(kept)
-
-    def extended(self, kept: Array) -> Array:
-        """All unknowns without load, (n,), that follow from those kept, (n_kept,)."""
-        state = np.zeros(self._right.getSize())
-        state[self._kept] = kept
-        return state - self._solve(self._product(state))
-
-
-@dataclass
-class Response:
-    """Of a body to its loads and prescribed values, linear in them; the unknowns kept at rest.
-
-    Attributes:
-        field: Displacement p of all unknowns, zero at those kept, (n,).
-        forces: K p at the unknowns eliminated, zero at those kept, (n,) (force).
-        load: The condensed external force g, (n_kept,) (force).
-        by_values: The part of it that the prescribed values make, (n_kept,) (force).
-    """
-
-    field: Array
-    forces: Array
-    load: Array
-    by_values: Array
-
-    @classmethod
-    def none(cls, n: int, n_kept: int) -> Response:
-        """To nothing."""
-        return cls(np.zeros(n), np.zeros(n), np.zeros(n_kept), np.zeros(n_kept))
-
-    def plus(self, shares: Sequence[float], others: Sequence[Response]) -> Response:
-        """This and shares of others added, in place."""
-        for share, other in zip(shares, others, strict=True):
-            for name in ("field", "forces", "load", "by_values"):
-                getattr(self, name)[:] += share * getattr(other, name)
-        return self
-
-
-class CondensedSystem(FullSystem):
-    """The unknowns that contact touches, all others eliminated."""
+class CondensedSystem(System):
+    """The unknowns that contact touches, all others eliminated. One rank only."""
 
     # A dense factorisation costs no more than ten iterations. With fewer in a round L-BFGS is
     # Newton's method without a globalisation, and fails at a stiffness of 100 E/h.
     iterations_per_round = 8
 
-    def __init__(self, whole: FullSystem, unknowns: Selection, *, prefix: str = "") -> None:
+    def __init__(self, full: FullSystem, unknowns: Selection, *, prefix: str = "") -> None:
         """Select.
 
         Args:
-            whole: All unknowns of a problem.
+            full: All unknowns of a problem.
             unknowns: All of those that contact touches.
             prefix: Of the options of the factorisation.
         """
-        self.u, self.unknowns, self.bulk = whole.u, unknowns, whole.bulk
-        self.contacts, self.motions = whole.contacts, whole.motions
-        self.constrained = whole.constrained[unknowns.kept]
-        self.prescribed: Array = np.zeros(int(self.constrained.sum()))
-        self.load: Array = np.zeros(unknowns.n_local)
-        self.diagonal: Array = np.zeros(unknowns.n_local)
-        self.label, self.n_bodies = whole.label[unknowns.kept], whole.n_bodies
-        self.outside: Array = np.zeros((2, self.n_bodies))
-        self.reach = whole.reach
-        self._parts = self._operators = None
+        super().__init__(
+            full.u,
+            unknowns,
+            full.bulk,
+            full.contacts,
+            full.constrained[unknowns.kept],
+            full.label[unknowns.kept],
+            full.n_bodies,
+        )
         self.ready = False
         self.mark = object()
         self._fixed: Array | None = None  # the constant part of the matrices
         self._places: Array | None = None
-        self._whole, self._prefix = whole, prefix
+        self._full, self._prefix = full, prefix
         self._kept_dofs = unknowns.kept[: unknowns.n_dofs]
-        self._contact_vector = unknowns.vector()
         self._condensation: Condensation | None = None
 
     def linear_solver(self, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
         """That of `prepare`."""
         return {"ksp_type": "preonly"}
 
-    def update(self, stiffness: PETSc.Mat) -> int:
-        """Factor and condense a new bulk tangent over all unknowns."""
+    def update(self) -> int:
+        """Factor and condense the bulk's tangent."""
+        stiffness = self._full.stiffness
+        assert stiffness is not None
         self._condensation = self._fixed = None  # their memory first
         self._condensation = Condensation(
             stiffness,
-            self._whole.constrained,
+            self._full.constrained,
             self.unknowns.kept,
             symmetric=self.bulk.symmetric,
             prefix=self._prefix,
@@ -315,7 +113,7 @@ class CondensedSystem(FullSystem):
         self.mark = object()
         self.ready = True
         diagonal = stiffness.getDiagonal()
-        self._whole.diagonal = diagonal.array.copy()
+        self._full.diagonal = diagonal.array.copy()
         diagonal.destroy()
         return 1
 
@@ -327,13 +125,12 @@ class CondensedSystem(FullSystem):
 
     def state(self) -> Array:
         """The present values of the unknowns kept; a copy."""
-        motions = np.array([float(c.value) for c in self.motions])
-        return np.concatenate([self.u.x.array[self._kept_dofs], motions])
+        return np.concatenate([self.u.x.array[self._kept_dofs], self.motions()])
 
     def set_state(self, state: Array) -> None:
         """Set the unknowns kept; the others stay behind until `complete`."""
         self.u.x.array[self._kept_dofs] = state[: self.unknowns.n_dofs]
-        self._set_motions(state)
+        self.set_motions(state)
 
     def part(self, state: Array) -> Array:
         """What of a state of all unknowns is kept."""
@@ -341,18 +138,18 @@ class CondensedSystem(FullSystem):
 
     def begin(self, load: Array) -> None:
         """Condense the load and the values prescribed."""
-        self._whole.begin(load)
-        state = self._whole.state()
+        self._full.begin(load)
+        state = self._full.state()
         self.condensation.set_load(load, state)
         self.load = load[self.unknowns.kept]
         self.prescribed = self.state()[self.constrained]
-        outside = load.copy(), self._whole.terms(state)
+        outside = load.copy(), self._full.terms(state)
         for vector in outside:
             vector[self.unknowns.kept] = 0.0
-        self.outside = self._whole.by_body(*outside)
+        self.outside = self._full.by_body(*outside)
 
     def extended(self, change: Array) -> Array:
-        """See `FullSystem.extended`: one back-substitution."""
+        """One back-substitution; see `System.extended`."""
         return self.condensation.extended(change)
 
     @property
@@ -363,7 +160,7 @@ class CondensedSystem(FullSystem):
     def complete(self, field: Array | None) -> None:
         """One back-substitution for the unknowns eliminated."""
         assert field is not None
-        self._whole.set_state(self.condensation.recover(self.state(), field))
+        self._full.set_state(self.condensation.recover(self.state(), field))
 
     def bulk_force(self) -> Array:
         """S x - g: the residual of the bulk and of free supports."""
@@ -394,7 +191,7 @@ class CondensedSystem(FullSystem):
         if self._condensation is not None:
             self._condensation.forget()
 
-    def matrix(self, stiffness: PETSc.Mat, *, symmetric: bool) -> PETSc.Mat:
+    def matrix(self, *, symmetric: bool) -> PETSc.Mat:
         """A new operator, S and contact side by side."""
         n = self.unknowns.n_local
         matrix = PETSc.Mat().createPython((n, n), Sum(), comm=self.unknowns.comm)
@@ -412,7 +209,7 @@ class CondensedSystem(FullSystem):
         ksp.pc.setType("python")
         ksp.pc.setPythonContext(PartlyFactored(self._places))
 
-    def fill(self, matrix: PETSc.Mat, stiffness: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
+    def fill(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
         """S plus contact, conditions applied, dimensionless; no sparse factorisation."""
         scale = self.bulk.scale
         held = np.flatnonzero(self.constrained)
@@ -429,7 +226,7 @@ class CondensedSystem(FullSystem):
         on = rows == columns
         added = np.bincount(rows[on], values[on], minlength=len(fixed))
         self.diagonal = scale * (np.diag(fixed) + added)
-        self._whole.diagonal[self.unknowns.kept] = self.diagonal  # for the round-off of contact
+        self._full.diagonal[self.unknowns.kept] = self.diagonal  # for the round-off of contact
         return 0
 
 
@@ -445,21 +242,3 @@ def _entries(parts: Sequence[PETSc.Mat]) -> tuple[Indices, Indices, Array]:
     total.destroy()
     rows = np.repeat(np.arange(pointers.size - 1, dtype=np.int32), np.diff(pointers))
     return rows, columns, values
-
-
-def _object(item: PETSc.Object) -> ctypes.c_void_p:
-    return ctypes.c_void_p(item.handle)
-
-
-def _call(name: str, *arguments: Any) -> None:
-    """A function of PETSc that petsc4py does not wrap.
-
-    Raises:
-        RuntimeError: It failed, or this PETSc does not have it.
-    """
-    function = getattr(ctypes.CDLL(petsc4py.PETSc.__file__), name, None)
-    if function is None:
-        raise RuntimeError(f"this PETSc has no {name}; use condensation=False")
-    code = function(*arguments)
-    if code:
-        raise RuntimeError(f"PETSc's {name} failed with error {code}; use condensation=False")

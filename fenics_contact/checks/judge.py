@@ -1,0 +1,191 @@
+"""The judge: recomputes what a solution must satisfy, apart from the method that found it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from fenics_contact.checks.kinematics import Linearisation, linearisation
+from fenics_contact.checks.rigid_motions import RigidMotions
+from fenics_contact.checks.verdict import Balance, Verdict, check_laws
+from fenics_contact.contact.contact import passing
+from fenics_contact.parallel import global_max, global_sum, warn
+from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.system import System
+
+__all__ = ["Judge", "Respond"]
+
+Array = npt.NDArray[np.float64]
+# The change of the relative displacements at the points of every contact by springs there and by
+# tractions added on the body.
+Respond = Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]]
+
+# Share by which small displacements may change forces or pressures before it is said.
+_NOTABLE = 0.01
+# Displacements beyond this many sizes of the mesh excuse no round-off: a body that nothing loads
+# may go anywhere, and then anything would pass.
+_FARTHEST = 10.0
+# Round-off of displacements that two routes add up in different orders, by their size.
+_ROUND_OFF = 100 * np.finfo(float).eps
+
+
+class Judge:
+    """Looks at evaluated states of a problem.
+
+    Attributes:
+        kinematics: See `ContactProblem`.
+    """
+
+    def __init__(
+        self, full: FullSystem, motions: RigidMotions, *, kinematics: float, second_route: bool
+    ) -> None:
+        """Measure the mesh.
+
+        Args:
+            full: The system on all unknowns.
+            motions: Rigid motions of the bodies.
+            kinematics: See `ContactProblem`.
+            second_route: Likewise.
+        """
+        self.kinematics = kinematics
+        self._full, self._motions, self._second_route = full, motions, second_route
+        self._contacts, self._comm = full.contacts, full.unknowns.comm
+        self._imposed = motions.size
+        self._told: set[str] = set()
+        gdim = len(full.u)
+        n_nodes = full.unknowns.first_motion / gdim
+        self._cell_size = motions.size / n_nodes ** (1 / gdim)
+
+    def begin(self) -> float:
+        """Take the motions and gaps that are imposed in this increment. Collective.
+
+        Returns:
+            Largest displacement whose round-off counts (length).
+        """
+        imposed = [self._full.state()[self._full.constrained]]
+        for contact in self._contacts:
+            imposed += [contact.values[name] for name in ("shift", "gap")]
+        largest = (global_max(self._comm, np.abs(v)) for v in imposed)
+        self._imposed = max(self._motions.size, *largest)
+        return _FARTHEST * self._imposed
+
+    def judge(
+        self,
+        system: System,
+        bulk: Array,
+        *,
+        start: Array,
+        rtol: float,
+        laws: bool = True,
+        respond: Respond | None = None,
+    ) -> tuple[Verdict, Array]:
+        """Recompute residual, balance and laws at evaluated contacts. Collective.
+
+        Args:
+            system: The unknowns on which the residual is looked at.
+            bulk: Residual of the bulk on these.
+            start: Norms of `System.terms` where the increment began, (n_bodies,).
+            rtol: Residual that passes, as a share of the forces.
+            laws: Whether to check the laws, too.
+            respond: To look at what small displacements leave out; None: it is not looked at.
+
+        Returns:
+            The verdict, and the reactions at the unknowns.
+        """
+        contacts = system.contact_forces()
+        total = sum(contacts, bulk)
+        norms = system.norms(total, contacts, start)
+        names, tolerance = system.parts.names, norms.tolerance(rtol)
+        reaction = np.where(system.constrained, total, 0.0)
+        imbalance, sizes = self._force_sums(system, bulk - reaction, [bulk, *contacts])
+        allowed = np.sqrt(sizes[0]) * 2 * tolerance[: len(imbalance)] + 1e-12 * sizes[1]
+        augmented = [c for c in self._contacts if c.multipliers is not None and laws]
+        equations = zip(names, norms.residual, norms.force, tolerance, strict=True)
+        sums = zip(names, np.abs(imbalance).max(axis=1), sizes[1], allowed, strict=False)
+        verdict = Verdict(
+            equations={name: Balance(*map(float, row)) for name, *row in equations},
+            sums={name: Balance(*map(float, row)) for name, *row in sums},
+            laws={c.name: check_laws(c) for c in self._contacts} if laws else {},
+            enforcement={c.name: c.enforcement_error() for c in augmented},
+            enforcement_tolerance={c.name: c.tolerance for c in augmented},
+            # Of the opposite only what Γc meets is known before u is complete.
+            unseen=passing(self._contacts) if system is self._full else {},
+            kinematics=self._linearisation(respond) if respond else {},
+            kinematics_allowed=self.kinematics,
+            displacement=global_max(self._comm, np.abs(self._full.u.x.array)) / self._imposed,
+            routes=self._compare_routes() if self._second_route and laws else {},
+        )
+        return verdict, reaction
+
+    def warn_of_large_motion(self, verdict: Verdict) -> None:
+        """Say once of every contact that displacements are not small. Collective."""
+        for name, found in verdict.kinematics.items():
+            if found.worst > _NOTABLE and name not in self._told:
+                self._told.add(name)
+                warn(
+                    self._comm,
+                    f"{name}: displacements are taken as small, with gap and normals of the "
+                    "undeformed body; where it has moved to, the contact force would differ by "
+                    f"{100 * found.force:.2g} % and the pressure by {100 * found.pressure:.2g} %",
+                )
+
+    def _linearisation(self, respond: Respond) -> dict[str, Linearisation]:
+        """What taking displacements as small changes at this state, by contact. Collective."""
+        if not self._contacts:
+            return {}
+        modulus = self._full.bulk.scale * self._cell_size ** (2 - len(self._full.u))
+        return linearisation(self._contacts, modulus, respond)
+
+    def _force_sums(
+        self, system: System, internal: Array, forces: Sequence[Array]
+    ) -> tuple[Array, Array]:
+        """What does not cancel of ∑F(u) - reactions - ∫ (r_n n + τ) on every body. Collective.
+
+        Moments, too. The last is the contacts' own sum over their points, not that of their nodal
+        forces.
+
+        Args:
+            system: The unknowns.
+            internal: Residual of the bulk without reactions, (n_local,).
+            forces: What tells how large all forces are, (n_local,) each.
+
+        Returns:
+            The sums, (n_bodies, n_per_body) (force), see `RigidMotions.work`; of every body the
+            number of its unknowns, and the sum of the absolute forces, (2, n_bodies).
+        """
+        motions, n = self._motions.of_bodies, len(self._motions.of_bodies)
+        total = np.array([[system.part(mode) @ internal for mode in body] for body in motions])
+        for operator in self._full.operators:
+            contact = operator.contact
+            total -= self._motions.work(operator, contact.measure[:, None] * contact.traction)
+        count = np.bincount(system.label, minlength=n)[:n]
+        sizes = [np.bincount(system.label, np.abs(f), minlength=n)[:n] for f in forces]
+        sums = global_sum(self._comm, np.stack([*total.T, count, np.sum(sizes, axis=0)]))
+        # What cannot be told is left out; a force that is no number is seen by the translations.
+        rotations = sums[len(self._full.u) : -2]
+        rotations[np.isnan(rotations)] = 0.0
+        return sums[:-2].T, sums[-2:]
+
+    def _compare_routes(self) -> dict[str, Balance]:
+        """Nodal forces on Γc as the solver has them against those of the boundary form. Collective.
+
+        Both have the round-off of the displacement, by as much as the springs are stiff.
+        """
+        found = {}
+        for contact in self._contacts:
+            mine, assembled = contact.own_forces()
+            values = contact.values
+            stiffness = np.zeros(len(values["gap"]))
+            if contact.law.has_normal_stiffness:
+                stiffness += contact.normal_stiffness
+            if contact.law.has_tangential:
+                stiffness += np.abs(contact.tangential_stiffness).max(axis=(1, 2))
+            terms = np.linalg.norm(values["jump"], axis=1) + np.abs(values["gap"])
+            blur = float(global_sum(self._comm, contact.measure @ (stiffness * terms)))
+            sizes = (global_max(self._comm, np.abs(f)) for f in (mine - assembled, mine))
+            residual, force = (float(size) for size in sizes)
+            allowed = 1e-10 * force + _ROUND_OFF * blur
+            found[contact.name] = Balance(residual, force, allowed)
+        return found

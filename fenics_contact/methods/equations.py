@@ -1,0 +1,217 @@
+"""What a method sees of a problem: dimensionless equations over a system, and their matrices.
+
+Displacements are by the size of the mesh, stiffness by the largest entry of the bulk's diagonal, so
+that the same scene takes the same iterations in any units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from fenics_contact.checks.chattering import StatusWatch
+from fenics_contact.checks.rigid_motions import RigidMotions
+from fenics_contact.contact.contact import Status
+from fenics_contact.parallel import global_max, global_sum
+from fenics_contact.systems.balance import Norms
+from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.system import System
+
+__all__ = ["Equations"]
+
+Array = npt.NDArray[np.float64]
+
+# An open point keeps this share of its stiffness in H₀: enough that a body held by contact alone
+# stays held when its whole surface is open, too little to be felt as a wrong tangent.
+_OPEN_SHARE = 1e-3
+# An unknown with less than this share of the bulk's stiffness has none.
+_FELT = 1e-12
+
+
+class Equations:
+    """Residual, energy and matrices at a state that a method asks for.
+
+    Attributes:
+        full: The system on all unknowns.
+        system: The one that is iterated on, `full` or one condensed.
+        contacts: The contacts.
+        motions: Rigid motions of the bodies.
+        length: What displacements are divided by.
+        watch: What becomes of the status of the points from iteration to iteration.
+        norms: Norms where `residual` was computed last.
+        start: Norms of `System.terms` where the increment began, (n_bodies,).
+        rtol: Residual that ends the whole solution, as a share of the forces.
+        round_rtol: That of the present round of multipliers, if larger.
+        solution: The state to start from and, after a method, the one found; dimensionless.
+        function: For the residual.
+        solvers: Linear solvers for H₀ (False) and the consistent tangent (True).
+        h0_is_made: Whether the matrix of H₀ holds what the method made it of.
+        factorisations: Of sparse matrices, counted.
+    """
+
+    solution: PETSc.Vec
+    function: PETSc.Vec
+
+    def __init__(
+        self, full: FullSystem, motions: RigidMotions, *, alpha: float, phi: float
+    ) -> None:
+        """Nothing is assembled yet.
+
+        Args:
+            full: The system on all unknowns.
+            motions: Rigid motions of the bodies.
+            alpha: Share of the normal stiffness in H₀.
+            phi: Share of the tangential stiffness of sticking points in H₀.
+        """
+        self.full, self.motions, self.contacts = full, motions, full.contacts
+        self.length = motions.size
+        self._bulk, self._comm = full.bulk, full.unknowns.comm
+        self._alpha, self._phi = alpha, phi
+        self.watch = StatusWatch(full.contacts)
+        nothing: Array = np.zeros(full.n_bodies)
+        self.norms = Norms(nothing, nothing, nothing, nothing.size)
+        self.start = nothing
+        self.rtol = self.round_rtol = 0.0
+        self.solvers: dict[bool, PETSc.KSP] = {}
+        self.h0_is_made = False
+        self.factorisations = 0
+        self._matrices: dict[bool, PETSc.Mat] = {}
+        self._filled: set[bool] = set()
+        self.take(full)
+
+    def take(self, system: System) -> None:
+        """Iterate on a system from now on. Collective."""
+        self.system = system
+        self.solution, self.function = system.vector(), system.vector()
+
+    # ---- at a state ------------------------------------------------------------------------------
+
+    def set_state(self, x: PETSc.Vec) -> None:
+        """Make a dimensionless state the present one, prescribed values apart. Collective."""
+        state = x.array_r * self.length
+        # A V-cycle moves the prescribed unknowns too, which nothing would bring back.
+        state[self.system.constrained] = self.system.prescribed
+        self.system.set_state(state)
+
+    def residual(self, x: PETSc.Vec, f: PETSc.Vec) -> Norms:
+        """Compute the residual at ``x`` into ``f``, and its norms, kept too. Collective."""
+        self.set_state(x)
+        contacts = self.system.contact_forces()
+        total = sum(contacts, self.system.bulk_force())
+        self.norms = self.system.norms(total, contacts, self.start)
+        total[self.system.constrained] = 0.0
+        f.array[:] = total / (self._bulk.scale * self.length)
+        return self.norms
+
+    def residual_at(self, state: Array) -> float:
+        """Norm of the residual at a state of the system, left in ``function``. Collective."""
+        self.solution.array[:] = state / self.length
+        return self.residual(self.solution, self.function).total
+
+    def energy(self, x: PETSc.Vec) -> float:
+        """Potential of a linear bulk and contacts at ``x``. Collective."""
+        self.set_state(x)
+        energy = self.system.bulk_energy() + sum(c.energy() for c in self.contacts)
+        total = float(global_sum(self._comm, energy))
+        return total / (self._bulk.scale * self.length**2)
+
+    def solved(self, rtol: float = 0.0) -> bool:
+        """Whether the residual computed last ends the present round, or is below ``rtol``."""
+        return self.norms.within(max(self.rtol, self.round_rtol, rtol))
+
+    # ---- matrices --------------------------------------------------------------------------------
+
+    @property
+    def has_potential(self) -> bool:
+        """Whether every contact law has one."""
+        return all(c.law.has_potential for c in self.contacts)
+
+    def symmetric(self, consistent: bool) -> bool:
+        """Whether the matrix of H₀, or of the consistent tangent, is."""
+        return self._bulk.symmetric and (not consistent or self.has_potential)
+
+    def matrix(self, consistent: bool) -> PETSc.Mat:
+        """The matrix of H₀ or of the consistent tangent, made when first needed. Collective."""
+        if consistent not in self._matrices:
+            matrix = self.system.matrix(symmetric=self.symmetric(consistent))
+            self.system.prepare(self.solvers[consistent], matrix)
+            self._matrices[consistent] = matrix
+        return self._matrices[consistent]
+
+    def forget_matrices(self) -> None:
+        """Drop the matrices of H₀ and of the consistent tangent. Collective."""
+        self._matrices, self._filled = {}, set()
+        for ksp in self.solvers.values():
+            ksp.reset()
+        self.h0_is_made = False
+
+    def filled(self, consistent: bool) -> bool:
+        """Whether H₀ or the consistent tangent holds anything."""
+        return consistent in self._filled
+
+    def assemble(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> None:
+        """Bulk tangent plus contact, conditions applied, dimensionless. Collective.
+
+        Args:
+            matrix: What to fill.
+            contacts: Contact's part, used up.
+        """
+        self.factorisations += self.system.fill(matrix, contacts)
+        self._filled |= {c for c, m in self._matrices.items() if m.handle == matrix.handle}
+
+    def assemble_tangent(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
+        """The consistent tangent of bulk and contact at ``x``. Collective."""
+        self.evaluate(x)
+        # Until enough points are closed to hold the body its tangent is singular: take H₀ of the
+        # whole surface, as for the start of the quasi-Newton iteration.
+        if self.held():
+            self.assemble(matrix, self.tangents())
+        else:
+            self.assemble(matrix, self.stiffnesses(everywhere=True))
+
+    def evaluate(self, x: PETSc.Vec) -> None:
+        """Evaluate bulk and contacts at ``x``, where the residual was computed last. Collective."""
+        residual = self.norms.total
+        self.set_state(x)
+        self.full.update_stiffness()
+        for contact in self.contacts:
+            contact.evaluate()
+        self.watch.note(residual)
+
+    def held(self) -> bool:
+        """Whether the closed points hold all free motions. Collective."""
+        return self.motions.held(self.full.operators)
+
+    def tangents(self) -> Iterator[PETSc.Mat]:
+        """Consistent tangents of the contacts. Collective."""
+        return (operator.tangent() for operator in self.system.operators)
+
+    def stiffnesses(self, *, everywhere: bool) -> Iterator[PETSc.Mat]:
+        """The shares αK_n + φK_t of the contacts, as evaluated.
+
+        Args:
+            everywhere: Take all of Γc as closed and sticking, as the paper does, where nothing
+                can be told from the status.
+        """
+        for operator in self.system.operators:
+            contact = operator.contact
+            normal = tangential = np.ones(contact.quadrature.n_points)
+            if not everywhere:
+                normal = np.where(contact.status != Status.OPEN, 1.0, _OPEN_SHARE)
+                tangential = np.where(contact.status == Status.STICK, 1.0, _OPEN_SHARE)
+            springs = contact.springs(self._alpha * normal, self._phi * tangential)
+            yield operator.springs(springs)
+
+    def hardness(self) -> float:
+        """Largest ratio of contact's stiffness to the bulk's at an unknown. Collective."""
+        diagonals = []
+        for operators in ([], self.system.operators):
+            parts = (o.springs(o.contact.springs(1.0, 1.0)) for o in operators)
+            self.system.fill(self.matrix(True), parts)
+            diagonals.append(self.system.diagonal.copy())
+        bulk, both = diagonals
+        felt = bulk > _FELT * self._bulk.scale  # the motion of a support has no stiffness
+        return global_max(self._comm, both[felt] / bulk[felt] - 1.0)

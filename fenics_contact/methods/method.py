@@ -1,0 +1,108 @@
+"""What a method of solution is, and those that are one solution by SNES."""
+
+from __future__ import annotations
+
+import weakref
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Protocol
+
+from petsc4py import PETSc
+
+from fenics_contact.methods.callbacks import Callbacks
+from fenics_contact.methods.equations import Equations
+
+__all__ = ["Method", "Newton", "SnesMethod"]
+
+# Iterations without a lower residual after which another method takes over.
+_PATIENCE = 20
+
+_REASONS = PETSc.SNES.ConvergedReason
+
+
+class Method(Protocol):
+    """A way to solve equations from a start; a new one is a file of its own with such a class."""
+
+    def solve(self) -> tuple[int, int]:
+        """Solve from ``solution`` of the equations on, which becomes what was found. Collective.
+
+        Returns:
+            Iterations, and the reason as SNES has them (positive: converged).
+        """
+        ...
+
+
+class SnesMethod(ABC):
+    """A method on the main SNES, whose options are the user's.
+
+    Attributes:
+        snes: The solver.
+        gives_up: Whether to stop where the residual does not fall any more.
+    """
+
+    def __init__(
+        self, equations: Equations, snes: PETSc.SNES, gives_up: Callable[[], bool]
+    ) -> None:
+        """Take the solver; `attach` gives it the equations.
+
+        Args:
+            equations: What to solve.
+            snes: By what.
+            gives_up: See the attribute.
+        """
+        self.snes, self.gives_up = snes, gives_up
+        self._equations = equations
+        self._callbacks = Callbacks(equations.full.unknowns.comm)
+        self.consistent = False
+
+    @property
+    def max_it(self) -> int:
+        """Iterations in all before it is given up."""
+        return int(self.snes.getTolerances()[3])
+
+    @max_it.setter
+    def max_it(self, limit: int) -> None:
+        self.snes.setTolerances(max_it=limit)
+
+    def attach(self, *, consistent: bool) -> None:
+        """Give SNES its callbacks and the linear solver for H₀ or the consistent tangent."""
+        self.consistent = consistent
+        # Weak, so that SNES does not keep what keeps SNES: the garbage collector would free such a
+        # cycle, at another time on every rank, and to free a factorisation is collective.
+        this: SnesMethod = weakref.proxy(self)
+        equations = self._equations
+        self.snes.setKSP(equations.solvers[consistent])
+        self._callbacks.attach(
+            self.snes,
+            lambda x, f: this._compute_residual(x, f),
+            equations.function,
+            lambda x, J: this._compute_jacobian(x, J),
+            equations.matrix(consistent),
+            lambda: this.converged(),
+        )
+
+    @abstractmethod
+    def solve(self) -> tuple[int, int]:
+        """Solve; see `Method`."""
+
+    def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        self._equations.residual(x, f)
+
+    def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
+        self._equations.assemble_tangent(x, J)
+
+    def converged(self) -> int:
+        """Why SNES ends here, or that it goes on, as SNES has it."""
+        if self._equations.solved():
+            return int(_REASONS.CONVERGED_FNORM_RELATIVE)
+        if self._equations.watch.idle > _PATIENCE and self.gives_up():
+            return int(_REASONS.DIVERGED_LINE_SEARCH)
+        return int(_REASONS.ITERATING)
+
+
+class Newton(SnesMethod):
+    """Newton's method with the consistent tangent."""
+
+    def solve(self) -> tuple[int, int]:
+        """Solve; see `Method`."""
+        return self._callbacks.solve(self.snes, self._equations.solution)

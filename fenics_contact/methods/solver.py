@@ -1,0 +1,572 @@
+"""The solution of one increment: system, start, method, rounds with multipliers, fallback."""
+
+from __future__ import annotations
+
+import logging
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from fenics_contact import compat
+from fenics_contact.checks.rigid_motions import RigidMotions
+from fenics_contact.checks.verdict import Attempt
+from fenics_contact.contact.accuracy import Accuracy
+from fenics_contact.methods.alternating import Alternation
+from fenics_contact.methods.callbacks import interrupts_held
+from fenics_contact.methods.continuation import Continuation
+from fenics_contact.methods.equations import Equations
+from fenics_contact.methods.method import Method, Newton, SnesMethod
+from fenics_contact.methods.options import Defaults, take_command_line
+from fenics_contact.methods.quasi_newton import QuasiNewton
+from fenics_contact.systems import dense, linear
+from fenics_contact.systems.choice import linear_kind, obstacle_to_condensation
+from fenics_contact.systems.condensed import CondensedSystem, touched
+from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.system import System
+from fenics_contact.systems.unknowns import Selection
+
+__all__ = ["METHODS", "Settings", "Solver"]
+
+Array = npt.NDArray[np.float64]
+logger = logging.getLogger("fenics_contact")
+
+# Rounds with multipliers before it is given up.
+_MAX_ROUNDS = 60
+# Residual, relative, to which the first round is solved; share of a round's error to which the next
+# is; and the error, in units of the tolerance, from which on the next may be the last one.
+_FIRST_ROUND, _INNER, _NEARLY = 1e-4, 1e-2, 10.0
+# A start with up to this many times the residual of the best is taken first if its points slip.
+_FAR = 100.0
+# Residual to which systems near the one factored last are solved.
+_NEARBY = 1e-4
+# Increments expected where nothing is said.
+_EXPECTED = 4
+
+_REASONS = PETSc.SNES.ConvergedReason
+_OUTCOMES = {
+    int(_REASONS.DIVERGED_LINEAR_SOLVE): "the matrix is singular",
+    compat.NOT_FINITE: "the residual is not finite",
+    int(_REASONS.DIVERGED_MAX_IT): "iterations used up",
+    int(_REASONS.DIVERGED_LINE_SEARCH): "no progress",
+    int(_REASONS.DIVERGED_DTOL): "no progress",
+}
+_COMMON: dict[str, Any] = {
+    "snes_rtol": 1e-9,
+    "snes_stol": 0.0,
+    "snes_max_it": 1000,
+    # The paper's line search: |ρ·Ψ(ΔU + sρ)| ≤ c_L |ρ·Ψ(ΔU)|. With the single secant step that is
+    # `cp`'s default it takes three times the iterations, and fails at stiffness it can solve.
+    "snes_linesearch_type": "cp",
+    "snes_linesearch_rtol": 0.1,
+    "snes_linesearch_max_it": 20,
+    # Bodies without contact are led to it before: no step of the iteration needs to be long.
+    compat.LONGEST_STEP: 100.0,
+    # `cp` takes |F·y| below this for convergence of the whole; the residual itself is tested here.
+    "snes_linesearch_atol": 1e-300,
+}
+# Options that only make sense for the sparse matrices over all unknowns.
+_NAMES_A_SOLVER = ("ksp_type", "pc_type", "pc_factor_mat_solver_type")
+# The methods, and the options of the main SNES with each.
+METHODS: dict[str, dict[str, Any]] = {
+    "lbfgs": {
+        "snes_type": "qn",
+        "snes_qn_type": "lbfgs",
+        "snes_qn_scale_type": "jacobian",
+        "snes_qn_restart_type": "none",  # Powell's uses K where K⁻¹ is meant
+        "snes_qn_m": 20,
+        "qn_mat_lmvm_eps": 0.0,  # else pairs are dropped by a test that depends on the units
+    },
+    "newton": {"snes_type": "newtonls", "snes_max_it": 100},
+    "alternating": {},
+    "continuation": {},
+}
+# What takes over where a method fails.
+_LAST_RESORT = "continuation"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the caller of `ContactProblem` says of the solution; see its arguments."""
+
+    method: str | None
+    fallback: bool
+    condensation: bool | None
+    linear_solver: str | None
+    petsc_options: Mapping[str, Any]
+    prefix: str
+    accuracy: Accuracy | None
+
+
+class Solver:
+    """Solves the equations of an increment by one method, and by others where that fails.
+
+    Attributes:
+        snes: The main SNES, with the user's options.
+        equations: What is solved.
+        options: PETSc options, present in the database only while they are read.
+        method: Name of the method tried first.
+        main: The method on the main SNES.
+        condensed: Whether the unknowns that contact touches are iterated on alone.
+        expected: How many increments are expected.
+        methods: Further methods, by name.
+        predicts: Whether the tangent factored last is that of a solution.
+    """
+
+    snes: PETSc.SNES
+    main: SnesMethod
+
+    def __init__(
+        self,
+        full: FullSystem,
+        motions: RigidMotions,
+        settings: Settings,
+        *,
+        alpha: float,
+        phi: float,
+    ) -> None:
+        """Choose system and method. Collective.
+
+        Args:
+            full: The system on all unknowns.
+            motions: Rigid motions of the bodies.
+            settings: What the caller says.
+            alpha: See `Equations`.
+            phi: Likewise.
+        """
+        self.equations = Equations(full, motions, alpha=alpha, phi=phi)
+        self.expected = _EXPECTED
+        self.predicts = False
+        self._full, self._settings = full, settings
+        self._comm = full.unknowns.comm
+        self._obstacle: str | None = None  # to condensation, as last said
+        take_command_line(settings.prefix, self._comm)
+        self._configure()
+
+    @property
+    def system(self) -> System:
+        """The system that is iterated on."""
+        return self.equations.system
+
+    # ---- choices ---------------------------------------------------------------------------------
+
+    def _configure(self) -> None:
+        """Set up SNES and its two linear solvers: for H₀, and for the consistent tangent."""
+        settings, prefix, equations = self._settings, self._settings.prefix, self.equations
+        options = self.options = Defaults()
+        options.give(settings.petsc_options, prefix)
+        if settings.accuracy is not None:
+            # Residuals as large as what multipliers may miss would make rounds that change nothing.
+            augmented = [c for c in self._full.contacts if c.multipliers is not None]
+            least = [_INNER * c.tolerance for c in augmented]
+            options.set({"snes_rtol": min(settings.accuracy.rtol, *least, 1.0)}, prefix)
+            if self._comm.rank == 0:
+                logger.info("accuracy %s", settings.accuracy)
+        solvers = [part + name for part in ("", "tangent_") for name in _NAMES_A_SOLVER]
+        self._named = [name for name in solvers if options.get(prefix + name) is not None]
+        self.condensed = self._choose_condensation()
+        self._full.linear_kind = self._choose_linear_solver()
+        self._set_system()
+        self._automatic = settings.method is None
+        self.method = settings.method or ("newton" if self.condensed else "lbfgs")
+        options.set(_COMMON | METHODS[self.method], prefix)
+        quasi_newton = options.get(prefix + "snes_type") == PETSc.SNES.Type.QN
+        newton = linear.newton_options(self.system.linear_kind)
+        if not quasi_newton:
+            options.set(newton, prefix)
+        snes = self.snes = PETSc.SNES().create(self._comm)
+        snes.setOptionsPrefix(prefix)
+        snes.setSolution(equations.solution)
+        equations.solvers = {}
+        for consistent in (False, True):
+            # Tolerances that follow the residual are for a solver that SNES has made.
+            own = consistent and not quasi_newton
+            ksp = snes.getKSP() if own else PETSc.KSP().create(self._comm)
+            part = prefix + ("tangent_" if consistent else "")
+            ksp.setOptionsPrefix(part)
+            symmetric = equations.symmetric(consistent)
+            options.set(
+                self.system.linear_solver(symmetric=symmetric, accurate=not quasi_newton), part
+            )
+            with options.present():
+                ksp.setFromOptions()
+            equations.solvers[consistent] = ksp
+        this: Solver = weakref.proxy(self)  # SNES would keep what keeps it
+        main = QuasiNewton if quasi_newton else Newton
+        self.main = main(equations, snes, lambda: this.may_go_on())
+        self._quasi_newton = quasi_newton
+        self._forget_matrices()
+        self.main.attach(consistent=not quasi_newton)
+        with options.present():
+            snes.setFromOptions()
+            snes.setUp()
+
+        def newton_solver(symmetric: bool) -> dict[str, Any]:
+            """Options of one for Newton's method; none where that of H₀ or the tangent is one."""
+            if not newton:
+                return {}
+            return self.system.linear_solver(symmetric=symmetric, accurate=True) | newton
+
+        inside = newton_solver(equations.symmetric(False))
+        alternation = Alternation(equations, options, prefix, inside)
+        inside = newton_solver(equations.symmetric(True))
+        continuation = Continuation(equations, alternation, options, prefix, inside)
+        self.methods: dict[str, Method] = {
+            "alternating": alternation,
+            "continuation": continuation,
+        }
+        equations.rtol = snes.getTolerances()[0]
+
+    def expect(self, increments: int) -> None:
+        """Choose for a number of increments, before the first is solved. Collective."""
+        if self.expected != increments:
+            self.expected = increments
+            if self._choose_condensation() != self.condensed:
+                self._configure()
+
+    def _choose_condensation(self) -> bool:
+        """Whether to iterate on the unknowns that contact touches alone. Collective."""
+        obstacle = obstacle_to_condensation(
+            self._full,
+            wanted=self._settings.condensation,
+            linear_solver=self._settings.linear_solver,
+            named=self._named,
+            increments=self.expected,
+        )
+        if obstacle and obstacle != self._obstacle and self._comm.rank == 0:
+            logger.info("iterating on all unknowns: %s", obstacle)
+        self._obstacle = obstacle
+        return obstacle is None
+
+    def _choose_linear_solver(self) -> str:
+        """How to solve systems over all unknowns, one of `linear.KINDS`. Collective."""
+        kind, reason = linear_kind(
+            self._full,
+            wanted=self._settings.linear_solver,
+            condensed=self.condensed,
+            named=self._named,
+            symmetric=self.equations.symmetric(False),
+            tangent_symmetric=self.equations.symmetric(True),
+        )
+        if reason and self._comm.rank == 0 and not self.condensed:
+            n = self._full.unknowns.first_motion
+            logger.info("linear systems of %d unknowns, solver %s: %s", n, kind, reason)
+        return kind
+
+    # ---- the system ------------------------------------------------------------------------------
+
+    def _set_system(self, kept: npt.NDArray[np.int32] | None = None) -> None:
+        """Take the system to iterate on: all unknowns, or those kept, by default those touched.
+
+        Collective.
+        """
+        system: System = self._full
+        if self.condensed:
+            kept = touched(self._full.operators, self._full.unknowns) if kept is None else kept
+            system = CondensedSystem(
+                self._full,
+                Selection(self._full.unknowns, kept),
+                prefix=self._settings.prefix + "interior_",
+            )
+            logger.info("condensed onto %d of %d unknowns", kept.size, self._full.unknowns.n_local)
+        self._pairings = self._present_pairings()
+        self.equations.take(system)
+
+    def _present_pairings(self) -> list[int]:
+        return [c.pairings for c in self._full.contacts]
+
+    def is_current(self) -> bool:
+        """Whether bulk and pairs are those of the last solution. Collective."""
+        return self._full.bulk.is_current() and self._present_pairings() == self._pairings
+
+    def update_system(self, stiffness_changed: bool) -> None:
+        """Follow changes of the pairs and of the bulk's tangent. Collective."""
+        if self._pairings != self._present_pairings():
+            if not self.condensed:
+                self._set_system()
+            else:
+                # A body that slides comes back to places where it was: what is kept grows only.
+                before = self.system.unknowns.kept
+                kept = np.union1d(before, touched(self._full.operators, self._full.unknowns))
+                if kept.size > before.size:
+                    self._set_system(kept.astype(np.int32))
+                self._pairings = self._present_pairings()
+            self.snes.reset()
+            self._make_matrices()
+        if stiffness_changed or not self.system.ready:
+            self.equations.factorisations += self.system.update()
+
+    def keep(self, kept: npt.NDArray[np.int32]) -> None:
+        """Iterate on the unknowns that another run had kept. Collective."""
+        self._set_system(kept)
+        self.snes.reset()
+
+    def restart(self) -> None:
+        """Drop what is kept from earlier increments. Collective."""
+        self.system.forget()
+        self._make_matrices()
+
+    def recover(self) -> None:
+        """Replace what an error of PETSc may have left locked or half done. Collective."""
+        self.equations.take(self.system)
+        self.snes.reset()
+        self._make_matrices()
+
+    def _make_matrices(self) -> None:
+        """New matrices for new couplings, or to forget all that was factored. Collective."""
+        self._forget_matrices()
+        self.main.attach(consistent=not self._quasi_newton)
+
+    def _forget_matrices(self) -> None:
+        self.equations.forget_matrices()
+        self.predicts = False
+
+    # ---- solving ---------------------------------------------------------------------------------
+
+    def solve(
+        self, *, ahead: float, rate: Array | None, cold: bool, stiffness_changed: bool
+    ) -> tuple[int, list[Attempt], int]:
+        """Solve, let multipliers take over what the springs bear, and again. Collective.
+
+        Args:
+            ahead: Size of the increment in units of the last one.
+            rate: By how much that moved all unknowns; None: there was none.
+            cold: Whether nothing was borne before.
+            stiffness_changed: Whether the bulk's tangent is another one than in the last increment.
+
+        Returns:
+            Reason of the last solution, what was tried, and how many solutions there were.
+        """
+        contacts = self._full.contacts
+        self.equations.start = np.zeros_like(self.equations.start)
+        augmented = [c for c in contacts if c.multipliers is not None]
+        if not augmented:
+            return *self._iterate(ahead, rate, cold, stiffness_changed), 1
+        attempts: list[Attempt] = []
+        exact = False
+        # The first solutions need not be better than the multipliers they are found with.
+        self.equations.round_rtol = _FIRST_ROUND
+        try:
+            for number in range(1, _MAX_ROUNDS + 1):
+                reason, tried = self._iterate(ahead, rate, cold, stiffness_changed)
+                _append(attempts, tried)
+                if reason <= 0:
+                    break
+                for contact in augmented:
+                    contact.evaluate()
+                errors = [c.enforcement_error() for c in augmented]
+                worst = max(e / c.tolerance for e, c in zip(errors, augmented, strict=True))
+                logger.debug("round %d: errors %s", number, errors)
+                if worst <= 1.0 and exact:
+                    break
+                ahead, stiffness_changed = 0.0, False
+                exact = worst <= _NEARLY
+                left = min((e for e in errors if e > 0), default=0.0)
+                self.equations.round_rtol = 0.0 if exact else min(_FIRST_ROUND, _INNER * left)
+                if number < _MAX_ROUNDS and worst > 1.0:
+                    for contact in augmented:
+                        contact.augment()
+        finally:
+            self.equations.round_rtol = 0.0
+        return reason, attempts, number
+
+    def _iterate(
+        self, ahead: float, rate: Array | None, cold: bool, stiffness_changed: bool
+    ) -> tuple[int, list[Attempt]]:
+        """Iterate from one start after another, then by continuation. Collective.
+
+        Returns:
+            Reason, and what was tried.
+        """
+        equations = self.equations
+        reason, attempts = int(_REASONS.DIVERGED_LINEAR_SOLVE), []
+        factored = self.predicts
+        starts = [s / equations.length for s in self._starts(ahead, rate, cold)]
+        tries = [(start, self.method) for start in starts]
+        goes_on = self.may_go_on()
+        first = cold and ahead > 0.0  # and no later round of multipliers
+        if goes_on and first and self._automatic and self.condensed:
+            # From nothing, Newton's method on the stiff problem often gives up first.
+            tries = [(starts[0], _LAST_RESORT)]
+        elif goes_on:
+            tries.append((starts[0], _LAST_RESORT))
+        for start, method in tries:
+            equations.solution.array[:] = start
+            equations.watch.start()
+            if stiffness_changed:
+                equations.h0_is_made = False
+            iterations, reason = self.methods.get(method, self.main).solve()
+            attempts.append(Attempt(method, iterations, self._outcome(reason)))
+            if reason > 0:
+                break
+            if self._comm.rank == 0:
+                logger.info("%s", attempts[-1])
+        equations.set_state(equations.solution)
+        newton = method not in self.methods and not self._quasi_newton
+        made = sum(attempt.iterations for attempt in attempts[-1:])
+        self.predicts = reason > 0 and newton and (factored or made > 0)
+        return int(reason), attempts
+
+    def _outcome(self, reason: int) -> str:
+        """What became of an attempt, in words. Collective."""
+        if reason > 0:
+            return "converged"
+        words = _OUTCOMES.get(reason, f"SNES reason {reason}")
+        return "; ".join(filter(None, (words, self.equations.watch.chattering())))
+
+    def may_go_on(self) -> bool:
+        """Whether to go on after a failure: not if iterations are rationed by the caller."""
+        return bool(
+            self._settings.fallback
+            and self.method != _LAST_RESORT
+            and self.main.max_it >= (_COMMON | METHODS[self.method])["snes_max_it"]
+        )
+
+    def _starts(self, ahead: float, rate: Array | None, cold: bool) -> list[Array]:
+        """Unknowns of the system to start from, nearest to equilibrium first. Collective.
+
+        The present state; that state moved on by as much as the last increment moved it: in
+        proportional loading that is the solution; and that state with one step of Newton's method
+        on the tangent in which the last increment ended. At the present state itself no point has
+        slipped yet, and all closed ones stick: from there Newton's method takes ten steps to let
+        them slip again, one after another from the edge of the contact inwards. The start by a step
+        has the right ones slipping, and comes first unless it is far off.
+        """
+        equations, system = self.equations, self.system
+        present: Array = system.state()
+        starts = [present]
+        # What a step from here takes away leaves the round-off of what was there.
+        terms: Array = system.by_body(system.terms(present))[0]
+        terms = np.asarray(np.hypot(terms, system.outside[1]), dtype=np.float64)
+        # The last matrix may be that of a step that overflowed. Later rounds of multipliers have
+        # the round-off of the first one's start, too.
+        terms = np.where(np.isfinite(terms), terms, 0.0)
+        equations.start = np.maximum(equations.start, terms)
+        residuals = [equations.residual_at(present)]
+        # Where nothing was borne yet the last increment tells nothing of this one.
+        predicts = self.predicts and not cold
+        if predicts:
+            starts.append(self._predicted(present))
+        if rate is not None and ahead and not cold:
+            starts.append(present + ahead * system.part(rate))
+        residuals += [equations.residual_at(start) for start in starts[1:]]
+        if predicts and residuals[1] <= _FAR * min(residuals):
+            residuals[1] = 0.0
+        return [starts[i] for i in np.argsort(residuals, kind="stable")]
+
+    def _predicted(self, present: Array) -> Array:
+        """One Newton step on the tangent factored last; the residual is there. Collective."""
+        self.predicts = False
+        equations, ksp = self.equations, self.equations.solvers[True]
+        step = equations.solution.duplicate()
+        ksp.solve(equations.function, step)
+        dense.raise_kept(ksp)
+        moved = present - equations.length * step.array_r
+        step.destroy()
+        return np.asarray(moved, dtype=np.float64)
+
+    # ---- the neighbourhood of a solution ---------------------------------------------------------
+
+    @contextmanager
+    def linearised(
+        self, springs: Sequence[Array], load: Array
+    ) -> Iterator[Callable[[Sequence[Array] | None], Array]]:
+        """See `ContactProblem.linearised`, about a complete state under a load."""
+        # After a history that was taken up and is at its end nothing has been assembled yet.
+        self.update_system(self._full.update_stiffness())
+        self.predicts = False  # by the matrix that is about to be used
+        equations, system = self.equations, self.system
+        system.begin(load)
+        right, left = system.vector(), system.vector()
+        ksp = PETSc.KSP().create(self._comm)
+
+        def solve(tractions: Sequence[Array] | None) -> Array:
+            right.set(0.0)
+            if tractions is None:
+                right.array[:] = system.bulk_force() + system.contact_force()
+            else:
+                for operator, traction in zip(system.operators, tractions, strict=True):
+                    operator.add_force(right, traction)
+            right.array[system.constrained] = 0.0
+            right.scale(-1.0 / system.bulk.scale)
+            with interrupts_held():
+                ksp.solve(right, left)
+            dense.raise_kept(ksp)
+            return system.extended(left.array_r.copy())
+
+        try:
+            matrices = (o.springs(s) for o, s in zip(system.operators, springs, strict=True))
+            equations.assemble(equations.matrix(True), matrices)
+            # The tangent's own solver may be a V-cycle and no more; after a factorisation GMRES
+            # ends with its first iteration.
+            ksp.setOperators(equations.matrix(True))
+            ksp.setType(PETSc.KSP.Type.GMRES)
+            ksp.setPC(equations.solvers[True].getPC())
+            ksp.setTolerances(rtol=1e-8, max_it=1000)
+            yield solve
+        finally:
+            for item in (ksp, right, left):
+                item.destroy()
+
+    def respond(self, springs: Sequence[Array], tractions: Sequence[Array]) -> list[Array]:
+        """Changes of the relative displacements at the points of every contact. Collective.
+
+        To some digits: with the matrix factored last, which is the tangent near the solution.
+
+        Args:
+            springs: Stiffness at the points of every contact, (n_points, gdim, gdim) each
+                (stress/length).
+            tractions: What is added on the body, (n_points, gdim) each (stress).
+        """
+        equations, system = self.equations, self.system
+        consistent = self.main.consistent or equations.filled(True) or not equations.filled(False)
+        right, left, diagonal = system.vector(), system.vector(), system.diagonal
+        matrix = system.matrix(symmetric=False)
+        ksp = PETSc.KSP().create(self._comm)
+        try:
+            if not equations.filled(consistent):  # nothing was iterated yet
+                equations.assemble(equations.matrix(consistent), equations.tangents())
+            parts = (o.springs(k) for o, k in zip(system.operators, springs, strict=True))
+            system.fill(matrix, parts)
+            for operator, traction in zip(system.operators, tractions, strict=True):
+                operator.add_force(right, traction)
+            right.array[system.constrained] = 0.0
+            right.scale(-1.0 / system.bulk.scale)
+            ksp.setOperators(matrix)
+            ksp.setType(PETSc.KSP.Type.FGMRES)
+            ksp.getPC().setType("python")
+            ksp.getPC().setPythonContext(_Nearby(equations.solvers[consistent]))
+            ksp.setTolerances(rtol=_NEARBY, max_it=100)
+            ksp.solve(right, left)
+            return [operator.jump(left.array_r) for operator in system.operators]
+        finally:
+            system.diagonal = diagonal
+            for item in (ksp, matrix, right, left):
+                item.destroy()
+
+
+class _Nearby:
+    """A preconditioner: the solver of a matrix that differs by the status of some points."""
+
+    def __init__(self, ksp: PETSc.KSP) -> None:
+        ksp.setUp()
+        self._pc = ksp.getPC()
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """For PETSc."""
+        self._pc.apply(x, y)
+
+
+def _append(attempts: list[Attempt], tried: Sequence[Attempt]) -> None:
+    """Add what was tried; the same with the same outcome once more counts iterations alone."""
+    for attempt in tried:
+        last = attempts[-1] if attempts else None
+        if last and (last.method, last.outcome) == (attempt.method, attempt.outcome):
+            attempts[-1] = replace(attempt, iterations=last.iterations + attempt.iterations)
+        else:
+            attempts.append(attempt)

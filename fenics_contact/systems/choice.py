@@ -1,0 +1,97 @@
+"""Which system to iterate on, and how to solve linear systems over all unknowns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fenics_contact.systems import linear
+from fenics_contact.systems.condensed import touched, worthwhile
+from fenics_contact.systems.full import FullSystem
+
+__all__ = ["linear_kind", "obstacle_to_condensation"]
+
+
+def obstacle_to_condensation(
+    full: FullSystem,
+    *,
+    wanted: bool | None,
+    linear_solver: str | None,
+    named: Sequence[str],
+    increments: int,
+) -> str | None:
+    """Why not to iterate on the unknowns that contact touches alone; None: do. Collective.
+
+    Args:
+        full: All unknowns.
+        wanted: What the caller says; None: where it can be done and is worth it.
+        linear_solver: What the caller wants for systems over all unknowns.
+        named: Options given that name a linear solver, which the dense one cannot be.
+        increments: How many of them are expected.
+
+    Raises:
+        ValueError: It is wanted and cannot be had.
+    """
+    unknowns, gdim = full.unknowns, len(full.u)
+    obstacle = None
+    if not full.contacts:
+        obstacle = "there is no contact"
+    elif not full.bulk.linear:
+        obstacle = "the bulk is not linear in u"
+    elif unknowns.comm.size > 1:
+        obstacle = f"it takes one rank, and there are {unknowns.comm.size}"
+    elif named:
+        obstacle = f"the options name a linear solver ({', '.join(named)})"
+    elif linear_solver == "multigrid":
+        obstacle = "linear_solver is 'multigrid', and it takes a factorisation"
+    if wanted and obstacle:
+        raise ValueError(
+            f"condensation is True, but {obstacle}; leave it out, or give condensation=False"
+        )
+    if wanted is False:
+        return "the caller wants none"
+    if wanted or obstacle:
+        return obstacle
+    n, n_touched = unknowns.n_local, touched(full.operators, unknowns).size
+    if n_touched == n or not worthwhile(n, n_touched, gdim):
+        return f"contact touches {n_touched} of {n} unknowns, too many to gain by it"
+    if unknowns.n_motions or linear_solver is not None:
+        return None
+    n_bytes = linear.factor_bytes(n, gdim, symmetric=full.bulk.symmetric)
+    obstacle = linear.too_large(n_bytes, unknowns.comm)
+    if not obstacle and linear.quicker(n, gdim, condensed_for=increments):
+        obstacle = f"multigrid is quicker for {n} unknowns"
+    return obstacle or None
+
+
+def linear_kind(
+    full: FullSystem,
+    *,
+    wanted: str | None,
+    condensed: bool,
+    named: Sequence[str],
+    symmetric: bool,
+    tangent_symmetric: bool,
+) -> tuple[str, str]:
+    """How to solve systems over all unknowns, one of `linear.KINDS`, and why. Collective.
+
+    Args:
+        full: All unknowns.
+        wanted: What the caller says.
+        condensed: Whether another system is iterated on.
+        named: Options given that name a linear solver; they win.
+        symmetric: Whether the matrix of H₀ is.
+        tangent_symmetric: Whether the consistent tangent is.
+    """
+    kind, reason = wanted, "the caller's choice"
+    if kind is None:
+        n, gdim = full.unknowns.first_motion, len(full.u)
+        n_bytes = linear.factor_bytes(n, gdim, symmetric=symmetric)
+        if not tangent_symmetric:  # L-BFGS keeps the factors of both
+            n_bytes += linear.factor_bytes(n, gdim, symmetric=False)
+        reason = linear.too_large(n_bytes, full.unknowns.comm) or ""
+        if not reason and linear.quicker(n, gdim):
+            reason = "it is quicker for as many"
+        kind = "multigrid" if reason and not condensed and not named else "direct"
+    if kind == "multigrid" and full.unknowns.n_motions:
+        return "direct", "supports that move freely are no nodes with rigid motions"
+    return kind, reason

@@ -1,0 +1,252 @@
+"""A system: unknowns, and the equations of bulk and contact on them.
+
+There are two, side by side: `FullSystem` on all unknowns, and `CondensedSystem` on those that
+contact touches, all others eliminated. What both have in common is here; what iterates on one of
+them needs no more than this.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
+
+from fenics_contact.contact.contact import Contact
+from fenics_contact.systems.balance import Norms, Parts, by_body
+from fenics_contact.systems.bulk import Bulk
+from fenics_contact.systems.forces import Forces
+from fenics_contact.systems.operator import ContactOperator, contact_operators
+from fenics_contact.systems.unknowns import Unknowns
+
+__all__ = ["System"]
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+
+class System(ABC):
+    """States, forces and matrices over some unknowns of a problem.
+
+    Attributes:
+        u: The displacement.
+        unknowns: The unknowns of the system.
+        bulk: The bulk form.
+        contacts: The contacts.
+        constrained: Mask over this rank's unknowns: those with Dirichlet conditions.
+        prescribed: Values at them, in the present increment.
+        load: External forces at the unknowns (force).
+        diagonal: Diagonal of the matrix assembled last (force/length).
+        outside: Norms of load and of `terms` at unknowns outside of the system, (2, n_bodies).
+        farthest: Largest displacement whose round-off counts (length).
+        label: Body or free support of every unknown of this rank, (n_local,).
+        n_bodies: Their number.
+        iterations_per_round: Iterations of L-BFGS after which H₀ is made anew from the status.
+        linear_kind: How linear systems are solved, one of `linear.KINDS`.
+        mark: Of the coordinates that `forces` are in.
+        ready: Whether `fill` can be called; else `update` comes first.
+    """
+
+    iterations_per_round: int
+    linear_kind = "direct"
+    mark: object
+    ready: bool
+
+    def __init__(
+        self,
+        u: fem.Function,
+        unknowns: Unknowns,
+        bulk: Bulk,
+        contacts: Sequence[Contact],
+        constrained: Mask,
+        label: npt.NDArray[np.intp],
+        n_bodies: int,
+    ) -> None:
+        """Take over the parts of a problem; see the attributes. Collective."""
+        self.u, self.unknowns, self.bulk = u, unknowns, bulk
+        self.contacts, self.constrained = contacts, constrained
+        self.label, self.n_bodies = label, n_bodies
+        self.prescribed: Array = np.zeros(int(constrained.sum()))
+        self.load: Array = np.zeros(unknowns.n_local)
+        self.diagonal: Array = np.zeros(unknowns.n_local)
+        self.outside: Array = np.zeros((2, n_bodies))
+        self.farthest = np.inf
+        self._motions = [c for contact in contacts for c in contact.free_motion.values()]
+        self._contact_vector = unknowns.vector()
+        self._operators: tuple[list[int], list[ContactOperator]] | None = None
+        self._parts: tuple[list[int], Parts] | None = None
+
+    # ---- contact, and what has to be in balance --------------------------------------------------
+
+    @property
+    def operators(self) -> list[ContactOperator]:
+        """What the contacts are over these unknowns, with the pairs as they are. Collective."""
+        pairings = [c.pairings for c in self.contacts]
+        if self._operators is None or self._operators[0] != pairings:
+            self._operators = pairings, contact_operators(self.contacts, self.unknowns)
+        return self._operators[1]
+
+    @property
+    def parts(self) -> Parts:
+        """What has to be in balance, for the present pairs. Collective."""
+        pairings = [c.pairings for c in self.contacts]
+        if self._parts is None or self._parts[0] != pairings:
+            moving = [(n, i) for n, c in enumerate(self.contacts) for i in c.free_motion]
+            n = self.n_bodies - len(moving)
+            bodies = [f"body {b + 1}" if n > 1 else "the body" for b in range(n)]
+            bodies += [f"support of {self.contacts[c].name} along {'xyz'[i]}" for c, i in moving]
+            touched = [operator.touched for operator in self.operators]
+            names = [c.name for c in self.contacts]
+            parts = Parts(
+                self.unknowns.comm, self.label, bodies, names, touched, [c for c, _ in moving]
+            )
+            self._parts = pairings, parts
+        return self._parts[1]
+
+    def contact_forces(self) -> list[Array]:
+        """Parts of the residual at the present state by contact, (n_local,) each. Collective."""
+        forces = []
+        for operator in self.operators:
+            self._contact_vector.set(0.0)
+            operator.add_force(self._contact_vector)
+            forces.append(self._contact_vector.array_r.copy())
+        return forces
+
+    def contact_force(self) -> Array:
+        """Their sum, (n_local,). Collective."""
+        return sum(self.contact_forces(), np.zeros(self.unknowns.n_local))
+
+    def norms(self, total: Array, contacts: Sequence[Array], start: Array) -> Norms:
+        """How large residual and forces are at the present state, by part. Collective.
+
+        Args:
+            total: The residual with reactions, (n_local,) (force).
+            contacts: Of every contact the part that is its own, (n_local,) each.
+            start: Norms of `terms` where the increment began, (n_bodies,).
+        """
+        return self.parts.norms(
+            total,
+            contacts,
+            self.load,
+            self.terms(self.state()),
+            self.constrained,
+            self.outside,
+            start,
+        )
+
+    # ---- states ----------------------------------------------------------------------------------
+
+    def vector(self) -> PETSc.Vec:
+        """A new vector over the unknowns. Collective."""
+        return self.unknowns.vector()
+
+    def terms(self, state: Array) -> Array:
+        """Size of what K u sums up in each row, whose round-off is left in it (force)."""
+        return np.asarray(self.diagonal * np.clip(state, -self.farthest, self.farthest))
+
+    def by_body(self, *vectors: Array) -> Array:
+        """Norms of vectors over the unknowns, (n_vectors, n_bodies). Collective."""
+        return by_body(self.unknowns.comm, vectors, self.label, self.n_bodies)
+
+    def motions(self) -> Array:
+        """The present free motions of supports, on every rank."""
+        return np.array([float(c.value) for c in self._motions])
+
+    def set_motions(self, state: Array) -> None:
+        """Make those of a state the present ones. Collective."""
+        for constant, value in zip(self._motions, self.unknowns.motions(state), strict=True):
+            constant.value = value
+
+    @abstractmethod
+    def state(self) -> Array:
+        """The present unknowns of this rank; a copy."""
+
+    @abstractmethod
+    def set_state(self, state: Array) -> None:
+        """Make a state the present one. Collective."""
+
+    @abstractmethod
+    def part(self, state: Array) -> Array:
+        """What of a state of all unknowns is in this system."""
+
+    @abstractmethod
+    def extended(self, change: Array) -> Array:
+        """The change of all unknowns that one of those in this system brings along. Collective."""
+
+    # ---- an increment ----------------------------------------------------------------------------
+
+    @abstractmethod
+    def begin(self, load: Array) -> None:
+        """Start an increment under a load over all unknowns, u with its conditions. Collective."""
+
+    @property
+    @abstractmethod
+    def pending_field(self) -> Array | None:
+        """What `complete` needs of the present increment; None: nothing is outside."""
+
+    @abstractmethod
+    def complete(self, field: Array | None) -> None:
+        """Find the unknowns outside of the system for those inside. Collective.
+
+        Args:
+            field: What `pending_field` was in the increment that set those inside.
+        """
+
+    @abstractmethod
+    def forces(self, bulk: Array, reaction: Array) -> Forces:
+        """For the energies: forces at the present state, in the coordinates of ``mark``.
+
+        Args:
+            bulk: Residual of the bulk, (n,) (force).
+            reaction: Forces at the constrained unknowns, zero at others, (n,) (force).
+        """
+
+    @abstractmethod
+    def forget(self) -> None:
+        """Drop what was kept of earlier increments and could show in the digits of the next."""
+
+    @abstractmethod
+    def bulk_force(self) -> Array:
+        """The residual without contact's: the bulk's and the free supports'. Collective."""
+
+    @abstractmethod
+    def bulk_energy(self) -> float:
+        """This rank's part of the potential of a linear bulk and its loads, up to a constant."""
+
+    # ---- matrices --------------------------------------------------------------------------------
+
+    @abstractmethod
+    def update(self) -> int:
+        """Take the bulk's tangent as it is now; number of factorisations. Collective."""
+
+    @abstractmethod
+    def matrix(self, *, symmetric: bool) -> PETSc.Mat:
+        """A new matrix for `fill`. Collective.
+
+        Args:
+            symmetric: Whether what will be filled in is symmetric.
+        """
+
+    @abstractmethod
+    def linear_solver(self, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
+        """Options of the solver for `matrix`; see `linear.options`."""
+
+    @abstractmethod
+    def prepare(self, ksp: PETSc.KSP, matrix: PETSc.Mat) -> None:
+        """Give a solver a matrix of `matrix`. Collective."""
+
+    @abstractmethod
+    def fill(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
+        """Bulk tangent plus contact, conditions applied, dimensionless. Collective.
+
+        Args:
+            matrix: What to fill.
+            contacts: Contact's part, used up.
+
+        Returns:
+            How many factorisations of sparse matrices this leads to.
+        """
