@@ -5,7 +5,8 @@ from fenics_contact import elasticity
 from fenics_contact._version import __version__
 from fenics_contact.checks.verdict import Balance, NotConverged, Verdict
 from fenics_contact.contact.accuracy import Accuracy
-from fenics_contact.contact.contact import Contact, Resultants, Status
+from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.values import Resultants, Status
 from fenics_contact.estimates.adaptation import Level, adapt
 from fenics_contact.estimates.errors import ErrorBudget, estimate_errors
 from fenics_contact.histories import checkpoint

@@ -16,6 +16,8 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
+from fenics_contact.types import Array
+
 __all__ = ["compile_form", "create_facet_submesh", "interpolation_points", "model_to_mesh"]
 
 if tuple(map(int, dolfinx.__version__.split(".")[:2])) < (0, 9):
@@ -131,7 +133,7 @@ def geometry_dofmap(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:
     return geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
 
 
-def interpolation_points(element: Any) -> npt.NDArray[np.float64]:
+def interpolation_points(element: Any) -> Array:
     """Interpolation points of a DOLFINx element: a method in 0.9, a property since."""
     points = element.interpolation_points
     return points() if callable(points) else points

@@ -13,6 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from fenics_contact.types import Array
+
 __all__ = [
     "agreed",
     "collective_errors",
@@ -115,12 +117,12 @@ def agreed(comm: MPI.Comm, value: Any) -> Any:
     return comm.bcast(value) if comm.size > 1 else value
 
 
-def global_sum(comm: MPI.Comm, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def global_sum(comm: MPI.Comm, values: npt.ArrayLike) -> Array:
     """Sum of an array over the ranks, same shape. Collective."""
     return np.asarray(comm.allreduce(np.asarray(values, dtype=np.float64), op=MPI.SUM))
 
 
-def global_max(comm: MPI.Comm, values: npt.NDArray[np.float64], empty: float = 0.0) -> float:
+def global_max(comm: MPI.Comm, values: Array, empty: float = 0.0) -> float:
     """Largest entry over the ranks; ``empty`` where no rank has one; NaN wins. Collective."""
     local = float(np.max(values)) if values.size else -np.inf
     # max() of MPI has no rule for NaN, so it goes through a gather.
@@ -128,11 +130,11 @@ def global_max(comm: MPI.Comm, values: npt.NDArray[np.float64], empty: float = 0
     return empty if largest == -np.inf else largest
 
 
-def global_min(comm: MPI.Comm, values: npt.NDArray[np.float64], empty: float = 0.0) -> float:
+def global_min(comm: MPI.Comm, values: Array, empty: float = 0.0) -> float:
     """Smallest entry over the ranks; ``empty`` where no rank has one; NaN wins. Collective."""
     return -global_max(comm, -np.asarray(values), -empty)
 
 
-def gather_rows(comm: MPI.Comm, rows: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def gather_rows(comm: MPI.Comm, rows: Array) -> Array:
     """Stack the rows of all ranks, in the order of the ranks, on all ranks. Collective."""
     return np.concatenate(comm.allgather(rows), axis=0)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from petsc4py import PETSc
@@ -21,13 +20,8 @@ from fenics_contact.checks.energy import Energy, EnergyState
 from fenics_contact.checks.judge import Judge
 from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.verdict import Attempt, NotConverged, Verdict
-from fenics_contact.contact.contact import (
-    Contact,
-    Found,
-    Resultants,
-    Status,
-    displacement_degree,
-)
+from fenics_contact.contact.contact import Contact, Found, displacement_degree
+from fenics_contact.contact.values import Resultants, Status
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
 from fenics_contact.methods.solver import METHODS, Settings, Solver
 from fenics_contact.parallel import fail_together, global_max, global_min
@@ -40,10 +34,10 @@ from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Unknowns
+from fenics_contact.types import Array, Mask
 
 __all__ = ["ContactProblem", "Step"]
 
-Array = npt.NDArray[np.float64]
 logger = logging.getLogger("fenics_contact")
 
 # Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
@@ -305,7 +299,7 @@ class ContactProblem:
             for i in contact.free_motion
         ]
 
-    def _constrained_unknowns(self) -> npt.NDArray[np.bool_]:
+    def _constrained_unknowns(self) -> Mask:
         mask = np.zeros(self.unknowns.n_local, dtype=np.bool_)
         for bc in self._bcs:
             dofs, _ = bc.dof_indices()
@@ -339,7 +333,7 @@ class ContactProblem:
         for contact in self.contacts:
             contact.check_input()
             contact.check_side()
-            gap = global_min(self._comm, contact.values["gap"])
+            gap = global_min(self._comm, contact.values.initial_gap)
             if gap < -_TOUCHING * self.motions.size and not contact.gap_prescribed:
                 worst = max(worst, -gap)
                 if self._comm.rank == 0:
@@ -784,7 +778,7 @@ def _facets_held(contact: Contact, constrained: Array) -> int:
     space = contact.u.function_space
     mesh, dofmap = space.mesh, space.dofmap
     facets = contact.surface.facets
-    held: npt.NDArray[np.bool_] = np.all(constrained.reshape(-1, dofmap.bs), axis=1)
+    held: Mask = np.all(constrained.reshape(-1, dofmap.bs), axis=1)
     count = 0
     for cell, local in zip(facet_cells(mesh, facets), local_facets(mesh, facets), strict=True):
         closure = dofmap.dof_layout.entity_closure_dofs(mesh.topology.dim - 1, local)

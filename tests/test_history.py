@@ -169,7 +169,7 @@ def test_history_is_exact(cell, degree):
         u = field(scene.x.T).T
         expected = law.step(u, FRICTION, K_N, K_T)
         assert expected["margin"][0] > 1e-9, f"increment {number} is decided by rounding"
-        values = {name: gathered(COMM, v) for name, v in contact.values.items()}
+        values = {name: gathered(COMM, v) for name, v in contact.values.arrays.items()}
         for name in ("opening", "penetration", "normal_traction", "traction", "slip_increment"):
             scale = {"opening": 0.1, "penetration": 0.1, "slip_increment": 0.1}.get(name, 1.0)
             assert close(values[name], expected[name], EXACT, scale=scale), (number, name)
@@ -232,7 +232,7 @@ def test_gather_is_all_of_the_surface_in_order(cell):
     assert np.all(np.diff(table["x"][:, 0]) >= 0)
     columns = {
         "x": contact.points,
-        "normal": contact.values["normal"],
+        "normal": contact.values.normal,
         "tangential_traction": contact.tangential_traction,
         "gap": contact.gap,
         "pressure": contact.pressure,

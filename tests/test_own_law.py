@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import ufl
 from mpi4py import MPI
-from scenes import TOP, block, close, gathered, raised_everywhere
+from scenes import TOP, block, close, gathered, raised_everywhere, stress
 
 import fenics_contact as fc
 from fenics_contact.laws.base import Law, Response
@@ -84,6 +84,31 @@ class Asperities(FrictionLaw):
         return p0 * h * (ufl.exp(penetration / h) - 1) - p0 * penetration
 
 
+@dataclass(frozen=True)
+class Saturating(FrictionLaw):
+    """Friction that a weak layer bounds: τ ≤ s (1 - exp(-μ p/s)), nearly Coulomb's for p ≪ s/μ."""
+
+    friction: Any
+    strength: Any
+    k_n: Any
+    k_t: Any
+
+    def limit(self, pressure, parameters):
+        """The bound."""
+        s = parameters["strength"]
+        return s * (1 - ufl.exp(-parameters["friction"] * pressure / s))
+
+    def response(self, kinematics, parameters):
+        """Unilateral contact, and friction up to the limit."""
+        penetration = positive_part(kinematics.normal_displacement - kinematics.gap)
+        opening = positive_part(kinematics.gap - kinematics.normal_displacement)
+        pressure = parameters["k_n"] * penetration
+        limit = self.limit(pressure, parameters)
+        traction, slip = self.slide(kinematics, limit, parameters)
+        slip = tuple(ufl.conditional(ufl.gt(pressure, 0), mode, 0) for mode in slip)
+        return Response(-pressure, opening, penetration, traction, limit, slip)
+
+
 # ---- against closed answers ----------------------------------------------------------------------
 
 # Newton's method and L-BFGS to 1e-9 of the forces; of the overclosure that is as much of h.
@@ -121,10 +146,10 @@ def _ones(contact):
 def test_any_units():
     """The same in MPa and in Pa, in metres and in micrometres: relative results are equal."""
     found = []
-    for stress, length in ((1.0, 1.0), (1e6, 1.0), (1.0, 1e6)):
+    for force, length in ((1.0, 1.0), (1e6, 1.0), (1.0, 1e6)):
         size = [length, length]
-        scene = block("quadrilateral", E=E * stress, nu=NU, up=-3.0 * stress, size=size)
-        problem, contact = scene.problem(Overclosure(P0 * stress, H * length), scene.rollers())
+        scene = block("quadrilateral", E=E * force, nu=NU, up=-3.0 * force, size=size)
+        problem, contact = scene.problem(Overclosure(P0 * force, H * length), scene.rollers())
         problem.solve()
         found.append(-gathered(COMM, contact.gap) / length)
     assert close(found[1], found[0], EXACT) and close(found[2], found[0], EXACT)
@@ -160,6 +185,50 @@ def test_overclosure_with_friction(cell, method, condensation):
             assert r.force[0] * side < 0.0
         problem.commit()
     assert step.energy.dissipation > 0
+
+
+def dragged(law, cell="quadrilateral", **options):
+    """A block pressed on a plane by its top and dragged until all slips."""
+    scene = block(cell, E=E, nu=NU, n=3)
+    d = scene.dim
+    push, press = (scene.hold(TOP, i) for i in (0, d - 1))
+    held = [scene.hold(TOP, 1)] if d == 3 else []
+    problem, contact = scene.problem(law, [push, press, *held], **options)
+    push.g.value[...], press.g.value[...] = 4e-2, -2e-2
+    return scene, problem, contact
+
+
+@pytest.mark.parametrize("condensation", [None, False] if COMM.size == 1 else [None])
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
+def test_friction_that_does_not_grow_as_the_pressure(cell, method, condensation):
+    """All slips: |τ| is the limit under the pressure at every point, to the solver's 1e-9."""
+    mu, strength = 0.5, 4.0
+    law = Saturating(mu, strength, fc.Scaled(), fc.Scaled())
+    _, problem, contact = dragged(law, cell, method=method, condensation=condensation)
+    step = problem.solve()
+    assert step.verdict.failures == [] and step.contacts["contact"].stick == 0
+    p, tau = (gathered(COMM, v) for v in (contact.pressure, contact.tangential_traction))
+    assert mu * p.max() > 2 * strength  # far from Coulomb's
+    assert close(np.linalg.norm(tau, axis=1), strength * (1 - np.exp(-mu * p / strength)), 1e-9)
+
+
+def test_its_error_is_estimated_by_its_derivative():
+    """Friction of a soft penalty against that of one 1000 times as stiff: estimated within 30 %.
+
+    With the pressure itself for measure, as Coulomb's would have it, it would be 5 times too large.
+    """
+    found = []
+    for factor in (3.0, 3e3):
+        law = Saturating(0.5, 4.0, fc.Scaled(factor), fc.Scaled(factor))
+        scene, problem, _ = dragged(law)
+        problem.solve()
+        budget = fc.estimate_errors(problem, stress(scene.u, E, NU))
+        found.append(budget)
+    soft, stiff = found
+    name = "friction force"
+    error = soft.values[name] - stiff.values[name]
+    assert soft.parts["enforcement"][name] == pytest.approx(error, rel=0.3)
 
 
 # ---- what is refused, and what is found out ------------------------------------------------------
@@ -221,6 +290,22 @@ def test_a_potential_of_another_law():
     scene = block(up=-3.0)
     problem, _ = scene.problem(Wrong(P0, H), scene.rollers())
     with pytest.raises(fc.NotConverged, match="complementarity violated by"):
+        problem.solve()
+
+
+def test_a_limit_of_another_law():
+    """A response whose limit is none that `Law.limit` tells is found by the verdict."""
+
+    class Wrong(Saturating):
+        """It slides at the limit of another strength than the one that it tells."""
+
+        def response(self, kinematics, parameters):
+            """That of a layer as strong again."""
+            more = {**parameters, "strength": 2 * parameters["strength"]}
+            return super().response(kinematics, more)
+
+    _, problem, _ = dragged(Wrong(0.5, 4.0, fc.Scaled(), fc.Scaled()))
+    with pytest.raises(fc.NotConverged, match="limit violated by"):
         problem.solve()
 
 

@@ -335,7 +335,7 @@ def test_checks_see_tractions_where_nothing_is_opposite():
     _, contact, _ = overhang("triangle", fc.Frictionless(1e7))
     contact.evaluate()
     assert check_laws(contact)["complementarity"] <= 1e-12
-    contact._values["normal_traction"][~contact.paired] = -1.0
+    contact.values.normal_traction[~contact.paired] = -1.0
     assert check_laws(contact)["complementarity"] > 1e-10
 
 

@@ -206,7 +206,7 @@ def picture(made: Scene) -> dict[str, np.ndarray]:
         found[f"{c.name} ways"] = at_points(c, np.hstack(ways))
         if c.multipliers is not None:
             found[f"{c.name} multipliers"] = at_points(c, c.multipliers.fields.rows())
-        for name, values in c.values.items():
+        for name, values in c.values.arrays.items():
             found[f"{c.name} {name}"] = at_points(c, np.column_stack([values]))
         found[f"{c.name} status"] = at_points(c, c.status)
         r = c.resultants()

@@ -65,7 +65,7 @@ def test_a_flat_support_leaves_nothing_out():
     step = problem.solve()
     assert step.verdict.kinematics["contact"].worst <= 1e-12
     _, normal = contact.true_placement()
-    assert close(at_points(contact, normal), at_points(contact, contact.values["normal"]), 1e-14)
+    assert close(at_points(contact, normal), at_points(contact, contact.values.normal), 1e-14)
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])

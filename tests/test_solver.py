@@ -777,7 +777,7 @@ def test_forces_by_a_second_route(factor, condensation):
     What the solver, the laws and the sums of forces make of it agrees, within their tolerances.
     """
     made = rub(second_route=True, condensation=condensation if COMM.size == 1 else None)
-    made.contact._own_map.scale(factor)
+    made.contact.pairs.own_map.scale(factor)
     made.move(*PATH[1])
     if factor == 1.0:
         steps = walk(made)
@@ -1098,9 +1098,9 @@ def test_plane_stress_with_thickness():
     law = fc.Frictionless(k_n=fc.Scaled(5.0))
     scene.problem(law, scene.rollers(), contact={"weight": t})
     _, scaled = scene.problem(law, scene.rollers(), contact={"weight": t})
-    k = gathered(COMM, scaled.values["parameter k_n"])
+    k = gathered(COMM, scaled.values.parameters["k_n"])
     given = scene.contact(law, modulus=E)
-    reference = gathered(COMM, given.values["parameter k_n"])
+    reference = gathered(COMM, given.values.parameters["k_n"])
     assert np.all(np.abs(k / reference - 1) <= 0.1)
     assert np.array_equal(gathered(COMM, contact.status), np.full(len(k), fc.Status.SLIP))
 
@@ -1167,7 +1167,7 @@ def test_variable_modulus(kind):
         fc.Frictionless(k_n=fc.Scaled(5.0)), scene.rollers(), petsc_options=TIGHT
     )
     problem.solve()
-    k_n = gathered(COMM, contact.values["parameter k_n"])
+    k_n = gathered(COMM, contact.values.parameters["k_n"])
     assert close(k_n, np.full(len(k_n), 5.0 * 1000.0 * 4), 1e-9)
 
     def exact(x):

@@ -188,7 +188,7 @@ def test_a_block_on_a_foundation(cell, method):
         found = step.contacts["contact"]
         assert close(found.force, -scene.vector(side=side, up=up), 1e-7, scale=1.0)
         assert found.normal_force == pytest.approx(-up, abs=1e-7)
-        jump = gathered(COMM, contact.values["jump"])
+        jump = gathered(COMM, contact.values.jump)
         measure = gathered(COMM, contact.measure)
         expected = scene.vector(side=side / 20.0, up=up / 50.0)
         assert close(measure @ jump, expected, 1e-7, scale=0.02)
@@ -224,7 +224,7 @@ def test_a_foundation_without_tangential_stiffness_has_no_tangential_state():
     step = problem.solve()
     assert step.contacts["contact"].normal_force == pytest.approx(-0.5, abs=1e-7)
     assert np.all(gathered(COMM, contact.status) == fc.Status.SLIP)
-    assert "traction" not in contact.history and "traction" not in contact.values
+    assert "traction" not in contact.history and "traction" not in contact.values.arrays
     assert not np.any(gathered(COMM, contact.tangential_traction))
 
 

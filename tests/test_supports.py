@@ -70,8 +70,8 @@ def check(contact: fc.Contact, reference, shift=0.0) -> None:
     contact.evaluate()
     x = gathered(COMM, contact.points)
     gap, normal = reference(x, shift)
-    assert close(gathered(COMM, contact.values["gap"]), gap, EXACT, scale=1.0)
-    assert close(gathered(COMM, contact.values["normal"]), normal, EXACT, scale=1.0)
+    assert close(gathered(COMM, contact.values.initial_gap), gap, EXACT, scale=1.0)
+    assert close(gathered(COMM, contact.values.normal), normal, EXACT, scale=1.0)
     # u = 0 here, so that what is open is the initial gap (eq. 6).
     assert close(gathered(COMM, contact.gap), gap, EXACT, scale=1.0)
 
@@ -198,12 +198,10 @@ def test_length_of_the_normal_does_not_matter(d):
     law = fc.Frictionless(k_n=1.0)
     one = fc.Contact(u, surface, fc.HalfSpace(POINT[d], SLOPE[d]), law)
     long = fc.Contact(u, surface, fc.HalfSpace(POINT[d], 1e6 * np.array(SLOPE[d])), law)
-    for name in ("gap", "normal"):
-        a, b = (gathered(COMM, c.values[name]) for c in (one, long))
+    for name in ("initial_gap", "normal"):
+        a, b = (gathered(COMM, c.values.arrays[name]) for c in (one, long))
         assert close(a, b, EXACT, scale=1.0)
-    assert close(
-        np.linalg.norm(gathered(COMM, one.values["normal"]), axis=1), a[:, 0] * 0 + 1, EXACT
-    )
+    assert close(np.linalg.norm(gathered(COMM, one.values.normal), axis=1), a[:, 0] * 0 + 1, EXACT)
 
 
 @pytest.mark.parametrize("d", [2, 3])

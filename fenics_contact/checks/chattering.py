@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fenics_contact.contact.contact import Contact, Status
+from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.values import Status
 from fenics_contact.parallel import gather_rows, global_sum
 
 __all__ = ["StatusWatch"]

@@ -8,16 +8,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_sum
 from fenics_contact.systems.forces import Forces
+from fenics_contact.types import Array
 
 __all__ = ["Energy", "EnergyState"]
 
-Array = npt.NDArray[np.float64]
 
 # Work, as a share of the energies that there are, that is within the solver's tolerance.
 _NOTHING = 1e-8
@@ -83,14 +82,14 @@ class EnergyState:
     @classmethod
     def unloaded(cls, forces: dict[Any, Forces], contacts: Sequence[Contact]) -> EnergyState:
         """No forces on Γc."""
-        ways = [np.stack([0 * c.points, c.values["jump"], c.values["shift"]]) for c in contacts]
+        ways = [np.stack([0 * c.points, c.values.jump, c.values.shift]) for c in contacts]
         return cls(forces, ways, 0.0)
 
     @classmethod
     def at(cls, forces: dict[Any, Forces], contacts: Sequence[Contact]) -> EnergyState:
         """The state that ``contacts`` have evaluated."""
-        ways = [np.stack([c.traction, c.values["jump"], c.values["shift"]]) for c in contacts]
-        springs = sum(float(c.measure @ c.values["stored"]) for c in contacts)
+        ways = [np.stack([c.traction, c.values.jump, c.values.shift]) for c in contacts]
+        springs = sum(float(c.measure @ c.values.stored) for c in contacts)
         return cls(forces, ways, springs)
 
     def between(self, jumps: Sequence[Array]) -> EnergyState:
@@ -114,9 +113,9 @@ class EnergyState:
             sums[0] += np.sum(mean * (here[2] - there[2]))
             sums[4] -= np.sum(mean * (here[1] - there[1]))
             if contact.law.has_friction:
-                sums[3] += contact.measure @ contact.values["dissipated"]
+                sums[3] += contact.measure @ contact.values.dissipated
                 # Tractions before are those of the commit, not multipliers in their place.
-                slip, normal = contact.slip_vector(), contact.values["normal"]
+                slip, normal = contact.slip_vector(), contact.values.normal
                 weight, length = 0.5 * contact.measure, np.sqrt(_dot(slip, slip))
                 for traction in (there[0], here[0]):
                     side = traction - _dot(traction, normal)[:, None] * normal

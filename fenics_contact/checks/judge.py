@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from fenics_contact.checks.kinematics import Linearisation, linearisation
 from fenics_contact.checks.rigid_motions import RigidMotions
@@ -14,10 +13,10 @@ from fenics_contact.contact.contact import passing
 from fenics_contact.parallel import global_max, global_sum, warn
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.system import System
+from fenics_contact.types import Array
 
 __all__ = ["Judge", "Respond"]
 
-Array = npt.NDArray[np.float64]
 # The change of the relative displacements at the points of every contact by springs there and by
 # tractions added on the body.
 Respond = Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]]
@@ -66,7 +65,7 @@ class Judge:
         """
         imposed = [self._full.state()[self._full.constrained]]
         for contact in self._contacts:
-            imposed += [contact.values[name] for name in ("shift", "gap")]
+            imposed += [contact.values.shift, contact.values.initial_gap]
         largest = (global_max(self._comm, np.abs(v)) for v in imposed)
         self._imposed = max(self._motions.size, *largest)
         return _FARTHEST * self._imposed
@@ -177,12 +176,9 @@ class Judge:
         for contact in self._contacts:
             mine, assembled = contact.own_forces()
             values = contact.values
-            stiffness = np.zeros(len(values["gap"]))
-            if contact.law.has_normal_stiffness:
-                stiffness += contact.normal_stiffness
-            if contact.law.has_tangential:
-                stiffness += np.abs(contact.tangential_stiffness).max(axis=(1, 2))
-            terms = np.linalg.norm(values["jump"], axis=1) + np.abs(values["gap"])
+            across = np.abs(values.tangential_stiffness).max(axis=(1, 2))
+            stiffness = values.normal_stiffness + across
+            terms = np.linalg.norm(values.jump, axis=1) + np.abs(values.initial_gap)
             blur = float(global_sum(self._comm, contact.measure @ (stiffness * terms)))
             sizes = (global_max(self._comm, np.abs(f)) for f in (mine - assembled, mine))
             residual, force = (float(size) for size in sizes)

@@ -11,14 +11,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from fenics_contact.contact.contact import Contact, Status
+from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_max, global_min, global_sum
+from fenics_contact.types import Array
 
 __all__ = ["Deviation", "LinearSprings", "Linearisation", "linearisation"]
 
-Array = npt.NDArray[np.float64]
 
 # Share of the largest pressure, or of the force, below which what is left out needs no solve.
 _NEGLIGIBLE = 1e-3
@@ -44,7 +44,7 @@ class LinearSprings:
     def of(cls, contact: Contact) -> LinearSprings:
         """Of an evaluated contact. Collective."""
         law, values, status = contact.law, contact.values, contact.status
-        normal = values["normal"]
+        normal = values.normal
         tangential, pressure = contact.tangential_traction, contact.pressure
         closed = status != Status.OPEN
         d = normal.shape[1]
@@ -52,9 +52,10 @@ class LinearSprings:
         stretch = np.zeros_like(normal)
         borne = contact.borne_by_springs()
         if law.has_normal_stiffness:
-            # A slipping point's friction follows the pressure, unless its limit is given.
-            follows = closed & (status == Status.SLIP) & (pressure > 0) & (not law.has_potential)
-            ratio = np.where(follows, 1.0, 0.0) / np.where(pressure > 0, pressure, 1.0)
+            # A slipping point's friction follows the pressure as its limit does.
+            follows = (status == Status.SLIP) & (pressure > 0) & (values.limit > 0)
+            slope = np.where(follows, values.limit_slope, 0.0)
+            ratio = slope / np.where(follows, values.limit, 1.0)
             direction = normal - ratio[:, None] * tangential
             k_n = np.where(closed, contact.normal_stiffness, 0.0)
             stiffness += k_n[:, None, None] * np.einsum("qi,qj->qij", direction, normal)
@@ -64,7 +65,7 @@ class LinearSprings:
             k_t, stick = contact.tangential_stiffness, status == Status.STICK
             stiffness += np.where(stick[:, None, None], k_t, 0.0)
             # K_t has no inverse along the normal, where nothing acts: any stiffness will do.
-            along = np.einsum("q,qi,qj->qij", values["parameter k_t"], normal, normal)
+            along = np.einsum("q,qi,qj->qij", values.parameters["k_t"], normal, normal)
             side = borne - np.sum(borne * normal, axis=1)[:, None] * normal
             stretch -= np.linalg.solve(k_t + along, side[:, :, None])[:, :, 0]
         return cls(stiffness, stretch)
@@ -118,36 +119,36 @@ class Deviation:
     def of(cls, contact: Contact) -> Deviation:
         """At the evaluated state of a contact; nothing where it could not be told. Collective."""
         values, closed = contact.values, contact.status != Status.OPEN
-        none = cls(np.zeros(len(closed)), np.zeros_like(values["normal"]))
+        none = cls(np.zeros(len(closed)), np.zeros_like(values.normal))
         if contact.support.is_flat or not (contact.rigid or _moves(contact)):
             return none
         change, normal = contact.gap_deviation()
         told = closed & np.isfinite(normal).all(axis=1)
-        turn = np.where(told[:, None], normal - values["normal"], 0.0)
+        turn = np.where(told[:, None], normal - values.normal, 0.0)
         if contact.gap_prescribed:
             return cls(none.gap, turn)
         # A point that has left the opposite bears nothing in truth.
-        change = np.where(np.isnan(change), values["penetration"], change)
+        change = np.where(np.isnan(change), values.penetration, change)
         return cls(np.where(told, change, 0.0), turn)
 
     def shift(self, contact: Contact) -> Array:
         """Displacement at the points that closes the linearised gap as much, (n_points, gdim)."""
-        return -self.gap[:, None] * contact.values["normal"]
+        return -self.gap[:, None] * contact.values.normal
 
     def turned(self, contact: Contact) -> Array:
         """Change of the traction by the turn of the normal, (n_points, gdim) (stress)."""
-        return contact.values["normal_traction"][:, None] * self.turn
+        return contact.values.normal_traction[:, None] * self.turn
 
 
 def _moves(contact: Contact) -> bool:
     """Whether bodies slide or turn by enough for a search anew to find anything. Collective."""
     comm, values = contact.surface.mesh.comm, contact.values
     rows = contact.quadrature.point_rows()
-    d = values["normal"].shape[1]
+    d = values.normal.shape[1]
     facets = contact.quadrature.weights[rows].sum(axis=1) ** (1 / (d - 1))
     smallest = global_min(comm, facets, empty=np.inf)
     slid = global_max(comm, np.linalg.norm(contact.relative_slide(), axis=1))
-    x, u = values["x"], contact.own_displacement()
+    x, u = values.x, contact.own_displacement()
     spread = np.zeros((2, d))
     for i in range(d):
         for row, field in zip(spread, (x[:, i], u[:, i]), strict=True):
@@ -199,7 +200,7 @@ def _relative(contact: Contact, change: Array) -> Linearisation:
     sums = global_sum(comm, np.stack([measure @ contact.traction, measure @ change]))
     size = float(global_sum(comm, measure @ np.linalg.norm(contact.traction, axis=1)))
     largest = global_max(comm, np.abs(contact.pressure)) or 1.0  # squares must not overflow
-    along = np.sum(change * contact.values["normal"], axis=1) / largest
+    along = np.sum(change * contact.values.normal, axis=1) / largest
     squares = [measure @ along**2, measure @ (contact.pressure / largest) ** 2]
     changed, whole = np.sqrt(global_sum(comm, squares))
     force = float(np.abs(sums[1]).max()) / size if size else 0.0

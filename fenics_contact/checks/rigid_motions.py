@@ -10,24 +10,23 @@ import weakref
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import scipy.optimize
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact import compat
-from fenics_contact.contact.contact import Status
+from fenics_contact.contact.values import Status
 from fenics_contact.parallel import agreed, gather_rows, global_min, global_sum
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.facets import facet_cells
 from fenics_contact.systems.modes import rigid_motions
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.unknowns import Unknowns
+from fenics_contact.types import Array, Mask
 
 __all__ = ["RigidMotions"]
 
-Array = npt.NDArray[np.float64]
 
 # Relative sizes below which an energy, a work or a share of a mode counts as zero. One clamped dof
 # among N gives 1/N, so that the first must lie below any 1/N; the others are far above round-off.
@@ -95,14 +94,14 @@ class RigidMotions:
         self._free_fields: Array = np.zeros((0, unknowns.n_local))
         self._balanced: list[Array] = []
         # Masks of points that were found to hold all motions, and of which contacts.
-        self._holding: list[npt.NDArray[np.bool_]] = []
+        self._holding: list[Mask] = []
         self._holders: weakref.WeakSet[ContactOperator] = weakref.WeakSet()
         self._jumps: weakref.WeakKeyDictionary[ContactOperator, Array]
         self._jumps = weakref.WeakKeyDictionary()
         self._travels: weakref.WeakKeyDictionary[ContactOperator, Array]
         self._travels = weakref.WeakKeyDictionary()
 
-    def find_free(self, stiffness: PETSc.Mat, constrained: npt.NDArray[np.bool_]) -> None:
+    def find_free(self, stiffness: PETSc.Mat, constrained: Mask) -> None:
         """Find the motions with no bulk energy that no Dirichlet condition holds. Collective.
 
         Args:
@@ -205,7 +204,7 @@ class RigidMotions:
             closed = contact.status != Status.OPEN
             bearing.append(closed)
             if contact.law.has_tangential:
-                bearing.append(closed & (contact.values["grip"] > 0))
+                bearing.append(closed & (contact.values.grip > 0))
         # What holds a body still does with more of Γc closed: no need to look again.
         same = bool(self._holding) and all(operator in self._holders for operator in operators)
         known = self._holding if same else []
@@ -238,7 +237,7 @@ class RigidMotions:
         for operator in operators:
             contact, values = operator.contact, operator.contact.values
             modes = self._at_points(operator)
-            along = np.einsum("mqd,qd->mq", modes, values["normal"])
+            along = np.einsum("mqd,qd->mq", modes, values.normal)
             weights = contact.quadrature.weights
             if closed_only:
                 weights = weights * (contact.status != Status.OPEN)
@@ -246,8 +245,8 @@ class RigidMotions:
             if contact.law.has_normal_stiffness:
                 gram += (along * weights) @ along.T
             if contact.law.has_tangential:
-                grip = weights * (values["grip"] > 0)
-                across = modes - along[:, :, None] * values["normal"][None]
+                grip = weights * (values.grip > 0)
+                across = modes - along[:, :, None] * values.normal[None]
                 gram += np.einsum("mqd,q,nqd->mn", across, grip, across)
         mean = global_sum(self._comm, gram) / max(float(global_sum(self._comm, area)), 1e-300)
         sizes, vectors = np.linalg.eigh(mean)
@@ -280,9 +279,9 @@ class RigidMotions:
         for operator in operators:
             values = operator.contact.values
             jump = np.tensordot(coefficients, self._at_points(operator), axes=1)
-            closing = np.einsum("qd,qd->q", jump, values["normal"])
+            closing = np.einsum("qd,qd->q", jump, values.normal)
             nearing = closing > _FELT
-            ways = values["opening"][nearing] / closing[nearing]
+            ways = values.opening[nearing] / closing[nearing]
             way = min(way, global_min(self._comm, ways, empty=np.inf))
         return None if way == np.inf else way * coefficients @ free
 
@@ -309,7 +308,7 @@ class RigidMotions:
         contacts = [operator.contact for operator in operators]
         for operator, contact in zip(operators, contacts, strict=True):
             if not contact.law.has_normal_stiffness:  # a prescribed normal traction is a load
-                force = -contact.values["parameter pressure"][:, None] * contact.values["normal"]
+                force = -contact.values.parameters["pressure"][:, None] * contact.values.normal
                 work = np.einsum("mqd,qd,q->m", self._at_points(operator), force, contact.measure)
                 resultant += global_sum(self._comm, work)
         if np.abs(resultant).max() <= _BALANCED * size:
@@ -317,7 +316,7 @@ class RigidMotions:
         # A history often has one direction of load and one support: what balanced it does again.
         data = [resultant / np.abs(resultant).max()]
         for contact in contacts:
-            data += [contact.values["normal"], contact.values.get("grip", np.zeros(0))]
+            data += [contact.values.normal, contact.values.grip]
             data += [np.array([contact.pairings])]
         known = len(data) == len(self._balanced) and all(map(_alike, data, self._balanced))
         if self._comm.allreduce(not known) == 0:
@@ -354,7 +353,7 @@ class RigidMotions:
     def _rays(self, operator: ContactOperator) -> Array:
         """Generalised forces of every admissible direction at every point: (n_rays, n_free)."""
         contact, values = operator.contact, operator.contact.values
-        normal = values["normal"]
+        normal = values.normal
         d = normal.shape[1]
         directions = []
         law = contact.law
@@ -364,7 +363,7 @@ class RigidMotions:
                 around.append(-around[0])
             else:
                 around = _around(normal)
-            friction = values["grip"][:, None]
+            friction = values.grip[:, None]
             if law.has_friction and not law.has_potential:
                 enlarge = 1.0 if d == 2 else 1 / np.cos(np.pi / _CONE_SIDES)
                 directions = [-normal + enlarge * friction * t for t in around]

@@ -10,6 +10,7 @@ import numpy as np
 from fenics_contact.checks.kinematics import Linearisation
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_max
+from fenics_contact.types import Array
 
 __all__ = ["Attempt", "NotConverged", "Verdict", "check_laws"]
 
@@ -42,7 +43,8 @@ class Balance:
         finite = np.isfinite([self.residual, self.force, self.tolerance]).all()
         return bool(finite and self.residual <= times * self.tolerance)
 
-    def _excess(self) -> float:
+    def excess(self) -> float:
+        """Residual over tolerance; infinite where something is not finite."""
         if not self.holds(np.inf):
             return np.inf
         return self.residual / self.tolerance if self.residual > 0 else 0.0
@@ -122,7 +124,7 @@ class Verdict:
 
     @staticmethod
     def _worst(balances: dict[str, Balance]) -> Balance:
-        return max(balances.values(), key=Balance._excess)
+        return max(balances.values(), key=Balance.excess)
 
     @property
     def failures(self) -> list[str]:
@@ -197,80 +199,82 @@ def check_laws(contact: Contact) -> dict[str, float]:
         (eq. 6-11: r_n ≤ 0, δ± ≥ 0, δ₊δ₋ = 0, r_n δ₊ = 0, s - u_n = δ₊ - δ₋, r_n = -k_n δ₋;
         with multipliers r_n = -k_n (u_n - s) - λ_n where that is < 0; of a law with its own
         `normal_potential` r_n is minus the derivative of it by u_n instead), or
-        where the law bears tension "stiffness" (r_n = -k_n (u_n - s)). With friction, by the law's
-        yield functions g_j: "cone" (g_j ≤ 0), "slip" (eq. 44: Δβ ≥ 0, the change of the traction
-        is that of adherence and associated slip, Δτ = -K_t (Δu_t + Σ Δβ_j ∂g_j/∂τ)) and
-        "dissipation" (Δβ_j g_j = 0, slip against τ). With tangential tractions but no friction
+        where the law bears tension "stiffness" (r_n = -k_n (u_n - s)). With friction "limit" (it is
+        what the law tells of the pressure) and, by the law's yield functions g_j, "cone" (g_j ≤ 0),
+        "slip" (eq. 44: Δβ ≥ 0, the change of the traction is that of adherence and associated slip,
+        Δτ = -K_t (Δu_t + Σ Δβ_j ∂g_j/∂τ)) and "dissipation" (Δβ_j g_j = 0, slip against τ). With
+        tangential tractions but no friction
         "stiffness" holds τ = -K_t u_t too, or τ = 0 where open. NaN where something is not finite.
     """
     comm = contact.surface.mesh.comm
     # Points without an opposite bear nothing, whatever they do.
     law, paired, v = contact.law, contact.paired, contact.values
     if not paired.all():
-        v = {name: values[paired] for name, values in v.items()}
+        v = v.at(paired)
 
-    def worst(*violations: np.ndarray) -> float:
+    def worst(*violations: Array) -> float:
         return max(global_max(comm, np.abs(x)) for x in violations)
 
-    def relative(value: float, *scales: np.ndarray) -> float:
+    def relative(value: float, *scales: Array) -> float:
         scale = worst(*scales)
         return value / scale if scale > 0 or not np.isfinite(scale) else value
 
-    opening, penetration, r_n = v["opening"], v["penetration"], v["normal_traction"]
-    length = (opening, penetration, v["gap"], v["normal_displacement"])
+    opening, penetration, r_n = v.opening, v.penetration, v.normal_traction
+    length = (opening, penetration, v.initial_gap, v.normal_displacement)
     violations = [
         relative(
             worst(
                 np.minimum(opening, 0),
                 np.minimum(penetration, 0),
                 np.minimum(opening, penetration),
-                v["gap"] - v["normal_displacement"] - opening + penetration,
+                v.initial_gap - v.normal_displacement - opening + penetration,
             ),
             *length,
         )
     ]
     if law.has_own_normal:
         k = np.where(r_n != 0, contact.normal_stiffness, 0.0)
-        parts = (k * v["normal_displacement"], k * v["gap"])  # whose round-off is in r_n
+        parts = (k * v.normal_displacement, k * v.initial_gap)  # whose round-off is in r_n
         pull = np.maximum(r_n, 0) if not law.has_tension else np.zeros_like(r_n)
-        violations.append(relative(worst(pull, r_n - v["normal_reaction"]), r_n, *parts))
+        violations.append(relative(worst(pull, r_n - v.normal_reaction), r_n, *parts))
     elif law.has_tension:
-        k_n = v["parameter k_n"]
-        elastic = k_n * (v["normal_displacement"] - v["gap"])
-        parts = (k_n * v["normal_displacement"], k_n * v["gap"])  # whose round-off is in r_n
+        k_n = v.parameters["k_n"]
+        elastic = k_n * (v.normal_displacement - v.initial_gap)
+        parts = (k_n * v.normal_displacement, k_n * v.initial_gap)  # whose round-off is in r_n
         violations.append(relative(worst(r_n + elastic), r_n, *parts))
     elif law.has_normal_stiffness and contact.multipliers is not None:
-        slack = -r_n - v["multiplier"] - v["parameter k_n"] * (penetration - opening)
-        violations.append(relative(worst(np.minimum(-r_n, slack)), r_n, v["multiplier"]))
+        slack = -r_n - v.multiplier - v.parameters["k_n"] * (penetration - opening)
+        violations.append(relative(worst(np.minimum(-r_n, slack)), r_n, v.multiplier))
     elif law.has_normal_stiffness:
-        elastic = v["parameter k_n"] * penetration
+        elastic = v.parameters["k_n"] * penetration
         violations.append(relative(worst(np.maximum(r_n, 0), r_n + elastic), r_n))
     violations.append(relative(worst(contact.traction[~paired]), contact.traction))
     found = {"stiffness" if law.has_tension else "complementarity": max(violations)}
     if not law.has_tangential:
         return found
 
-    tau, stiffness = v["traction"], contact.tangential_stiffness[paired]
+    tau, stiffness = v.traction, contact.tangential_stiffness[paired]
     if not law.has_friction:
         elastic = np.einsum("qij,qj->qi", stiffness, contact.tangential_displacement[paired])
         if not law.has_tension:
             elastic[penetration <= 0] = 0.0
         # Round-off in u_t is that of the displacement it is a part of.
-        whole = np.abs(stiffness).max(axis=(1, 2))[:, None] * v["jump"]
+        whole = np.abs(stiffness).max(axis=(1, 2))[:, None] * v.jump
         violation = relative(worst(tau + elastic), tau, whole)
         found["stiffness"] = max(found.get("stiffness", 0.0), violation)
         return found
 
-    limit, beta = v["limit"], v["slip_increment"]
+    limit, beta = v.limit, v.slip_increment
     functions, gradients = (rows[paired] for rows in contact.evaluate_yield())
     missing = contact.slip_vector()[paired]  # = -Σ Δβ_j ∂g_j/∂τ (44)
-    change = missing - v["increment"]
+    change = missing - v.increment
     # An open point keeps no traction and counts no slip, whatever it moves.
     bears = limit > 0
     slipped = -np.einsum("qm,qmd->qd", beta, gradients)
     # Round-off in the increments is that of the displacements they are differences of.
-    travel = (v["jump"], v["increment"], change)
+    travel = (v.jump, v.increment, change)
     found["cone"] = relative(worst(np.maximum(functions, 0)), limit)
+    found["limit"] = relative(worst(limit - v.limit_told), limit)
     found["slip"] = relative(worst(np.minimum(beta, 0), (missing - slipped)[bears]), *travel)
     found["dissipation"] = relative(
         worst((beta * functions)[bears], np.maximum(np.sum(tau * missing, axis=1) * bears, 0)),

@@ -18,21 +18,21 @@ falls with the mesh as the rest of the error does.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
+from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law
 from fenics_contact.parallel import global_max
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import SurfaceQuadrature
+from fenics_contact.types import Array
 
 __all__ = ["Multipliers", "TraceProjection"]
 
-Array = npt.NDArray[np.float64]
 
 # Of the projection of tractions, relative.
 _ROUND_OFF = 1e-12
@@ -106,16 +106,16 @@ class Multipliers:
         self.fields = PointFields(quadrature, {"pressure": 0} | friction)
         self._project = TraceProjection(quadrature, degree)
 
-    def _next(self, values: Mapping[str, Array]) -> dict[str, Array]:
+    def _next(self, values: PointValues) -> dict[str, Array]:
         """The multipliers that the tractions of an evaluated contact make."""
-        found: dict[str, Array] = {"pressure": np.zeros(len(values["normal_traction"]))}
+        found: dict[str, Array] = {"pressure": np.zeros(len(values.normal_traction))}
         if self._law.has_normal_stiffness:
-            found["pressure"] = self._project(-values["normal_traction"])
+            found["pressure"] = self._project(-values.normal_traction)
         if self._law.has_friction:
-            found["traction"] = self._project(values["traction"])
+            found["traction"] = self._project(values.traction)
         return found
 
-    def error(self, values: Mapping[str, Array], history: PointFields) -> float:
+    def error(self, values: PointValues, history: PointFields) -> float:
         """Largest change that `update` would make, see `Contact.enforcement_error`. Collective."""
         found = self._next(values)
         names = [n for n in ("normal_traction", "traction") if n in history]
@@ -125,22 +125,22 @@ class Multipliers:
 
         change = largest(lambda n: found[n] - self.fields.values(n), found)
         # By the tractions of this increment: those before it leave round-off and no more.
-        scale = largest(lambda n: values[n], names)
+        scale = largest(lambda n: values.arrays[n], names)
         before = largest(history.values, names)
         if change <= _ROUND_OFF * max(scale, before):
             return 0.0
         # Displacements have round-off however little is borne, and springs make a traction of it.
-        moved = np.linalg.norm(values["jump"], axis=1)
-        for name in sorted({"parameter k_n", "parameter k_t"} & set(values)):
-            if change <= _BLUR * global_max(self._comm, values[name] * moved):
+        moved = np.linalg.norm(values.jump, axis=1)
+        for name in sorted({"k_n", "k_t"} & set(values.parameters)):
+            if change <= _BLUR * global_max(self._comm, values.parameters[name] * moved):
                 return 0.0
         return change / scale if scale > 0 else np.inf
 
-    def update(self, values: Mapping[str, Array]) -> None:
+    def update(self, values: PointValues) -> None:
         """Make the tractions of an evaluated contact the multipliers. Collective."""
         self.fields.commit(self._next(values))
 
-    def committed(self, values: Mapping[str, Array]) -> dict[str, Array]:
+    def committed(self, values: PointValues) -> dict[str, Array]:
         """What of the state of an evaluated contact becomes history, by name.
 
         The next increment counts Δu_t from where its return map, which starts from λ_t, gives the
@@ -150,7 +150,7 @@ class Multipliers:
         found = {"multiplier": self.fields.values("pressure")}
         if self._law.has_friction:
             found["traction"] = self.fields.values("traction")
-            found["jump"] = values["jump"] - values["elastic_slip"]
+            found["jump"] = values.jump - values.elastic_slip
         return found
 
     def restore(self, history: PointFields) -> None:

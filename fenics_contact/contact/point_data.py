@@ -9,17 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-import numpy as np
-import numpy.typing as npt
 import ufl
 
 from fenics_contact.surface.dependence import Dependence
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
+from fenics_contact.types import Array
 
 __all__ = ["PointData"]
-
-Array = npt.NDArray[np.float64]
 
 
 class PointData:

@@ -19,10 +19,10 @@ from fenics_contact import compat
 from fenics_contact.estimates.errors import ErrorBudget, estimate_errors
 from fenics_contact.parallel import gather_rows
 from fenics_contact.problem import ContactProblem
+from fenics_contact.types import Array
 
 __all__ = ["Level", "adapt"]
 
-Array = npt.NDArray[np.float64]
 _SIMPLICES = (dolfinx.mesh.CellType.triangle, dolfinx.mesh.CellType.tetrahedron)
 
 

@@ -14,21 +14,21 @@ from typing import Any
 
 import dolfinx.fem.petsc
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem, la
 from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.checks.kinematics import Deviation, LinearSprings
-from fenics_contact.contact.contact import Contact, Status
+from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.problem import ContactProblem
 from fenics_contact.surface.surface import PointEvaluator
+from fenics_contact.types import Array
 
 __all__ = ["ErrorBudget", "estimate_errors", "quantities"]
 
-Array = npt.NDArray[np.float64]
 
 DISPLACEMENT = "displacement"
 # What to change where a part dominates.
@@ -278,7 +278,7 @@ def _differences(
     comm = problem.u.function_space.mesh.comm
     after: dict[str, float] = {}
     for contact, change in zip(problem.contacts, changes, strict=True):
-        normal, measure = contact.values["normal"], contact.measure
+        normal, measure = contact.values.normal, contact.measure
         along = np.sum(change * normal, axis=1)
         pressure, side = contact.pressure - along, change - along[:, None] * normal
         friction = np.linalg.norm(contact.tangential_traction + side, axis=1)
@@ -293,10 +293,9 @@ def _differences(
 
 def _limit(contact: Contact, pressure: Array) -> Array:
     """Largest friction at the points under another pressure (stress)."""
-    limit, present = contact.values["limit"], contact.pressure
-    if contact.law.has_potential:
-        return limit  # given
-    return limit * np.clip(pressure, 0, None) / np.where(present > 0, present, 1.0)
+    values = contact.values
+    changed = values.limit + values.limit_slope * (pressure - contact.pressure)
+    return np.where(contact.status == Status.OPEN, values.limit, np.maximum(changed, 0.0))
 
 
 # ---- discretisation ------------------------------------------------------------------------------
@@ -348,12 +347,12 @@ def _discretisation(
     driven = 1.0 - loaded
     found: dict[str, float] = {}
     for contact in contacts:
-        d, values_at = mesh.geometry.dim, contact.values
+        d, normals = mesh.geometry.dim, contact.values.normal
         plane = ufl.as_tensor([[smooth.stress[i, j] for j in range(d)] for i in range(d)])
         outward = ufl.dot(plane, ufl.FacetNormal(mesh))
         traction = PointEvaluator(contact.quadrature, {"traction": outward})()["traction"]
-        normal = np.sum(traction * values_at["normal"], axis=1)
-        side = np.linalg.norm(traction - normal[:, None] * values_at["normal"], axis=1)
+        normal = np.sum(traction * normals, axis=1)
+        side = np.linalg.norm(traction - normal[:, None] * normals, axis=1)
         closed = contact.status != Status.OPEN
         measure = contact.measure * closed
         smooth_normal, smooth_friction = global_sum(mesh.comm, [-measure @ normal, measure @ side])

@@ -23,7 +23,6 @@ from typing import Any
 
 import dolfinx
 import numpy as np
-import numpy.typing as npt
 import scipy.spatial
 from dolfinx import fem, la
 from mpi4py import MPI
@@ -35,13 +34,13 @@ from fenics_contact.problem import ContactProblem
 from fenics_contact.results import files
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.facets import facet_cells
+from fenics_contact.types import Array
 
 __all__ = ["check_fields", "exists", "load", "save"]
 
-Array = npt.NDArray[np.float64]
 logger = logging.getLogger("fenics_contact")
 
-_FORMAT = 2
+_FORMAT = 3
 # The file's end: these words, and the digest of all before them.
 _MARK = b"\nfenics_contact checkpoint, sha256 "
 # Distance, relative to the mesh, within which a place is found again: computed on other ranks its
@@ -50,7 +49,7 @@ _SAME = 1e-9
 # Relative difference up to which data are the same, and, of lengths, relative to the mesh: the gap
 # to a support is a difference of coordinates.
 _EQUAL, _ROUND_OFF = 1e-9, 1e-11
-_LENGTHS = ("gap", "shift")
+_LENGTHS = ("initial_gap", "shift")
 _REMEDY = "remove it to start anew"
 
 
@@ -131,7 +130,7 @@ def save(
     scene: dict[str, Any] = {"format": _FORMAT, "notes": notes, "contacts": {}}
     scene["fixed"], scene["data"] = _fixed(problem, fields), _data(problem)
     for contact in problem.contacts:
-        given, values = contact.given(), dict(contact.values)
+        given, values = contact.given(), dict(contact.values.arrays)
         scene["contacts"][contact.name] = _layout(given), _layout(values)
         places = _point_places(contact)
         arrays[f"contact {contact.name}"] = _gather(comm, places, contact.history.rows(), given)

@@ -15,15 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import ufl
 
 from fenics_contact.laws.return_maps import positive_part
+from fenics_contact.types import Expr
 
 __all__ = ["Kinematics", "Law", "Response", "signorini", "signorini_potential"]
-
-Expr: TypeAlias = ufl.core.expr.Expr
 
 
 @dataclass(frozen=True)
@@ -191,6 +190,13 @@ class Law:
 
     def grip(self, parameters: Mapping[str, Expr]) -> Expr:
         """Bound of |τ|/p over all directions; not zero wherever motion along Γc is resisted."""
+        return ufl.as_ufl(0.0)
+
+    def limit(self, pressure: Expr, parameters: Mapping[str, Expr]) -> Expr:
+        """Limit of friction under a contact pressure (stress): the `Response.limit` there.
+
+        Its derivative by the pressure is what friction follows the pressure by.
+        """
         return ufl.as_ufl(0.0)
 
     def tangential_stiffness(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:

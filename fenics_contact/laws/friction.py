@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from numbers import Integral
-from typing import Any, TypeAlias
+from typing import Any
 
 import ufl
 
@@ -18,10 +18,9 @@ from fenics_contact.laws.return_maps import (
     return_to_segment,
 )
 from fenics_contact.laws.stiffness import Scaled
+from fenics_contact.types import Expr
 
 __all__ = ["Coulomb", "FrictionLaw", "Tresca", "perpendicular"]
-
-Expr: TypeAlias = ufl.core.expr.Expr
 
 
 class FrictionLaw(Law):
@@ -110,6 +109,10 @@ class FrictionLaw(Law):
         if self.transverse_friction is not None:
             bound = ufl.max_value(bound, parameters["transverse_friction"])
         return bound if self.modes is None else bound / math.cos(math.pi / self.modes)
+
+    def limit(self, pressure: Expr, parameters: Mapping[str, Expr]) -> Expr:
+        """See `Law.limit`: μ p."""
+        return parameters["friction"] * pressure
 
     def _frame(self, normal: Expr, parameters: Mapping[str, Expr]) -> tuple[Expr, Expr]:
         """Orthonormal vectors of the tangent plane, the first along the direction.
@@ -209,7 +212,7 @@ class FrictionLaw(Law):
 
 
 class _AtPressure(FrictionLaw):
-    """Another law, but for the limit of its friction, which is μ times a given "pressure"."""
+    """Another law, but for the limit of its friction, which is that under a given "pressure"."""
 
     def __init__(self, law: FrictionLaw) -> None:
         self._law, self.friction, self.k_t = law, law.friction, law.k_t
@@ -223,14 +226,14 @@ class _AtPressure(FrictionLaw):
 
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """See `Law.response`."""
-        limit = parameters["friction"] * parameters["pressure"]
+        limit = self._law.limit(parameters["pressure"], parameters)
         traction, slip = self.slide(kinematics, limit, parameters)
         found = self._law.response(kinematics, parameters)
         return replace(found, traction=traction, limit=limit, slip=slip)
 
     def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
         """See `Law.potential`."""
-        limit = parameters["friction"] * parameters["pressure"]
+        limit = self._law.limit(parameters["pressure"], parameters)
         normal = self._law.normal_potential(kinematics, parameters)
         return normal + self.sliding_potential(kinematics, limit, parameters)
 
@@ -268,7 +271,7 @@ class Coulomb(FrictionLaw):
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """See `Law.response`. Where the gap is open τ = 0, and moving is not slipping."""
         r_n, opening, penetration = signorini(kinematics, parameters["k_n"])
-        limit = -parameters["friction"] * r_n
+        limit = self.limit(-r_n, parameters)
         traction, slip = self.slide(kinematics, limit, parameters)
         closed = ufl.lt(r_n, 0)
         slip = tuple(ufl.conditional(closed, mode, 0) for mode in slip)
@@ -314,9 +317,13 @@ class Tresca(FrictionLaw):
         without = {"unilateral"} if self.unilateral else {"unilateral", "k_n"}
         return {n: v for n, v in super().parameters().items() if n not in without}
 
+    def limit(self, pressure: Expr, parameters: Mapping[str, Expr]) -> Expr:
+        """See `Law.limit`: μ times the pressure that is prescribed, whatever the other is."""
+        return parameters["friction"] * parameters["pressure"]
+
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """See `Law.response`."""
-        limit = parameters["friction"] * parameters["pressure"]
+        limit = self.limit(parameters["pressure"], parameters)
         traction, slip = self.slide(kinematics, limit, parameters)
         k_n = parameters["k_n"] if self.unilateral else ufl.as_ufl(0)
         r_n, opening, penetration = signorini(kinematics, k_n)
@@ -326,7 +333,7 @@ class Tresca(FrictionLaw):
 
     def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
         """Eq. (19) and (43)."""
-        limit = parameters["friction"] * parameters["pressure"]
+        limit = self.limit(parameters["pressure"], parameters)
         tangential = self.sliding_potential(kinematics, limit, parameters)
         if not self.unilateral:
             return tangential + parameters["pressure"] * kinematics.normal_displacement

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
 
 import ufl
+
+from fenics_contact.types import Expr
 
 __all__ = [
     "clip",
@@ -15,8 +16,6 @@ __all__ = [
     "return_to_polygon",
     "return_to_segment",
 ]
-
-Expr: TypeAlias = ufl.core.expr.Expr
 
 
 def positive_part(value: Expr) -> Expr:

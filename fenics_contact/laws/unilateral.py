@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, TypeAlias
+from typing import Any
 
 import ufl
 
 from fenics_contact.laws.base import Kinematics, Law, Response, signorini, signorini_potential
 from fenics_contact.laws.stiffness import Scaled
+from fenics_contact.types import Expr
 
 __all__ = ["Foundation", "Frictionless"]
-
-Expr: TypeAlias = ufl.core.expr.Expr
 
 
 @dataclass(frozen=True)

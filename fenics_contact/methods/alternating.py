@@ -19,16 +19,15 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
 from fenics_contact.methods.callbacks import Callbacks
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.options import Defaults
+from fenics_contact.types import Array
 
 __all__ = ["OPTIONS", "Alternation"]
 
-Array = npt.NDArray[np.float64]
 logger = logging.getLogger("fenics_contact")
 
 OPTIONS = {

@@ -14,13 +14,13 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.parallel import fail_together
 from fenics_contact.systems import dense
+from fenics_contact.types import Array
 
 __all__ = ["Callbacks", "interrupts_held", "release_interrupt"]
 
@@ -75,7 +75,7 @@ class Callbacks:
         self._comm = comm
         self._error: BaseException | None = None
         # Where the residual was computed last, and it.
-        self._last: tuple[npt.NDArray[np.float64], ...] = ()
+        self._last: tuple[Array, ...] = ()
 
     def attach(
         self,

@@ -9,20 +9,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
 from fenics_contact.checks.chattering import StatusWatch
 from fenics_contact.checks.rigid_motions import RigidMotions
-from fenics_contact.contact.contact import Status
+from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.systems.balance import Norms
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.system import System
+from fenics_contact.types import Array
 
 __all__ = ["Equations"]
 
-Array = npt.NDArray[np.float64]
 
 # An open point keeps this share of its stiffness in H₀: enough that a body held by contact alone
 # stays held when its whole surface is open, too little to be felt as a wrong tangent.

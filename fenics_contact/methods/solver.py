@@ -30,10 +30,10 @@ from fenics_contact.systems.condensed import CondensedSystem, touched
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Selection
+from fenics_contact.types import Array
 
 __all__ = ["METHODS", "Settings", "Solver"]
 
-Array = npt.NDArray[np.float64]
 logger = logging.getLogger("fenics_contact")
 
 # Rounds with multipliers before it is given up.

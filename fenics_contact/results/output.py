@@ -11,7 +11,6 @@ from typing import Any
 import basix
 import dolfinx
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem, io
 from mpi4py import MPI
@@ -20,6 +19,7 @@ from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_min
 from fenics_contact.results import files
+from fenics_contact.types import Array
 
 __all__ = [
     "at_node",
@@ -31,8 +31,6 @@ __all__ = [
     "write_json",
     "write_surface",
 ]
-
-Array = npt.NDArray[np.float64]
 
 
 def surface_fields(contact: Contact) -> dict[str, fem.Function]:

@@ -8,16 +8,15 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.mesh import CellType
 
-from fenics_contact.contact.contact import Status
+from fenics_contact.contact.values import Status
 from fenics_contact.results import files
+from fenics_contact.types import Array
 
 __all__ = ["figure", "plot_deformation", "plot_tractions"]
 
-Array = npt.NDArray[np.float64]
 
 _COLOURS = {"pressure": "#1f5fa8", "tangential": "#c8502a", "mesh": "#9a9a9a"}
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
+
+from fenics_contact.types import Array
 
 __all__ = ["Dependence"]
 
@@ -26,7 +27,7 @@ class Dependence:
         # Views stay valid as long as what they are of.
         self._owners = (tuple(constants), tuple(coefficients))
         self._views = [np.ravel(c.value) for c in constants] + [f.x.array for f in coefficients]
-        self._noted: npt.NDArray[np.float64] | None = None
+        self._noted: Array | None = None
 
     @property
     def changed(self) -> bool:
@@ -41,5 +42,5 @@ class Dependence:
         """Have nothing noted: for while what depends on them is not complete."""
         self._noted = None
 
-    def _numbers(self) -> npt.NDArray[np.float64]:
+    def _numbers(self) -> Array:
         return np.concatenate(self._views) if self._views else np.zeros(0)

@@ -8,18 +8,16 @@ from typing import Any, TypeAlias
 import basix
 import dolfinx
 import numpy as np
-import numpy.typing as npt
 import scipy.spatial
 from dolfinx import fem
 
 from fenics_contact import compat
+from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["FacetSet", "tabulate"]
 
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.integer[Any]]
 # Of points, facets, places on them and signed distances: which of these hits count.
-Rule: TypeAlias = Callable[[Index, Index, Array, Array], npt.NDArray[np.bool_]]
+Rule: TypeAlias = Callable[[Index, Index, Array, Array], Mask]
 
 # Facets tried first for every point, nearest first; more only where these need not be enough.
 _NEAREST = 12
@@ -238,7 +236,7 @@ class FacetSet:
 
     def meet(
         self, facet: Index, x: Array, ray: Array, u: fem.Function | None = None
-    ) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+    ) -> tuple[Array, Array, Mask]:
         """Where rays meet given facets, by Newton's method, all at once.
 
         Returns:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
 from fenics_contact.surface.surface import SurfaceQuadrature
+from fenics_contact.types import Array
 
 __all__ = ["PointFields"]
 
@@ -54,16 +54,16 @@ class PointFields:
             return self.function[place]
         return ufl.as_vector([self.function[i] for i in range(place.start, place.stop)])
 
-    def values(self, name: str) -> npt.NDArray[np.float64]:
+    def values(self, name: str) -> Array:
         """Committed values at the owned points, (n_points,) or (n_points, d); a copy."""
         rows = self.function.x.array.reshape(-1, self._size)
         return rows[: self._n_owned, self._slices[name]].copy()
 
-    def rows(self) -> npt.NDArray[np.float64]:
+    def rows(self) -> Array:
         """All fields at the owned points, (n_points, n_components); a copy."""
         return self.function.x.array.reshape(-1, self._size)[: self._n_owned].copy()
 
-    def set_rows(self, rows: npt.NDArray[np.float64]) -> None:
+    def set_rows(self, rows: Array) -> None:
         """Put back what `rows` gave. Collective.
 
         Raises:
@@ -77,7 +77,7 @@ class PointFields:
         array[: self._n_owned] = rows
         self.function.x.scatter_forward()
 
-    def commit(self, values: Mapping[str, npt.NDArray[np.float64]]) -> None:
+    def commit(self, values: Mapping[str, Array]) -> None:
         """Replace every field by its values at the owned points. Collective.
 
         Raises:

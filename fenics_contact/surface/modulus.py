@@ -16,6 +16,7 @@ from fenics_contact import compat
 from fenics_contact.parallel import global_min
 from fenics_contact.surface.facets import facet_cells
 from fenics_contact.surface.surface import ContactSurface
+from fenics_contact.types import Array
 
 __all__ = ["cell_modulus", "modulus_over_height"]
 
@@ -110,7 +111,7 @@ def modulus_over_height(surface: ContactSurface, modulus: fem.Function) -> fem.F
     return result
 
 
-def _sizes(mesh: dolfinx.mesh.Mesh, cells: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.float64]:
+def _sizes(mesh: dolfinx.mesh.Mesh, cells: npt.NDArray[np.integer[Any]]) -> Array:
     """Area or volume of cells, that of their midpoints' Jacobian: exact for straight simplices."""
     kind = basix.CellType[mesh.topology.cell_name()]
     middle = basix.geometry(kind).mean(axis=0, keepdims=True)
@@ -146,7 +147,7 @@ def _smooth(values: fem.Function, length: fem.Function) -> fem.Function:
     return result
 
 
-def _assemble(form: fem.Form) -> np.ndarray:
+def _assemble(form: fem.Form) -> Array:
     """Assembled linear form, ghosts included. Collective."""
     vector = fem.assemble_vector(form)
     vector.scatter_reverse(la.InsertMode.add)

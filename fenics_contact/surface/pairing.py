@@ -21,7 +21,6 @@ from typing import Any
 import dolfinx
 import dolfinx.geometry
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse
 import scipy.spatial
 from dolfinx import fem
@@ -40,10 +39,10 @@ from fenics_contact.surface.projection import (
     polynomials,
 )
 from fenics_contact.surface.surface import SurfaceQuadrature, tagged_facets
+from fenics_contact.types import Array
 
 __all__ = ["REASONS", "LookBack", "Pairing"]
 
-Array = npt.NDArray[np.float64]
 
 # Of the height of a cell: how far behind its facet another one of its own body may lie (initial
 # interference of a body with itself), and one whose cell shares a node with it (the lips of a
@@ -205,6 +204,8 @@ class Pairing:
     """The surface opposite Γc, ready to be paired with the points of Γc.
 
     Attributes:
+        facets: This rank's facets of it.
+        surface: Γc.
         round_off: Distances no larger than this are differences of coordinates and nothing else.
     """
 
@@ -225,7 +226,7 @@ class Pairing:
         self._here = FacetSet(space, quadrature.surface.facets)
         _, body = connected_bodies(space)
         self._sides = _Side(self._here, body), _Side(self._there, body)
-        self._body, self._facets = body, facets
+        self._body, self.facets, self.surface = body, facets, quadrature.surface
         # Facet of Γc of every owned point: the points of a facet are the dofs of a submesh cell.
         rows = quadrature.point_rows()
         self._facet = np.empty(quadrature.n_points, dtype=np.int64)
@@ -316,7 +317,7 @@ class Pairing:
         hit = found.facet[kept]
         return LookBack(
             x[kept],
-            self._facets[facet[kept]],
+            self.facets[facet[kept]],
             hit,
             np.einsum("qd,qd->q", found.place - x, ray)[kept],
             self._slack(here)[hit] + self._slack(there)[there.first + facet[kept]],
@@ -362,7 +363,7 @@ class Pairing:
 
     def facets_among(self, other: Pairing) -> Any:
         """Which of all facets of Γc are of the opposite surface of another contact. Collective."""
-        mine = np.isin(self._quadrature.surface.facets, other._facets)
+        mine = np.isin(self._quadrature.surface.facets, other.facets)
         return np.concatenate(self._comm.allgather(mine))
 
     def largest(self, values: Array) -> Array:

@@ -10,9 +10,10 @@ import numpy.typing as npt
 import scipy.sparse
 import scipy.spatial
 
+from fenics_contact.types import Array
+
 __all__ = ["cut_lines", "cut_polygons", "facing_pairs", "polynomials"]
 
-Array = npt.NDArray[np.float64]
 
 # Pieces of a facet smaller than this, relative to it, are left out; a facet is covered if what is
 # left out is no more.

@@ -17,6 +17,7 @@ from petsc4py import PETSc
 from fenics_contact import compat
 from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.parallel import collective_errors, gather_rows, global_min
+from fenics_contact.types import Array
 
 __all__ = ["ContactSurface", "PointEvaluator", "SurfaceQuadrature", "VertexAreas"]
 
@@ -169,6 +170,7 @@ class SurfaceQuadrature:
         n_points: Quadrature points that this rank owns.
         weights: Weight times surface Jacobian of the owned points, shape (n_points,), in
             length^(gdim-1).
+        weights_with_ghosts: Those of all points that this rank knows.
     """
 
     def __init__(self, surface: ContactSurface, degree: int, scheme: str) -> None:
@@ -181,18 +183,18 @@ class SurfaceQuadrature:
         self._cell = surface.submesh.topology.cell_name()
         self._points_and_weights = _vertex_rule(self._cell) if scheme == "vertex" else None
         space = self.space()
-        self._weights_with_ghosts = self._weigh(self.ds)
+        self.weights_with_ghosts = self._weigh(self.ds)
         self.n_points = space.dofmap.index_map.size_local
-        self.weights = self._weights_with_ghosts[: self.n_points]
+        self.weights = self.weights_with_ghosts[: self.n_points]
 
-    def _weigh(self, measure: ufl.Measure) -> npt.NDArray[np.float64]:
+    def _weigh(self, measure: ufl.Measure) -> Array:
         """Weight times Jacobian of all points that this rank knows. Collective."""
         space = self.space()
         form = compat.compile_form(ufl.TestFunction(space) * measure, self.surface.entity_maps)
         return _assemble(form, la.vector(space.dofmap.index_map, 1))
 
     @cached_property
-    def _on_submesh(self) -> tuple[ufl.Measure, npt.NDArray[np.float64]]:
+    def on_submesh(self) -> tuple[ufl.Measure, Array]:
         """The measure of Γc as a mesh of its own, and `_weigh` by it. Collective."""
         measure = ufl.Measure("dx", self.surface.submesh, metadata=self.ds.metadata())
         return measure, self._weigh(measure)
@@ -342,16 +344,16 @@ class PointEvaluator:
         self._size = len(components)
         space = quadrature.space(self._size)
         test = ufl.TestFunction(space)
-        measure, self._weights = quadrature.ds, quadrature._weights_with_ghosts
+        measure, self._weights = quadrature.ds, quadrature.weights_with_ghosts
         if by_points:
-            measure, self._weights = quadrature._on_submesh
+            measure, self._weights = quadrature.on_submesh
         self.form = ufl.inner(ufl.as_vector(components), test) * measure
         maps = None if by_points else quadrature.surface.entity_maps
         self._compiled = compat.compile_form(self.form, maps)
         self._vector = la.vector(space.dofmap.index_map, self._size)
         self._n_owned = quadrature.n_points
 
-    def __call__(self) -> dict[str, npt.NDArray[np.float64]]:
+    def __call__(self) -> dict[str, Array]:
         """The values at the owned points by name, shape (n_points,) or (n_points, d). Collective.
 
         The arrays are copies.
@@ -362,7 +364,7 @@ class PointEvaluator:
         return {name: values[: self._n_owned, c].copy() for name, c in self._columns.items()}
 
 
-def _assemble(form: fem.Form, vector: la.Vector) -> npt.NDArray[np.float64]:
+def _assemble(form: fem.Form, vector: la.Vector) -> Array:
     """Assemble into ``vector``, ghosts consistent. Collective."""
     vector.array[:] = 0.0
     with collective_errors(form.mesh.comm):
@@ -372,7 +374,7 @@ def _assemble(form: fem.Form, vector: la.Vector) -> npt.NDArray[np.float64]:
     return vector.array
 
 
-def _vertex_rule(cell: str) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _vertex_rule(cell: str) -> tuple[Array, Array]:
     """Points and weights of the rule "vertex" as the form compiler has it."""
     points = basix.geometry(basix.CellType[cell])
     volume = {"interval": 1.0, "triangle": 0.5, "quadrilateral": 1.0}[cell]

@@ -14,10 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from fenics_contact.types import Array, Mask
+
 __all__ = ["Norms", "Parts", "by_body"]
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
+Labels = npt.NDArray[np.intp]
 
 # Sums of squares from here on, and up to one over it, have lost none of their terms.
 _SMALL = 1e-200
@@ -78,7 +79,7 @@ class Parts:
     def __init__(
         self,
         comm: MPI.Comm,
-        label: Indices,
+        label: Labels,
         bodies: Sequence[str],
         contacts: Sequence[str],
         touched: Sequence[npt.NDArray[np.int32]],
@@ -96,7 +97,7 @@ class Parts:
         """
         self._comm, self.label, self._touched = comm, label, touched
         self.n_bodies = len(bodies)
-        self._bodies: Indices | int = label if len(bodies) > 1 else 0
+        self._bodies: Labels | int = label if len(bodies) > 1 else 0
         self.names = [*bodies, *contacts]
         self._motions = list(motions)
         meets = np.zeros((len(contacts), self.n_bodies), dtype=np.bool_)
@@ -111,7 +112,7 @@ class Parts:
         contacts: Sequence[Array],
         load: Array,
         product: Array,
-        constrained: npt.NDArray[np.bool_],
+        constrained: Mask,
         outside: Array,
         start: Array,
     ) -> Norms:
@@ -152,7 +153,7 @@ class Parts:
         return Norms(np.append(left, own), np.append(force, push), np.append(floor, floors), n)
 
 
-def by_body(comm: MPI.Comm, vectors: Sequence[Array], label: Indices, n_bodies: int) -> Array:
+def by_body(comm: MPI.Comm, vectors: Sequence[Array], label: Labels, n_bodies: int) -> Array:
     """Norms of vectors over this rank's unknowns, (n_vectors, n_bodies). Collective.
 
     Args:
@@ -172,7 +173,7 @@ def _root(values: Array) -> float:
     return largest * float(np.sqrt(np.sum((values / largest) ** 2)))
 
 
-def _norms(comm: MPI.Comm, rows: Sequence[tuple[Array, Indices | int]], n: int) -> Array:
+def _norms(comm: MPI.Comm, rows: Sequence[tuple[Array, Labels | int]], n: int) -> Array:
     """Norms of vectors by label, one for all or of each entry, (n_vectors, n). Collective.
 
     Squares neither overflow nor vanish.

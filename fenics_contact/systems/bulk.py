@@ -7,7 +7,6 @@ from contextlib import contextmanager
 
 import dolfinx.fem.petsc
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from petsc4py import PETSc
@@ -15,10 +14,9 @@ from petsc4py import PETSc
 from fenics_contact import compat
 from fenics_contact.parallel import collective_errors, global_max
 from fenics_contact.surface.dependence import Dependence
+from fenics_contact.types import Array
 
 __all__ = ["Bulk"]
-
-Array = npt.NDArray[np.float64]
 
 
 class Bulk:

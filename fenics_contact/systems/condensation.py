@@ -8,17 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import petsc4py
 from petsc4py import PETSc
 
 from fenics_contact import compat
+from fenics_contact.types import Array, Indices, Mask
 
 __all__ = ["Condensation", "Response"]
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int32]
-Mask = npt.NDArray[np.bool_]
 
 # Directions of loads whose particular solutions are kept, and the remainder, relative to the load,
 # below which a load is a combination of them.

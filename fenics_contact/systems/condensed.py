@@ -13,7 +13,6 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
 from fenics_contact.systems.condensation import Condensation
@@ -23,11 +22,10 @@ from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Selection, Unknowns
+from fenics_contact.types import Array, Indices
 
 __all__ = ["CondensedSystem", "touched", "worthwhile"]
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int32]
 logger = logging.getLogger("fenics_contact")
 
 # Dense matrices of this many unknowns take 200 MB each, and there are five or so.

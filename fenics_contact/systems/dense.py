@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg
 import scipy.spatial
 from petsc4py import PETSc
 
+from fenics_contact.types import Array, Index
+
 __all__ = ["PartlyFactored", "Sum", "raise_kept"]
 
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.integer[Any]]
-Mask = npt.NDArray[np.bool_]
 
 # So many more unknowns than C acts on, the nearest ones, are factored with it, that a contact has
 # room to grow.
@@ -97,6 +94,13 @@ class PartlyFactored:
         self._fixed = self._operator.fixed
         self._pattern = self._operator.added[:2]
         self._forget()
+
+    def raise_kept(self) -> None:
+        """Raise what this, or the operator, ran into when PETSc called it last."""
+        for part in (self, self._operator):
+            error, part.error = part.error, None
+            if error is not None:
+                raise error
 
     def _forget(self) -> None:
         self._in: Index = np.arange(len(self._places))
@@ -254,7 +258,4 @@ def raise_kept(ksp: PETSc.KSP) -> None:
     """Raise what the contexts of a solver ran into when PETSc called them last, if it has any."""
     context = ksp.getPC().getPythonContext() if ksp.getPC().getType() == "python" else None
     if isinstance(context, PartlyFactored):
-        for part in (context, context._operator):
-            error, part.error = part.error, None
-            if error is not None:
-                raise error
+        context.raise_kept()

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
@@ -15,12 +14,11 @@ from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.systems import linear
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.forces import Forces
-from fenics_contact.systems.system import Mask, System
+from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Unknowns
+from fenics_contact.types import Array, Mask
 
 __all__ = ["FullSystem"]
-
-Array = npt.NDArray[np.float64]
 
 
 class FullSystem(System):

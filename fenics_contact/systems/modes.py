@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
+
+from fenics_contact.types import Array
 
 __all__ = ["rigid_motions"]
-
-Array = npt.NDArray[np.float64]
 
 
 def rigid_motions(arm: Array, size: float) -> dict[str, Array]:

@@ -14,13 +14,13 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from fenics_contact.contact.contact import Contact, PointTangent
+from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.point_law import PointTangent
 from fenics_contact.systems.products import PointProduct
 from fenics_contact.systems.unknowns import Selection, Unknowns
+from fenics_contact.types import Array
 
 __all__ = ["ContactOperator", "contact_operators"]
-
-Array = npt.NDArray[np.float64]
 
 
 class ContactOperator:

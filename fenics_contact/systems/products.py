@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse
 from petsc4py import PETSc
 
-__all__ = ["PointProduct"]
+from fenics_contact.types import Array
 
-Array = npt.NDArray[np.float64]
+__all__ = ["PointProduct"]
 
 
 class PointProduct:

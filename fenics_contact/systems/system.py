@@ -22,11 +22,9 @@ from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.operator import ContactOperator, contact_operators
 from fenics_contact.systems.unknowns import Unknowns
+from fenics_contact.types import Array, Mask
 
 __all__ = ["System"]
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 
 class System(ABC):

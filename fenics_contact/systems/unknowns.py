@@ -11,9 +11,9 @@ import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
-__all__ = ["Unknowns"]
+from fenics_contact.types import Array
 
-Array = npt.NDArray[np.float64]
+__all__ = ["Unknowns"]
 
 
 class Unknowns:

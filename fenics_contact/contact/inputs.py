@@ -1,0 +1,257 @@
+"""What the user gives of a contact, as UFL: numbers become constants, so that they may change."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+from fenics_contact.arguments import is_number
+from fenics_contact.contact.accuracy import DEFAULT_FACTOR, Accuracy
+from fenics_contact.contact.values import PointValues
+from fenics_contact.laws.base import Law
+from fenics_contact.laws.stiffness import Scaled, Springs
+from fenics_contact.parallel import global_max, global_min
+from fenics_contact.supports.base import Motion, Support, nonzero_vector
+from fenics_contact.surface.modulus import modulus_over_height
+from fenics_contact.surface.surface import SurfaceQuadrature, VertexAreas
+from fenics_contact.types import Array
+
+__all__ = ["Inputs"]
+
+
+# A direction with no more than this share across the normal counts as parallel to it.
+_PARALLEL = 1e-6
+
+
+class Inputs:
+    """Weight, parameters of the law and displacement of the support, as UFL.
+
+    Attributes:
+        constants: Every parameter given by a number, by name; see `Contact.parameters`.
+        stiffness_factor: Factor of k_n and k_t.
+        weight: Factor of the surface measure.
+        law: Parameters of the law, by name.
+        shift: Displacement of the support; None: it has none.
+        free_motion: Components of it that are unknown, as constants by number.
+        free_shift: The same as variables, to differentiate by.
+        applied_force: The forces on these.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        quadrature: SurfaceQuadrature,
+        law: Law,
+        support: Support,
+        *,
+        weight: Any,
+        accuracy: Accuracy | None,
+    ) -> None:
+        """Take them over. Collective.
+
+        Args:
+            name: Of the contact, in messages.
+            quadrature: The points.
+            law: Whose parameters are wanted.
+            support: Whose displacement is.
+            weight: Factor of the surface measure; None: 1.
+            accuracy: Says the stiffness where the user does not.
+
+        Raises:
+            ValueError: A number is out of range, or a shape is wrong.
+            TypeError: Something is neither number nor UFL.
+        """
+        self._name, self._law, self._quadrature = name, law, quadrature
+        self._surface, self._accuracy = quadrature.surface, accuracy
+        self._gdim = self._surface.mesh.geometry.dim
+        self._scale: fem.Function | None = None  # E/h, if a stiffness is Scaled
+        self._scale_known = False
+        self._tributary: VertexAreas | None = None  # if a stiffness is that of Springs
+        self.constants: dict[str, fem.Constant] = {}
+        self.weight = self.scalar("weight", 1.0 if weight is None else weight)
+        self.law = {n: self._parameter(n, v) for n, v in law.parameters().items()}
+        self.stiffness_factor = fem.Constant(self._surface.mesh, 1.0)
+        for n in {"k_n", "k_t"} & set(self.law):
+            self.law[n] = self.stiffness_factor * self.law[n]
+        self.free_motion: dict[int, fem.Constant] = {}
+        self.free_shift: dict[int, ufl.core.expr.Expr] = {}
+        self.applied_force: dict[int, Any] = {}
+        self.shift = self._displacement(support.displacement)
+
+    # ---- as UFL ----------------------------------------------------------------------------------
+
+    def scalar(self, name: str, value: Any) -> ufl.core.expr.Expr:
+        """A number, constant or UFL scalar as UFL."""
+        expression = self.to_ufl(name, value)
+        if expression.ufl_shape != ():
+            raise ValueError(
+                f"{self._name}: {name} has shape {expression.ufl_shape}; it must be a scalar"
+            )
+        return expression
+
+    def to_ufl(self, name: str, value: Any) -> ufl.core.expr.Expr:
+        """Numbers become constants of the mesh, so that their value is not compiled in."""
+        if isinstance(value, ufl.core.expr.Expr):
+            return value
+        try:
+            array = np.asarray(value)
+        except ValueError:  # a ragged list
+            array = np.asarray(None)
+        if array.dtype.kind not in "iuf":
+            raise TypeError(
+                f"{self._name}: {name} is {value!r}; give numbers, a fem.Constant, a fem.Function "
+                "or a UFL expression"
+            )
+        constant = fem.Constant(self._surface.mesh, array.astype(np.float64))
+        if name != "support":
+            self.constants[name] = constant
+        return constant
+
+    def _parameter(self, name: str, value: Any) -> ufl.core.expr.Expr:
+        if name == "direction":
+            return self.to_ufl(
+                name, nonzero_vector(f"{self._name}: direction of friction", value, self._gdim)
+            )
+        if isinstance(value, Springs):
+            if self._tributary is None:
+                self._tributary = VertexAreas(self._quadrature, self.weight, self._name)
+            return self.to_ufl(name, value.k) / self._tributary.area
+        if isinstance(value, Scaled):
+            if self._scale is None:
+                space = fem.functionspace(self._surface.submesh, ("Lagrange", 1))
+                self._scale = fem.Function(space)
+                self._scale.x.array[:] = 1.0
+            factor = self._accuracy.factor if self._accuracy else DEFAULT_FACTOR
+            return self.to_ufl(name, value.factor or factor) * self._scale
+        positive = name in self._law.positive
+        if is_number(value):
+            bad = not np.isfinite(value) or value < 0 or (positive and value == 0)
+            if bad:
+                raise ValueError(_range_error(self._name, name, float(value), positive))
+        return self.scalar(name, value)
+
+    def _displacement(self, displacement: Any) -> Any:
+        if isinstance(displacement, Motion):
+            return self._moving(displacement)
+        if displacement is None:
+            return None
+        shift = self.to_ufl("displacement", displacement)
+        if shift.ufl_shape != (self._gdim,):
+            raise ValueError(
+                f"{self._name}: displacement of the support has shape {shift.ufl_shape}; the mesh "
+                f"needs ({self._gdim},)"
+            )
+        return shift
+
+    def _moving(self, motion: Motion) -> ufl.core.expr.Expr:
+        """The displacement of a support some components of which are unknown."""
+        forces, given = motion.components(self._gdim)
+        shift: list[Any] = [None] * self._gdim
+        for i, value in given.items():
+            shift[i] = self.scalar(f"displacement {i}", value)
+        for i, value in forces.items():
+            if not (is_number(value) or (isinstance(value, fem.Constant) and not value.ufl_shape)):
+                raise TypeError(
+                    f"{self._name}: force {i} of the Motion is {value!r}; give a number or a "
+                    "scalar fem.Constant"
+                )
+            self.applied_force[i] = value
+            self.free_motion[i] = fem.Constant(self._surface.mesh, 0.0)
+            shift[i] = self.free_shift[i] = ufl.variable(self.free_motion[i])
+        return ufl.as_vector(shift)
+
+    def prescribed_shift(self) -> Any:
+        """Displacement of the support without its free components."""
+        if self.shift is None:
+            return ufl.as_vector([0.0] * self._gdim)
+        return ufl.replace(self.shift, {c: ufl.as_ufl(0.0) for c in self.free_motion.values()})
+
+    # ---- what is measured ------------------------------------------------------------------------
+
+    @property
+    def needs_modulus(self) -> bool:
+        """Whether a stiffness is `Scaled` and still waits for `set_modulus`."""
+        return self._scale is not None and not self._scale_known
+
+    def set_modulus(self, modulus: Any) -> None:
+        """See `Contact.set_modulus`."""
+        if self._scale is None:
+            return
+        if not isinstance(modulus, fem.Function):
+            if not (is_number(modulus) and np.isfinite(modulus) and modulus > 0):
+                raise ValueError(
+                    f"{self._name}: modulus is {modulus!r}; it must be a positive number, or a "
+                    "fem.Function with one value per cell"
+                )
+            value = float(modulus)
+            modulus = fem.Function(fem.functionspace(self._surface.mesh, ("DG", 0)))
+            modulus.x.array[:] = value
+        scale = modulus_over_height(self._surface, modulus)
+        self._scale.x.array[:] = scale.x.array
+        self._scale_known = True
+
+    def update(self) -> None:
+        """Measure again what depends on data that may have changed. Collective."""
+        if self._tributary is not None:
+            self._tributary.update()
+
+    # ---- checks ----------------------------------------------------------------------------------
+
+    def check(self, values: PointValues) -> None:
+        """Refuse what is out of range or not finite at some point of Γc. Collective.
+
+        Args:
+            values: Evaluated with the data as they are.
+
+        Raises:
+            ValueError: On all ranks.
+        """
+        comm, parameters = self._surface.mesh.comm, values.parameters
+        shortest = global_min(comm, values.direction_length, empty=1.0)
+        if not shortest > 0.0:
+            raise ValueError(
+                f"{self._name}: the normal of the support has length {shortest:g} at a point of "
+                "Γc; it must point from the body to the support everywhere"
+            )
+        # Only what was given: what follows from u is checked with u.
+        given = {"weight": values.weight, "gap": values.initial_gap, "normal": values.normal}
+        for name, array in {**given, **parameters}.items():
+            low, high = global_min(comm, array), global_max(comm, array)
+            if not (np.isfinite(low) and np.isfinite(high)):
+                raise ValueError(
+                    f"{self._name}: {name} is not finite at a point of Γc (values from {low:g} "
+                    f"to {high:g}); check the expression or function it was given by"
+                )
+            if name in given or name == "direction":
+                continue
+            positive = name in self._law.positive
+            if low < 0 or (low == 0 and positive):
+                raise ValueError(_range_error(self._name, name, low, positive))
+        if global_min(comm, values.weight) < 0:
+            raise ValueError(f"{self._name}: weight is negative at a point of Γc")
+        if "direction" in parameters:
+            self._check_direction(parameters, values)
+
+    def _check_direction(self, parameters: Mapping[str, Array], values: PointValues) -> None:
+        given = parameters["direction"]
+        length = np.linalg.norm(given, axis=1)
+        across = np.linalg.norm(values.tangential(given), axis=1)
+        share = across / np.where(length > 0, length, 1.0)
+        least = global_min(self._surface.mesh.comm, share, empty=1.0)
+        if not least > _PARALLEL:
+            raise ValueError(
+                f"{self._name}: direction of friction is zero or parallel to the normal at a "
+                f"point of Γc (share across the normal: {least:.1g}); it must have a part in "
+                "the tangent plane everywhere: give another direction, or a UFL vector that "
+                "follows the surface"
+            )
+
+
+def _range_error(contact: str, name: str, value: float, positive: bool) -> str:
+    wanted = "greater than zero" if positive else "zero or greater"
+    wanted += " (stress/length)" if name.startswith("k_") else ""
+    return f"{contact}: {name} is {value:g} at a point of Γc; it must be finite and {wanted}"

@@ -1,0 +1,75 @@
+"""What points of Γc feel of displacements: kinematics of small displacements.
+
+Gap and normals are those of the undeformed body. The map from displacements to what a point feels
+relative to its support is constant (`ContactOperator`), and a linear bulk stays linear. Another
+kinematics has another class with the same methods.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import ufl
+
+from fenics_contact.laws.base import Kinematics, Law
+from fenics_contact.surface.fields import PointFields
+
+__all__ = ["Seen", "SmallKinematics"]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a law sees of a point apart from displacements (UFL).
+
+    Attributes:
+        gap: Initial gap, the motion of the support included (length).
+        normal: Unit normal from body to support.
+        shift: Displacement of the support; None: it has none.
+        parameters: Of the law, by name.
+    """
+
+    gap: Any
+    normal: Any
+    shift: Any
+    parameters: Mapping[str, Any]
+
+    def relative(self, jump: Any) -> Any:
+        """Displacement of the body relative to the support (UFL)."""
+        return jump if self.shift is None else jump - self.shift
+
+
+class SmallKinematics:
+    """Displacements that change neither the normals nor the place of the support."""
+
+    def __init__(self, history: PointFields, multipliers: PointFields | None) -> None:
+        """Take the state that increments start from.
+
+        Args:
+            history: The committed state.
+            multipliers: λ_n and λ_t, which take the place of committed tractions.
+        """
+        self._history, self._multipliers = history, multipliers
+
+    def felt(self, jump: Any, law: Law, seen: Seen) -> Kinematics:
+        """What a law sees of a displacement of the body, relative to what lies opposite (UFL)."""
+        normal = seen.normal
+        total = increment = traction = multiplier = None
+        old_traction = self._history
+        if self._multipliers is not None:
+            old_traction = self._multipliers
+            multiplier = old_traction.ufl("pressure")
+
+        def tangential(vector: Any) -> Any:
+            return vector - ufl.dot(vector, normal) * normal
+
+        if law.has_tangential:
+            total = tangential(seen.relative(jump))
+        if law.has_friction:
+            # The old traction and displacement are taken along the present normal: the support
+            # may have moved on since the last commit.
+            increment = tangential(seen.relative(jump) - self._history.ufl("jump"))
+            traction = tangential(old_traction.ufl("traction"))
+        u_n = ufl.dot(jump, normal)
+        return Kinematics(seen.gap, u_n, normal, total, increment, traction, multiplier)

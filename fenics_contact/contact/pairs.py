@@ -1,0 +1,191 @@
+"""The pairs of a contact: what lies opposite each of its points now."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from dolfinx import fem
+from petsc4py import PETSc
+
+from fenics_contact.contact.values import PointValues
+from fenics_contact.parallel import gather_rows, global_max, global_sum, warn
+from fenics_contact.supports.base import Support
+from fenics_contact.supports.deformable import DeformableBody
+from fenics_contact.surface.pairing import REASONS, LookBack, Pairing
+from fenics_contact.surface.surface import SurfaceQuadrature
+from fenics_contact.types import Array, Mask
+
+__all__ = ["Pairs"]
+
+
+# Share of the approach of two bodies that is no penetration between the points yet.
+_UNSEEN = 0.01
+
+
+class Pairs:
+    """Opposites of the points, and the sparse map from displacements to jumps at the points.
+
+    On a rigid support there is nothing to find, and every point has its opposite.
+
+    Attributes:
+        own_map: From ``u`` to the displacement of the points, (n_points gdim, n_dofs).
+        jump_map: Likewise to that relative to what lies opposite; it changes with the pairs.
+        paired: Which of this rank's points have an opposite, (n_points,).
+        n_unpaired: Points without, on all ranks.
+        number: How often opposites were found.
+        distance: To the opposite, as a function at the points; None on a rigid support.
+        acts: 1 at points with an opposite, 0 at others, likewise.
+        search: The surface opposite, to search; likewise.
+        found_at: Displacement in which the present pairs were found; None: the undeformed bodies.
+    """
+
+    def __init__(
+        self, name: str, u: fem.Function, quadrature: SurfaceQuadrature, support: Support
+    ) -> None:
+        """Collect the surfaces; `find` finds the pairs. Collective."""
+        self._name, self._u, self._quadrature = name, u, quadrature
+        self._mesh = quadrature.surface.mesh
+        self._gdim = self._mesh.geometry.dim
+        self.own_map = quadrature.interpolation_matrix(u.function_space)
+        self.jump_map: PETSc.Mat = self.own_map
+        self.paired = np.ones(quadrature.n_points, dtype=np.bool_)
+        self.n_unpaired = self.number = 0
+        self.search: Pairing | None = None
+        self.distance: fem.Function | None = None
+        self.acts: fem.Function | None = None
+        self.found_at: fem.Function | None = None
+        self._looking_back: LookBack | None = None
+        if isinstance(support, DeformableBody):
+            self.search = Pairing(support, quadrature, u.function_space)
+            self.distance = fem.Function(quadrature.space(), name="distance")
+            self.acts = fem.Function(quadrature.space(), name="paired")
+
+    def find(self, x: Array, normal: Array, depth: Array, u: fem.Function | None) -> None:
+        """Find the opposites of all points; see `Contact.pair`. Collective.
+
+        Args:
+            x: Places of the points, (n_points, gdim).
+            normal: Of the undeformed Γc there.
+            depth: How deep the points are in the opposite in ``u``, (n_points,) (length).
+            u: Displacement in which to find them; None: the undeformed bodies.
+        """
+        assert self.search and self.distance and self.acts
+        comm, n = self._mesh.comm, self._quadrature.n_points
+        opposite, distance, why = self.search.pair(x, normal, u, depth)
+        self._forget_look_back()
+        self.found_at = None if u is None else u.copy()
+        self.paired = ~np.isnan(distance)
+        for function, values in (
+            (self.distance, np.nan_to_num(distance)),
+            (self.acts, self.paired),
+        ):
+            function.x.array[:n] = values
+            function.x.scatter_forward()
+        relative = self.own_map.copy()
+        mask = relative.createVecLeft()
+        mask.array[:] = np.repeat(self.paired, self._gdim)
+        relative.diagonalScale(mask, None)
+        relative.axpy(-1.0, opposite, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        opposite.destroy()
+        mask.destroy()
+        self.jump_map = relative
+        self.number += 1
+        lost = [np.count_nonzero(~self.paired & (why == reason)) for reason in REASONS]
+        *counts, total = (int(number) for number in global_sum(comm, [*lost, n]))
+        self.n_unpaired = sum(counts)
+        if 2 * self.n_unpaired > total:
+            told = [f"{k}: {text}" for k, text in zip(counts, REASONS.values(), strict=True) if k]
+            warn(
+                comm,
+                f"{self._name}: {self.n_unpaired} of the {total} points of Γc have no opposite and "
+                f"bear nothing ({'; '.join(told)}). Check the tags of Γc and of the opposite "
+                "surface, search_distance and release of the DeformableBody",
+            )
+
+    def depth(self, normal_displacement: Array) -> Array:
+        """Depth of points in the opposite, whatever gap is prescribed: (n_points,) (length)."""
+        assert self.distance is not None
+        depth = normal_displacement - self.distance.x.array[: self._quadrature.n_points]
+        return np.where(self.paired, np.maximum(depth, 0.0), 0.0)
+
+    def own_displacement(self) -> Array:
+        """Of the body that has Γc, at the points, (n_points, gdim) (length). Collective."""
+        product = self.own_map.createVecLeft()
+        self.own_map.mult(self._u.x.petsc_vec, product)
+        values = product.array_r.reshape(-1, self._gdim).copy()
+        product.destroy()
+        return values
+
+    def true_gap(self, values: PointValues) -> tuple[Array, Array]:
+        """See `Contact.true_gap`. Collective."""
+        assert self.search is not None
+        depth = self.depth(values.normal_displacement)
+        return self.search.true_gap(values.x, values.normal, self._u, depth)
+
+    def linear_gap(self, values: PointValues) -> Array:
+        """The gap between the pairs as they are, linearised where they were found. Collective."""
+        assert self.search is not None
+        return self.search.linear_gap(
+            values.x,
+            values.normal,
+            self.found_at,
+            self.depth(values.normal_displacement),
+            self._u,
+            self.own_displacement(),
+        )
+
+    def _forget_look_back(self) -> None:
+        if self._looking_back is not None:
+            self._looking_back.approach.destroy()
+        self._looking_back = None
+
+    def unseen_penetration(
+        self,
+        values: PointValues,
+        closed: Mask,
+        deepest: float,
+        others: Sequence[Pairs],
+        *,
+        gap_prescribed: bool,
+    ) -> tuple[float, Array]:
+        """See `Contact.unseen_penetration`. Collective.
+
+        Args:
+            values: At the points.
+            closed: Which of them are.
+            deepest: Penetration at the deepest point of all contacts (length).
+            others: Pairs of the other contacts.
+            gap_prescribed: Whether the gap was given apart from the geometry.
+        """
+        comm, search = self._mesh.comm, self.search
+        nowhere = 0.0, np.zeros(self._gdim)
+        if search is None:
+            return nowhere
+        if self._looking_back is None:
+            depth = global_max(comm, self.depth(values.normal_displacement))
+            self._looking_back = search.look_back(self.found_at, depth)
+        back = self._looking_back
+        product = back.approach.createVecLeft()
+        back.approach.mult(self._u.x.petsc_vec, product)
+        approach = product.array_r.copy()
+        product.destroy()
+        distance = back.distance
+        if gap_prescribed:
+            distance = search.largest(values.initial_gap)[back.facet]
+        allowed = max(deepest, _UNSEEN * global_max(comm, np.abs(approach)), search.round_off)
+        deep = approach - distance - back.slack - allowed
+        if not global_max(comm, deep, empty=-1.0) > 0:
+            return nowhere
+        for pairs in (self, *others):  # what has points of its own that look back
+            if pairs.search is not None:
+                mutual = search.facets_among(pairs.search)[back.facet]
+                own = pairs.search.surface.facets
+                deep[mutual & np.isin(back.source, own)] = -1.0
+        deep[search.facets_near(closed)[back.facet]] = -1.0
+        rows = np.column_stack([approach - distance, back.place])[deep > 0]
+        rows = gather_rows(comm, rows)
+        if not len(rows):
+            return nowhere
+        worst = rows[np.argmax(rows[:, 0])]
+        return float(worst[0]), worst[1:]

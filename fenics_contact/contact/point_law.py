@@ -1,0 +1,267 @@
+"""A law at the points of Γc: what it makes of the jump there, compiled when first asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+from fenics_contact.contact.kinematics import Seen, SmallKinematics
+from fenics_contact.laws.base import Kinematics, Law, Response
+from fenics_contact.parallel import global_max, global_min
+from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
+from fenics_contact.types import Array
+
+__all__ = ["PointLaw", "PointTangent"]
+
+
+# The size of the mesh times this is a penetration that is next to none.
+_BARELY = 1e-8
+
+
+@dataclass(frozen=True)
+class PointTangent:
+    """Derivatives of the traction at the points, (n_points, gdim, gdim) each (stress/length).
+
+    Attributes:
+        by_jump: By the displacement of the body.
+        by_shift: By that of the support; None where no component of it is free.
+    """
+
+    by_jump: Array
+    by_shift: Array | None = None
+
+
+class PointLaw:
+    """What a law makes of displacements at the points.
+
+    Attributes:
+        law: The law.
+        seen: What it sees of the points apart from displacements.
+    """
+
+    def __init__(
+        self,
+        law: Law,
+        seen: Seen,
+        kinematics: SmallKinematics,
+        quadrature: SurfaceQuadrature,
+        jump: fem.Function,
+        *,
+        acts: fem.Function | None,
+        free: Sequence[int],
+    ) -> None:
+        """Bind; nothing is compiled yet.
+
+        Args:
+            law: The law.
+            seen: What it sees of the points apart from displacements.
+            kinematics: What it sees of these.
+            quadrature: The points.
+            jump: Displacement of the body at the points, of that opposite taken away.
+            acts: 1 at points with an opposite, 0 at others; None: all have one.
+            free: Components of the support's displacement that are unknown.
+        """
+        self.law, self.seen = law, seen
+        self._kinematics, self._quadrature, self._jump = kinematics, quadrature, jump
+        self._acts, self._free = acts, list(free)
+        self._gdim = quadrature.surface.mesh.geometry.dim
+
+    def with_law(self, law: Law, parameters: Mapping[str, Any]) -> PointLaw:
+        """Another law at the same points, with parameters of its own."""
+        return PointLaw(
+            law,
+            replace(self.seen, parameters=parameters),
+            self._kinematics,
+            self._quadrature,
+            self._jump,
+            acts=self._acts,
+            free=self._free,
+        )
+
+    # ---- as UFL ----------------------------------------------------------------------------------
+
+    def _there(self, value: Any) -> Any:
+        """A value at points with an opposite, 0 at the others."""
+        return value if self._acts is None else self._acts * value
+
+    def _felt(self, jump: Any = None, seen: Seen | None = None) -> Kinematics:
+        jump = self._jump if jump is None else jump
+        return self._kinematics.felt(jump, self.law, seen or self.seen)
+
+    def _response(self, felt: Kinematics, seen: Seen | None = None) -> Response:
+        """What the law answers, nothing at points without an opposite."""
+        response = self.law.response(felt, (seen or self.seen).parameters)
+        if self._acts is None:
+            return response
+        there = self._there
+        return replace(
+            response,
+            normal_traction=there(response.normal_traction),
+            opening=there(response.opening),
+            penetration=there(response.penetration),
+            traction=None if response.traction is None else there(response.traction),
+            limit=None if response.limit is None else there(response.limit),
+            slip=tuple(there(mode) for mode in response.slip),
+        )
+
+    def traction(self, jump: Any, seen: Seen | None = None) -> Any:
+        """r_n n + τ on the body, at a displacement (UFL)."""
+        seen = seen or self.seen
+        response = self._response(self._felt(jump, seen), seen)
+        total = response.normal_traction * seen.normal
+        return total if response.traction is None else total + response.traction
+
+    def potential(self, jump: Any = None, seen: Seen | None = None) -> Any:
+        """Potential per area, at a displacement (UFL)."""
+        seen = seen or self.seen
+        return self._there(self.law.potential(self._felt(jump, seen), seen.parameters))
+
+    # ---- as numbers ------------------------------------------------------------------------------
+
+    def evaluate_traction(self) -> Array:
+        """r_n n + τ, (n_points, gdim) (stress). Collective."""
+        return self._traction()["traction"]
+
+    @cached_property
+    def _traction(self) -> PointEvaluator:
+        return self._evaluator({"traction": self.traction(self._jump)})
+
+    def evaluate_potential(self) -> Array:
+        """The potential per area, (n_points,). Collective."""
+        return self._potential()["potential"]
+
+    @cached_property
+    def _potential(self) -> PointEvaluator:
+        return self._evaluator({"potential": self.potential()})
+
+    def evaluate_tangent(self, turns: Mapping[int, tuple[Array, Array]]) -> PointTangent:
+        """Derivatives of the traction. Collective.
+
+        Args:
+            turns: Of every free component of the support's displacement the derivatives of gap
+                and normal by it, (n_points,) and (n_points, gdim).
+        """
+        rows, d = self._tangent(), self._gdim
+        by_jump = np.stack([rows[f"jump {i}"] for i in range(d)], axis=1)
+        if not self._free:
+            return PointTangent(by_jump)
+        by_normal = np.stack([rows[f"normal {i}"] for i in range(d)], axis=1)
+        by_support = np.stack([rows[f"support {i}"] for i in range(d)], axis=1)
+        by_shift = np.zeros_like(by_jump)
+        for i, (gap, normal) in turns.items():
+            by_shift[:, :, i] = by_support[:, :, i]
+            by_shift[:, :, i] += rows["gap"] * gap[:, None]
+            by_shift[:, :, i] += np.einsum("qij,qj->qi", by_normal, normal)
+        return PointTangent(by_jump, by_shift)
+
+    @cached_property
+    def _tangent(self) -> PointEvaluator:
+        """By the jump; where the support moves freely by its displacement, the normal, the gap."""
+        seen, jump = self.seen, ufl.variable(self._jump)
+        by = {"jump": jump}
+        if self._free:
+            by |= {"normal": ufl.variable(seen.normal), "support": ufl.variable(seen.shift)}
+            by |= {"gap": ufl.variable(seen.gap)}
+            seen = replace(seen, gap=by["gap"], normal=by["normal"], shift=by["support"])
+        traction = self.traction(jump, seen)
+        rows: dict[str, Any] = {}
+        for name, variable in by.items():
+            derivative = ufl.diff(traction, variable)
+            if name == "gap":
+                rows[name] = derivative
+            else:
+                rows |= {f"{name} {i}": derivative[i, :] for i in range(self._gdim)}
+        return self._evaluator(rows)
+
+    def evaluate_yield(self) -> tuple[Array, Array]:
+        """The law's yield functions and their gradients. Collective.
+
+        Returns:
+            g_j(τ, limit) (stress), (n_points, n_modes), and ∂g_j/∂τ, (n_points, n_modes, gdim).
+        """
+        found = self._yield()
+        gradients = [found[name] for name in found if name != "functions"]
+        return found["functions"], np.stack(gradients, axis=1)
+
+    @cached_property
+    def _yield(self) -> PointEvaluator:
+        felt = self._felt()
+        response, parameters = self._response(felt), self.seen.parameters
+        traction = ufl.variable(response.traction)
+        functions = self.law.yield_functions(felt, traction, response.limit, parameters)
+        rows = {f"gradient {j}": ufl.diff(g, traction) for j, g in enumerate(functions)}
+        return self._evaluator({"functions": ufl.as_vector(functions)} | rows)
+
+    def prepare(self) -> None:
+        """Compile what `evaluate` needs. Collective."""
+        _ = self._all
+
+    def evaluate(self) -> dict[str, Array]:
+        """All that a law tells, by name; see `PointValues`. Collective."""
+        return self._all()
+
+    @cached_property
+    def _all(self) -> PointEvaluator:
+        law, parameters, felt = self.law, self.seen.parameters, self._felt()
+        response = self._response(felt)
+        told = {
+            "normal_displacement": felt.normal_displacement,
+            "opening": response.opening,
+            "penetration": response.penetration,
+            "normal_traction": response.normal_traction,
+            "jump": self.seen.relative(self._jump),
+            "stored": self._there(law.stored(felt, response, parameters)),
+        }
+        if law.has_own_normal:
+            told |= self._own_normal(felt, response)
+        if law.has_tangential:
+            stiffness = law.tangential_stiffness(felt, parameters)
+            told |= {"traction": response.traction, "grip": law.grip(parameters)}
+            told |= {f"tangential_stiffness {i}": stiffness[i, :] for i in range(self._gdim)}
+        if law.has_friction:
+            pressure = ufl.variable(-response.normal_traction)
+            limit = law.limit(pressure, parameters)
+            told |= {
+                "limit_told": self._there(limit),
+                "limit_slope": self._there(ufl.diff(limit, pressure)),
+                "increment": felt.tangential_increment,
+                "old_traction": felt.traction,
+                "limit": response.limit,
+                "dissipated": self._there(law.dissipated(felt, response, parameters)),
+                "slip_increment": ufl.as_vector(response.slip),
+            }
+        if felt.multiplier is not None:
+            told |= {"multiplier": felt.multiplier}
+            if law.has_friction:
+                assert felt.traction is not None
+                borne = felt.traction - response.traction
+                told |= {"elastic_slip": law.elastic_displacement(felt, borne, parameters)}
+        return self._evaluator(told)
+
+    def _own_normal(self, felt: Kinematics, response: Response) -> dict[str, Any]:
+        """What is known of r_n that does not follow from k_n (UFL): stiffness, and another way."""
+        law, parameters = self.law, self.seen.parameters
+        u_n = ufl.variable(felt.normal_displacement)
+        at_variable = replace(felt, normal_displacement=u_n)
+        surface = self._quadrature.surface
+        comm, x = surface.mesh.comm, surface.mesh.geometry.x
+        barely = fem.Constant(
+            surface.submesh, _BARELY * (global_max(comm, x) - global_min(comm, x))
+        )
+        # Where nothing acts the stiffness is that of a point that has just closed.
+        acts = ufl.ne(response.normal_traction, 0)
+        closed = ufl.conditional(acts, felt.normal_displacement, felt.gap + barely)
+        at_closed = replace(felt, normal_displacement=closed)
+        return {
+            "normal_reaction": -ufl.diff(law.normal_potential(at_variable, parameters), u_n),
+            "normal_stiffness": law.normal_stiffness(at_closed, parameters),
+        }
+
+    def _evaluator(self, expressions: Mapping[str, Any]) -> PointEvaluator:
+        return PointEvaluator(self._quadrature, expressions, by_points=True)

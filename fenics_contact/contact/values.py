@@ -1,0 +1,201 @@
+"""What is known at the points of Γc at one state, and what follows from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from fenics_contact.types import Array, Mask
+
+__all__ = ["PointValues", "Resultants", "Status"]
+
+
+class Status(IntEnum):
+    """State of a quadrature point of Γc."""
+
+    OPEN = 0
+    STICK = 1
+    SLIP = 2
+
+
+@dataclass(frozen=True)
+class Resultants:
+    """Integrals over Γc and counts of its points, the same on every rank.
+
+    Attributes:
+        force: Contact force on the body, ∫ (r_n n + τ), shape (gdim,) (2D: per thickness).
+        normal_force: ∫ -r_n, tension counted negative.
+        tangential_force: ∫ |τ|.
+        area: Measure of the closed part; all that has a support where the law bears tension.
+        open, stick, slip: Numbers of quadrature points.
+        max_pressure: Largest -r_n at a point (stress).
+        max_penetration: Largest δ₋ (length).
+    """
+
+    force: Array
+    normal_force: float
+    tangential_force: float
+    area: float
+    open: int
+    stick: int
+    slip: int
+    max_pressure: float
+    max_penetration: float
+
+
+@dataclass(frozen=True)
+class PointValues:
+    """Fields at this rank's points at one state, (n_points,) or (n_points, gdim).
+
+    What the law has no use for is zero, and takes no memory.
+
+    Attributes:
+        x: Places of the points (length).
+        normal: Unit normal n from body to support.
+        direction_length: Length of the direction it was given by.
+        facing: n by the outward normal of the body.
+        weight: Factor of the surface measure.
+        initial_gap: s (length), the motion of the support included.
+        shift: Displacement of the support as far as it is prescribed (length).
+        parameters: Of the law, by name.
+        jump: Displacement relative to the support (length).
+        normal_displacement: u_n (length).
+        opening, penetration: δ₊ and δ₋ (length).
+        normal_traction: r_n (stress).
+        normal_stiffness: -∂r_n/∂u_n where closed (stress/length).
+        normal_reaction: r_n by the law's own potential, where it has one (stress).
+        traction: τ on the body (stress).
+        tangential_stiffness: K_t of a sticking point, (n_points, gdim, gdim) (stress/length).
+        grip: Bound of |τ|/p; not zero where motion along Γc is resisted.
+        stored: Energy in the springs per area.
+        increment: Δu_t since the last commit (length).
+        old_traction: τ that the increment started from (stress).
+        limit: Of |τ| (stress).
+        limit_told: The same by `Law.limit` at the contact pressure (stress).
+        limit_slope: Its derivative by the pressure.
+        dissipated: Work of friction per area.
+        slip_increment: Δβ of every mode, (n_points, n_modes) (length).
+        multiplier: λ_n (stress).
+        elastic_slip: What multipliers leave of K_t⁻¹ τ (length).
+        arrays: All that was evaluated, by name, for files.
+    """
+
+    x: Array
+    normal: Array
+    direction_length: Array
+    facing: Array
+    weight: Array
+    initial_gap: Array
+    shift: Array
+    parameters: Mapping[str, Array]
+    jump: Array
+    normal_displacement: Array
+    opening: Array
+    penetration: Array
+    normal_traction: Array
+    normal_stiffness: Array
+    normal_reaction: Array
+    traction: Array
+    tangential_stiffness: Array
+    grip: Array
+    stored: Array
+    increment: Array
+    old_traction: Array
+    limit: Array
+    limit_told: Array
+    limit_slope: Array
+    dissipated: Array
+    slip_increment: Array
+    multiplier: Array
+    elastic_slip: Array
+    arrays: Mapping[str, Array]
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Array]) -> PointValues:
+        """Sort arrays by name: "parameter NAME" are parameters, "tangential_stiffness I" rows."""
+        n, d = arrays["x"].shape
+        parameters = {
+            name.removeprefix("parameter "): values
+            for name, values in arrays.items()
+            if name.startswith("parameter ")
+        }
+
+        def get(name: str, *shape: int) -> Array:
+            return arrays[name] if name in arrays else np.broadcast_to(0.0, (n, *shape))
+
+        stiffness: Array = np.broadcast_to(0.0, (n, d, d))
+        if "tangential_stiffness 0" in arrays:
+            rows = [arrays[f"tangential_stiffness {i}"] for i in range(d)]
+            stiffness = np.stack(rows, axis=1)
+        by_penalty = parameters.get("k_n", np.broadcast_to(0.0, (n,)))
+        scalars = (
+            *("normal_reaction", "grip", "limit", "limit_told", "limit_slope", "dissipated"),
+            "multiplier",
+        )
+        vectors = ("traction", "increment", "old_traction", "elastic_slip")
+        always = (
+            *("x", "normal", "direction_length", "facing", "weight", "initial_gap", "shift"),
+            *("jump", "normal_displacement", "opening", "penetration", "normal_traction", "stored"),
+        )
+        return cls(
+            **{name: arrays[name] for name in always},
+            **{name: get(name) for name in scalars},
+            **{name: get(name, d) for name in vectors},
+            parameters=parameters,
+            normal_stiffness=arrays.get("normal_stiffness", by_penalty),
+            tangential_stiffness=stiffness,
+            slip_increment=get("slip_increment", 0),
+            arrays=arrays,
+        )
+
+    def at(self, points: Mask) -> PointValues:
+        """Those of some of the points."""
+        return self.of({name: values[points] for name, values in self.arrays.items()})
+
+    @property
+    def gap(self) -> Array:
+        """Open distance s - u_n = δ₊ - δ₋ (eq. 6)."""
+        return self.opening - self.penetration
+
+    @property
+    def total_traction(self) -> Array:
+        """r_n n + τ on the body."""
+        return self.normal_traction[:, None] * self.normal + self.traction
+
+    @cached_property
+    def slip_vector(self) -> Array:
+        """Slip Δu_t + K_t⁻¹ Δτ of the increment; Δu_t where the law has no k_t.
+
+        Raises:
+            numpy.linalg.LinAlgError: k_t is next to nothing.
+        """
+        if "k_t" not in self.parameters:
+            return self.increment
+        # K_t has no inverse along the normal, and nothing acts there: any stiffness will do.
+        along = np.einsum("q,qi,qj->qij", self.parameters["k_t"], self.normal, self.normal)
+        change = (self.traction - self.old_traction)[:, :, None]
+        stretched = np.linalg.solve(self.tangential_stiffness + along, change)[:, :, 0]
+        return np.asarray(self.increment + stretched, dtype=np.float64)
+
+    def tangential(self, vectors: Array) -> Array:
+        """The part of vectors across the normal, (n_points, gdim)."""
+        return vectors - np.sum(vectors * self.normal, axis=1)[:, None] * self.normal
+
+    def status(self, paired: Mask, *, tension: bool, sticks: bool) -> npt.NDArray[np.int8]:
+        """`Status` of every point, (n_points,).
+
+        Args:
+            paired: Which points have an opposite; the others are open.
+            tension: Whether the law bears tension: then no point with an opposite is open.
+            sticks: Whether there are tangential tractions; without, closed points count as slip.
+        """
+        closed = paired & ((self.normal_traction < 0) | tension)
+        status = np.where(closed, Status.SLIP, Status.OPEN).astype(np.int8)
+        if sticks:
+            status[closed & np.all(self.slip_increment == 0, axis=1)] = Status.STICK
+        return status
