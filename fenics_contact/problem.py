@@ -432,6 +432,8 @@ class ContactProblem:
         """
         start = time.perf_counter()
         self._fresh = False
+        if self._pending_field is not None and not self.solver.is_current():
+            self.complete()  # what it takes is about to go
         saved = self.full.state(), self._load, self._pending_field, self._energy
         try:
             # A trial of a line search may overflow, and the convergence test and the verdict see
@@ -455,8 +457,6 @@ class ContactProblem:
 
     def _solve(self, start: float, ahead: float, field: bool) -> Step:
         solver = self.solver
-        if self._pending_field is not None and not solver.is_current():
-            self.complete()  # what it takes is about to go
         self._check_before()
         for bc in self._bcs:
             bc.set(self.u.x.array)
@@ -526,8 +526,8 @@ class ContactProblem:
         if self._pending_field is None:
             return None
         committed = self._committed_lag[0] is self._pending_field
+        before = self.full.state()
         self.solver.system.complete(self._pending_field)
-        self._pending_field = None
         state, image = self.unknowns.vector(), self.unknowns.vector()
         state.array[:] = self.full.state()
         assert self.full.stiffness is not None
@@ -535,6 +535,14 @@ class ContactProblem:
         self.full.begin(self._load)
         bulk = image.array_r - self._load
         verdict, reaction = self._judged(self.full, bulk, laws=False)
+        for vector in (state, image):
+            vector.destroy()
+        if verdict.failures:
+            self.full.set_state(before)
+            number = self.increment + (not committed)
+            reason = int(self.snes.getConvergedReason())
+            raise NotConverged(number, reason, verdict, prefix=self.prefix)
+        self._pending_field = None
         energy = self._committed_energy if committed else self._energy
         energy.forces[self.full.mark] = self.full.forces(bulk, reaction)
         if committed:
@@ -542,12 +550,6 @@ class ContactProblem:
             self._committed_lag = None, self._load
         elif self._solved is not None:
             self._solved = replace(self._solved, state=self.full.state())
-        for vector in (state, image):
-            vector.destroy()
-        if verdict.failures:
-            number = self.increment + (not committed)
-            reason = int(self.snes.getConvergedReason())
-            raise NotConverged(number, reason, verdict, prefix=self.prefix)
         return verdict
 
     def _check_before(self) -> None:
@@ -648,15 +650,15 @@ class ContactProblem:
         solved, self._solved = self._solved, None
         if solved is None:
             return
-        before = [c.history.function.x.array.copy() for c in self.contacts]
+        before = [c.committed() for c in self.contacts]
         try:
             self.full.set_state(solved.state)
             for contact, found in zip(self.contacts, solved.contacts, strict=True):
                 contact.commit(found)
         except BaseException as error:
             fail_together(self._comm, error)
-            for contact, values in zip(self.contacts, before, strict=True):
-                contact.history.function.x.array[:] = values
+            for contact, state in zip(self.contacts, before, strict=True):
+                contact.set_committed(state)
             self.restore()
             raise
         state = self.full.state()

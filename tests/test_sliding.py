@@ -19,7 +19,9 @@ pytestmark = pytest.mark.mpi
 class Slider:
     """A block of width 1 that stands at ``start`` on one of width 4, its top moved."""
 
-    def __init__(self, cell, law, *, start, update="increment", n=(14, 4), contact=None, **options):
+    def __init__(
+        self, cell, law, *, start, n=(14, 4), contact=None, update="increment", release=None, **more
+    ):
         """Make it, unloaded."""
         mesh, tags = two_blocks(cell, n, (4.0, 1.0), start)
         d = mesh.geometry.dim
@@ -33,10 +35,10 @@ class Slider:
                 dofs = fem.locate_dofs_topological(V.sub(i), d - 1, tags.find(tag))
                 bcs.append(fem.dirichletbc(value, dofs, V.sub(i)))
         surface = fc.ContactSurface(mesh, tags, UPPER)
-        base = fc.DeformableBody(tags, LOWER, update=update)
+        base = fc.DeformableBody(tags, LOWER, update=update, release=release)
         self.contact = fc.Contact(self.u, surface, base, law, **(contact or {}))
         F = elasticity(self.u, v, 0.3)
-        self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=[self.contact], **options)
+        self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=[self.contact], **more)
 
     def step(self, down, along) -> fc.Step:
         """Move the top, solve and commit."""

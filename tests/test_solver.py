@@ -87,7 +87,8 @@ def rub(
     stiffness = pressure / length
     if law is None:
         law = fc.Coulomb(0.3, k_n=2e4 * stiffness, k_t=1e4 * stiffness)
-    problem, contact = scene.problem(law, bcs, contact={"support": cushion}, **kwargs)
+    contact = {"support": cushion} | kwargs.pop("contact", {})
+    problem, contact = scene.problem(law, bcs, contact=contact, **kwargs)
     return Rub(scene, push, contact, problem)
 
 

@@ -59,15 +59,17 @@ class LinearSprings:
             direction = normal - ratio[:, None] * tangential
             k_n = np.where(closed, contact.normal_stiffness, 0.0)
             stiffness += k_n[:, None, None] * np.einsum("qi,qj->qij", direction, normal)
-            along = -np.sum(borne * normal, axis=1)
-            stretch += (along / contact.normal_stiffness)[:, None] * normal
+            if contact.regularised:
+                along = -np.sum(borne * normal, axis=1)
+                stretch += (along / contact.normal_stiffness)[:, None] * normal
         if law.has_tangential:
             k_t, stick = contact.tangential_stiffness, status == Status.STICK
             stiffness += np.where(stick[:, None, None], k_t, 0.0)
-            # K_t has no inverse along the normal, where nothing acts: any stiffness will do.
-            along = np.einsum("q,qi,qj->qij", values.parameters["k_t"], normal, normal)
-            side = borne - np.sum(borne * normal, axis=1)[:, None] * normal
-            stretch -= np.linalg.solve(k_t + along, side[:, :, None])[:, :, 0]
+            if contact.regularised:
+                # K_t has no inverse along the normal, where nothing acts: any stiffness will do.
+                along = np.einsum("q,qi,qj->qij", values.parameters["k_t"], normal, normal)
+                side = values.tangential(borne)
+                stretch -= np.linalg.solve(k_t + along, side[:, :, None])[:, :, 0]
         return cls(stiffness, stretch)
 
     def change(self, jump: Array) -> Array:

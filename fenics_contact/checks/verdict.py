@@ -233,7 +233,7 @@ def check_laws(contact: Contact) -> dict[str, float]:
         )
     ]
     if law.has_own_normal:
-        k = np.where(r_n != 0, contact.normal_stiffness, 0.0)
+        k = np.where(r_n != 0, v.normal_stiffness, 0.0)
         parts = (k * v.normal_displacement, k * v.initial_gap)  # whose round-off is in r_n
         pull = np.maximum(r_n, 0) if not law.has_tension else np.zeros_like(r_n)
         violations.append(relative(worst(pull, r_n - v.normal_reaction), r_n, *parts))

@@ -21,7 +21,7 @@ from fenics_contact.contact.deformed import DeformedPlaces
 from fenics_contact.contact.inputs import Inputs
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
 from fenics_contact.contact.multipliers import Multipliers, TraceProjection
-from fenics_contact.contact.pairs import Pairs
+from fenics_contact.contact.pairs import Pairs, PairsState
 from fenics_contact.contact.point_data import PointData
 from fenics_contact.contact.point_law import PointLaw, PointTangent
 from fenics_contact.contact.values import PointValues, Resultants, Status
@@ -40,7 +40,7 @@ from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import ContactSurface
 from fenics_contact.types import Array, Mask
 
-__all__ = ["Contact", "Found", "displacement_degree", "passing"]
+__all__ = ["Committed", "Contact", "Found", "displacement_degree", "passing"]
 
 
 logger = logging.getLogger("fenics_contact")
@@ -65,6 +65,21 @@ class Found:
 
     points: PointValues
     history: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class Committed:
+    """A committed state of a contact.
+
+    Attributes:
+        history: `PointFields.rows`.
+        jump: `Contact.committed_jump`.
+        pairs: Between what.
+    """
+
+    history: Array
+    jump: Array
+    pairs: PairsState
 
 
 class Contact:
@@ -210,6 +225,7 @@ class Contact:
         self._projection: TraceProjection | None = None
         self._own_form: Any = None
         self._values: PointValues | None = None
+        self.committed_jump: Array = np.zeros((self.quadrature.n_points, gdim))
         if not self.rigid:
             self.pair()
 
@@ -304,8 +320,14 @@ class Contact:
             v: Test function of ``u``'s space. Compile with ``entity_maps=contact.entity_maps``.
 
         Raises:
-            ValueError: A stiffness is `Scaled` and the modulus is not known.
+            ValueError: A stiffness is `Scaled` and the modulus is not known; or the support is
+                another body, or moves by an amount that is unknown.
         """
+        self._check_form()
+        return self._form_at(self.u, v)
+
+    def _check_form(self) -> None:
+        """Refuse what no form on Γc can hold."""
         if self.free_motion:
             raise ValueError(
                 f"{self.name}: the form on Γc cannot hold the unknown motion of the support; use "
@@ -322,7 +344,6 @@ class Contact:
                 "Contact(modulus=...), give k_n and k_t in stress/length, or use ContactProblem, "
                 "which measures E in the bulk form"
             )
-        return self._form_at(self.u, v)
 
     def _form_at(self, displacement: Any, v: ufl.Argument) -> ufl.Form:
         """`form` at a displacement relative to what lies opposite."""
@@ -333,8 +354,10 @@ class Contact:
         """Energy whose derivative by ``u`` is `form` (eq. 19, 43).
 
         Raises:
-            ValueError: The law has none (Coulomb; a foundation with k_t and without tension).
+            ValueError: The law has none (Coulomb; a foundation with k_t and without tension), or as
+                for `form`.
         """
+        self._check_form()
         return self.inputs.weight * self._in_form.potential(self.u) * self.quadrature.ds
 
     def tangent(self, v: ufl.Argument, du: ufl.Argument) -> ufl.Form:
@@ -416,6 +439,11 @@ class Contact:
         self._pressure.x.scatter_forward()
         self._acting = self._frozen
 
+    @property
+    def freezes(self) -> bool:
+        """Whether the law has a potential, at least under a given pressure."""
+        return self.law.at_pressure(ufl.as_ufl(0.0)).has_potential
+
     def thaw(self) -> None:
         """Let the law itself act again."""
         self._acting = self._point_law
@@ -448,7 +476,14 @@ class Contact:
     def _evaluate(self) -> PointValues:
         """Everything at the points, with the jump as it was updated last. Collective."""
         self._data.update()
-        return PointValues.of({**self._data.values, **self._point_law.evaluate()})
+        arrays = {**self._data.values, **self._point_law.evaluate()}
+        if not self.rigid:
+            arrays["paired"] = self.paired.astype(np.float64)
+            arrays["depth"] = self.pairs.depth(arrays["normal_displacement"])
+            since = 0.0 if self.pairs.found_at is None else self.committed_jump
+            slide, normal = arrays["jump"] - since, arrays["normal"]
+            arrays["slide"] = slide - np.sum(slide * normal, axis=1)[:, None] * normal
+        return PointValues.of(arrays)
 
     # ---- what was given --------------------------------------------------------------------------
 
@@ -588,10 +623,14 @@ class Contact:
         Points that find none are open, whatever they do, and counted in ``n_unpaired``. A warning
         says why, if they are more than half of all.
         """
+        self._find_pairs(u, None)
+
+    def _find_pairs(self, u: fem.Function | None, depth: Array | None) -> None:
+        """`pair`, with the depth of the points in the opposite where it is known. Collective."""
+        self._update_points()
         points = self._evaluate()
-        depth = np.zeros(self.quadrature.n_points)
-        if u is not None:
-            depth = self.pairs.depth(points.normal_displacement)
+        if depth is None:
+            depth = np.zeros(self.quadrature.n_points) if u is None else points.depth
         self.pairs.find(points.x, points.normal, depth, u)
         self.forget()
 
@@ -601,10 +640,7 @@ class Contact:
 
     def relative_slide(self) -> Array:
         """Tangential displacement since pairs were found, (n_points, gdim) (length)."""
-        jump = self.values.jump
-        if self.pairs.found_at is not None:
-            jump = jump - self.committed_jump
-        return self.values.tangential(jump)
+        return self.values.slide
 
     def true_placement(self) -> tuple[Array, Array]:
         """Gap and normal where the body has moved to: at X + u instead of X. Collective.
@@ -806,6 +842,17 @@ class Contact:
         if self.multipliers is not None:
             self.multipliers.restore(self.history)
 
+    def committed(self) -> Committed:
+        """The committed state, for `set_committed`."""
+        return Committed(self.history.rows(), self.committed_jump, self.pairs.state())
+
+    def set_committed(self, state: Committed) -> None:
+        """Make a state the committed one again, after a commit that failed. Collective."""
+        self.history.set_rows(state.history)
+        self.committed_jump = state.jump
+        self.pairs.set_state(state.pairs)
+        self.restore()
+
     def take_up(self, history: Array, values: Mapping[str, Array]) -> None:
         """Make a state of another run the committed one, at the u that it has. Collective.
 
@@ -815,7 +862,8 @@ class Contact:
         """
         self.history.set_rows(history)
         if self.pairs_anew:
-            self.pair(self.u)
+            # The pairs by which they were as deep as that are gone.
+            self._find_pairs(self.u, values.get("depth"))
         self.restore()
         self.committed_jump = self.values.jump
         mine = self.values.arrays
@@ -843,7 +891,7 @@ class Contact:
 
         NaN at points without an opposite.
         """
-        return self.values.gap if self.rigid else np.where(self.paired, self.values.gap, np.nan)
+        return np.where(self.values.paired > 0, self.values.gap, np.nan)
 
     @property
     def pressure(self) -> Array:
@@ -905,7 +953,7 @@ class Contact:
         bears tension no point with an opposite is open; one without is, always.
         """
         law = self.law
-        return self.values.status(self.paired, tension=law.has_tension, sticks=law.has_tangential)
+        return self.values.status(tension=law.has_tension, sticks=law.has_tangential)
 
     @property
     def measure(self) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from dolfinx import fem
@@ -16,11 +17,22 @@ from fenics_contact.surface.pairing import REASONS, LookBack, Pairing
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.types import Array, Mask
 
-__all__ = ["Pairs"]
+__all__ = ["Pairs", "PairsState"]
 
 
 # Share of the approach of two bodies that is no penetration between the points yet.
 _UNSEEN = 0.01
+
+
+@dataclass(frozen=True)
+class PairsState:
+    """Pairs as they are: see the attributes of `Pairs`."""
+
+    jump_map: PETSc.Mat
+    paired: Mask
+    n_unpaired: int
+    distance: Array
+    found_at: fem.Function | None
 
 
 class Pairs:
@@ -102,6 +114,24 @@ class Pairs:
                 f"bear nothing ({'; '.join(told)}). Check the tags of Γc and of the opposite "
                 "surface, search_distance and release of the DeformableBody",
             )
+
+    def state(self) -> PairsState:
+        """The pairs as they are; what is found later does not change it."""
+        distance = np.zeros(0) if self.distance is None else self.distance.x.array.copy()
+        return PairsState(self.jump_map, self.paired, self.n_unpaired, distance, self.found_at)
+
+    def set_state(self, state: PairsState) -> None:
+        """Put back what `state` gave. Collective."""
+        if self.jump_map is state.jump_map:
+            return
+        assert self.distance and self.acts
+        self._forget_look_back()
+        self.jump_map, self.paired = state.jump_map, state.paired
+        self.n_unpaired, self.found_at = state.n_unpaired, state.found_at
+        self.number += 1  # what was made of the pairs in between is of others
+        self.distance.x.array[:] = state.distance
+        self.acts.x.array[: self._quadrature.n_points] = self.paired
+        self.acts.x.scatter_forward()
 
     def depth(self, normal_displacement: Array) -> Array:
         """Depth of points in the opposite, whatever gap is prescribed: (n_points,) (length)."""

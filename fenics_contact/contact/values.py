@@ -63,6 +63,9 @@ class PointValues:
         initial_gap: s (length), the motion of the support included.
         shift: Displacement of the support as far as it is prescribed (length).
         parameters: Of the law, by name.
+        paired: Whether the point has an opposite; 1 or 0.
+        depth: How deep it is in the opposite body, whatever gap is prescribed (length).
+        slide: Tangential displacement relative to it since the pairs were found (length).
         jump: Displacement relative to the support (length).
         normal_displacement: u_n (length).
         opening, penetration: δ₊ and δ₋ (length).
@@ -93,6 +96,9 @@ class PointValues:
     initial_gap: Array
     shift: Array
     parameters: Mapping[str, Array]
+    paired: Array
+    depth: Array
+    slide: Array
     jump: Array
     normal_displacement: Array
     opening: Array
@@ -135,9 +141,9 @@ class PointValues:
         by_penalty = parameters.get("k_n", np.broadcast_to(0.0, (n,)))
         scalars = (
             *("normal_reaction", "grip", "limit", "limit_told", "limit_slope", "dissipated"),
-            "multiplier",
+            *("multiplier", "depth"),
         )
-        vectors = ("traction", "increment", "old_traction", "elastic_slip")
+        vectors = ("slide", "traction", "increment", "old_traction", "elastic_slip")
         always = (
             *("x", "normal", "direction_length", "facing", "weight", "initial_gap", "shift"),
             *("jump", "normal_displacement", "opening", "penetration", "normal_traction", "stored"),
@@ -147,6 +153,7 @@ class PointValues:
             **{name: get(name) for name in scalars},
             **{name: get(name, d) for name in vectors},
             parameters=parameters,
+            paired=arrays.get("paired", np.broadcast_to(1.0, (n,))),
             normal_stiffness=arrays.get("normal_stiffness", by_penalty),
             tangential_stiffness=stiffness,
             slip_increment=get("slip_increment", 0),
@@ -186,15 +193,14 @@ class PointValues:
         """The part of vectors across the normal, (n_points, gdim)."""
         return vectors - np.sum(vectors * self.normal, axis=1)[:, None] * self.normal
 
-    def status(self, paired: Mask, *, tension: bool, sticks: bool) -> npt.NDArray[np.int8]:
-        """`Status` of every point, (n_points,).
+    def status(self, *, tension: bool, sticks: bool) -> npt.NDArray[np.int8]:
+        """`Status` of every point, (n_points,); one without an opposite is open.
 
         Args:
-            paired: Which points have an opposite; the others are open.
             tension: Whether the law bears tension: then no point with an opposite is open.
             sticks: Whether there are tangential tractions; without, closed points count as slip.
         """
-        closed = paired & ((self.normal_traction < 0) | tension)
+        closed = (self.paired > 0) & ((self.normal_traction < 0) | tension)
         status = np.where(closed, Status.SLIP, Status.OPEN).astype(np.int8)
         if sticks:
             status[closed & np.all(self.slip_increment == 0, axis=1)] = Status.STICK

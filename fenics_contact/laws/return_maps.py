@@ -17,6 +17,11 @@ __all__ = [
     "return_to_segment",
 ]
 
+# A trial beyond the limit by no more than this share of it sticks. A point that slipped in the last
+# increment stands at its limit when the next one begins: whether it sticks or slips there must not
+# hang on round-off, which is another one in other units.
+_TIE = 1e-12
+
 
 def positive_part(value: Expr) -> Expr:
     """⟨value⟩₊, with the derivative 0 at the kink."""
@@ -49,16 +54,32 @@ def return_to_segment(trial: Expr, limit: Expr, tangent: Expr) -> tuple[Expr, tu
         τ, shape (2,), and k_t Δβ of each mode (stress).
     """
     along = ufl.dot(trial, tangent)
-    excess = (positive_part(along - limit), positive_part(-along - limit))
-    return clip(along, limit) * tangent, excess
+    excess = (_beyond(along, limit), _beyond(-along, limit))
+    slips = ufl.gt(abs(along), (1 + _TIE) * limit)
+    kept = ufl.conditional(slips, clip(along, limit), along)
+    return _where_borne(limit, kept) * tangent, excess
+
+
+def _where_borne(limit: Expr, value: Expr) -> Expr:
+    """A value, or none where the limit is zero: there nothing sticks, not even what is at rest.
+
+    An open point has the trial zero and the limit zero; taken for sticking it would put k_t into
+    the tangent, or not, by round-off.
+    """
+    return ufl.conditional(ufl.gt(limit, 0), value, 0 * value)
+
+
+def _beyond(value: Expr, limit: Expr) -> Expr:
+    """By how much a value exceeds the limit, where it slips."""
+    return ufl.conditional(ufl.gt(value, (1 + _TIE) * limit), value - limit, 0)
 
 
 def return_to_cone(trial: Expr, limit: Expr) -> tuple[Expr, tuple[Expr, ...]]:
     """In space: the one mode g = |τ| - limit; see `return_to_segment`."""
     # The norm is only used, and only differentiated, where it exceeds the limit: never at zero.
     size = ufl.sqrt(ufl.dot(trial, trial))
-    slips = ufl.gt(size, limit)
-    traction = ufl.conditional(slips, limit / size, 1) * trial
+    slips = ufl.gt(size, (1 + _TIE) * limit)
+    traction = _where_borne(limit, ufl.conditional(slips, limit / size, 1)) * trial
     return traction, (ufl.conditional(slips, size - limit, 0),)
 
 
@@ -83,9 +104,9 @@ def return_to_polygon(
     traction, excess = trial, []
     for a, b in sides:
         x, y = ufl.dot(trial, a), ufl.dot(trial, b)
-        over = positive_part(x - limit - share * positive_part(abs(y) - half * limit))
+        over = _beyond(x - share * positive_part(abs(y) - half * limit), limit)
         # The closest point of this side: at a vertex both neighbours give the same.
         on_side = limit * a + clip(y, half * limit) * b
         traction = ufl.conditional(ufl.gt(over, 0), on_side, traction)
         excess.append(over)
-    return traction, tuple(excess)
+    return _where_borne(limit, traction), tuple(excess)

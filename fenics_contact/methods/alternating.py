@@ -41,6 +41,9 @@ OPTIONS = {
 }
 # Newton steps without line search finish where the energy has no digits left.
 _FINISH = OPTIONS | {"snes_max_it": 5, "snes_linesearch_type": "basic"}
+# Round-off of the energy, by the size of its terms; and residual, as a share of the forces, from
+# which on its differences are not far above that: no line search tells a descent there.
+_NOISE, _NEAR = 10 * np.finfo(float).eps, 1e-6
 # Cycles, and Newton iterations in all, before it is given up; and cycles in a row that may pass
 # without a lower residual.
 _MAX_CYCLES = 200
@@ -82,6 +85,8 @@ class Alternation:
         self._finish = defaults.make_snes(comm, prefix, "finishing_", _FINISH | solver)
         self._callbacks = Callbacks(comm)
         self._goal = 0.0
+        # Potential at the state asked for last, and where it was last found to have fallen.
+        self._energy = self._reached = np.inf
 
     def _attach(self) -> None:
         """Take the vectors, matrices and solver of H₀ of the present system."""
@@ -100,14 +105,16 @@ class Alternation:
                 self._function,
                 lambda x, J: this._assemble(x, J),
                 equations.matrix(False),
-                lambda: this._test(),
+                (lambda: this._falls()) if snes is self.snes else (lambda: this._test()),
             )
         if equations.full.bulk.linear:
-            self._callbacks.set_objective(self.snes, lambda x: this._equations.energy(x))
+            self._callbacks.set_objective(self.snes, lambda x: this._compute_energy(x))
 
     def solve(self) -> tuple[int, int]:
         """Solve; see `Method`. Iterations are Newton's, in all."""
         equations, reasons = self._equations, PETSc.SNES.ConvergedReason
+        if not self.possible():
+            return 0, int(reasons.DIVERGED_LINE_SEARCH)
         self._attach()
         iterations = stalls = 0
         best = np.inf
@@ -141,6 +148,11 @@ class Alternation:
             for contact in equations.contacts:
                 contact.thaw()
 
+    def possible(self) -> bool:
+        """Whether there are minimum problems, all of which the line search asks for energies."""
+        contacts = self._equations.contacts
+        return bool(contacts) and all(contact.freezes for contact in contacts)
+
     def _pressure(self) -> Array:
         """Of all contacts at this rank's points."""
         contacts = self._equations.contacts
@@ -158,6 +170,7 @@ class Alternation:
     def _minimise(self) -> int:
         """Newton's method with the line search on the energy, then without any."""
         solution = self._equations.solution
+        self._energy = self._reached = np.inf
         made, reason = self._callbacks.solve(self.snes, solution)
         if reason <= 0:
             # The last digits of the residual are below the rounding of the energy.
@@ -171,6 +184,23 @@ class Alternation:
         reasons, equations = PETSc.SNES.ConvergedReason, self._equations
         converged = equations.norms.total <= self._goal or equations.solved()
         return int(reasons.CONVERGED_FNORM_RELATIVE if converged else reasons.ITERATING)
+
+    def _compute_energy(self, x: PETSc.Vec) -> float:
+        self._energy = self._equations.energy(x)
+        return self._energy
+
+    def _falls(self) -> int:
+        """`_test`, and an end where the energy has no digits left to tell a descent. Collective."""
+        reason, ongoing = self._test(), int(PETSc.SNES.ConvergedReason.ITERATING)
+        if reason == ongoing and self._equations.solved(_NEAR):
+            return int(PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH)
+        if reason != ongoing or not np.isfinite(self._energy):
+            return reason
+        fallen = self._reached - self._energy
+        self._reached = self._energy
+        if fallen <= _NOISE * self._equations.energy_size():
+            return int(PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH)
+        return ongoing
 
     def _assemble(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
         equations = self._equations

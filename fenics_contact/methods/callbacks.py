@@ -136,8 +136,11 @@ class Callbacks:
         finally:
             self._last = ()  # another solution may be of other equations
             error, self._error = self._error, None
-            if error is not None:
-                raise error
+            try:
+                if error is not None:
+                    raise error
+            finally:
+                del error  # it keeps this frame, which would keep it and all that solves
         dense.raise_kept(snes.getKSP())
         reason = snes.getConvergedReason()
         if reason <= 0 and self._comm.allreduce(compat.refused_memory(snes.getKSP().getPC())):

@@ -117,6 +117,14 @@ class Equations:
         total = float(global_sum(self._comm, energy))
         return total / (self._bulk.scale * self.length**2)
 
+    def energy_size(self) -> float:
+        """Size of the terms that `energy` sums up at the present state. Collective."""
+        state = self.system.state()
+        size = float(np.abs(self.system.terms(state) * state).sum())
+        size += float(np.abs(self.system.load * state).sum())
+        total = float(global_sum(self._comm, size + sum(abs(c.energy()) for c in self.contacts)))
+        return total / (self._bulk.scale * self.length**2)
+
     def solved(self, rtol: float = 0.0) -> bool:
         """Whether the residual computed last ends the present round, or is below ``rtol``."""
         return self.norms.within(max(self.rtol, self.round_rtol, rtol))

@@ -45,6 +45,8 @@ _FIRST_ROUND, _INNER, _NEARLY = 1e-4, 1e-2, 10.0
 _FAR = 100.0
 # Residual to which systems near the one factored last are solved.
 _NEARBY = 1e-4
+# Residual with which they are not solved at all.
+_ROUGHLY = 1e-2
 # Increments expected where nothing is said.
 _EXPECTED = 4
 
@@ -214,6 +216,12 @@ class Solver:
 
         inside = newton_solver(equations.symmetric(False))
         alternation = Alternation(equations, options, prefix, inside)
+        if settings.method == "alternating" and self._full.contacts and not alternation.possible():
+            laws = [type(c.law).__name__ for c in self._full.contacts if not c.freezes]
+            raise ValueError(
+                f"method is 'alternating', but {', '.join(laws)} has no potential, not even under "
+                "a given pressure: there is nothing to minimise; use another method"
+            )
         inside = newton_solver(equations.symmetric(True))
         continuation = Continuation(equations, alternation, options, prefix, inside)
         self.methods: dict[str, Method] = {
@@ -497,6 +505,11 @@ class Solver:
             with interrupts_held():
                 ksp.solve(right, left)
             dense.raise_kept(ksp)
+            if ksp.getConvergedReason() < 0:
+                raise RuntimeError(
+                    "the linearised problem at the solution was not solved (KSP reason "
+                    f"{ksp.getConvergedReason()}); use linear_solver='direct'"
+                )
             return system.extended(left.array_r.copy())
 
         try:
@@ -543,6 +556,9 @@ class Solver:
             ksp.getPC().setPythonContext(_Nearby(equations.solvers[consistent]))
             ksp.setTolerances(rtol=_NEARBY, max_it=100)
             ksp.solve(right, left)
+            dense.raise_kept(equations.solvers[consistent])
+            if ksp.getResidualNorm() > _ROUGHLY * right.norm():
+                left.set(np.nan)  # nothing is known
             return [operator.jump(left.array_r) for operator in system.operators]
         finally:
             system.diagonal = diagonal

@@ -101,6 +101,7 @@ class CondensedSystem(System):
         stiffness = self._full.stiffness
         assert stiffness is not None
         self._condensation = self._fixed = None  # their memory first
+        self.ready = False
         self._condensation = Condensation(
             stiffness,
             self._full.constrained,
@@ -186,6 +187,8 @@ class CondensedSystem(System):
 
     def forget(self) -> None:
         """Drop the solutions for earlier loads."""
+        self.diagonal[:] = 0.0
+        self._full.forget()
         if self._condensation is not None:
             self._condensation.forget()
 

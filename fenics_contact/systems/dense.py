@@ -99,8 +99,11 @@ class PartlyFactored:
         """Raise what this, or the operator, ran into when PETSc called it last."""
         for part in (self, self._operator):
             error, part.error = part.error, None
-            if error is not None:
-                raise error
+            try:
+                if error is not None:
+                    raise error
+            finally:
+                del error  # it keeps this frame, which would keep it and all that solves
 
     def _forget(self) -> None:
         self._in: Index = np.arange(len(self._places))

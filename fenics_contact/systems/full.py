@@ -103,7 +103,8 @@ class FullSystem(System):
         return Forces(self.state(), bulk + self.load, self.load + reaction)
 
     def forget(self) -> None:
-        """Nothing is kept."""
+        """Drop the diagonal, whose round-off is allowed for."""
+        self.diagonal[:] = 0.0
 
     def bulk_force(self) -> Array:
         """The residual of the bulk, and the forces on free supports. Collective."""

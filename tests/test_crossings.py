@@ -1,0 +1,132 @@
+"""Where two features meet: each test holds what went wrong where both had tests of their own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import TOP, block, close, nodal
+from test_own_law import Asperities
+from test_pairs import FLOOR, LOWER, ROOF, UPPER, stack
+from test_sliding import K_N, Slider
+
+import fenics_contact as fc
+
+COMM = MPI.COMM_WORLD
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+
+
+def test_a_law_with_its_own_normal_part_where_points_have_no_opposite():
+    """A wide block on a narrow one: half of the points of Γc are unpaired, and bear nothing."""
+    body = stack("quadrilateral", (3, 6), (0.5, 0.5), widths=[0.5, 1.0])
+    surface = fc.ContactSurface(body.mesh, body.tags, 10 + UPPER)
+    law = Asperities(0.3, 0.5, 2e-3, fc.Scaled())
+    contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, 10 + LOWER), law)
+    body.hold(FLOOR, 0, 1)
+    body.hold(ROOF, 0)
+    body.hold(ROOF, 1, value=-5e-3)
+    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    step = problem.solve()
+    assert 0 < contact.n_unpaired and step.verdict.failures == []
+    assert step.contacts["contact"].normal_force > 0
+
+
+@pytest.mark.parametrize("release", [None, 0.0])
+def test_pairs_found_anew_in_bodies_that_penetrate(release, tmp_path):
+    """Going on from a file finds the pairs of an uninterrupted history: points behind keep theirs.
+
+    The same digits, 1e-9, of all that follows; by a soft penalty the points are well inside.
+    """
+
+    def load(made):
+        def move(t):
+            made.move[-1].value, made.move[0].value = -5e-3 * min(t, 1.0), 0.1 * max(t - 1.0, 0.0)
+
+        return move
+
+    def make():
+        law = fc.Coulomb(0.2, K_N / 50, K_N / 50)
+        return Slider("quadrilateral", law, start=0.4, release=release)
+
+    whole = make()
+    list(fc.increments(whole.problem, load(whole), 0.0, 3.0, steps=3))
+    path = tmp_path / "state"
+    path = COMM.bcast(path)
+    first = make()
+    steps = fc.increments(first.problem, load(first), 0.0, 3.0, steps=3, checkpoint=path)
+    next(steps), next(steps)
+    steps.close()
+    again = make()
+    rest = list(fc.increments(again.problem, load(again), 0.0, 3.0, steps=3, checkpoint=path))
+    assert len(rest) == 1
+    assert again.contact.n_unpaired == whole.contact.n_unpaired
+    assert close(nodal(again.u), nodal(whole.u), 1e-9)
+    assert close(rest[0].contacts["contact"].force, whole.contact.resultants().force, 1e-9)
+
+
+def test_a_commit_that_fails_while_pairs_are_found(monkeypatch):
+    """The second of two contacts fails: pairs, jumps and history of the first are as before."""
+    law = fc.Coulomb(0.2, K_N, K_N)
+    made, twin = (Slider("quadrilateral", law, start=0.4) for _ in range(2))
+    for each in (made, twin):
+        each.step(2e-3, 0.0)
+        each.move[0].value = 0.15
+        each.problem.solve()
+    with monkeypatch.context() as patch:
+
+        def broken(*args, **kwargs):
+            kept(*args, **kwargs)
+            raise MemoryError("on purpose")
+
+        kept = made.contact.pair
+        patch.setattr(made.contact, "pair", broken)
+        with pytest.raises(MemoryError):
+            made.problem.commit()
+    for each in (made, twin):
+        if each is twin:
+            each.problem.restore()
+        each.problem.solve()
+        each.problem.commit()
+        each.step(2e-3, 0.3)
+    assert close(nodal(made.u), nodal(twin.u), 1e-9)
+    assert close(made.contact.resultants().force, twin.contact.resultants().force, 1e-9)
+
+
+def test_a_foundation_without_tangential_stiffness_on_a_curved_support():
+    """What small displacements change is told there, too, where k_t is zero."""
+    scene = block("quadrilateral", n=4)
+    law = fc.Foundation(1e3, fem.Constant(scene.mesh, 0.0))
+    push = [scene.hold(TOP, i, fem.Constant(scene.mesh, v)) for i, v in enumerate((0.01, -0.05))]
+    contact = {"support": fc.Ball((0.5, -2.0), 2.0)}
+    problem, _ = scene.problem(law, push, contact=contact, kinematics=np.inf)
+    verdict = problem.solve().verdict
+    assert verdict.failures == [] and np.isfinite(verdict.kinematics["contact"].worst)
+
+
+def test_a_law_that_no_pressure_gives_a_potential():
+    """A foundation that lets go: the alternation is refused by name, and no end of the fallback."""
+    scene = block("quadrilateral", n=2, up=-1.0)
+    law = fc.Foundation(1e3, 1e2, tension=False)
+    with pytest.raises(ValueError, match="Foundation has no potential"):
+        scene.problem(law, scene.rollers(), method="alternating")
+    problem, _ = scene.problem(law, scene.rollers(), method="newton")
+    alternation = problem.solver.methods["alternating"]
+    assert alternation.solve()[1] < 0
+    assert problem.solve().verdict.failures == []
+
+
+def test_no_contact_and_the_last_resort():
+    """Without any contact the methods that follow give up in good order."""
+    scene = block("quadrilateral", n=2, up=-1.0)
+    problem = fc.ContactProblem(
+        scene.F, scene.u, bcs=[scene.hold(TOP, i) for i in (0, 1)], method="newton"
+    )
+    assert problem.solver.methods["alternating"].solve()[1] < 0
+
+
+def test_a_form_that_cannot_hold_the_contact_has_no_potential_either():
+    """Between two bodies u itself stands in no potential on Γc."""
+    made = Slider("quadrilateral", fc.Frictionless(K_N), start=0.4)
+    with pytest.raises(ValueError, match="opposite body"):
+        made.contact.potential()
