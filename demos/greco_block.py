@@ -105,7 +105,7 @@ def solve(arguments: argparse.Namespace) -> tuple[fc.Contact, dict[str, Any]]:
         "wall_seconds": time.perf_counter() - start,
     }
     if arguments.errors:
-        budget = fc.estimate_errors(problem, stress, increments=made[-1].increment_error)
+        budget = fc.estimate_errors(problem, stress, increment_error=made[-1].increment_error)
         result["errors"] = budget.numbers()
     return contact, result
 

@@ -1,11 +1,8 @@
-"""The one place that knows that DOLFINx releases differ (0.9 to 0.11), by feature."""
+"""The one place that knows that releases differ, by feature: DOLFINx 0.9 to 0.11, PETSc with it."""
 
 from __future__ import annotations
 
 import ctypes
-import functools
-import logging
-from pathlib import Path
 from typing import Any
 
 import basix
@@ -18,7 +15,19 @@ from petsc4py import PETSc
 
 from fenics_contact.types import Array
 
-__all__ = ["compile_form", "create_facet_submesh", "interpolation_points", "model_to_mesh"]
+__all__ = [
+    "LEAST_RESIDUAL",
+    "LONGEST_STEP",
+    "NOT_FINITE",
+    "cell_partitioner",
+    "compile_form",
+    "create_facet_submesh",
+    "geometry_dofmap",
+    "geometry_element",
+    "interpolation_points",
+    "model_to_mesh",
+    "option_was_read",
+]
 
 if tuple(map(int, dolfinx.__version__.split(".")[:2])) < (0, 9):
     raise ImportError(
@@ -39,19 +48,6 @@ NOT_FINITE = int(
     if hasattr(_reasons, "DIVERGED_FUNCTION_NANORINF")
     else _reasons.DIVERGED_FNORM_NAN
 )
-# MUMPS' errors INFOG(1) for workspace that is too small, or memory that was not to be had.
-_NO_MEMORY = (-5, -7, -8, -9, -11, -13, -14, -15, -17, -18, -19, -20)
-
-
-def refused_memory(pc: PETSc.PC) -> bool:
-    """Whether a factorisation failed because it did not get its memory."""
-    if not pc.getFailedReason():
-        return False
-    if pc.getFailedReason() == PETSc.PC.FailedReason.FACTOR_OUTMEMORY:
-        return True
-    mumps = pc.getType() in ("lu", "cholesky") and pc.getFactorSolverType() == "mumps"
-    # PETSc has no reason of its own for some of MUMPS' errors.
-    return mumps and pc.getFactorMatrix().getMumpsInfog(1) in _NO_MEMORY
 
 
 def create_facet_submesh(
@@ -90,20 +86,6 @@ def option_was_read(name: str) -> bool:
     library = ctypes.CDLL(PETSc.__file__)
     library.PetscOptionsUsed(None, name.encode(), ctypes.byref(read))
     return bool(read.value)
-
-
-@functools.cache
-def warn_of_slow_blas() -> None:
-    """Log once if the process runs on the reference BLAS, as Debian's packages do by default."""
-    try:
-        libraries = Path("/proc/self/maps").read_text()
-    except OSError:
-        return  # no Linux: nothing to tell from
-    if "/blas/libblas.so" in libraries:
-        logging.getLogger("fenics_contact").warning(
-            "the reference BLAS is in use: factorisations take up to eight times longer than with "
-            "OpenBLAS (Debian: apt install libopenblas0-pthread)"
-        )
 
 
 def cell_partitioner(ghost_mode: dolfinx.mesh.GhostMode) -> Any:

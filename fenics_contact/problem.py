@@ -14,7 +14,6 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact import compat
 from fenics_contact.arguments import check_instance, is_number, listed
 from fenics_contact.checks.energy import Energy, EnergyState
 from fenics_contact.checks.judge import Judge
@@ -25,7 +24,7 @@ from fenics_contact.contact.values import Resultants, Status
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
 from fenics_contact.methods.solver import METHODS, Settings, Solver
 from fenics_contact.parallel import fail_together, global_max, global_min
-from fenics_contact.surface.facets import facet_cells, local_facets
+from fenics_contact.surface.facets import facet_nodes
 from fenics_contact.surface.modulus import cell_modulus
 from fenics_contact.systems import linear
 from fenics_contact.systems.bulk import Bulk
@@ -215,7 +214,7 @@ class ContactProblem:
             check_instance("petsc_options", petsc_options, Mapping)
         self.contacts = listed("contacts", contacts, Contact)
         self._bcs = listed("bcs", bcs, fem.DirichletBC)
-        compat.warn_of_slow_blas()
+        linear.warn_of_slow_blas()
         self.u = u
         self.bulk = Bulk(F, u)
         said = [c.accuracy for c in self.contacts if c.accuracy is not None]
@@ -777,12 +776,6 @@ class ContactProblem:
 
 def _facets_held(contact: Contact, constrained: Array) -> int:
     """Number of this rank's facets of Γc all of whose displacements are prescribed."""
-    space = contact.u.function_space
-    mesh, dofmap = space.mesh, space.dofmap
-    facets = contact.surface.facets
-    held: Mask = np.all(constrained.reshape(-1, dofmap.bs), axis=1)
-    count = 0
-    for cell, local in zip(facet_cells(mesh, facets), local_facets(mesh, facets), strict=True):
-        closure = dofmap.dof_layout.entity_closure_dofs(mesh.topology.dim - 1, local)
-        count += bool(held[dofmap.cell_dofs(cell)[closure]].all())
-    return count
+    space, facets = contact.u.function_space, contact.surface.facets
+    held: Mask = np.all(constrained.reshape(-1, space.dofmap.bs), axis=1)
+    return int(np.count_nonzero(held[facet_nodes(space, facets)].all(axis=1)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,11 @@ ROOMS = [
 GROUND = {"compat", "parallel", "types", "arguments", "elasticity", "_version"}
 # DOLFINx names its C++ objects so, and there is no other way to them.
 OF_DOLFINX = {"_cpp_object"}
+# What releases of DOLFINx have by different names or with different arguments.
+BY_RELEASE = {
+    *("cmap", "cmaps", "dofmaps", "create_submesh", "create_cell_partitioner"),
+    *("interpolation_points", "model_to_mesh", "gmshio"),
+}
 KNOWN = {"problem", "contact", "system", "solver", "operator", "unknowns", "verdict", "law"}
 
 
@@ -115,3 +121,94 @@ def test_no_argument_may_be_anything_that_is_known():
             if isinstance(node, ast.arg) and node.annotation is not None:
                 anything = ast.unparse(node.annotation) == "Any"
                 assert not (anything and node.arg in KNOWN), f"{name(path)}: {node.arg}: Any"
+
+
+def test_what_releases_differ_in_is_asked_of_compat():
+    """Other modules, demos, benchmarks and verification go through it."""
+    folders = ("fenics_contact", "demos", "benchmarks", "verification")
+    paths = {path for folder in folders for path in (PACKAGE.parent / folder).rglob("*.py")}
+    past = [
+        f"{path.name}, line {node.lineno}: {ast.unparse(node)}"
+        for path in paths - {PACKAGE / "compat.py"}
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) != "compat"
+        if node.attr in BY_RELEASE or ast.unparse(node).endswith("geometry.dofmap")
+    ]
+    assert not past
+
+
+@cache
+def exported(path: Path) -> set[str]:
+    """What a module says others may import."""
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            return set(ast.literal_eval(node.value))
+    return set()
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name)
+def test_what_others_import_is_in_all(path):
+    """Whether by its name, or as an attribute of the module; and what is there has no secrets."""
+    said = {name(p): exported(p) for p in MODULES}
+    tree, modules, unsaid = ast.parse(path.read_text()), {}, []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("fenics_contact"):
+            module = (node.module or "").removeprefix("fenics_contact").removeprefix(".")
+            for alias in node.names:
+                whole = f"{module}.{alias.name}".removeprefix(".")
+                if whole in said:
+                    modules[alias.asname or alias.name] = whole
+                elif alias.name not in said[module]:
+                    unsaid.append(whole)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            module = modules.get(node.value.id)
+            if module is not None and node.attr not in said[module]:
+                unsaid.append(f"{module}.{node.attr}")
+    assert not unsaid
+    assert not [n for n in said[name(path)] if re.match("_[a-z]", n)]
+
+
+def made_in_constructor(of: ast.ClassDef, known: dict[str, ast.ClassDef]) -> set[str]:
+    """Attributes that a class, or one of the package that it inherits from, has from the start."""
+    found = set()
+    for part in of.body:
+        if isinstance(part, ast.FunctionDef) and part.name == "__init__":
+            found |= set(set_on_self(part))
+        if isinstance(part, ast.FunctionDef) and part.decorator_list:
+            found.add(part.name)  # a property
+        if isinstance(part, ast.AnnAssign) and any(
+            "dataclass" in ast.unparse(decorator) for decorator in of.decorator_list
+        ):
+            found.add(ast.unparse(part.target))
+    for base in of.bases:
+        if ast.unparse(base) in known:
+            found |= made_in_constructor(known[ast.unparse(base)], known)
+    return found
+
+
+def set_on_self(function: ast.FunctionDef) -> Iterator[str]:
+    """Attributes that are assigned to, or declared."""
+    for node in ast.walk(function):
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            if ast.unparse(node.value) == "self":
+                yield node.attr
+
+
+def test_attributes_are_made_in_the_constructor():
+    """Whoever reads it knows all that an object may have; no method makes more of it."""
+    classes = [
+        node
+        for path in MODULES
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ClassDef)
+    ]
+    known = {one.name: one for one in classes}
+    late = {
+        f"{one.name}.{attribute}, in {part.name}"
+        for one in classes
+        for part in one.body
+        if isinstance(part, ast.FunctionDef)
+        for attribute in set(set_on_self(part)) - made_in_constructor(one, known)
+    }
+    assert not late

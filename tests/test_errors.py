@@ -173,7 +173,7 @@ def test_the_table():
     """Five lines, one for each part, and what dominates; several contacts by name."""
     made = Press(k=1e3)
     step = made.solved(estimate=True)
-    found = budget(made.scene, made.problem, increments=step.increment_error)
+    found = budget(made.scene, made.problem, increment_error=step.increment_error)
     lines = str(found).splitlines()
     assert [line.split()[0] for line in lines[1:6]] == list(found.parts)
     assert found.dominant in lines[6]
@@ -282,3 +282,20 @@ def test_multigrid_gives_the_same_budget():
     for part in ("enforcement", "discretisation"):
         for name, value in direct.relative(part).items():
             assert close(multigrid.relative(part)[name], value, 1e-6, scale=1.0)
+
+
+def test_the_former_name_of_an_argument():
+    """`increments=` took their errors: it still does, with a warning; not both names at once."""
+    made = Press()
+    made.solved()
+    errors = {"normal force": 0.5}
+    with pytest.warns(FutureWarning, match="increment_error="):
+        found = budget(made.scene, made.problem, increments=errors)
+    assert found.parts["increments"] == errors
+    again = budget(made.scene, made.problem, increment_error=errors)
+    assert again.parts["increments"] == errors
+    raised_everywhere(
+        lambda: budget(made.scene, made.problem, increments=errors, increment_error=errors),
+        ValueError,
+        "increment_error",
+    )

@@ -30,6 +30,7 @@ from scenes import (
 )
 
 import fenics_contact as fc
+from fenics_contact.surface.facets import facet_cells, facet_nodes
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
@@ -291,3 +292,21 @@ def test_a_shell_is_no_body():
     edges = np.arange(shell.topology.index_map(1).size_local, dtype=np.int32)
     tags = dolfinx.mesh.meshtags(shell, 1, edges, np.full(edges.size, BOTTOM, dtype=np.int32))
     raised_everywhere(lambda: fc.ContactSurface(shell, tags, BOTTOM), ValueError, "dimension")
+
+
+@pytest.mark.parametrize(("cell", "degree"), GRID)
+def test_cells_and_nodes_of_facets(cell, degree):
+    """Facet by facet as DOLFINx finds them; in the order asked for, whatever it is."""
+    mesh, tags = block_mesh(cell, n=3, shuffled=True)
+    fdim, space = mesh.topology.dim - 1, displacement_space(mesh, degree)
+    facets = fc.ContactSurface(mesh, tags, [BOTTOM, RIGHT]).facets[::-1]
+    cells, nodes = facet_cells(mesh, facets), facet_nodes(space, facets)
+    mesh.topology.create_connectivity(fdim, mesh.topology.dim)
+    to_cell = mesh.topology.connectivity(fdim, mesh.topology.dim)
+    found = [
+        set(nodes[i]) == set(fem.locate_dofs_topological(space, fdim, facets[[i]], remote=False))
+        and [cells[i]] == list(to_cell.links(facet))
+        for i, facet in enumerate(facets)
+    ]
+    assert all(COMM.allgather(all(found)))
+    assert len(nodes) == len(cells) == len(facets)

@@ -78,7 +78,7 @@ def half_cylinder(
         scene.problem, scene.pressure, 0.0, hertz.PAPER_LOAD, steps=steps, estimate=True
     )
     last = list(history)[-1]
-    budget = fc.estimate_errors(scene.problem, scene.stress, increments=last.increment_error)
+    budget = fc.estimate_errors(scene.problem, scene.stress, increment_error=last.increment_error)
     return quantities(scene.problem), budget
 
 

@@ -24,6 +24,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from fenics_contact import compat
 
 __all__ = ["LAWS", "SUPPORTS", "Made", "draw", "frictions", "history", "model", "path"]
 
@@ -472,7 +473,7 @@ class Made:
         for b, (body, rise) in enumerate(
             zip(self.scene["bodies"], self.scene["bend"], strict=True)
         ):
-            nodes = np.unique(self.mesh.geometry.dofmap[self.box == b])
+            nodes = np.unique(compat.geometry_dofmap(self.mesh)[self.box == b])
             nodes = nodes[~done[nodes]]
             done[nodes] = True
             middle = (body["origin"][0] + 0.5 * body["size"][0]) * self.length
@@ -836,12 +837,12 @@ def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float],
         cell=scene["cell"],
         degree=scene["degree"],
         x=made.mesh.geometry.x[:, :d].copy(),
-        vertices=np.array(made.mesh.geometry.dofmap),
+        vertices=np.array(compat.geometry_dofmap(made.mesh)),
         nodes=np.array(V.dofmap.list),
         places=V.tabulate_dof_coordinates()[:, :d].copy(),
         parts=parts,
         stiffness=0.5 * (stiffness + stiffness.T),
-        bent=made.mesh.geometry.cmap.degree,
+        bent=compat.geometry_element(made.mesh).degree,
     )
     made.mesh.topology.create_connectivity(d, d - 1)
     to_facet = made.mesh.topology.connectivity(d, d - 1)

@@ -28,15 +28,16 @@ class StatusWatch:
     def __init__(self, contacts: Sequence[Contact]) -> None:
         """Take the contacts to look at."""
         self._contacts = contacts
-        self.start()
+        n = sum(c.quadrature.n_points for c in contacts)
+        self.idle, self._best = 0, np.inf
+        self._status = np.full(n, -1, dtype=np.int8)
+        self._changes = np.zeros(n, dtype=np.int64)
+        self._seen = np.zeros((len(Status), n), dtype=np.bool_)
 
     def start(self) -> None:
         """Forget what was seen."""
         self.idle, self._best = 0, np.inf
-        n = sum(c.quadrature.n_points for c in self._contacts)
-        self._status = np.full(n, -1, dtype=np.int8)
-        self._changes = np.zeros(n, dtype=np.int64)
-        self._seen = np.zeros((len(Status), n), dtype=np.bool_)
+        self._status[:], self._changes[:], self._seen[:] = -1, 0, False
 
     def note(self, residual: float) -> None:
         """Look at the contacts as evaluated.

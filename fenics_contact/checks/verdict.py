@@ -12,7 +12,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_max
 from fenics_contact.types import Array
 
-__all__ = ["Attempt", "NotConverged", "Verdict", "check_laws"]
+__all__ = ["Attempt", "Balance", "NotConverged", "Verdict", "check_laws"]
 
 # The laws hold point by point up to rounding of their few operations.
 _LAW_TOLERANCE = 1e-10

@@ -11,7 +11,7 @@ import basix
 import numpy as np
 import numpy.typing as npt
 import ufl
-from dolfinx import fem, la
+from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact import compat
@@ -37,6 +37,7 @@ from fenics_contact.parallel import (
 from fenics_contact.supports.base import Placement, Support
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.fields import PointFields
+from fenics_contact.surface.mass import assembled
 from fenics_contact.surface.surface import ContactSurface
 from fenics_contact.types import Array, Mask
 
@@ -104,7 +105,7 @@ class Contact:
         pairs: What lies opposite the points.
         gap_prescribed: Whether the gap was given apart from the geometry.
         committed_jump: Displacement relative to the support at the last commit, (n_points, gdim),
-            between the places that are opposite each other from then on.
+            between the places that are opposite each other from then on; zero before the first.
     """
 
     def __init__(
@@ -173,7 +174,7 @@ class Contact:
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
         self.accuracy = None if accuracy is None else Accuracy.of(accuracy)
-        augments = self._choose_enforcement(enforcement, tolerance)
+        augments, self.tolerance = self._choose_enforcement(enforcement, tolerance)
         # Linear elements hold a curved gap at their nodes alone (docs/enforcement.md). But between
         # two meshes, and on quadrilaterals of any shape, nodes carry no uniform pressure over.
         nodal = augments and degree == 1 and not isinstance(support, DeformableBody)
@@ -197,6 +198,7 @@ class Contact:
         if self.multipliers is not None:
             fields |= {"multiplier": 0}
         self.history = PointFields(self.quadrature, fields)
+        self.committed_jump: Array = np.zeros((self.quadrature.n_points, gdim))
 
         # All of contact is a sparse map from u to the jump at the points, and the law there.
         self._jump = fem.Function(self.quadrature.space(gdim), name="jump")
@@ -220,7 +222,7 @@ class Contact:
         self._in_form, self._point_law = at_points(given), at_points(sampled)
         self._point_law.prepare()
         self._acting = self._point_law
-        self._frozen: PointLaw | None = None
+        self._frozen: tuple[PointLaw, fem.Function] | None = None  # and the pressure in it
         self._deformed = DeformedPlaces(self.quadrature, self._jump, placement)
         self._projection: TraceProjection | None = None
         self._own_form: Any = None
@@ -231,8 +233,10 @@ class Contact:
 
     # ---- construction ----------------------------------------------------------------------------
 
-    def _choose_enforcement(self, enforcement: str | None, tolerance: float | None) -> bool:
-        """Whether there are multipliers, and ``tolerance``.
+    def _choose_enforcement(
+        self, enforcement: str | None, tolerance: float | None
+    ) -> tuple[bool, float]:
+        """Whether there are multipliers, and the tolerance.
 
         Raises:
             ValueError: The law has no use for them, or the tolerance is none.
@@ -242,7 +246,6 @@ class Contact:
             enforcement = chosen.enforcement if chosen and self.regularised else "penalty"
         if tolerance is None:
             tolerance = chosen.tolerance if chosen else _TOLERANCE
-        self.tolerance = tolerance
         if enforcement not in _ENFORCEMENTS:
             raise ValueError(
                 f"{self.name}: enforcement is {enforcement!r}; use one of {_ENFORCEMENTS}"
@@ -252,7 +255,7 @@ class Contact:
                 f"{self.name}: tolerance is {tolerance!r}; it must be a number between 0 and 1"
             )
         if enforcement == "penalty":
-            return False
+            return False, tolerance
         if not self.regularised:
             springs = [n for n, v in self.law.parameters().items() if isinstance(v, Springs)]
             what = f"{springs[0]} by Springs" if springs else type(self.law).__name__
@@ -261,7 +264,7 @@ class Contact:
                 'would take it away; use enforcement="penalty", or a law and stiffness that stand '
                 "for rigid contact"
             )
-        return True
+        return True, tolerance
 
     def _place(self) -> Placement:
         """Where the support is, seen from Γc (UFL)."""
@@ -403,7 +406,7 @@ class Contact:
             DOLFINx assembles the boundary form (46, 55), in which ``u`` itself stands where the
             support is rigid and no motion of it is unknown, and the jump at the points otherwise.
         """
-        mesh, space = self.surface.mesh, self.u.function_space
+        space = self.u.function_space
         self._update_points()
         vector, forces = self.pairs.own_map.createVecs()
         forces.array[:] = (self.area[:, None] * self._point_law.evaluate_traction()).ravel()
@@ -415,10 +418,7 @@ class Contact:
             displacement = self.u if self.rigid and not self.free_motion else self._jump
             form = self._form_at(displacement, ufl.TestFunction(space))
             self._own_form = compat.compile_form(-form, self.entity_maps)
-        with collective_errors(mesh.comm):
-            assembled = fem.assemble_vector(self._own_form)
-        assembled.scatter_reverse(la.InsertMode.add)
-        return by_points, assembled.array[: by_points.size].copy()
+        return by_points, assembled(self._own_form)[: by_points.size].copy()
 
     def freeze(self, pressure: Array) -> None:
         """Let `Law.at_pressure` act. Collective.
@@ -431,13 +431,13 @@ class Contact:
         if self.law.has_potential:
             return
         if self._frozen is None:
-            self._pressure = fem.Function(self.quadrature.space(), name="pressure")
-            parameters = {**self._point_law.seen.parameters, "pressure": self._pressure}
-            law = self.law.at_pressure(self._pressure)
-            self._frozen = self._point_law.with_law(law, parameters)
-        self._pressure.x.array[: self.quadrature.n_points] = pressure
-        self._pressure.x.scatter_forward()
-        self._acting = self._frozen
+            given = fem.Function(self.quadrature.space(), name="pressure")
+            parameters = {**self._point_law.seen.parameters, "pressure": given}
+            law = self.law.at_pressure(given)
+            self._frozen = self._point_law.with_law(law, parameters), given
+        self._acting, given = self._frozen
+        given.x.array[: self.quadrature.n_points] = pressure
+        given.x.scatter_forward()
 
     @property
     def freezes(self) -> bool:

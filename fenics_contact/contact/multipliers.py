@@ -22,12 +22,12 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 from dolfinx import fem
-from petsc4py import PETSc
 
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law
 from fenics_contact.parallel import global_max
 from fenics_contact.surface.fields import PointFields
+from fenics_contact.surface.mass import mass_solver
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.types import Array
 
@@ -65,11 +65,7 @@ class TraceProjection:
         gram = self._basis.transposeMatMult(weighted)
         weighted.destroy()
         self._right, self._solution = gram.createVecs()
-        self._ksp = PETSc.KSP().create(quadrature.surface.mesh.comm)
-        self._ksp.setOperators(gram)
-        self._ksp.setType(PETSc.KSP.Type.CG)
-        self._ksp.getPC().setType(PETSc.PC.Type.JACOBI)
-        self._ksp.setTolerances(rtol=1e-13, atol=1e-300, max_it=500)
+        self._ksp = mass_solver(gram, rtol=1e-13, atol=1e-300, max_it=500)
 
     def __call__(self, values: Array) -> Array:
         """Project, (n_points,) or a column at a time (n_points, n). Collective."""

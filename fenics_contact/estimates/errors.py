@@ -8,6 +8,7 @@ increments from halves of themselves (`increments`).
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,8 +16,7 @@ from typing import Any
 import dolfinx.fem.petsc
 import numpy as np
 import ufl
-from dolfinx import fem, la
-from petsc4py import PETSc
+from dolfinx import fem
 
 from fenics_contact import compat
 from fenics_contact.checks.kinematics import Deviation, LinearSprings
@@ -24,6 +24,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.problem import ContactProblem
+from fenics_contact.surface.mass import assembled, mass_solver
 from fenics_contact.surface.surface import PointEvaluator
 from fenics_contact.types import Array
 
@@ -158,6 +159,7 @@ def estimate_errors(
     stress: Any,
     *,
     strain: Any = None,
+    increment_error: Mapping[str, float] | None = None,
     increments: Mapping[str, float] | None = None,
 ) -> ErrorBudget:
     """Estimate the errors of the last solution, before or after its commit. Collective.
@@ -169,11 +171,21 @@ def estimate_errors(
         problem: A problem that has been solved; it stays as it is.
         stress: σ(u) of the bulk (UFL), shape (d, d) or (3, 3).
         strain: ε(u), of the shape of the stress; by default the symmetric gradient.
-        increments: Errors of the increments, as ``Step.increment_error`` has them.
+        increment_error: Errors by the size of the increments, ``Step.increment_error``.
+        increments: What ``increment_error`` was called before; to be left out.
 
     Raises:
-        ValueError: Shapes that do not fit.
+        ValueError: Shapes that do not fit, or both names of one argument.
     """
+    if increments is not None:
+        if increment_error is not None:
+            raise ValueError("increments is what increment_error was called before; give that one")
+        warnings.warn(
+            "increments= of estimate_errors takes their errors, and is increment_error= now",
+            FutureWarning,
+            stacklevel=2,
+        )
+        increment_error = increments
     problem.complete()
     u = problem.u
     stress = ufl.as_ufl(stress)
@@ -187,8 +199,8 @@ def estimate_errors(
     parts = _linear_parts(problem, values)
     smooth = _Smoothed(problem, stress, strain)
     parts["discretisation"] = _discretisation(problem, smooth, values)
-    if increments is not None:
-        parts["increments"] = dict(increments)
+    if increment_error is not None:
+        parts["increments"] = dict(increment_error)
     h, across = _bearing_facets(problem)
     return ErrorBudget(
         values,
@@ -440,13 +452,8 @@ def _projected(
     all_at_once = fem.functionspace(mesh, ("Lagrange", degree, (len(scalars),)))
     right = fem.Function(all_at_once)
     form = weight * ufl.dot(ufl.as_vector(scalars), ufl.TestFunction(all_at_once)) * dx
-    fem.assemble_vector(right.x.array, compat.compile_form(form))
-    right.x.scatter_reverse(la.InsertMode.add)
-    ksp = PETSc.KSP().create(mesh.comm)
-    ksp.setOperators(mass)
-    ksp.setType(PETSc.KSP.Type.CG)
-    ksp.getPC().setType(PETSc.PC.Type.JACOBI)
-    ksp.setTolerances(rtol=1e-8)
+    assembled(compat.compile_form(form), right.x)
+    ksp = mass_solver(mass, rtol=1e-8)
     known, found = fem.Function(space), fem.Function(all_at_once)
     for c in range(len(scalars)):
         known.x.array[:] = right.x.array[c :: len(scalars)]

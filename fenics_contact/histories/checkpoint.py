@@ -36,7 +36,16 @@ from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.facets import facet_cells
 from fenics_contact.types import Array
 
-__all__ = ["check_fields", "exists", "load", "save"]
+__all__ = [
+    "Stored",
+    "check_changed",
+    "check_fields",
+    "exists",
+    "load",
+    "read",
+    "save",
+    "take_up",
+]
 
 logger = logging.getLogger("fenics_contact")
 

@@ -18,6 +18,7 @@ from fenics_contact.estimates.errors import quantities
 from fenics_contact.histories import checkpoint as states
 from fenics_contact.parallel import collective_errors
 from fenics_contact.problem import ContactProblem, Step
+from fenics_contact.types import Array
 
 __all__ = ["increments"]
 
@@ -423,6 +424,7 @@ class _Watch:
         kept = {id(problem.u), *(id(field) for field in fields)}
         coefficients = problem.bulk.form.coefficients()
         self._functions = [f for f in coefficients if id(f) not in kept]
+        self._values: list[Array] = []
         self._comm = problem.u.function_space.mesh.comm
 
     def look(self) -> None:

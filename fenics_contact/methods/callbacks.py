@@ -19,7 +19,7 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.parallel import fail_together
-from fenics_contact.systems import dense
+from fenics_contact.systems import dense, linear
 from fenics_contact.types import Array
 
 __all__ = ["Callbacks", "interrupts_held", "release_interrupt"]
@@ -143,7 +143,7 @@ class Callbacks:
                 del error  # it keeps this frame, which would keep it and all that solves
         dense.raise_kept(snes.getKSP())
         reason = snes.getConvergedReason()
-        if reason <= 0 and self._comm.allreduce(compat.refused_memory(snes.getKSP().getPC())):
+        if reason <= 0 and self._comm.allreduce(linear.refused_memory(snes.getKSP().getPC())):
             raise MemoryError(
                 "the factorisation was refused its memory: use more ranks, an iterative solver, or "
                 "a coarser mesh; if options limit MUMPS, raise the limit (mat_mumps_icntl_14, "

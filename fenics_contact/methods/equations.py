@@ -51,9 +51,6 @@ class Equations:
         factorisations: Of sparse matrices, counted.
     """
 
-    solution: PETSc.Vec
-    function: PETSc.Vec
-
     def __init__(
         self, full: FullSystem, motions: RigidMotions, *, alpha: float, phi: float
     ) -> None:
@@ -79,7 +76,8 @@ class Equations:
         self.factorisations = 0
         self._matrices: dict[bool, PETSc.Mat] = {}
         self._filled: set[bool] = set()
-        self.take(full)
+        self.system: System = full
+        self.solution, self.function = full.vector(), full.vector()
 
     def take(self, system: System) -> None:
         """Iterate on a system from now on. Collective."""

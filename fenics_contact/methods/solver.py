@@ -120,9 +120,6 @@ class Solver:
         predicts: Whether the tangent factored last is that of a solution.
     """
 
-    snes: PETSc.SNES
-    main: SnesMethod
-
     def __init__(
         self,
         full: FullSystem,
@@ -147,6 +144,17 @@ class Solver:
         self._full, self._settings = full, settings
         self._comm = full.unknowns.comm
         self._obstacle: str | None = None  # to condensation, as last said
+        self._pairings = self._present_pairings()  # those of the system
+        # What is chosen and made by `_configure`, for the increments that are expected.
+        self.options = Defaults()
+        self._named: list[str] = []  # options given that name a linear solver
+        self.condensed = False
+        self._automatic = settings.method is None
+        self.method = settings.method or "lbfgs"
+        self.methods: dict[str, Method] = {}
+        self._quasi_newton = True
+        self.snes: PETSc.SNES
+        self.main: SnesMethod
         take_command_line(settings.prefix, self._comm)
         self._configure()
 
@@ -174,7 +182,6 @@ class Solver:
         self.condensed = self._choose_condensation()
         self._full.linear_kind = self._choose_linear_solver()
         self._set_system()
-        self._automatic = settings.method is None
         self.method = settings.method or ("newton" if self.condensed else "lbfgs")
         options.set(_COMMON | METHODS[self.method], prefix)
         quasi_newton = options.get(prefix + "snes_type") == PETSc.SNES.Type.QN
@@ -224,10 +231,7 @@ class Solver:
             )
         inside = newton_solver(equations.symmetric(True))
         continuation = Continuation(equations, alternation, options, prefix, inside)
-        self.methods: dict[str, Method] = {
-            "alternating": alternation,
-            "continuation": continuation,
-        }
+        self.methods = {"alternating": alternation, "continuation": continuation}
         equations.rtol = snes.getTolerances()[0]
 
     def expect(self, increments: int) -> None:

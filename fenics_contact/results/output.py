@@ -1,4 +1,4 @@
-"""Results in files and figures: ParaView collections, JSON, values at points, references met."""
+"""Results in files, ParaView collections and JSON; values at points, tables of references met."""
 
 from __future__ import annotations
 

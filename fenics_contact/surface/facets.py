@@ -14,7 +14,7 @@ from dolfinx import fem
 from fenics_contact import compat
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["FacetSet", "tabulate"]
+__all__ = ["FacetSet", "facet_cells", "facet_nodes", "local_facets", "tabulate"]
 
 # Of points, facets, places on them and signed distances: which of these hits count.
 Rule: TypeAlias = Callable[[Index, Index, Array, Array], Mask]
@@ -34,16 +34,26 @@ def facet_cells(mesh: dolfinx.mesh.Mesh, facets: Index) -> Index:
     d = mesh.topology.dim
     mesh.topology.create_connectivity(d - 1, d)
     to_cell = mesh.topology.connectivity(d - 1, d)
-    return np.array([to_cell.links(facet)[0] for facet in facets], dtype=np.int32)
+    return to_cell.array[to_cell.offsets[facets]]
 
 
-def local_facets(mesh: dolfinx.mesh.Mesh, facets: Index) -> list[int]:
-    """The number of every exterior facet of this rank in its cell."""
+def local_facets(mesh: dolfinx.mesh.Mesh, facets: Index) -> Index:
+    """The number of every exterior facet of this rank in its cell, (n_facets,)."""
     d = mesh.topology.dim
     mesh.topology.create_connectivity(d, d - 1)
-    to_facet = mesh.topology.connectivity(d, d - 1)
-    pairs = zip(facet_cells(mesh, facets), facets, strict=True)
-    return [int(np.flatnonzero(to_facet.links(cell) == facet)[0]) for cell, facet in pairs]
+    n = len(basix.topology(basix.CellType[mesh.topology.cell_name()])[d - 1])
+    of_cell = mesh.topology.connectivity(d, d - 1).array.reshape(-1, n)
+    return np.argmax(of_cell[facet_cells(mesh, facets)] == facets[:, None], axis=1)
+
+
+def facet_nodes(space: fem.FunctionSpace, facets: Index) -> Index:
+    """The nodes of a space on every exterior facet of this rank, (n_facets, n_nodes)."""
+    mesh, layout = space.mesh, space.dofmap.dof_layout
+    fdim = mesh.topology.dim - 1
+    n = len(basix.topology(basix.CellType[mesh.topology.cell_name()])[fdim])
+    closures = np.array([layout.entity_closure_dofs(fdim, i) for i in range(n)])
+    cells, local = facet_cells(mesh, facets), local_facets(mesh, facets)
+    return space.dofmap.list[cells[:, None], closures[local]]
 
 
 class FacetSet:

@@ -9,12 +9,12 @@ import dolfinx.fem.petsc
 import numpy as np
 import numpy.typing as npt
 import ufl
-from dolfinx import fem, la
-from petsc4py import PETSc
+from dolfinx import fem
 
 from fenics_contact import compat
 from fenics_contact.parallel import global_min
 from fenics_contact.surface.facets import facet_cells
+from fenics_contact.surface.mass import assembled, mass_solver
 from fenics_contact.surface.surface import ContactSurface
 from fenics_contact.types import Array
 
@@ -55,7 +55,7 @@ def cell_modulus(
         field = fem.Function(space)
         field.x.array[1 :: len(u)] = x[:, direction]
         form += ufl.replace(ufl.Form(cells), {test: q[direction] * field, trial: field})
-    shear, stretch, volume = _assemble(compat.compile_form(form)).reshape(-1, 3).T
+    shear, stretch, volume = assembled(compat.compile_form(form)).reshape(-1, 3).T
     shear, stretch = shear / volume, stretch / volume
     isotropic = stretch > 1.2 * shear  # λ > -0.8 G: else no isotropic solid, and E is the stretch's
     modulus = fem.Function(fem.functionspace(space.mesh, ("DG", 0)), name="modulus")
@@ -133,23 +133,10 @@ def _smooth(values: fem.Function, length: fem.Function) -> fem.Function:
     matrix.assemble()
     result = fem.Function(space, name="modulus_over_height")
     rhs = fem.Function(space)
-    fem.assemble_vector(rhs.x.array, compat.compile_form(values * v * dx))
-    rhs.x.scatter_reverse(la.InsertMode.add)
-    ksp = PETSc.KSP().create(mesh.comm)
-    ksp.setOperators(matrix)
-    ksp.setType(PETSc.KSP.Type.CG)
-    ksp.getPC().setType(PETSc.PC.Type.JACOBI)
-    ksp.setTolerances(rtol=1e-14, max_it=10_000)
+    assembled(compat.compile_form(values * v * dx), rhs.x)
+    ksp = mass_solver(matrix, rtol=1e-14, max_it=10_000)
     ksp.solve(rhs.x.petsc_vec, result.x.petsc_vec)
     result.x.scatter_forward()
     ksp.destroy()
     matrix.destroy()
     return result
-
-
-def _assemble(form: fem.Form) -> Array:
-    """Assembled linear form, ghosts included. Collective."""
-    vector = fem.assemble_vector(form)
-    vector.scatter_reverse(la.InsertMode.add)
-    vector.scatter_forward()
-    return vector.array.copy()

@@ -32,7 +32,7 @@ from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.facets import FacetSet, tabulate
 from fenics_contact.surface.projection import (
-    _COVERED,
+    COVERED,
     cut_lines,
     cut_polygons,
     facing_pairs,
@@ -527,13 +527,13 @@ class Pairing:
         """
         here, there = self._sides
         n = len(self._here.cells)
-        doubtful = np.abs(np.bincount(facet, share, n) - 1) > _COVERED
+        doubtful = np.abs(np.bincount(facet, share, n) - 1) > COVERED
         doubtful[facet[here.body[here.first + facet] == there.body[other]]] = True
         if not doubtful.any():
             return facet
         ends = there.vertices[other][:, :, None] == there.vertices[hit][:, None, :]
         kept = ~doubtful[facet] | ((hit >= 0) & ends.any(axis=(1, 2)))
-        full = np.abs(np.bincount(facet, share * kept, n) - 1) <= _COVERED
+        full = np.abs(np.bincount(facet, share * kept, n) - 1) <= COVERED
         return np.where(kept & full[facet], facet, -1)
 
     def _projection(

@@ -16,10 +16,17 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.arguments import check_instance, is_number
-from fenics_contact.parallel import collective_errors, gather_rows, global_min
+from fenics_contact.parallel import gather_rows, global_min
+from fenics_contact.surface.mass import assembled
 from fenics_contact.types import Array
 
-__all__ = ["ContactSurface", "PointEvaluator", "SurfaceQuadrature", "VertexAreas"]
+__all__ = [
+    "ContactSurface",
+    "PointEvaluator",
+    "SurfaceQuadrature",
+    "VertexAreas",
+    "tagged_facets",
+]
 
 _SCHEMES = ("default", "vertex")
 
@@ -191,7 +198,7 @@ class SurfaceQuadrature:
         """Weight times Jacobian of all points that this rank knows. Collective."""
         space = self.space()
         form = compat.compile_form(ufl.TestFunction(space) * measure, self.surface.entity_maps)
-        return _assemble(form, la.vector(space.dofmap.index_map, 1))
+        return assembled(form, la.vector(space.dofmap.index_map, 1))
 
     @cached_property
     def on_submesh(self) -> tuple[ufl.Measure, Array]:
@@ -294,7 +301,7 @@ class VertexAreas:
         Raises:
             ValueError: The area of a vertex is not positive.
         """
-        _assemble(self._form, self.area.x)
+        assembled(self._form, self.area.x)
         smallest = global_min(self._comm, self.area.x.array, empty=1.0)
         if not smallest > 0.0:
             raise ValueError(
@@ -358,20 +365,10 @@ class PointEvaluator:
 
         The arrays are copies.
         """
-        weighted = _assemble(self._compiled, self._vector).reshape(-1, self._size)
+        weighted = assembled(self._compiled, self._vector).reshape(-1, self._size)
         with np.errstate(invalid="ignore", divide="ignore"):
             values = weighted / self._weights[:, None]
         return {name: values[: self._n_owned, c].copy() for name, c in self._columns.items()}
-
-
-def _assemble(form: fem.Form, vector: la.Vector) -> Array:
-    """Assemble into ``vector``, ghosts consistent. Collective."""
-    vector.array[:] = 0.0
-    with collective_errors(form.mesh.comm):
-        fem.assemble_vector(vector.array, form)
-    vector.scatter_reverse(la.InsertMode.add)
-    vector.scatter_forward()
-    return vector.array
 
 
 def _vertex_rule(cell: str) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ import numpy as np
 import petsc4py
 from petsc4py import PETSc
 
-from fenics_contact import compat
+from fenics_contact.systems import linear
 from fenics_contact.types import Array, Indices, Mask
 
 __all__ = ["Condensation", "Response"]
@@ -81,7 +81,7 @@ class Condensation:
         _call("MatFactorSetSchurIS", _object(self._factor), _object(chosen))
         self._pc.setUp()
         error = self._factor.getMumpsInfog(1)
-        if compat.refused_memory(self._pc):
+        if linear.refused_memory(self._pc):
             raise MemoryError(
                 f"condensing {constrained.size} unknowns onto {kept.size} was refused its memory "
                 f"(MUMPS error {error}): use condensation=False, or several ranks"

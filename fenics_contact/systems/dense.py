@@ -9,7 +9,7 @@ import scipy.linalg
 import scipy.spatial
 from petsc4py import PETSc
 
-from fenics_contact.types import Array, Index
+from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["PartlyFactored", "Sum", "raise_kept"]
 
@@ -36,10 +36,9 @@ class Sum:
         error: What `mult` ran into: PETSc carries no exception; see `raise_kept`.
     """
 
-    error: BaseException | None = None
-
     def __init__(self) -> None:
         """Nothing yet; see `set_parts`."""
+        self.error: BaseException | None = None
         self.fixed: Array = np.zeros((0, 0))
         nothing = np.zeros(0, dtype=np.intp)
         self.added: tuple[Index, Index, Array] = nothing, nothing, np.zeros(0)
@@ -81,19 +80,35 @@ class PartlyFactored:
         error: As of `Sum`.
     """
 
-    error: BaseException | None = None
-
     def __init__(self, places: Array) -> None:
         """Nothing is factored yet.
 
         Args:
             places: Where the unknowns are, (n, gdim); NaN for those nowhere, which are always in A.
         """
+        nothing: Array = np.zeros((0, 0))
+        nowhere: Index = np.zeros(0, dtype=np.intp)
+        factors = nothing, nowhere
+        self.error: BaseException | None = None
         self._places, self._nowhere = places, np.any(np.isnan(places), axis=1)
+        self._acted: Mask = self._nowhere  # the unknowns that must be in A
         self._operator = Sum()
         self._fixed = self._operator.fixed
         self._pattern = self._operator.added[:2]
-        self._forget()
+        # The unknowns in A, in O, and the places in A of those that are there.
+        self._in: Index = np.arange(len(places))
+        self._out, self._position = nowhere, self._in
+        # LU of S_OO; S_AO; S_OO⁻¹ S_OA; and what they leave of S_AA.
+        self._factor_out, self._coupling, self._extension = factors, nothing, nothing
+        self._reduced = self._fixed
+        # LU of that with C, and the values of C in it.
+        self._factor = factors
+        self._factored: Array | None = None
+        # Columns of its inverse: those known, and of which unknowns; those for the unknowns that
+        # have changed, the change, and LU of the system that corrects by it.
+        self._known, self._columns = nowhere, nothing
+        self._changed, self._answers, self._change = nowhere, nothing, nothing
+        self._core = factors
 
     def raise_kept(self) -> None:
         """Raise what this, or the operator, ran into when PETSc called it last."""
@@ -106,11 +121,9 @@ class PartlyFactored:
                 del error  # it keeps this frame, which would keep it and all that solves
 
     def _forget(self) -> None:
-        self._in: Index = np.arange(len(self._places))
-        self._out: Index = np.zeros(0, dtype=np.intp)
-        self._position: Index = self._in  # of the unknowns in A
-        self._reduced = self._fixed
-        self._factored: Array | None = None  # the values of C in the last factors
+        self._in = np.arange(len(self._places))
+        self._out, self._position = np.zeros(0, dtype=np.intp), self._in
+        self._reduced, self._factored = self._fixed, None
 
     def setUp(self, pc: PETSc.PC) -> None:
         """Factor, or find out what the last factors lack."""
@@ -149,8 +162,7 @@ class PartlyFactored:
         self._factor = _factors(block)
         regular = bool(np.all(np.diag(self._factor[0])))
         self._factored = self._operator.added[2] if regular else None
-        self._changed: Index = np.zeros(0, dtype=np.intp)
-        self._known: Index = self._changed
+        self._changed = self._known = np.zeros(0, dtype=np.intp)
         self._columns = np.zeros((self._in.size, 0))
         return regular
 

@@ -13,6 +13,8 @@ tolerance that follows the residual (Eisenstat and Walker).
 
 from __future__ import annotations
 
+import functools
+import logging
 import os
 from pathlib import Path
 from typing import Any
@@ -33,8 +35,12 @@ __all__ = [
     "newton_options",
     "options",
     "quicker",
+    "refused_memory",
     "too_large",
+    "warn_of_slow_blas",
 ]
+
+logger = logging.getLogger("fenics_contact")
 
 KINDS = ("direct", "multigrid")
 
@@ -49,6 +55,9 @@ _MANY = 30_000
 # One factorisation for a whole load history pays longer: condensed onto Γc, it takes as long as two
 # increments by multigrid at 108,000 unknowns, and as long as four at 200,000.
 _MANY_PER_INCREMENT = 50_000
+
+# MUMPS' errors INFOG(1) for workspace that is too small, or memory that was not to be had.
+_NO_MEMORY = (-5, -7, -8, -9, -11, -13, -14, -15, -17, -18, -19, -20)
 
 _MULTIGRID: dict[str, Any] = {
     "pc_type": "gamg",
@@ -123,6 +132,31 @@ def too_large(n_bytes: float, comm: MPI.Comm) -> str | None:
         f"its factorisation would take about {n_bytes / 2**30:.1f} of {available / 2**30:.1f} GiB "
         "of memory"
     )
+
+
+def refused_memory(pc: PETSc.PC) -> bool:
+    """Whether a factorisation failed because it did not get its memory."""
+    if not pc.getFailedReason():
+        return False
+    if pc.getFailedReason() == PETSc.PC.FailedReason.FACTOR_OUTMEMORY:
+        return True
+    mumps = pc.getType() in ("lu", "cholesky") and pc.getFactorSolverType() == "mumps"
+    # PETSc has no reason of its own for some of MUMPS' errors.
+    return mumps and pc.getFactorMatrix().getMumpsInfog(1) in _NO_MEMORY
+
+
+@functools.cache
+def warn_of_slow_blas() -> None:
+    """Log once if the process runs on the reference BLAS, as Debian's packages do by default."""
+    try:
+        libraries = Path("/proc/self/maps").read_text()
+    except OSError:
+        return  # no Linux: nothing to tell from
+    if "/blas/libblas.so" in libraries:
+        logger.warning(
+            "the reference BLAS is in use: factorisations take up to eight times longer than with "
+            "OpenBLAS (Debian: apt install libopenblas0-pthread)"
+        )
 
 
 def quicker(n: int, dimension: int, *, condensed_for: int = 0) -> bool:

@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from fenics_contact.types import Array
 
-__all__ = ["Unknowns"]
+__all__ = ["Selection", "Unknowns"]
 
 
 class Unknowns:
