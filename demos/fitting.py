@@ -48,7 +48,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from fenics_contact import compat, output, plotting
+from fenics_contact import output, plotting
 from fenics_contact.elasticity import LinearElastic
 
 E, NU, THICKNESS, LOAD = 240.0, 0.38, 6.4, 0.02656  # daN, mm
@@ -96,7 +96,8 @@ def make_mesh(g: argparse.Namespace) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.Me
 
             gmsh.model.mesh.setSizeCallback(size)
             gmsh.model.mesh.generate(2)
-        return compat.model_to_mesh(gmsh.model, MPI.COMM_WORLD, 0, 2)
+        mesh, _, tags = fc.model_to_mesh(gmsh.model, MPI.COMM_WORLD, gdim=2)
+        return mesh, tags
     finally:
         gmsh.finalize()
 

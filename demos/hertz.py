@@ -41,7 +41,7 @@ from petsc4py import PETSc
 from tqdm import tqdm
 
 import fenics_contact as fc
-from fenics_contact import compat, output, plotting
+from fenics_contact import output, plotting
 
 E, NU, R = 1000.0, 0.3, 8.0
 PAPER_LOAD, PAPER_H = 30.0, 0.42  # 0.42: ten contact elements on the quarter, as in the paper
@@ -114,7 +114,8 @@ def make_mesh(
             gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
             gmsh.model.mesh.generate(2)
             gmsh.model.mesh.setOrder(2)
-        return compat.model_to_mesh(gmsh.model, comm, 0, 2)
+        mesh, _, tags = fc.model_to_mesh(gmsh.model, comm, gdim=2)
+        return mesh, tags
     finally:
         gmsh.finalize()
 

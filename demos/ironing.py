@@ -38,7 +38,7 @@ from mpi4py import MPI
 from tqdm import tqdm
 
 import fenics_contact as fc
-from fenics_contact import compat, output, plotting
+from fenics_contact import output, plotting
 from fenics_contact.elasticity import LinearElastic
 
 E, NU, MU, R, P = 1000.0, 0.3, 0.3, 12.0, 4.5
@@ -90,7 +90,8 @@ def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
 
             gmsh.model.mesh.setSizeCallback(size)
             gmsh.model.mesh.generate(2)
-        return compat.model_to_mesh(gmsh.model, MPI.COMM_WORLD, 0, 2)
+        mesh, _, tags = fc.model_to_mesh(gmsh.model, MPI.COMM_WORLD, gdim=2)
+        return mesh, tags
     finally:
         gmsh.finalize()
 

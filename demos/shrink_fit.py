@@ -39,7 +39,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from fenics_contact import compat, output, plotting
+from fenics_contact import output, plotting
 from fenics_contact.elasticity import LinearElastic
 
 E, NU, OVERSIZE = 210e3, 0.3, 0.02  # MPa, mm
@@ -99,7 +99,8 @@ def make_mesh(h: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
             gmsh.model.mesh.setSizeCallback(size)
             gmsh.model.mesh.generate(2)
             gmsh.model.mesh.setOrder(2)
-        return compat.model_to_mesh(gmsh.model, MPI.COMM_WORLD, 0, 2)
+        mesh, _, tags = fc.model_to_mesh(gmsh.model, MPI.COMM_WORLD, gdim=2)
+        return mesh, tags
     finally:
         gmsh.finalize()
 

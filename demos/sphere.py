@@ -39,7 +39,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from fenics_contact import compat, output, plotting
+from fenics_contact import output, plotting
 from fenics_contact.elasticity import LinearElastic
 
 R, NU, E_STAR = 1.0, 0.3, 1.5e7
@@ -85,7 +85,8 @@ def make_mesh(case: str, a: float, cells: int) -> tuple[dolfinx.mesh.Mesh, dolfi
             gmsh.model.mesh.setSizeCallback(size)
             gmsh.model.mesh.generate(3)
             gmsh.model.mesh.setOrder(2)
-        return compat.model_to_mesh(gmsh.model, MPI.COMM_WORLD, 0, 3)
+        mesh, _, tags = fc.model_to_mesh(gmsh.model, MPI.COMM_WORLD)
+        return mesh, tags
     finally:
         gmsh.finalize()
 

@@ -42,7 +42,7 @@ from petsc4py import PETSc
 from tqdm import tqdm
 
 import fenics_contact as fc
-from fenics_contact import compat, output, plotting
+from fenics_contact import output, plotting
 from fenics_contact.elasticity import LinearElastic
 
 R, E, NU, FRICTION = 8.0, 200.0, 0.3, 0.2  # mm, MPa
@@ -100,7 +100,8 @@ def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
             gmsh.model.mesh.setSizeCallback(size)
             gmsh.model.mesh.generate(2)
             gmsh.model.mesh.setOrder(2)
-        return compat.model_to_mesh(gmsh.model, MPI.COMM_WORLD, 0, 2)
+        mesh, _, tags = fc.model_to_mesh(gmsh.model, MPI.COMM_WORLD, gdim=2)
+        return mesh, tags
     finally:
         gmsh.finalize()
 

@@ -15,6 +15,7 @@ from fenics_contact.laws.base import Kinematics, Law, Response
 from fenics_contact.laws.friction import Coulomb, FrictionLaw, Tresca
 from fenics_contact.laws.stiffness import Scaled, Springs
 from fenics_contact.laws.unilateral import Foundation, Frictionless
+from fenics_contact.meshes import model_to_mesh
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.results import output, plotting
 from fenics_contact.supports.base import Motion, Placement, Support
@@ -61,6 +62,7 @@ __all__ = [
     "elasticity",
     "estimate_errors",
     "increments",
+    "model_to_mesh",
     "output",
     "plotting",
 ]

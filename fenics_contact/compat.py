@@ -24,8 +24,8 @@ __all__ = [
     "create_facet_submesh",
     "geometry_dofmap",
     "geometry_element",
+    "gmsh_data",
     "interpolation_points",
-    "model_to_mesh",
     "option_was_read",
 ]
 
@@ -121,13 +121,18 @@ def interpolation_points(element: Any) -> Array:
     return points() if callable(points) else points
 
 
-def model_to_mesh(model: Any, comm: Any, rank: int, gdim: int) -> tuple[Any, Any]:
-    """Distribute the gmsh model of ``rank``: the mesh and its facet tags. Collective."""
+def gmsh_data(model: Any, comm: Any, rank: int, gdim: int) -> tuple[dolfinx.mesh.Mesh, Any, Any]:
+    """Mesh of the gmsh model of ``rank``, tags of its cells and facets (or None). Collective."""
     try:
         from dolfinx.io import gmsh as gmshio  # DOLFINx >= 0.10
     except ImportError:
         from dolfinx.io import gmshio
     data = gmshio.model_to_mesh(model, comm, rank, gdim=gdim)
-    if isinstance(data, tuple):
-        return data[0], data[2]
-    return data.mesh, data.facet_tags
+    if isinstance(data, tuple):  # a named one from 0.10 on, which has more behind these
+        return data[0], data[1], data[2]
+    return data.mesh, data.cell_tags, data.facet_tags
+
+
+def model_to_mesh(model: Any, comm: Any, rank: int, gdim: int) -> tuple[Any, Any]:
+    """Mesh and facet tags of `gmsh_data`. Collective."""
+    return gmsh_data(model, comm, rank, gdim)[::2]

@@ -14,7 +14,6 @@ from dolfinx import fem
 from statics import near
 
 import fenics_contact as fc
-from fenics_contact import compat
 
 GROUND, LOAD, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
 
@@ -180,7 +179,8 @@ def cylinder_on_block(h: float):
             gmsh.model.mesh.setSizeCallback(size)
             gmsh.model.mesh.generate(2)
             gmsh.model.mesh.setOrder(2)
-        return compat.model_to_mesh(gmsh.model, COMM, 0, 2)
+        mesh, _, tags = fc.model_to_mesh(gmsh.model, COMM, gdim=2)
+        return mesh, tags
     finally:
         gmsh.finalize()
 

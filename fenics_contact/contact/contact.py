@@ -227,7 +227,6 @@ class Contact:
         self._projection: TraceProjection | None = None
         self._own_form: Any = None
         self._values: PointValues | None = None
-        self.committed_jump: Array = np.zeros((self.quadrature.n_points, gdim))
         if not self.rigid:
             self.pair()
 
