@@ -10,14 +10,14 @@ norm as estimated; beside it what the contact force and the peak pressure come t
 from __future__ import annotations
 
 import numpy as np
-import problems
 import ufl
 from dolfinx import fem, mesh
 from dolfinx.mesh import GhostMode
 from mpi4py import MPI
-from timing import draw, parser, write
 
 import fenics_contact as fc
+from benchmarks import problems
+from benchmarks.timing import draw, parser, write
 from fenics_contact.elasticity import LinearElastic
 
 E, NU, R, DEPTH, STIFFNESS = 1000.0, 0.3, 4.0, 0.01, 1e5

@@ -18,11 +18,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-import costs
 import numpy as np
-import problems
-import timing
 from mpi4py import MPI
+
+from benchmarks import costs, problems, timing
 
 
 def runs(case: costs.Case, friction: float) -> dict[str, Callable[[], costs.Row]]:

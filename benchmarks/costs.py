@@ -13,14 +13,13 @@ from functools import cached_property, partial
 from typing import Any
 
 import dolfinx.fem.petsc  # noqa: F401
-import problems
-import timing
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
+from benchmarks import problems, timing
 from fenics_contact.surface.surface import PointEvaluator
 from fenics_contact.systems import linear
 

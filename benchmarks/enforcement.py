@@ -23,15 +23,14 @@ from typing import Any
 
 import dolfinx.fem.petsc  # noqa: F401
 import numpy as np
-import problems
-import timing
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from problems import Body
 
 import fenics_contact as fc
+from benchmarks import problems, timing
+from benchmarks.problems import Body
 from fenics_contact.elasticity import LinearElastic
 from fenics_contact.surface.surface import PointEvaluator
 

@@ -17,12 +17,11 @@ from __future__ import annotations
 from functools import cache, partial
 from typing import Any
 
-import costs
 import numpy as np
-import problems
-import timing
 from mpi4py import MPI
-from problems import hertz
+
+from benchmarks import costs, problems, timing
+from benchmarks.problems import hertz
 
 # The fewest increments whose solution is that of the reference's history.
 MANY = 40

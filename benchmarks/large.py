@@ -29,12 +29,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import costs
 import numpy as np
-import problems
-import timing
 from mpi4py import MPI
 from petsc4py import PETSc
+
+from benchmarks import costs, problems, timing
 
 COMM = MPI.COMM_WORLD
 FRICTION = 0.3

@@ -13,23 +13,18 @@ compiled once.
 from __future__ import annotations
 
 import statistics
-import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import dolfinx
 import numpy as np
-import problems
-import timing
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
-import ironing
+from benchmarks import problems, timing
+from demos import ironing
 
 METHODS = ("lbfgs", "newton", "continuation", "alternating")
 STIFFNESSES = (10.0, 1000.0)

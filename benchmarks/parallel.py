@@ -30,11 +30,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import large
 import numpy as np
-import timing
 from mpi4py import MPI
 
+from benchmarks import large, timing
 from fenics_contact import plotting
 
 RUNS = ("linear, multigrid", "contact, multigrid", "contact, multigrid, Newton")

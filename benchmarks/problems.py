@@ -7,11 +7,9 @@ a user of DOLFINx would write by hand.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import dolfinx
@@ -23,14 +21,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
+from demos import greco_block as greco
+from demos import hertz, shrink_fit, sphere
 from fenics_contact import output
 from fenics_contact.elasticity import LinearElastic
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
-import greco_block as greco
-import hertz
-import shrink_fit
-import sphere
 
 Parts = tuple[fem.Function, ufl.Form, fem.Constant, list[fem.DirichletBC]]
 Sides = Mapping[int, Callable[[np.ndarray], np.ndarray]]

@@ -18,11 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import problems
-import timing
 from mpi4py import MPI
 
 import fenics_contact as fc
+from benchmarks import problems, timing
 
 ENFORCEMENTS: dict[str, tuple[float, str]] = {
     "penalty 10": (10.0, "penalty"),

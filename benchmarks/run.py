@@ -25,12 +25,11 @@ import tempfile
 import time
 from pathlib import Path
 
-import targets
-import timing
+from benchmarks import targets, timing
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
-HELPERS = ("run", "timing", "costs", "problems", "targets")
+HELPERS = ("__init__", "run", "timing", "costs", "problems", "targets")
 # Long, and with pages of their own in docs/.
 BY_NAME_ONLY = ("methods", "trade")
 STAMP = "stamp.json"

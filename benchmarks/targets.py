@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import timing
+from benchmarks import timing
 
 Rows = Sequence[dict[str, str]]
 NOT_MEASURED = "not measured"

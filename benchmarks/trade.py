@@ -28,12 +28,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import costs
 import numpy as np
-import timing
 from mpi4py import MPI
 from petsc4py import PETSc
-from problems import (
+from tqdm import tqdm
+
+import fenics_contact as fc
+from benchmarks import costs, timing
+from benchmarks.problems import (
     Body,
     ball_on_half_space,
     greco,
@@ -45,9 +47,6 @@ from problems import (
     shrink_fit,
     sphere,
 )
-from tqdm import tqdm
-
-import fenics_contact as fc
 from fenics_contact import plotting
 from fenics_contact.contact.accuracy import PRESETS
 

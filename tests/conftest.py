@@ -8,6 +8,8 @@ from collections.abc import Iterator
 import pytest
 from mpi4py import MPI
 
+# Assertions of the scenes tell what differs, too.
+pytest.register_assert_rewrite("scenes")
 # Where traces go: the error stream as it is while pytest does not capture it.
 _stderr = 2
 # A rank that waits for another inside C++ holds the interpreter's lock, so that no other timeout

@@ -4,43 +4,29 @@ import itertools
 
 import numpy as np
 import pytest
-from dolfinx import fem
 from mpi4py import MPI
-from scenes import TOP, block, raised_everywhere, stress
 
 import fenics_contact as fc
 from fenics_contact.contact.accuracy import DEFAULT_FACTOR, PRESETS
 from fenics_contact.estimates.errors import quantities
+from scenes.blocks import TOP, block
+from scenes.comparing import raised_everywhere
+from scenes.elasticity import stress
+from scenes.rubbing import Aslant, cushion
 
 COMM = MPI.COMM_WORLD
 
 
-class Press:
-    """A block of quadratic cells pressed on a ball and moved along it."""
-
-    def __init__(self, law=None, **contact):
-        """Make it, unloaded."""
-        scene = self.scene = block("quadrilateral", 2, n=8)
-        self.push = [fem.Constant(scene.mesh, 0.0) for _ in range(2)]
-        bcs = [scene.hold(TOP, i, c) for i, c in enumerate(self.push)]
-        contact |= {"support": fc.Ball((0.5, -2.0), 2.0)}
-        self.problem, self.contact = scene.problem(
-            law or fc.Coulomb(0.3), bcs, contact=contact, method="newton"
-        )
-
-    def run(self, **kwargs):
-        """All steps of pressing down, and half as far to the side."""
-
-        def load(t):
-            self.push[1].value, self.push[0].value = -0.03 * t, 0.015 * t
-
-        return list(fc.increments(self.problem, load, **kwargs))
+def press(law=None, **contact) -> Aslant:
+    """Quadratic cells."""
+    law = law or fc.Coulomb(0.3)
+    return Aslant(law, degree=2, mesh={"n": 8}, contact=contact, method="newton")
 
 
 @pytest.fixture(scope="module")
 def truth():
     """Forces with multipliers to 1e-8 and 200 increments."""
-    made = Press(
+    made = press(
         fc.Coulomb(0.3, fc.Scaled(10), fc.Scaled(10)), enforcement="augmented", tolerance=1e-8
     )
     made.run(steps=200)
@@ -50,7 +36,7 @@ def truth():
 @pytest.mark.parametrize("wanted", [*PRESETS, 3e-3])
 def test_the_error_is_as_wanted(wanted, truth):
     """But for the mesh, which is the same: normal and friction force and peak pressure."""
-    made = Press(accuracy=wanted)
+    made = press(accuracy=wanted)
     steps = made.run()
     accuracy = fc.Accuracy.of(wanted)
     assert len(steps) == accuracy.increments
@@ -74,23 +60,23 @@ def test_choices():
 
 def test_what_is_given_wins():
     """Stiffness, enforcement, tolerance, solver and increments of the caller's own."""
-    made = Press(fc.Coulomb(0.3, k_n=fc.Scaled(7), k_t=1e3), accuracy="fine", enforcement="penalty")
+    made = press(fc.Coulomb(0.3, k_n=fc.Scaled(7), k_t=1e3), accuracy="fine", enforcement="penalty")
     assert made.contact.multipliers is None
     assert float(made.contact.parameters["k_n"].value) == 7.0
     assert float(made.contact.parameters["k_t"].value) == 1e3
     assert made.problem.snes.getTolerances()[0] == fc.Accuracy.of("fine").rtol
     assert len(made.run(steps=2)) == 2
-    plain = Press()
+    plain = press()
     assert float(plain.contact.parameters["k_n"].value) == DEFAULT_FACTOR
     assert plain.problem.accuracy is None and plain.problem.increments_wanted == 1
-    assert Press(fc.Frictionless(), accuracy="fine").problem.increments_wanted == 1
-    given = Press(accuracy="fine", tolerance=1e-3).contact
+    assert press(fc.Frictionless(), accuracy="fine").problem.increments_wanted == 1
+    given = press(accuracy="fine", tolerance=1e-3).contact
     assert given.tolerance == 1e-3 and given.multipliers is not None
 
 
 def test_physical_stiffness_stays():
     """A foundation is none of the regularisation's business: no multipliers, no other stiffness."""
-    made = Press(fc.Foundation(1e4, 1e3), accuracy="fine").contact
+    made = press(fc.Foundation(1e4, 1e3), accuracy="fine").contact
     assert made.multipliers is None
     assert float(made.parameters["k_n"].value) == 1e4
 
@@ -115,7 +101,7 @@ def test_the_mesh_it_takes():
     lucky or not.
     """
     wanted = 5e-3
-    made = Press(fc.Frictionless(), accuracy=wanted)
+    made = press(fc.Frictionless(), accuracy=wanted)
     made.run()
     scene = made.scene
     budget = fc.estimate_errors(made.problem, stress(scene.u, scene.E, scene.nu))
@@ -127,7 +113,7 @@ def test_the_mesh_it_takes():
     n = int(np.ceil(1 / budget.h_wanted))
     finer = block("quadrilateral", 2, n=n)
     bcs = [finer.hold(TOP, 0, 0.015), finer.hold(TOP, 1, -0.03)]
-    contact = {"support": fc.Ball((0.5, -2.0), 2.0), "accuracy": wanted}
+    contact = {"support": cushion(2), "accuracy": wanted}
     problem, _ = finer.problem(fc.Frictionless(), bcs, contact=contact, method="newton")
     problem.solve()
     again = fc.estimate_errors(problem, stress(finer.u, finer.E, finer.nu))
@@ -137,4 +123,4 @@ def test_the_mesh_it_takes():
 @pytest.mark.parametrize("wanted", ["best", 0.0, -1.0, 2.0, float("nan"), [0.1, 0.2]])
 def test_other_words(wanted):
     """No such word, or no relative error: said on all ranks, with those there are."""
-    raised_everywhere(lambda: Press(accuracy=wanted), ValueError, "standard", "between")
+    raised_everywhere(lambda: press(accuracy=wanted), ValueError, "standard", "between")

@@ -7,13 +7,14 @@ import ufl
 from dolfinx import fem
 from dolfinx.mesh import GhostMode
 from mpi4py import MPI
-from scenes import BOTTOM as INSIDE
-from scenes import TOP as OUTSIDE
-from scenes import block_mesh, raised_everywhere, side_tags
 
 import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic
 from fenics_contact.parallel import global_sum
+from scenes.blocks import BOTTOM as INSIDE
+from scenes.blocks import TOP as OUTSIDE
+from scenes.blocks import block_mesh, side_tags
+from scenes.comparing import raised_everywhere
 
 COMM = MPI.COMM_WORLD
 BASE, TOP, AXIS = 1, 2, 3

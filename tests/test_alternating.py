@@ -6,31 +6,13 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from scenes import GRID, TOP, at_points, block, close, nodal, owned, wave
 
 import fenics_contact as fc
+from scenes.blocks import GRID, TOP, block, wave
+from scenes.comparing import at_points, close, nodal, owned
+from scenes.rubbing import Rub, cushion, pressed
 
 COMM = MPI.COMM_WORLD
-
-
-def cushion(d: int, **kwargs) -> fc.Ball:
-    """A ball that just touches the middle of the block's bottom."""
-    center = np.full(d, 0.5)
-    center[-1] = -2.0
-    return fc.Ball(center, 2.0, **kwargs)
-
-
-def pressed(cell, law, method, *, degree=1, side=0.01, down=0.03, n=4, **options):
-    """A block pressed on a cushion and moved along it, solved."""
-    scene = block(cell, degree, n=n)
-    d = scene.dim
-    move = np.zeros(d)
-    move[0], move[-1] = side, -down
-    bcs = [scene.hold(TOP, i, value) for i, value in enumerate(move)]
-    problem, contact = scene.problem(
-        law, bcs, contact={"support": cushion(d)}, method=method, **options
-    )
-    return scene, problem, contact
 
 
 @pytest.mark.parametrize(("cell", "degree"), GRID)
@@ -74,18 +56,10 @@ def test_history_and_increments():
     """Over a cycle of loads both methods keep the same history."""
     ends = []
     for method in ("alternating", "lbfgs"):
-        scene = block("quadrilateral", 1, n=4)
-        push = [fem.Constant(scene.mesh, 0.0) for _ in range(2)]
-        bcs = [scene.hold(TOP, i, c) for i, c in enumerate(push)]
         law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
-        problem, contact = scene.problem(law, bcs, contact={"support": cushion(2)}, method=method)
-
-        def load(t, push=push):
-            push[1].value = -0.03 * min(t, 1.0)
-            push[0].value = np.interp(t, [1, 2, 4], [0, 0.05, -0.05])
-
-        list(fc.increments(problem, load, 0.0, 4.0, steps=8))
-        ends.append(at_points(contact, contact.history.rows()))
+        made = Rub(law, reach=0.05, method=method)
+        list(fc.increments(made.problem, made.load, 0.0, 4.0, steps=8))
+        ends.append(at_points(made.contact, made.contact.history.rows()))
     assert close(*ends, 1e-5)
 
 
@@ -105,7 +79,7 @@ def test_a_driven_support():
     for method in ("alternating", "newton"):
         scene = block("quadrilateral", 1, n=4)
         drag = fem.Constant(scene.mesh, 0.0)
-        support = cushion(2, displacement=fc.Motion(force=(drag, 5.0)))
+        support = cushion(2, fc.Motion(force=(drag, 5.0)))
         bcs = [scene.hold(TOP, i) for i in range(2)]
         law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
         problem, contact = scene.problem(law, bcs, contact={"support": support}, method=method)

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-import test_sliding
-import test_two_bodies as two_bodies
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from scenes import GRID, TOP, Block, at_points, block, close, gathered, raised_everywhere, wave
 
 import fenics_contact as fc
+from demos import hertz
 from fenics_contact import checkpoint, output
 from fenics_contact.methods import solver as module
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
-import hertz
+from scenes import two_blocks
+from scenes.blocks import GRID, TOP, Block, block, wave
+from scenes.comparing import at_points, close, gathered, raised_everywhere, shared_folder
 
 COMM = MPI.COMM_WORLD
 E = 1000.0
@@ -76,11 +73,11 @@ def test_patch_of_two_bodies(cell: str, degree: int) -> None:
     p/k_n. Each round leaves M/(M + k_n) = 1/8 of the jump.
     """
     nu, k_n = 0.3, 1e7
-    problem, contact, _ = two_bodies.pressed(
+    problem, contact, _ = two_blocks.pressed(
         cell, degree, nu, fc.Coulomb(0.3, k_n, k_n), contact=AUGMENTED | {"tolerance": 1e-8}
     )
     problem.solve()
-    p = 0.01 * two_bodies.E * (1 - nu) / (1 + nu) / (1 - 2 * nu)
+    p = 0.01 * two_blocks.E * (1 - nu) / (1 + nu) / (1 - 2 * nu)
     points = contact.gather()
     assert points["pressure"] == pytest.approx(np.full(len(points["x"]), p), rel=1e-7)
     assert np.abs(points["gap"]).max() <= 1e-7 * p / k_n
@@ -339,7 +336,7 @@ def test_sliding_over_a_body() -> None:
     normal = []
     for k, options in ((10.0, AUGMENTED), (1e4, {}), (10.0, {})):
         law = fc.Coulomb(0.3, fc.Scaled(k), fc.Scaled(k))
-        made = test_sliding.Slider("triangle", law, start=0.4, contact=options, method="newton")
+        made = two_blocks.Slider("triangle", law, start=0.4, contact=options, method="newton")
         steps = [made.step(0.01, 0.0), *(made.step(0.01, 0.1 * i) for i in range(1, 6))]
         last = steps[-1].contacts["contact"]
         assert last.tangential_force == pytest.approx(0.3 * last.normal_force, rel=1e-6)
@@ -385,7 +382,7 @@ def test_checkpoint(tmp_path: Path) -> None:
 
     To 1e-9 of the tractions: both start from the same numbers.
     """
-    folder = Path(COMM.bcast(str(tmp_path)))
+    folder = shared_folder(tmp_path)
     made = []
     for take_up in (False, True):
         scene = block("triangle", 2, n=3, up=-10.0)

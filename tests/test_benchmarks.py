@@ -11,13 +11,7 @@ import pytest
 from mpi4py import MPI
 from running import ROOT, environment
 
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-import large
-import parallel
-import run
-import targets
-import timing
+from benchmarks import large, parallel, run, targets, timing
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="of one process")
 

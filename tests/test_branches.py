@@ -10,9 +10,10 @@ import warnings
 import numpy as np
 import pytest
 from mpi4py import MPI
-from scenes import LEFT, RIGHT, block, close
 
 import fenics_contact as fc
+from scenes.blocks import LEFT, RIGHT, block
+from scenes.comparing import close
 
 COMM = MPI.COMM_WORLD
 PRESS = 10.0

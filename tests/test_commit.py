@@ -7,10 +7,11 @@ MUMPS adds in the order in which messages come: 1e-10.
 import numpy as np
 import pytest
 from mpi4py import MPI
-from scenes import at_points, block, close, nodal
 from test_pairs import FLOOR, LOWER, ROOF, UPPER, stack
 
 import fenics_contact as fc
+from scenes.blocks import block
+from scenes.comparing import at_points, close, nodal
 
 COMM = MPI.COMM_WORLD
 EXACT = 0.0 if COMM.size == 1 else 1e-10
@@ -87,10 +88,9 @@ def test_a_second_commit_finds_no_other_pairs():
     slide = body.constant()
     body.hold(ROOF, 0, value=slide)
     body.F += 1e4 * body.v[1] * body.ds(ROOF)
-    surface = fc.ContactSurface(body.mesh, body.tags, 10 + UPPER)
     support = fc.DeformableBody(body.tags, 10 + LOWER, update="increment")
-    contact = fc.Contact(body.u, surface, support, fc.Coulomb(0.3))
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    contact = body.contact(10 + UPPER, support, fc.Coulomb(0.3))
+    problem = body.problem(contact)
     for way in (0.0, 0.1):
         slide.value = way
         problem.solve()

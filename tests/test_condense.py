@@ -8,12 +8,13 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from scenes import CELLS, GRID, LEFT, RIGHT, TOP, block, close, owned, raised_everywhere
-from test_sliding import Slider
-from test_solver import PATH, kirchhoff, rub, walk
 
 import fenics_contact as fc
 from fenics_contact.systems.condensed import Condensation, touched, worthwhile
+from scenes.blocks import CELLS, GRID, LEFT, RIGHT, TOP, block, kirchhoff
+from scenes.comparing import close, owned, raised_everywhere
+from scenes.rubbing import PATH, Rub, cushion, walk
+from scenes.two_blocks import Slider
 
 pytestmark = pytest.mark.timeout(240)
 COMM = MPI.COMM_WORLD
@@ -144,7 +145,7 @@ def test_path(cell, degree, law, method):
         return fields(made, steps)
 
     def make(**options):
-        return rub(LAWS[law], cell=cell, degree=degree, method=method, **options)
+        return Rub(LAWS[law], cell=cell, degree=degree, method=method, **options)
 
     assert_same(*both(make, run))
     assert iterations[True] <= 1.5 * iterations[False]
@@ -157,7 +158,7 @@ def test_every_cell(cell, degree):
     mesh = {"n": 4 if cell in ("triangle", "quadrilateral") else 2}
 
     def make(**options):
-        return rub(cell=cell, degree=degree, mesh=mesh, **options)
+        return Rub(cell=cell, degree=degree, mesh=mesh, **options)
 
     assert_same(*both(make, lambda made: fields(made, walk(made, path=PATH[:4]))))
 
@@ -197,12 +198,10 @@ def test_driven_support(cell, method):
         motion = fc.Motion(
             force=[None] * (d - 1) + [5.0], displacement=[drag] + [0.0] * (d - 2) + [None]
         )
-        center = np.full(d, 0.5)
-        center[-1] = -2.0
         problem, contact = scene.problem(
             fc.Coulomb(0.3, k_n=2e4, k_t=1e4),
             [scene.hold(TOP, i) for i in range(d)],
-            contact={"support": fc.Ball(center, 2.0, displacement=motion)},
+            contact={"support": cushion(d, motion)},
             method=method,
             condensation=condensed,
         )
@@ -222,16 +221,8 @@ def test_several_contacts_and_loads():
     results = []
     for condensed in (True, False):
         scene = block("triangle", 2, n=4)
-        v = ufl.TestFunction(scene.u.function_space)
-        side = fem.Constant(scene.mesh, scene.vector(side=-1.0))
-        scene.F -= ufl.dot(side, v) * ufl.ds(scene.mesh, subdomain_data=scene.tags)(RIGHT)
-        wall = fc.Contact(
-            scene.u,
-            fc.ContactSurface(scene.mesh, scene.tags, LEFT),
-            fc.HalfSpace((0, 0), (1, 0)),
-            fc.Frictionless(k_n=2e4),
-            name="wall",
-        )
+        side = scene.pull(RIGHT, scene.vector(side=-1.0))
+        wall = scene.wall(fc.Frictionless(k_n=2e4))
         floor = scene.contact(fc.Coulomb(0.2, k_n=2e4, k_t=1e4), name="floor")
         problem = fc.ContactProblem(
             scene.F, scene.u, contacts=[wall, floor], condensation=condensed
@@ -263,7 +254,7 @@ def test_modulus_changed():
             assert [s.factorisations for s in steps] == [1, 1, 0, 1]
         return fields(made, steps)
 
-    assert_same(*both(rub, run))
+    assert_same(*both(Rub, run))
 
 
 @serial
@@ -272,7 +263,7 @@ def test_units(method):
     """The same iterations and digits in other units, 1e-9 of the fields."""
     results = []
     for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1e9)]:
-        made = rub(
+        made = Rub(
             fc.Coulomb(0.3), length=length, pressure=pressure, method=method, condensation=True
         )
         steps = walk(made, length, PATH[:4])
@@ -288,7 +279,7 @@ def test_units(method):
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_failure_leaves_no_trace(method):
     """An increment that fails leaves u, history and what comes next as if it had not been."""
-    made, twin = (rub(method=method, condensation=True) for _ in range(2))
+    made, twin = (Rub(method=method, condensation=True) for _ in range(2))
     for m in (made, twin):
         walk(m, path=PATH[:2])
     before = made.scene.u.x.array.copy(), made.contact.history.function.x.array.copy()
@@ -351,7 +342,7 @@ def test_the_choice(caplog):
         fc.ContactProblem(scene.F, scene.u, bcs=bcs, condensation=True)
 
     raised_everywhere(without_contact, ValueError, "condensation", "no contact")
-    F = kirchhoff(scene, scene.E)
+    F = kirchhoff(scene)
     raised_everywhere(lambda: condensed(F, [contact]), ValueError, "condensation", "not linear")
     if COMM.size > 1:
         raised_everywhere(lambda: condensed(scene.F, [contact]), ValueError, "one rank")
@@ -376,7 +367,7 @@ def test_what_is_worth_it():
 def test_a_nonlinear_bulk_is_not_condensed():
     """By default it iterates on all unknowns and says why."""
     scene = block("quadrilateral", up=-1.0)
-    scene.F = kirchhoff(scene, scene.E)
+    scene.F = kirchhoff(scene)
     problem, _ = scene.problem(fc.Frictionless(k_n=5e4), scene.rollers())
     assert not problem.solver.condensed
     problem.solve()

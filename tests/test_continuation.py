@@ -2,14 +2,14 @@
 
 import logging
 
-import numpy as np
 import pytest
 from dolfinx import fem
 from mpi4py import MPI
-from scenes import TOP, block, close, nodal
-from test_alternating import cushion, pressed
 
 import fenics_contact as fc
+from scenes.blocks import TOP, block
+from scenes.comparing import close, nodal
+from scenes.rubbing import Rub, pressed
 
 COMM = MPI.COMM_WORLD
 SERIAL = pytest.mark.skipif(COMM.size > 1, reason="the same on several ranks, and slow there")
@@ -107,19 +107,11 @@ def test_history_is_led_through():
     """
     ends = []
     for method in ("continuation", "lbfgs"):
-        scene = block("quadrilateral", 1, n=8)
-        push = [fem.Constant(scene.mesh, 0.0) for _ in range(2)]
-        bcs = [scene.hold(TOP, i, c) for i, c in enumerate(push)]
         law = fc.Coulomb(0.3, fc.Scaled(100), fc.Scaled(100))
-        problem, _ = scene.problem(law, bcs, contact={"support": cushion(2)}, method=method)
-
-        def load(t, push=push):
-            push[1].value = -0.03 * min(t, 1.0)
-            push[0].value = np.interp(t, [1, 2, 4], [0, 0.05, -0.05])
-
-        steps = list(fc.increments(problem, load, 0.0, 4.0, steps=8))
+        made = Rub(law, mesh={"n": 8}, reach=0.05, method=method)
+        steps = list(fc.increments(made.problem, made.load, 0.0, 4.0, steps=8))
         assert all(step.energy.dissipation >= 0 for step in steps)
-        ends.append(nodal(scene.u))
+        ends.append(nodal(made.scene.u))
     assert close(*ends, 1e-5)
 
 

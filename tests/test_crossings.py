@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 from dolfinx import fem
 from mpi4py import MPI
-from scenes import TOP, block, close, nodal
-from test_own_law import Asperities
-from test_pairs import FLOOR, LOWER, ROOF, UPPER, stack
-from test_sliding import K_N, Slider
 
 import fenics_contact as fc
+from scenes.blocks import TOP, block
+from scenes.comparing import close, nodal
+from scenes.laws import Asperities
+from scenes.stacks import FLOOR, LOWER, ROOF, UPPER, stack
+from scenes.two_blocks import Slider
 
 COMM = MPI.COMM_WORLD
+K_N = 1e7
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 
 

@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 import ufl
-from dolfinx import fem
 from mpi4py import MPI
-from scenes import GRID, TOP, block, close, nodal, raised_everywhere, stress
 
 import fenics_contact as fc
 from fenics_contact.estimates.errors import quantities
+from scenes.blocks import GRID, TOP, block
+from scenes.comparing import close, nodal, raised_everywhere, shared_folder
+from scenes.elasticity import stress
+from scenes.rubbing import Aslant, cushion
 
 COMM = MPI.COMM_WORLD
 # Effectivity that is asked of an estimate: estimated over true error.
@@ -19,28 +21,9 @@ def budget(scene, problem, **kwargs):
     return fc.estimate_errors(problem, stress(scene.u, scene.E, scene.nu), **kwargs)
 
 
-class Press:
-    """A block pressed on a ball and moved along it."""
-
-    def __init__(self, *, cell="quadrilateral", degree=1, n=8, k=1e4, friction=0.3, **options):
-        """Make it, unloaded."""
-        scene = self.scene = block(cell, degree, n=n)
-        d = scene.dim
-        self.push = [fem.Constant(scene.mesh, 0.0) for _ in range(d)]
-        bcs = [scene.hold(TOP, i, c) for i, c in enumerate(self.push)]
-        centre = np.full(d, 0.5)
-        centre[-1] = -2.0
-        law = fc.Coulomb(friction, k, k) if friction else fc.Frictionless(k)
-        contact = {"support": fc.Ball(centre, 2.0)}
-        self.problem, self.contact = scene.problem(law, bcs, contact=contact, **options)
-
-    def load(self, t: float) -> None:
-        """Down, and half as far to the side."""
-        self.push[-1].value, self.push[0].value = -0.03 * t, 0.015 * t
-
-    def solved(self, steps=1, **kwargs):
-        """The last step."""
-        return list(fc.increments(self.problem, self.load, steps=steps, **kwargs))[-1]
+def press(*, n=8, k=1e4, friction=0.3, **options) -> Aslant:
+    law = fc.Coulomb(friction, k, k) if friction else fc.Frictionless(k)
+    return Aslant(law, mesh={"n": n}, **options)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -67,9 +50,9 @@ def test_enforcement_of_uniform_pressure(cell, degree, method):
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_enforcement(friction):
     """Against the same mesh with 300 times the stiffness, whose own error is 300 times less."""
-    soft, stiff = (Press(friction=friction, k=k, n=16) for k in (1e4, 3e6))
-    soft.solved(steps=2)
-    stiff.solved(steps=2)
+    soft, stiff = (press(friction=friction, k=k, n=16) for k in (1e4, 3e6))
+    soft.run(steps=2)
+    stiff.run(steps=2)
     found, truth = budget(soft.scene, soft.problem), quantities(stiff.problem)
     for name in ("normal force", "peak pressure"):
         ratio = found.parts["enforcement"][name] / (found.values[name] - truth[name])
@@ -79,9 +62,9 @@ def test_enforcement(friction):
 @pytest.mark.parametrize(("cell", "degree", "n"), [("quadrilateral", 1, 12), ("triangle", 1, 8)])
 def test_discretisation(cell, degree, n):
     """Against a mesh of four times the cells each way: force of a prescribed displacement."""
-    coarse, fine = (Press(cell=cell, degree=degree, n=i, friction=0.0) for i in (n, 4 * n))
-    coarse.solved()
-    fine.solved()
+    coarse, fine = (press(cell=cell, degree=degree, n=i, friction=0.0) for i in (n, 4 * n))
+    coarse.run()
+    fine.run()
     found, truth = budget(coarse.scene, coarse.problem), quantities(fine.problem)
     name = "normal force"
     ratio = found.parts["discretisation"][name] / (found.values[name] - truth[name])
@@ -90,7 +73,7 @@ def test_discretisation(cell, degree, n):
 
 def test_discretisation_of_sliding():
     """Where all that is closed slips, friction's error is μ times that of the normal force."""
-    made = Press(friction=0.3)
+    made = press(friction=0.3)
     made.push[-1].value, made.push[0].value = -0.03, 0.2
     made.problem.kinematics = np.inf  # so far over the ball
     made.problem.solve()
@@ -104,7 +87,7 @@ def test_increments():
     """Against 32 increments: the friction under a contact that grows."""
     ends = {}
     for steps in (1, 2, 4, 32):
-        made = Press(n=16)
+        made = press(n=16)
         options = {"steps": steps, "estimate": steps < 32}
         end = list(fc.increments(made.problem, made.load, **options))
         assert len(end) == (2 * steps if steps < 32 else steps)
@@ -122,10 +105,10 @@ def test_solver(condensation):
     """A residual left on purpose: what was left shows to 1 %, for a residual of 1e-3."""
     # Newton's method would end with the exact solution all the same.
     options = {"petsc_options": {"snes_rtol": 1e-3}, "method": "lbfgs"}
-    rough = Press(friction=0.0, condensation=condensation, **options)
-    exact = Press(friction=0.0, condensation=condensation)
-    rough.solved()
-    exact.solved()
+    rough = press(friction=0.0, condensation=condensation, **options)
+    exact = press(friction=0.0, condensation=condensation)
+    rough.run()
+    exact.run()
     found, truth = budget(rough.scene, rough.problem), quantities(exact.problem)
     name = "normal force"
     error = found.values[name] - truth[name]
@@ -138,7 +121,7 @@ def test_nothing_is_changed():
 
     1e-9: on the way the tangent's solver is used, and the next increment starts from H₀ again.
     """
-    plain, asked = Press(), Press()
+    plain, asked = press(), press()
     for made in (plain, asked):
         made.load(0.5)
         made.problem.solve()
@@ -158,7 +141,7 @@ def test_nothing_is_changed():
 
 def test_the_same_before_and_after_the_commit():
     """1e-6: of the springs the same is left either way, once from the increment, once committed."""
-    made = Press()
+    made = press()
     made.load(1.0)
     made.problem.solve()
     before = budget(made.scene, made.problem)
@@ -171,8 +154,8 @@ def test_the_same_before_and_after_the_commit():
 
 def test_the_table():
     """Five lines, one for each part, and what dominates; several contacts by name."""
-    made = Press(k=1e3)
-    step = made.solved(estimate=True)
+    made = press(k=1e3)
+    step = made.run(estimate=True)[-1]
     found = budget(made.scene, made.problem, increment_error=step.increment_error)
     lines = str(found).splitlines()
     assert [line.split()[0] for line in lines[1:6]] == list(found.parts)
@@ -216,9 +199,10 @@ def test_units_do_not_matter():
     for length, pressure in ((1.0, 1.0), (1e-3, 1e6)):
         scene = block("triangle", 2, n=3, size=[length] * 2, E=1e3 * pressure)
         law = fc.Coulomb(0.3, fc.Scaled(10.0), fc.Scaled(10.0))
-        ball = fc.Ball((0.5 * length, -2.0 * length), 2.0 * length)
         bcs = [scene.hold(TOP, 0, 0.01 * length), scene.hold(TOP, 1, -0.03 * length)]
-        problem, _ = scene.problem(law, bcs, contact={"support": ball}, method="newton")
+        problem, _ = scene.problem(
+            law, bcs, contact={"support": cushion(2, length=length)}, method="newton"
+        )
         problem.solve()
         made = budget(scene, problem)
         found.append([v for part in made.parts for v in made.relative(part).values()])
@@ -227,8 +211,8 @@ def test_units_do_not_matter():
 
 def test_shapes_are_checked():
     """Stress and strain of different shapes, on all ranks."""
-    made = Press(n=2)
-    made.solved()
+    made = press(n=2)
+    made.run()
     u = made.scene.u
     raised_everywhere(
         lambda: fc.estimate_errors(made.problem, ufl.Identity(3), strain=ufl.sym(ufl.grad(u))),
@@ -240,20 +224,19 @@ def test_shapes_are_checked():
 
 def test_the_estimate_goes_on_from_a_checkpoint(tmp_path):
     """Broken off and taken up: the same error at the end; not from a file without (1e-7)."""
-    folder = COMM.bcast(str(tmp_path))
-    whole = Press()
-    end = whole.solved(3, estimate=True).increment_error
-    path = f"{folder}/state.npz"
-    broken, after = Press(), Press()
+    whole = press()
+    end = whole.run(steps=3, estimate=True)[-1].increment_error
+    path = shared_folder(tmp_path) / "state.npz"
+    broken, after = press(), press()
     for step in fc.increments(broken.problem, broken.load, steps=3, estimate=True, checkpoint=path):
         if step.increment == 4:
             break
-    again = after.solved(3, estimate=True, checkpoint=path).increment_error
+    again = after.run(steps=3, estimate=True, checkpoint=path)[-1].increment_error
     values = quantities(whole.problem)
     for name, error in end.items():
         assert close(again[name], error, 1e-7, scale=abs(values[name]))
     raised_everywhere(
-        lambda: Press().solved(3, checkpoint=path), ValueError, "estimate", "remove it"
+        lambda: press().run(steps=3, checkpoint=path), ValueError, "estimate", "remove it"
     )
 
 
@@ -263,7 +246,7 @@ def test_multipliers_leave_no_error_of_enforcement():
     for enforcement in ("penalty", "augmented"):
         scene = block("quadrilateral", 1, n=8)
         bcs = [scene.hold(TOP, 0, 0.015), scene.hold(TOP, 1, -0.03)]
-        contact = {"support": fc.Ball((0.5, -2.0), 2.0), "enforcement": enforcement}
+        contact = {"support": cushion(2), "enforcement": enforcement}
         problem, _ = scene.problem(fc.Coulomb(0.3, 1e4, 1e4), bcs, contact=contact)
         problem.solve()
         left[enforcement] = budget(scene, problem).relative("enforcement")["normal force"]
@@ -275,27 +258,10 @@ def test_multigrid_gives_the_same_budget():
     """The tangent's solver is a V-cycle there: to 1e-6, for systems are solved to 1e-8."""
     found = []
     for kind in ("direct", "multigrid"):
-        made = Press(cell="hexahedron", n=4, condensation=False, linear_solver=kind)
-        made.solved()
+        made = press(cell="hexahedron", n=4, condensation=False, linear_solver=kind)
+        made.run()
         found.append(budget(made.scene, made.problem))
     direct, multigrid = found
     for part in ("enforcement", "discretisation"):
         for name, value in direct.relative(part).items():
             assert close(multigrid.relative(part)[name], value, 1e-6, scale=1.0)
-
-
-def test_the_former_name_of_an_argument():
-    """`increments=` took their errors: it still does, with a warning; not both names at once."""
-    made = Press()
-    made.solved()
-    errors = {"normal force": 0.5}
-    with pytest.warns(FutureWarning, match="increment_error="):
-        found = budget(made.scene, made.problem, increments=errors)
-    assert found.parts["increments"] == errors
-    again = budget(made.scene, made.problem, increment_error=errors)
-    assert again.parts["increments"] == errors
-    raised_everywhere(
-        lambda: budget(made.scene, made.problem, increments=errors, increment_error=errors),
-        ValueError,
-        "increment_error",
-    )

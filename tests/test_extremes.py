@@ -4,18 +4,14 @@ References and tolerances are those of ``verification/extremes.py``.
 """
 
 import dataclasses
-import sys
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from running import ROOT
-from scenes import close
 
-sys.path.insert(0, str(ROOT / "verification"))
-
-from extreme_scenes import pressed, ranked
-from extremes import METHODS, Row, Trial, trials
+from scenes.comparing import close
+from verification.extreme_scenes import pressed, ranked
+from verification.extremes import METHODS, Row, Trial, trials
 
 COMM = MPI.COMM_WORLD
 # Some of every group, and what is cheap; all of it takes minutes.

@@ -20,13 +20,14 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 from running import ROOT, environment
-from scenes import close, nodal, raised_everywhere, stress
-from test_solver import PATH, identical, rub, snapshot, walk
 
 import fenics_contact as fc
 from fenics_contact import output, parallel, plotting
 from fenics_contact.surface import surface
 from fenics_contact.systems import dense
+from scenes.comparing import close, identical, nodal, raised_everywhere, shared_folder
+from scenes.elasticity import stress
+from scenes.rubbing import PATH, Rub, snapshot, walk
 
 COMM = MPI.COMM_WORLD
 LAST = COMM.size - 1
@@ -38,11 +39,6 @@ pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 
 class Fault(Exception):
     """What nothing in the package raises."""
-
-
-def shared_folder(tmp_path: Path) -> Path:
-    """Rank 0's folder, on all ranks."""
-    return Path(COMM.bcast(str(tmp_path)))
 
 
 def failing(function, after, error=Fault, *, rank=None):
@@ -76,7 +72,7 @@ def goes_on(made, twin):
 
 def pair(method="lbfgs", **kwargs):
     """Two that have made two increments and are loaded for the third."""
-    both = [rub(method=method, **kwargs) for _ in range(2)]
+    both = [Rub(method=method, **kwargs) for _ in range(2)]
     for made in both:
         walk(made, path=PATH[:2])
         made.move(*PATH[2])
@@ -240,7 +236,7 @@ def test_an_exception_in_a_linearised_solve(name, monkeypatch):
 )
 def test_memory_refused(method, condensation, prefix):
     """MUMPS may take 1 MB, which is not enough for this mesh: MemoryError, not a wrong answer."""
-    made = rub(mesh={"n": 64}, method=method, condensation=condensation)
+    made = Rub(mesh={"n": 64}, method=method, condensation=condensation)
     made.move(*PATH[0])
     options, key = PETSc.Options(), f"{prefix}mat_mumps_icntl_23"
     options[key] = 1
@@ -252,12 +248,10 @@ def test_memory_refused(method, condensation, prefix):
 
 
 ALONE = """
-import sys
-sys.path.insert(0, "tests")
-from test_solver import PATH, rub
+from scenes.rubbing import PATH, Rub
 from fenics_contact import parallel
 parallel.PATIENCE = 0.2
-made = rub()
+made = Rub()
 made.move(*PATH[0])
 name, rank = "{name}", made.problem.u.function_space.mesh.comm.rank
 equations = made.problem.solver.equations
@@ -280,7 +274,7 @@ def test_one_rank_fails_alone(name):
 
 def test_a_load_fails_on_one_rank():
     """The user's own function raises on one rank: all end, the load is that of before."""
-    made = rub()
+    made = Rub()
 
     def load(t):
         if t == 2.0 and COMM.rank == LAST:
@@ -346,7 +340,7 @@ def files(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("first", [True, False])
 def test_a_full_disk(kind, first, tmp_path):
     """A file that could not be written is not there, or as it was; the next one is whole."""
-    made = rub()
+    made = Rub()
     walk(made, path=PATH[:2])
     points = made.contact.gather()
     write = {
@@ -378,7 +372,7 @@ def test_a_full_disk(kind, first, tmp_path):
 def test_writing_fails_on_one_rank(kind, tmp_path, monkeypatch):
     """All ranks end, and no half of it is there."""
     folder = shared_folder(tmp_path)
-    made = rub()
+    made = Rub()
     write = {
         "json": lambda: output.write_json(folder / "r.json", {"x": 1}, COMM),
         "body": lambda: output.write_body(folder, made.scene.u),
@@ -395,7 +389,7 @@ def test_writing_fails_on_one_rank(kind, tmp_path, monkeypatch):
 def test_files_in_parallel_are_read_again(tmp_path):
     """Every file that a collection names is beside it (one for each rank, and one for all)."""
     folder = shared_folder(tmp_path)
-    made = rub()
+    made = Rub()
     output.write_body(folder, made.scene.u)
     found = files(folder)
     named = [w.split(b'"')[1].decode() for w in found["displacement.pvd"].split(b"file=")[1:]]

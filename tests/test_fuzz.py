@@ -14,11 +14,8 @@ import pytest
 from mpi4py import MPI
 from running import ROOT, environment
 
-sys.path.insert(0, str(ROOT / "verification"))
-
-import fuzz
-import fuzz_scenes
-import reference_solver as reference
+from verification import fuzz, fuzz_scenes
+from verification import reference_solver as reference
 
 COMM = MPI.COMM_WORLD
 serial = pytest.mark.skipif(COMM.size > 1, reason="nothing here depends on ranks")
@@ -147,7 +144,7 @@ def test_a_spoiled_history_is_found():
 
         def forgetful():
             commit()
-            values = {n: history.values(n) for n in history._slices}
+            values = {n: history.values(n) for n in history.names}
             history.commit(values | {"traction": 0.999 * values["traction"]})
 
         problem.commit = forgetful
@@ -321,7 +318,7 @@ def test_reference_returns_to_the_nearest_point_of_a_polygon(modes):
     # σ is nearest to σ* in a convex set if (σ* - σ)·(v - σ) ≤ 0 for all corners v.
     rng = np.random.default_rng(1)
     trial, limit = rng.normal(size=(200, 2)), rng.uniform(0.1, 2, 200)
-    sigma = reference._nearest_in_polygon(trial, limit, modes)
+    sigma = reference.nearest_in_polygon(trial, limit, modes)
     angles = np.pi * (2 * np.arange(modes) + 1) / modes
     corners = np.column_stack([np.cos(angles), np.sin(angles)]) / np.cos(np.pi / modes)
     for corner in corners:

@@ -7,22 +7,11 @@ import pytest
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from scenes import (
-    BOTTOM,
-    CELLS,
-    GRID,
-    RIGHT,
-    block,
-    block_mesh,
-    close,
-    dimension,
-    displacement_space,
-    gathered,
-    polynomial,
-    same_field,
-)
 
 import fenics_contact as fc
+from scenes.blocks import BOTTOM, CELLS, GRID, RIGHT, block, block_mesh, dimension, polynomial
+from scenes.comparing import close, gathered, same_field
+from scenes.elasticity import displacement_space
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD

@@ -11,21 +11,12 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from running import environment
-from scenes import (
-    BOTTOM,
-    LEFT,
-    RIGHT,
-    TOP,
-    Block,
-    block,
-    displacement_space,
-    raised_everywhere,
-    strain,
-    stress,
-)
 
 import fenics_contact as fc
 from fenics_contact import parallel
+from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, Block, block
+from scenes.comparing import raised_everywhere
+from scenes.elasticity import displacement_space, strain, stress
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD

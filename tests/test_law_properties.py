@@ -15,12 +15,12 @@ from dolfinx import fem
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
-from scenes import BOTTOM, block_mesh
 
 import fenics_contact as fc
 from fenics_contact.laws.base import Kinematics, Law
 from fenics_contact.laws.friction import FrictionLaw
 from fenics_contact.surface.surface import PointEvaluator
+from scenes.blocks import BOTTOM, block_mesh
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(200)]
 COMM = MPI.COMM_WORLD

@@ -9,28 +9,21 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from scenes import (
-    BOTTOM,
-    CELLS,
-    GRID,
-    RIGHT,
+
+import fenics_contact as fc
+from scenes.blocks import BOTTOM, CELLS, GRID, RIGHT, block_mesh, dimension, polynomial, wave
+from scenes.comparing import (
     assemble_matrix,
     assemble_number,
     assemble_owned,
-    block_mesh,
     close,
     compiled,
-    dimension,
-    displacement_space,
     gathered,
     owned,
-    polynomial,
     raised_everywhere,
     set_owned,
-    wave,
 )
-
-import fenics_contact as fc
+from scenes.elasticity import displacement_space
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD

@@ -11,9 +11,9 @@ import pytest
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from scenes import raised_everywhere
 
 import fenics_contact as fc
+from scenes.comparing import raised_everywhere
 
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]

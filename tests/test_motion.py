@@ -5,25 +5,21 @@ import pytest
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from scenes import LEFT, TOP, block, close, gathered, nodal, raised_everywhere
 
 import fenics_contact as fc
+from scenes.blocks import LEFT, TOP, block
+from scenes.comparing import close, gathered, nodal, raised_everywhere
+from scenes.rubbing import cushion
 
 COMM = MPI.COMM_WORLD
-
-
-def ball(d: int, motion) -> fc.Ball:
-    """A cushion that just touches the middle of the block's bottom."""
-    center = np.full(d, 0.5)
-    center[-1] = -2.0
-    return fc.Ball(center, 2.0, displacement=motion)
 
 
 def pressed(cell, law, motion, method="lbfgs"):
     scene = block(cell, 1, n=4)
     d = scene.dim
     bcs = [scene.hold(TOP, i) for i in range(d)]
-    problem, contact = scene.problem(law, bcs, contact={"support": ball(d, motion)}, method=method)
+    support = cushion(d, motion)
+    problem, contact = scene.problem(law, bcs, contact={"support": support}, method=method)
     return scene, problem, contact
 
 
@@ -76,7 +72,7 @@ def test_two_forces_and_their_history():
     motion = fc.Motion(force=(pull, 5.0))
     bcs = [scene.hold(TOP, i) for i in range(2)]
     problem, contact = scene.problem(
-        fc.Coulomb(0.3, k_n=2e4, k_t=1e4), bcs, contact={"support": ball(2, motion)}
+        fc.Coulomb(0.3, k_n=2e4, k_t=1e4), bcs, contact={"support": cushion(2, motion)}
     )
     problem.solve()
     problem.commit()

@@ -8,13 +8,15 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from scenes import GRID, LEFT, TOP, at_points, block, close, layers, nodal, raised_everywhere
-from test_solver import PATH, rub, walk
-from test_two_bodies import BOTTOM, LOWER, UPPER, elasticity, two_blocks
-from test_two_bodies import TOP as LID
 
 import fenics_contact as fc
 from fenics_contact.systems import linear
+from scenes.blocks import GRID, LEFT, TOP, block, layers
+from scenes.comparing import at_points, close, nodal, raised_everywhere
+from scenes.elasticity import residual
+from scenes.rubbing import PATH, Rub, cushion, walk
+from scenes.two_blocks import BOTTOM, LOWER, UPPER, E, two_blocks
+from scenes.two_blocks import TOP as LID
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
@@ -35,7 +37,7 @@ def assert_same_path(cell, degree, method, n, path):
     """A block to and fro on a round cushion with friction, its top prescribed: fields to 1e-8."""
 
     def make(**options):
-        made = rub(cell=cell, degree=degree, mesh={"n": n}, method=method, **options)
+        made = Rub(cell=cell, degree=degree, mesh={"n": n}, method=method, **options)
         steps = walk(made, path=path)
         if options["linear_solver"] == "multigrid":
             assert [s.factorisations for s in steps] == [0] * len(path)
@@ -94,7 +96,7 @@ def test_two_bodies(cell, method):
         load = np.zeros(d)
         load[0], load[-1] = 300.0, -2000.0
         ds = ufl.ds(mesh, subdomain_data=tags)
-        F = elasticity(u, v, 0.3) - ufl.dot(fem.Constant(mesh, load), v) * ds(LID)
+        F = residual(u, v, E, 0.3) - ufl.dot(fem.Constant(mesh, load), v) * ds(LID)
         dofs = fem.locate_dofs_topological(space, d - 1, tags.find(BOTTOM))
         bcs = [fem.dirichletbc(np.zeros(d), dofs, space)]
         surface = fc.ContactSurface(mesh, tags, UPPER)
@@ -116,7 +118,7 @@ def test_units(method):
     """
     found = []
     for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1e9)]:
-        made = rub(
+        made = Rub(
             cell="hexahedron",
             mesh={"n": 6, "size": np.full(3, length), "partitioner": layers("hexahedron")},
             length=length,
@@ -240,12 +242,11 @@ def test_a_support_that_moves_freely(caplog):
     """Its motions are no nodes: factors, and the log says why."""
     scene = block("triangle", n=4)
     motion = fc.Motion(force=(None, 5.0))
-    ball = fc.Ball((0.5, -2.0), 2.0, displacement=motion)
     with caplog.at_level(logging.INFO, logger="fenics_contact"):
         problem, contact = scene.problem(
             fc.Frictionless(k_n=2e4),
             [scene.hold(TOP, i) for i in range(2)],
-            contact={"support": ball},
+            contact={"support": cushion(2, motion)},
             linear_solver="multigrid",
         )
     assert problem.full.linear_kind == "direct"
@@ -257,7 +258,7 @@ def test_a_support_that_moves_freely(caplog):
 def test_options_reach_the_levels():
     """What the caller gives for solvers inside of solvers holds, and is not left behind."""
     before = PETSc.Options().getAll()
-    made = rub(
+    made = Rub(
         linear_solver="multigrid",
         petsc_options={"mg_levels_pc_type": "jacobi", "mg_levels_ksp_max_it": 3},
         mesh={"n": 16},

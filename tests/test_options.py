@@ -9,16 +9,15 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 from running import ROOT, environment
-from test_solver import rub, walk
+
+from scenes.rubbing import Rub, walk
 
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 
 SCRIPT = """
-import sys
-sys.path.insert(0, "tests")
-from test_solver import PATH, rub
-made = rub({arguments})
+from scenes.rubbing import PATH, Rub
+made = Rub({arguments})
 made.move(*PATH[0])
 made.problem.solve()
 if made.problem.u.function_space.mesh.comm.rank == 0:
@@ -61,7 +60,7 @@ def test_values_of_options(command_line) -> None:
         *("-x", "--tb", "short", "-mine_snes_max_it", "7", "--mine_snes_max_it", "8", "mesh.msh"),
         *("-mine_number", "-1e-3", "-mine_snes_monitor", "-mine_own", "two words", "-mine_"),
     )
-    made = rub(prefix="mine_")
+    made = Rub(prefix="mine_")
     options = PETSc.Options()
     taken = {n: options.getString(n) for n in options.getAll() if n.startswith("mine_")}
     assert taken == {
@@ -81,17 +80,17 @@ def test_who_wins(command_line) -> None:
     """
     command_line("-mine_snes_max_it", "7", "-mine_snes_type", "qn", "-snes_max_it", "9")
     PETSc.Options().setValue("mine_snes_type", "newtonls")
-    made = rub(prefix="mine_", petsc_options={"snes_max_it": 8, "snes_type": "ngmres"})
+    made = Rub(prefix="mine_", petsc_options={"snes_max_it": 8, "snes_type": "ngmres"})
     assert made.problem.snes.getTolerances()[3] == 7
     assert made.problem.snes.getType() == "newtonls"
-    usual = rub(prefix="").problem.snes.getTolerances()[3]
-    assert usual == rub().problem.snes.getTolerances()[3] != 9
+    usual = Rub(prefix="").problem.snes.getTolerances()[3]
+    assert usual == Rub().problem.snes.getTolerances()[3] != 9
 
 
 def test_one_command_line_for_all_ranks(command_line) -> None:
     """Where the ranks were started with different ones it is the first rank's."""
     command_line("-mine_snes_max_it", str(7 + COMM.rank))
-    made = rub(prefix="mine_")
+    made = Rub(prefix="mine_")
     assert set(COMM.allgather(made.problem.snes.getTolerances()[3])) == {7}
 
 
@@ -119,7 +118,7 @@ def test_options_that_nothing_reads(command_line, method, condensation, caplog) 
         line += [f"-mine_{name}", *([] if value is None else [str(value).lower()])]
     command_line(*line)
     given = {"snes_maxit": 3, "snes_force_iteration": False}
-    made = rub(prefix="mine_", method=method, condensation=condensation, petsc_options=given)
+    made = Rub(prefix="mine_", method=method, condensation=condensation, petsc_options=given)
     with caplog.at_level("WARNING", logger="fenics_contact"):
         walk(made)
     said = [r.message for r in caplog.records if "no solver has read" in r.message]

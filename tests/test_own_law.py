@@ -7,106 +7,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-import ufl
 from mpi4py import MPI
-from scenes import TOP, block, close, gathered, raised_everywhere, stress
 
 import fenics_contact as fc
 from fenics_contact.laws.base import Law, Response
 from fenics_contact.laws.friction import FrictionLaw
 from fenics_contact.laws.return_maps import positive_part
+from scenes.blocks import TOP, block
+from scenes.comparing import close, gathered, raised_everywhere
+from scenes.elasticity import stress
+from scenes.laws import Asperities, Overclosure, Saturating
 
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 
 E, NU = 1000.0, 0.3
 P0, H = 0.5, 2e-3
-
-
-# ---- the laws, as a user writes them -------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Overclosure(Law):
-    """Pressure p0 exp(δ/h) at the overclosure δ = u_n - s: asperities that touch at a distance."""
-
-    p0: Any
-    h: Any
-
-    @property
-    def positive(self):
-        """Both."""
-        return frozenset({"p0", "h"})
-
-    def pressure(self, closing, parameters):
-        """p0 exp(δ/h)."""
-        return parameters["p0"] * ufl.exp(closing / parameters["h"])
-
-    def response(self, kinematics, parameters):
-        """The pressure, nothing along Γc."""
-        closing = kinematics.normal_displacement - kinematics.gap
-        pressure = self.pressure(closing, parameters)
-        return Response(-pressure, positive_part(-closing), positive_part(closing))
-
-    def normal_potential(self, kinematics, parameters):
-        """∫ p dδ."""
-        closing = kinematics.normal_displacement - kinematics.gap
-        return parameters["h"] * self.pressure(closing, parameters)
-
-
-@dataclass(frozen=True)
-class Asperities(FrictionLaw):
-    """Coulomb's friction on a pressure p0 (exp(δ/h) - 1) of the penetration δ alone."""
-
-    friction: Any
-    p0: Any
-    h: Any
-    k_t: Any
-
-    @property
-    def positive(self):
-        """All but friction."""
-        return frozenset({"p0", "h", "k_t"})
-
-    def response(self, kinematics, parameters):
-        """The pressure, and friction up to μ times it."""
-        closing = kinematics.normal_displacement - kinematics.gap
-        penetration = positive_part(closing)
-        pressure = parameters["p0"] * (ufl.exp(penetration / parameters["h"]) - 1)
-        limit = parameters["friction"] * pressure
-        traction, slip = self.slide(kinematics, limit, parameters)
-        return Response(-pressure, positive_part(-closing), penetration, traction, limit, slip)
-
-    def normal_potential(self, kinematics, parameters):
-        """∫ p dδ."""
-        p0, h = parameters["p0"], parameters["h"]
-        penetration = positive_part(kinematics.normal_displacement - kinematics.gap)
-        return p0 * h * (ufl.exp(penetration / h) - 1) - p0 * penetration
-
-
-@dataclass(frozen=True)
-class Saturating(FrictionLaw):
-    """Friction that a weak layer bounds: τ ≤ s (1 - exp(-μ p/s)), nearly Coulomb's for p ≪ s/μ."""
-
-    friction: Any
-    strength: Any
-    k_n: Any
-    k_t: Any
-
-    def limit(self, pressure, parameters):
-        """The bound."""
-        s = parameters["strength"]
-        return s * (1 - ufl.exp(-parameters["friction"] * pressure / s))
-
-    def response(self, kinematics, parameters):
-        """Unilateral contact, and friction up to the limit."""
-        penetration = positive_part(kinematics.normal_displacement - kinematics.gap)
-        opening = positive_part(kinematics.gap - kinematics.normal_displacement)
-        pressure = parameters["k_n"] * penetration
-        limit = self.limit(pressure, parameters)
-        traction, slip = self.slide(kinematics, limit, parameters)
-        slip = tuple(ufl.conditional(ufl.gt(pressure, 0), mode, 0) for mode in slip)
-        return Response(-pressure, opening, penetration, traction, limit, slip)
 
 
 # ---- against closed answers ----------------------------------------------------------------------

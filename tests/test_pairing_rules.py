@@ -4,37 +4,29 @@ References are closed answers or invariants; the solver's tolerance on forces is
 what is solved for is met to 1e-8, and what follows from the same arrays to round-off.
 """
 
-import sys
 import warnings
 from contextlib import contextmanager
 
-import basix.ufl
 import dolfinx
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from running import ROOT
-from scenes import close, raised_everywhere
-from test_pairs import FLOOR, LOWER, ROOF, SIDES, UPPER, E, at, between, joint, stack
-
-sys.path.insert(0, str(ROOT / "verification"))
-
-from bodies import Bodies, _tagged, boxes
 
 import fenics_contact as fc
 from fenics_contact import output
 from fenics_contact.checks.verdict import check_laws
+from scenes.bodies import Bodies, boxes
+from scenes.comparing import close, raised_everywhere
+from scenes.meshes import mesh_of
+from scenes.stacks import FLOOR, LOWER, OUTSIDE, ROOF, SIDES, UPPER, E, joint, rings, stack
+from scenes.tags import between, either, near, tagged
 
 COMM = MPI.COMM_WORLD
 BOTH = 40
 
 pytestmark = pytest.mark.mpi
-
-
-def either(*choices):
-    return lambda x, cell: np.any([choice(x, cell) for choice in choices], axis=0)
 
 
 @contextmanager
@@ -62,7 +54,7 @@ def plates(cell, thickness, apart, *, layers=2, bend=None, degree=1):
         axes.append([line] * (d - 1) + [np.linspace(low, high, layers + 1)])
         flats += [low, high]
         low = high + (apart[j] if j < len(apart) else 0.0)
-    marks = {BOTH: either(*(at(d - 1, v) for v in flats))}
+    marks = {BOTH: either(*(near(d - 1, v) for v in flats))}
     for j in range(len(axes)):
         marks[10 * j + LOWER] = between(d - 1, flats[2 * j + 1], above=False)
         marks[10 * j + UPPER] = between(d - 1, flats[2 * j], above=True)
@@ -79,9 +71,7 @@ def test_a_plate_is_not_opposite_its_own_back(cell, layers):
     axes, marks = plates(cell, 0.05, [0.2], layers=layers)
     marks = {BOTH: marks[BOTH]}
     body = Bodies(boxes(axes, marks, simplex=cell == "triangle"), E, 0.3)
-    surface = fc.ContactSurface(body.mesh, body.tags, BOTH)
-    support = fc.DeformableBody(body.tags, BOTH)
-    contact = fc.Contact(body.u, surface, support, fc.Coulomb(0.3, 1e7, 1e7))
+    contact = body.contact(BOTH, BOTH, fc.Coulomb(0.3, 1e7, 1e7))
     contact.evaluate()
     assert contact.resultants().normal_force == 0.0
     points = contact.gather()
@@ -98,17 +88,16 @@ def test_lifted_plates_bear_nothing(cell):
     sunk, k_n = 1e-3, 1e7
     axes, marks = plates(cell, 0.05, [0.0])
     d = len(axes[0])
-    marks = {FLOOR: at(d - 1, 0), UPPER: marks[10 + UPPER], LOWER: marks[LOWER]}
-    marks[ROOF] = at(d - 1, 0.1)
+    marks = {FLOOR: near(d - 1, 0), UPPER: marks[10 + UPPER], LOWER: marks[LOWER]}
+    marks[ROOF] = near(d - 1, 0.1)
     body = Bodies(boxes(axes, marks, simplex=cell == "triangle"), E, 0.0)
     up = body.constant(0.0)
     body.hold(FLOOR, *range(d))
     body.hold(ROOF, *range(d - 1))
     body.hold(ROOF, d - 1, value=up)
-    surface = fc.ContactSurface(body.mesh, body.tags, UPPER)
     support = fc.DeformableBody(body.tags, [LOWER, ROOF], update="increment")
-    contact = fc.Contact(body.u, surface, support, fc.Frictionless(k_n))
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    contact = body.contact(UPPER, support, fc.Frictionless(k_n))
+    problem = body.problem(contact)
     for height in (0.2, -sunk, 0.2, -sunk):
         up.value = height
         problem.solve()
@@ -124,7 +113,7 @@ def test_leaves_in_one_tag(cell):
     q, k_n = 5e3, 1e7
     axes, marks = plates(cell, 0.02, [0.0, 0.0], layers=1)
     d = 3 if cell == "hexahedron" else 2
-    ends = either(*(at(i, v) for i in range(d - 1) for v in (0.0, 1.0)))
+    ends = either(*(near(i, v) for i in range(d - 1) for v in (0.0, 1.0)))
     body = Bodies(boxes(axes, {BOTH: marks[BOTH], SIDES: ends}, simplex=cell == "triangle"), E, 0.0)
     space = body.u.function_space
     low = dolfinx.mesh.locate_entities_boundary(body.mesh, d - 1, lambda x: np.abs(x[d - 1]) < 1e-9)
@@ -133,10 +122,8 @@ def test_leaves_in_one_tag(cell):
     body.hold(SIDES, *range(d - 1))
     top = ufl.conditional(ufl.gt(body.x[d - 1], 0.06 - 1e-9), 1.0, 0.0)
     body.F += q * top * body.v[d - 1] * body.ds(BOTH)
-    surface = fc.ContactSurface(body.mesh, body.tags, BOTH)
-    support = fc.DeformableBody(body.tags, BOTH)
-    contact = fc.Contact(body.u, surface, support, fc.Frictionless(k_n))
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    contact = body.contact(BOTH, BOTH, fc.Frictionless(k_n))
+    problem = body.problem(contact)
     problem.solve()
     points = contact.gather()
     inner = (points["x"][:, -1] > 1e-6) & (points["x"][:, -1] < 0.06 - 1e-6)
@@ -152,10 +139,9 @@ def test_a_long_facet_in_front_of_short_ones():
         [np.array([0.0, 1.0]), np.array([0.01, 0.02])],
         [np.linspace(0, 1, 8), np.array([0.03, 0.1])],
     ]
-    sides = {LOWER: either(at(1, 0.0), at(1, 0.02)), UPPER: at(1, 0.03)}
+    sides = {LOWER: either(near(1, 0.0), near(1, 0.02)), UPPER: near(1, 0.03)}
     body = Bodies(boxes(axes, sides), E, 0.3)
-    surface = fc.ContactSurface(body.mesh, body.tags, UPPER)
-    contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, LOWER), fc.Frictionless(1e6))
+    contact = body.contact(UPPER, LOWER, fc.Frictionless(1e6))
     gap = contact.gather()["gap"]
     assert close(gap, np.full(len(gap), 0.01), 1e-12)
 
@@ -166,10 +152,7 @@ def test_lips_of_a_notch_meet_down_to_its_root(opening):
 
     A square of 2 × 2, cut from its right side to its middle; opened to a wedge.
     """
-    mesh, tags = cut_square(8, opening)
-    body = Bodies((mesh, tags), E, 0.3)
-    surface = fc.ContactSurface(mesh, tags, FLOOR)
-    contact = fc.Contact(body.u, surface, fc.DeformableBody(tags, ROOF), fc.Frictionless(1e7))
+    contact = Bodies(cut_square(8, opening), E, 0.3).contact(FLOOR, ROOF, fc.Frictionless(1e7))
     assert contact.n_unpaired == 0
     points = contact.gather()
     assert np.all(points["gap"] >= -1e-12)
@@ -190,18 +173,14 @@ def cut_square(n, opening):
     above = x[cells].mean(axis=1)[:, 1] > 0
     cells[above] = twin[cells[above]]
     x = np.concatenate([x, x[cut] + np.column_stack([0 * cut, opening * x[cut, 0]])])
-    cells = cells.astype(np.int64)
-    if COMM.rank:
-        x, cells = x[:0], cells[:0]
-    element = ufl.Mesh(basix.ufl.element("Lagrange", "quadrilateral", 1, shape=(2,)))
-    mesh = dolfinx.mesh.create_mesh(COMM, cells=cells, x=x, e=element)
+    mesh = mesh_of("quadrilateral", x, cells)
 
     def lip(side):
         return lambda x, cell: (
             (np.abs(x[:, 1]) < 0.06) & (x[:, 0] % 1 > 1e-9) & (side * cell[:, 1] > 0)
         )
 
-    return mesh, _tagged(mesh, {FLOOR: lip(1), ROOF: lip(-1), SIDES: at(0, -1)})
+    return mesh, tagged(mesh, {FLOOR: lip(1), ROOF: lip(-1), SIDES: near(0, -1)})
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
@@ -217,12 +196,11 @@ def test_interference_deeper_than_the_cells(cell):
 def test_release():
     """The bound is the user's where it is given; a negative one is refused."""
     body = stack("quadrilateral", (10, 10), (0.5, 0.5), apart=-0.2)
-    surface = fc.ContactSurface(body.mesh, body.tags, 10 + UPPER)
     law = fc.Frictionless(1e6)
     for release, unpaired in ((0.25, False), (0.15, True)):
         support = fc.DeformableBody(body.tags, 10 + LOWER, release=release)
         with _told(unpaired, "behind"):
-            contact = fc.Contact(body.u, surface, support, law)
+            contact = body.contact(10 + UPPER, support, law)
         assert (contact.n_unpaired > 0) == unpaired
     raised_everywhere(
         lambda: fc.DeformableBody(body.tags, 10 + LOWER, release=-1.0), ValueError, "release"
@@ -236,10 +214,9 @@ def test_soft_contact_keeps_its_pairs():
     down = body.constant(0.0)
     body.hold(ROOF, 0)
     body.hold(ROOF, 1, value=down)
-    surface = fc.ContactSurface(body.mesh, body.tags, 10 + UPPER)
     support = fc.DeformableBody(body.tags, 10 + LOWER, update="increment")
-    contact = fc.Contact(body.u, surface, support, fc.Frictionless(1.0))
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    contact = body.contact(10 + UPPER, support, fc.Frictionless(1.0))
+    problem = body.problem(contact)
     for depth in (0.02, 0.04, 0.08, 0.15, 0.25):
         down.value = -depth
         problem.solve()
@@ -294,7 +271,7 @@ def test_a_prescribed_gap_over_an_edge(cell, name, enforcement):
     if enforcement == "augmented" and (law.is_physical or cell == "hexahedron"):
         pytest.skip("no multipliers for a physical layer; once is enough")
     body, contact, outside = overhang(cell, law, enforcement=enforcement)
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    problem = body.problem(contact)
     for lift in (-0.002, 0.001):
         body.lift.value = lift
         step = problem.solve()
@@ -345,13 +322,12 @@ def test_the_warning_says_how_many_and_why():
         [np.linspace(0, 1, 9), np.linspace(0, 0.5, 3)],
         [np.linspace(0, 1, 9), np.linspace(0.6, 1, 3)],
     ]
-    sides = {LOWER: at(1, 0.5), UPPER: at(1, 0.6), ROOF: at(1, 1.0), FLOOR: at(1, 0.0)}
+    sides = {LOWER: near(1, 0.5), UPPER: near(1, 0.6), ROOF: near(1, 1.0), FLOOR: near(1, 0.0)}
     body = Bodies(boxes(axes, sides), E, 0.3)
     law = fc.Frictionless(1e6)
 
     def made(here, there, **options):
-        surface = fc.ContactSurface(body.mesh, body.tags, here)
-        return fc.Contact(body.u, surface, fc.DeformableBody(body.tags, there, **options), law)
+        return body.contact(here, fc.DeformableBody(body.tags, there, **options), law)
 
     with _told(False):
         assert made(UPPER, LOWER).n_unpaired == 0
@@ -380,10 +356,10 @@ def indented(cell, width, depth, *, coarse=2, swap=False, both=False, raised=0.0
     ]
     low, high = 0.5, 0.5 + raised
     sides = {
-        FLOOR: at(d - 1, 0),
+        FLOOR: near(d - 1, 0),
         LOWER: between(d - 1, low, above=False),
         UPPER: between(d - 1, high, above=True),
-        ROOF: at(d - 1, high + width),
+        ROOF: near(d - 1, high + width),
     }
     body = Bodies(boxes(axes, sides, simplex=cell == "triangle"), E, 0.3)
     body.hold(FLOOR, *range(d))
@@ -393,16 +369,10 @@ def indented(cell, width, depth, *, coarse=2, swap=False, both=False, raised=0.0
     faces = [(UPPER, LOWER)] if swap else [(LOWER, UPPER)]
     faces += [(UPPER, LOWER)] if both else []
     contacts = [
-        fc.Contact(
-            body.u,
-            fc.ContactSurface(body.mesh, body.tags, here),
-            fc.DeformableBody(body.tags, there),
-            fc.Frictionless(),
-            name=f"side {i}",
-        )
+        body.contact(here, there, fc.Frictionless(), name=f"side {i}")
         for i, (here, there) in enumerate(faces)
     ]
-    return body, contacts, fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=contacts)
+    return body, contacts, body.problem(*contacts)
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
@@ -446,7 +416,7 @@ def test_meshes_of_any_ratio_pass(counts, swap):
     dofs = fem.locate_dofs_topological(spaces, 1, body.tags.find(ROOF))
     body.bcs.append(fem.dirichletbc(top, dofs, spaces[0]))
     contact = joint(body, 1, fc.Coulomb(0.3), swap=swap)
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    problem = body.problem(contact)
     for share in (0.5, 1.0):
         top.interpolate(lambda x, share=share: share * 0.01 * (x[0] - 0.4))
         step = problem.solve()
@@ -460,31 +430,14 @@ def test_meshes_of_any_ratio_pass(counts, swap):
 @pytest.mark.parametrize("degree", [1, 2])
 def test_facets_of_curved_surfaces_are_no_penetration(counts, swap, degree):
     """Rings of straight or curved cells, not loaded and pressed: chords overlap, and are borne."""
-    angle = 1.5
-    axes = [
-        [np.linspace(0, angle, counts[0] + 1), np.linspace(10, 20, 4)],
-        [np.linspace(0, angle, counts[1] + 1), np.linspace(20, 40, 4)],
-    ]
-
-    def bend(x):
-        return np.column_stack([x[:, 1] * np.cos(x[:, 0]), x[:, 1] * np.sin(x[:, 0])])
-
-    sides = {
-        LOWER: between(1, 20, above=False),
-        UPPER: between(1, 20, above=True),
-        FLOOR: at(0, 0),
-        ROOF: at(0, angle),
-        9: at(1, 40),
-    }
-    body = Bodies(boxes(axes, sides, bend=bend, degree=degree), E, 0.3, degree=degree)
+    body = rings(counts, degree=degree)
     body.hold(FLOOR, 0, 1)
     squeeze = body.constant(0.0)
-    body.F += squeeze * ufl.dot(ufl.FacetNormal(body.mesh), body.v) * body.ds(9)
+    body.F += squeeze * ufl.dot(ufl.FacetNormal(body.mesh), body.v) * body.ds(OUTSIDE)
     here, there = (UPPER, LOWER) if swap else (LOWER, UPPER)
-    surface = fc.ContactSurface(body.mesh, body.tags, here)
-    contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, there), fc.Coulomb(0.3))
+    contact = body.contact(here, there, fc.Coulomb(0.3))
     assert contact.unseen_penetration()[0] == 0.0
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    problem = body.problem(contact)
     for load in (1.0, 1e3):
         squeeze.value = load
         assert problem.solve().verdict.unseen == {}
@@ -512,11 +465,7 @@ def test_true_gap(cell):
         arm = x[:d] - pivot[:, None]
         return turn @ arm - arm + lift * np.eye(d)[:, -1:]
 
-    index_map = body.mesh.topology.index_map(d)
-    cells = np.arange(index_map.size_local + index_map.num_ghosts, dtype=np.int32)
-    middle = dolfinx.mesh.compute_midpoints(body.mesh, d, cells).reshape(-1, 3)
-    body.u.interpolate(moved, cells0=cells[middle[:, d - 1] > 0.5])
-    body.u.x.scatter_forward()
+    body.displace(moved, lambda x: x[:, -1] > 0.5)
     x = contact.points
     gap, normal = contact.true_gap()
     assert contact.pairings == 1

@@ -4,121 +4,35 @@ References are closed answers or invariants. What is uniform is met to 1e-9 and 
 to 1e-8, as the solver's tolerance on the forces is 1e-9; sums of forces to 1e-12, round-off.
 """
 
-import sys
-
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from dolfinx.mesh import compute_midpoints
 from mpi4py import MPI
-from running import ROOT
-from scenes import close, gathered
-
-sys.path.insert(0, str(ROOT / "verification"))
-
-from bodies import Bodies, boxes
 
 import fenics_contact as fc
+from scenes.bodies import Bodies, boxes
+from scenes.comparing import close, gathered
+from scenes.stacks import (
+    FLOOR,
+    LOWER,
+    ROOF,
+    SIDES,
+    UPPER,
+    WALL,
+    E,
+    balance,
+    floor,
+    joint,
+    rings,
+    stack,
+    uniform,
+)
+from scenes.tags import between, near
 
 COMM = MPI.COMM_WORLD
-FLOOR, ROOF, LOWER, UPPER, WALL, SIDES = 1, 2, 3, 4, 5, 6
-E = 1e6
 
 pytestmark = pytest.mark.mpi
-
-
-# ---- scenes --------------------------------------------------------------------------------------
-
-
-def at(i, value):
-    """Facets whose midpoint lies at the coordinate ``i``."""
-    return lambda x, cell: np.abs(x[:, i] - value) < 1e-9
-
-
-def between(i, value, *, above):
-    """The same, of the cells on one side."""
-    side = 1 if above else -1
-    return lambda x, cell: at(i, value)(x, cell) & (side * (cell[:, i] - value) > 0)
-
-
-def either(*choices):
-    return lambda x, cell: np.any([choice(x, cell) for choice in choices], axis=0)
-
-
-def stack(cell, counts, heights, *, widths=None, apart=0.0, degree=1, nu=0.0, tags=None):
-    """Blocks one on the other, ``counts`` cells along x in each, ``apart`` from each other.
-
-    Tags: FLOOR, ROOF, SIDES (all upright faces), and both faces of joint j, counted from 1 at the
-    top of the lowest block: 10 j + LOWER and 10 j + UPPER.
-    """
-    d = 3 if cell == "hexahedron" else 2
-    widths = widths or [1.0] * len(counts)
-    axes, low, marks = [], 0.0, {}
-    for j, (n, height, width) in enumerate(zip(counts, heights, widths, strict=True)):
-        across = np.linspace((1 - width) / 2, (1 + width) / 2, n + 1)
-        up = np.linspace(low, low + height, max(1, round(n * height / width)) + 1)
-        axes.append([across] * (d - 1) + [up])
-        if j:
-            marks[10 * j + UPPER] = between(d - 1, low, above=True)
-        low += height
-        if j + 1 < len(counts):
-            marks[10 * (j + 1) + LOWER] = between(d - 1, low, above=False)
-            low += apart
-    ends = [at(i, v) for i in range(d - 1) for v in (0.0, 1.0)]
-    marks = {FLOOR: at(d - 1, 0), ROOF: at(d - 1, low), SIDES: either(*ends)} | marks | (tags or {})
-    return Bodies(boxes(axes, marks, simplex=cell == "triangle"), E, nu, degree=degree)
-
-
-def joint(body, j, law, *, swap=False, **options):
-    """Contact of the blocks over and under joint ``j``."""
-    here, there = (LOWER, UPPER) if swap else (UPPER, LOWER)
-    surface = fc.ContactSurface(body.mesh, body.tags, 10 * j + here)
-    support = fc.DeformableBody(body.tags, 10 * j + there)
-    return fc.Contact(body.u, surface, support, law, name=f"joint {j}", **options)
-
-
-def floor(body, law, tag=FLOOR, **options):
-    up = np.eye(body.d)[-1]
-    surface = fc.ContactSurface(body.mesh, body.tags, tag)
-    return fc.Contact(body.u, surface, fc.HalfSpace(0 * up, up), law, name="floor", **options)
-
-
-def nodal(contact):
-    """Contact's forces at the nodes of this rank and where these are, (n, d) each."""
-    space = contact.u.function_space
-    force = fem.Function(space)
-    fc.ContactOperator(contact).add_force(force.x.petsc_vec)
-    d, n = len(contact.u), space.dofmap.index_map.size_local
-    return -force.x.array.reshape(-1, d)[:n], space.tabulate_dof_coordinates()[:n, :d]
-
-
-def balance(contact):
-    """Sum of the forces, of their moments about the origin, and of their sizes."""
-    f, x = nodal(contact)
-    i = contact.surface.mesh.geometry.dim - 1
-    moment = x[:, 0] * f[:, i] - x[:, i] * f[:, 0]
-    return (
-        COMM.allreduce(f.sum(axis=0)),
-        COMM.allreduce(moment.sum()),
-        COMM.allreduce(np.abs(f).sum()),
-    )
-
-
-def uniform(values, expected, rtol=1e-9):
-    values = gathered(COMM, values)
-    return close(values, np.full(values.shape, expected), rtol)
-
-
-def rough(u, size, where=None):
-    """An uneven displacement, of a part of the bodies if ``where`` says so."""
-    d = len(u)
-
-    def value(x):
-        field = [size * np.sin(3 * x[0] + 5 * x[d - 1] + i) for i in range(d)]
-        return np.vstack(field) * (1.0 if where is None else where(x))
-
-    u.interpolate(value)
 
 
 # ---- several pairs -------------------------------------------------------------------------------
@@ -135,7 +49,7 @@ def test_three_blocks_on_a_floor(cell, degree):
     body.F += q * body.v[up] * body.ds(ROOF)
     contacts = [floor(body, fc.Frictionless(stiffness[0]))]
     contacts += [joint(body, j, fc.Frictionless(stiffness[j]), swap=j == 2) for j in (1, 2)]
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=contacts)
+    problem = body.problem(*contacts)
     step = problem.solve()
     assert list(step.contacts) == ["floor", "joint 1", "joint 2"]
     for contact, k in zip(contacts, stiffness, strict=True):
@@ -156,7 +70,7 @@ def test_a_sheared_stack_that_friction_alone_holds(method):
     body.F += (q * body.v[1] - t * body.v[0]) * body.ds(ROOF)
     law = fc.Coulomb(0.4, k_n=1e7, k_t=1e7)
     contacts = [floor(body, law), joint(body, 1, law), joint(body, 2, law)]
-    problem = fc.ContactProblem(body.F, body.u, contacts=contacts, method=method)
+    problem = body.problem(*contacts, method=method)
     problem.solve()
     for contact in contacts:
         assert close(contact.resultants().force, [-t, q], 1e-8)
@@ -177,7 +91,7 @@ def test_one_joint_fails_and_the_others_hold():
     body.hold(ROOF, 0, value=push)
     laws = [fc.Coulomb(mu, k_n=1e7, k_t=1e7) for mu in (0.5, 0.1, 0.5)]
     contacts = [floor(body, laws[0])] + [joint(body, j, laws[j]) for j in (1, 2)]
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=contacts)
+    problem = body.problem(*contacts)
     list(fc.increments(problem, push, 0.0, 0.02, steps=4))
     first, middle, last = (contact.resultants() for contact in contacts)
     assert middle.stick == 0 and first.stick > 0 and last.stick > 0
@@ -189,20 +103,15 @@ def test_one_joint_fails_and_the_others_hold():
 def test_floor_and_wall(cell):
     """A block in a corner under two pressures: Γc's share an edge, both are met exactly."""
     nu, q, side, k = 0.3, 3e3, 2e3, 1e7
-    body = stack(cell, (4,), (1.0,), nu=nu, tags={WALL: at(0, 0), 9: at(0, 1)})
+    body = stack(cell, (4,), (1.0,), nu=nu, tags={WALL: near(0, 0), 9: near(0, 1)})
     up = body.d - 1
     if body.d == 3:  # plane strain
         body.hold(SIDES, 1)
     body.F += q * body.v[up] * body.ds(ROOF) + side * body.v[0] * body.ds(9)
-    wall = fc.Contact(
-        body.u,
-        fc.ContactSurface(body.mesh, body.tags, WALL),
-        fc.HalfSpace(np.zeros(body.d), np.eye(body.d)[0]),
-        fc.Frictionless(k),
-        name="wall",
-    )
+    upright = fc.HalfSpace(np.zeros(body.d), np.eye(body.d)[0])
+    wall = body.contact(WALL, upright, fc.Frictionless(k), name="wall")
     base = floor(body, fc.Frictionless(k))
-    fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[base, wall]).solve()
+    body.problem(base, wall).solve()
     assert uniform(base.pressure, q)
     assert uniform(wall.pressure, side)
     modulus, ratio = E / (1 - nu**2), nu / (1 - nu)
@@ -229,7 +138,7 @@ def test_one_surface_on_a_body_and_on_a_rigid_support():
     rest = fc.Contact(
         body.u, pair.surface, fc.HalfSpace((0, 0.5), (0, 1)), fc.Frictionless(k_2), name="rest"
     )
-    fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[pair, rest]).solve()
+    body.problem(pair, rest).solve()
     series = 1 / (1 / k_1 + 0.5 / E)
     assert uniform(pair.pressure, q * series / (series + k_2))
     assert uniform(rest.pressure, q * k_2 / (series + k_2))
@@ -247,7 +156,7 @@ def test_both_ways_round():
         joint(body, 1, fc.Frictionless(5e6), swap=True),
     )
     other.name = "back"
-    fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[one, other]).solve()
+    body.problem(one, other).solve()
     for contact in (one, other):
         assert uniform(contact.pressure, q / 2)
         assert uniform(contact.gap, -q / 1e7)
@@ -260,16 +169,10 @@ def test_a_stack_under_a_weight(cell):
     up, k_n, weight = body.d - 1, 1e7, 5e3
     body.hold(SIDES, *range(up))
     down = np.eye(body.d)[-1]
-    motion = fc.Motion(force=[None] * up + [-weight])
-    lid = fc.Contact(
-        body.u,
-        fc.ContactSurface(body.mesh, body.tags, ROOF),
-        fc.HalfSpace(down, -down, displacement=motion),
-        fc.Frictionless(k_n),
-        name="lid",
-    )
+    plate = fc.HalfSpace(down, -down, displacement=fc.Motion(force=[None] * up + [-weight]))
+    lid = body.contact(ROOF, plate, fc.Frictionless(k_n), name="lid")
     contacts = [floor(body, fc.Frictionless(k_n)), joint(body, 1, fc.Frictionless(k_n)), lid]
-    fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=contacts).solve()
+    body.problem(*contacts).solve()
     for contact in contacts:
         assert uniform(contact.pressure, weight, 1e-8)
     assert close(lid.free_motion[up].value, -weight * (1 / E + 3 / k_n), 1e-8)
@@ -285,14 +188,16 @@ def test_a_bonded_stack(cell, degree):
     """
     q, t, k_n, k_t = 5e3, 2e3, 1e7, 4e6
     counts = (2, 3, 4) if cell == "hexahedron" else (3, 5, 4)
-    body = stack(cell, counts, (0.5, 0.25, 0.75), degree=degree, tags={8: at(0, 0), 9: at(0, 1)})
+    body = stack(
+        cell, counts, (0.5, 0.25, 0.75), degree=degree, tags={8: near(0, 0), 9: near(0, 1)}
+    )
     up = body.d - 1
     body.hold(FLOOR, *range(body.d))
     body.F -= (q * body.v[up] + t * body.v[0]) * body.ds(ROOF)
     body.F -= t * body.v[up] * body.ds(9) - t * body.v[up] * body.ds(8)
     law = fc.Foundation(k_n, k_t)
     contacts = [joint(body, 1, law), joint(body, 2, law, swap=True)]
-    fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=contacts).solve()
+    body.problem(*contacts).solve()
     for contact, upward in zip(contacts, (False, True), strict=True):
         # Γc of joint 1 is the bottom of the upper block, that of joint 2 the top of the lower one.
         assert uniform(contact.pressure, -q)
@@ -340,10 +245,9 @@ def test_one_joint_slides_far_and_another_holds():
     body.hold(ROOF, 0, value=drag)
     body.F += q * body.v[1] * body.ds(ROOF)
     glued = joint(body, 1, fc.Coulomb(0.5, k_n=1e7, k_t=1e7))
-    surface = fc.ContactSurface(body.mesh, body.tags, 20 + UPPER)
     support = fc.DeformableBody(body.tags, 20 + LOWER, update="increment")
-    slides = fc.Contact(body.u, surface, support, fc.Coulomb(0.2, k_n=1e7, k_t=1e7), name="slides")
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[glued, slides])
+    slides = body.contact(20 + UPPER, support, fc.Coulomb(0.2, k_n=1e7, k_t=1e7), name="slides")
+    problem = body.problem(glued, slides)
     n = 0.4 * q
     for step in fc.increments(problem, drag, 0.0, 0.2, steps=10):
         r = step.contacts["slides"]
@@ -372,7 +276,7 @@ def slit_ring(*, half, degree):
         offset = 0.01 * (1 - x[:, 0] / np.pi)
         return np.column_stack([x[:, 1] * np.cos(x[:, 0]), x[:, 1] * np.sin(x[:, 0]) + offset])
 
-    sides = {FLOOR: at(0, 0), ROOF: at(0, end), SIDES: at(1, 1.5)}
+    sides = {FLOOR: near(0, 0), ROOF: near(0, end), SIDES: near(1, 1.5)}
     body = Bodies(boxes(axes, sides, bend=bend, degree=2), E, 0.3, degree=degree)
     space = body.u.function_space
     cut = fem.locate_dofs_geometrical(space, lambda x: (x[0] < 0) & (np.abs(x[1]) < 1e-9))
@@ -392,16 +296,12 @@ def test_a_slit_ring_closes(degree):
         body = slit_ring(half=half, degree=degree)
         squeeze = body.constant(0.0)
         body.F += squeeze * ufl.dot(ufl.FacetNormal(body.mesh), body.v) * body.ds(SIDES)
-        surface = fc.ContactSurface(body.mesh, body.tags, FLOOR)
         if half:
-            contact = fc.Contact(
-                body.u, surface, fc.HalfSpace((0, 0), (0, 1)), fc.Frictionless(2 * k_n)
-            )
+            contact = body.contact(FLOOR, fc.HalfSpace((0, 0), (0, 1)), fc.Frictionless(2 * k_n))
         else:
-            law = fc.Coulomb(0.3, k_n=k_n, k_t=k_n)
-            contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, ROOF), law)
+            contact = body.contact(FLOOR, ROOF, fc.Coulomb(0.3, k_n=k_n, k_t=k_n))
             assert contact.n_unpaired == 0
-        problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+        problem = body.problem(contact)
         few, *_ = list(fc.increments(problem, squeeze, 0.0, 1e3, steps=[200.0, 1e3]))
         assert few.contacts["contact"].open > 0, "first, only a part of the lips shall touch"
         made.append(contact)
@@ -429,7 +329,7 @@ def test_interference(cell):
     body.hold(ROOF, up, value=away)
     body.hold(SIDES, *range(up))
     contact = joint(body, 1, fc.Frictionless(k_n), gap=-oversize)
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    problem = body.problem(contact)
     assert problem.initial_penetration == 0.0
     for opening in (0.0, 0.004, 0.0099):
         away.value = opening
@@ -473,7 +373,7 @@ def test_patch_of_very_different_cells(counts, cell, degree, swap):
     body.hold(ROOF, body.d - 1, value=-0.001)
     body.hold(SIDES, *range(body.d - 1))
     contact = joint(body, 1, fc.Coulomb(0.3, k_n=k_n, k_t=k_n), swap=swap)
-    fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact]).solve()
+    body.problem(contact).solve()
     confined = E * (1 - nu) / ((1 + nu) * (1 - 2 * nu))
     p = 0.001 / (0.1 / confined + 1 / k_n)
     assert contact.n_unpaired == 0
@@ -513,32 +413,9 @@ def test_moment_of_a_gap(cell, swap):
     assert close(moment, sign * gap * r.force[0], 1e-10, scale=size * gap)
 
 
-def rings(inner, outer, law, **options):
-    """Sectors of two rings, 10/20 and 20/40, of curved cells that do not match; Γc is the inner."""
-    angle = 1.5
-    axes = [
-        [np.linspace(0, angle, inner + 1), np.linspace(10, 20, 4)],
-        [np.linspace(0, angle, outer + 1), np.linspace(20, 40, 4)],
-    ]
-
-    def bend(x):
-        return np.column_stack([x[:, 1] * np.cos(x[:, 0]), x[:, 1] * np.sin(x[:, 0])])
-
-    sides = {LOWER: between(1, 20, above=False), UPPER: between(1, 20, above=True)}
-    body = Bodies(boxes(axes, sides, bend=bend, degree=2), E, 0.3, degree=2)
-    surface = fc.ContactSurface(body.mesh, body.tags, LOWER)
-    contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, UPPER), law, **options)
-    return body, contact, angle
-
-
-def inside(body, field):
-    """Give the inner ring's cells the displacement ``field``; nodes are not shared."""
-    index_map = body.mesh.topology.index_map(2)
-    cells = np.arange(index_map.size_local + index_map.num_ghosts, dtype=np.int32)
-    middle = compute_midpoints(body.mesh, 2, cells).reshape(-1, 3)
-    cells = cells[np.linalg.norm(middle[:, :2], axis=1) < 20]
-    body.u.interpolate(field, cells0=cells)
-    body.u.x.scatter_forward()
+def inner(x):
+    """Midpoints of the inner ring's cells."""
+    return np.linalg.norm(x, axis=1) < 20
 
 
 @pytest.mark.parametrize("counts", [(7, 11), (14, 23)])
@@ -548,11 +425,12 @@ def test_turning_a_ring_in_a_ring(counts):
     With a prescribed gap, length and normals of the arcs are all that the cells can miss: their
     error is of the order (h/R)⁴, and that of 7 cells below 1e-5.
     """
-    k_n, oversize, friction = 1e5, 0.01, 0.2
+    k_n, oversize, friction, angle = 1e5, 0.01, 0.2, 1.5
     law = fc.Coulomb(friction, k_n=k_n, k_t=1e6)
-    body, contact, angle = rings(*counts, law, gap=-oversize)
+    body = rings(counts, angle=angle)
+    contact = body.contact(LOWER, UPPER, law, gap=-oversize)
     assert contact.n_unpaired == 0
-    inside(body, lambda x: 0.01 * np.vstack([-x[1], x[0]]))
+    body.displace(lambda x: 0.01 * np.vstack([-x[1], x[0]]), inner)
     contact.evaluate()
     r, points = contact.resultants(), contact.gather()
     assert r.stick == r.open == 0
@@ -566,8 +444,9 @@ def test_moments_of_curved_surfaces_cancel_as_the_meshes_are_refined():
     """Forces cancel to round-off, moments up to the distance of the two meshes' arcs."""
     errors = []
     for counts in ((4, 7), (8, 14), (16, 28)):
-        body, contact, _ = rings(*counts, fc.Coulomb(0.2, k_n=1e5, k_t=1e6), gap=-0.01)
-        inside(body, lambda x: 0.005 * np.sin(np.vstack([x[0] / 5, x[1] / 7])))
+        body = rings(counts)
+        contact = body.contact(LOWER, UPPER, fc.Coulomb(0.2, k_n=1e5, k_t=1e6), gap=-0.01)
+        body.displace(lambda x: 0.005 * np.sin(np.vstack([x[0] / 5, x[1] / 7])), inner)
         contact.evaluate()
         total, moment, size = balance(contact)
         assert np.abs(total).max() <= 1e-12 * size
@@ -594,7 +473,7 @@ def test_overhang(cell):
     points = contact.gather()
     outside = np.any(np.abs(points["x"][:, :up] - 0.5) > 0.3, axis=1)
     assert 0 < contact.n_unpaired == np.count_nonzero(outside)
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    problem = body.problem(contact)
     problem.solve()
     points = contact.gather()
     assert np.all(points["status"][outside] == fc.Status.OPEN)
@@ -615,9 +494,8 @@ def test_no_opposite_at_all():
     ]
     sides = {LOWER: between(1, 1, above=False), UPPER: between(1, 1, above=True)}
     body = Bodies(boxes(axes, sides), E, 0.3)
-    surface = fc.ContactSurface(body.mesh, body.tags, UPPER)
-    contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, LOWER), fc.Frictionless(1e6))
-    rough(body.u, 0.1)
+    contact = body.contact(UPPER, LOWER, fc.Frictionless(1e6))
+    body.u.interpolate(lambda x: 0.1 * np.sin([3 * x[0] + 5 * x[1] + i for i in range(2)]))
     contact.evaluate()
     assert contact.n_unpaired == len(contact.gather()["x"]) > 0
     assert contact.resultants().normal_force == 0.0

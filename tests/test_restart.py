@@ -22,253 +22,22 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from running import environment
-from scenes import (
-    RIGHT,
-    TOP,
-    at_points,
-    block,
-    close,
-    gathered,
-    nodal,
-    owned,
-    raised_everywhere,
-    strain,
-)
-from test_two_bodies import BOTTOM, LOWER, UPPER, elasticity, two_blocks
 
 import fenics_contact as fc
 from fenics_contact import checkpoint, compat
+from scenes.comparing import (
+    close,
+    gathered,
+    owned,
+    raised_everywhere,
+    shared_folder,
+)
+from scenes.elasticity import strain
+from scenes.histories import Press, Ramp, differences, goes_on
 
 COMM = MPI.COMM_WORLD
 
 pytestmark = pytest.mark.mpi
-
-
-# ---- scenes --------------------------------------------------------------------------------------
-
-
-class Scene:
-    """Something pressed and rubbed: down until t = 1, along until 2, back until 4."""
-
-    name: str
-    tolerance = 1e-7  # between two solutions of the same increments
-
-    def increments(self, end=4.0, start=0.0, **options):
-        """Lead ``t``, 0.5 an increment by default."""
-        options.setdefault("steps", round(abs(end - start) / 0.5))
-        return fc.increments(self.problem, self.load, start, end, **options)
-
-
-class Press(Scene):
-    """A block on a ball, by default with friction: the top moves, or the ball does."""
-
-    def __init__(
-        self,
-        law=None,
-        *,
-        cell="quadrilateral",
-        support="fixed",
-        bulk="linear",
-        wall=False,
-        surface=None,
-        contact=None,
-        n=4,
-        E=1000.0,
-        radius=2.0,
-        tilt=0.0,
-        degree=1,
-        names=("floor", "wall"),
-        **options,
-    ):
-        """Make it, unloaded."""
-        scene = self.scene = block(cell, degree, n=n, E=E, surface=surface)
-        mesh, d = scene.mesh, scene.dim
-        law = law or fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
-        self.push = [fem.Constant(mesh, 0.0) for _ in range(d)]
-        self.shift = fem.Constant(mesh, np.zeros(d))
-        self.force = fem.Constant(mesh, 0.0)
-        self.plastic = fem.Function(fem.functionspace(mesh, ("DG", 0)), name="plastic")
-        self.moves = support
-        displacement = None
-        if support == "moving":
-            displacement = self.shift
-        elif support == "force":
-            along = fem.Constant(mesh, 0.0)
-            rest = (None,) * (d - 1)
-            displacement = fc.Motion(
-                force=(*rest, self.force), displacement=(along, *(0.0,) * (d - 2), None)
-            )
-            self.along = along
-        center = np.full(d, 0.5)
-        center[-1] = -radius
-        center[0] += tilt
-        ball = fc.Ball(center, radius, displacement=displacement)
-        bcs = [scene.hold(TOP, i, c) for i, c in enumerate(self.push)]
-        F = scene.F
-        if bulk != "linear":
-            eps = strain(scene.u) - self.plastic * ufl.Identity(d)
-            v = ufl.TestFunction(scene.u.function_space)
-            stiffening = 1e3 if bulk == "nonlinear" else 900.0
-            if bulk != "linear with plastic":
-                F += scene.E * stiffening * ufl.tr(eps) ** 3 * ufl.tr(strain(v)) * ufl.dx
-            F += scene.E * ufl.tr(eps) * ufl.tr(strain(v)) * ufl.dx
-        self.contacts = [scene.contact(law, support=ball, name=names[0], **(contact or {}))]
-        if wall:
-            side = fc.ContactSurface(mesh, scene.tags, RIGHT)
-            normal = np.zeros(d)
-            normal[0], at = -1.0, np.full(d, 0.5)
-            at[0] = 1.01
-            self.contacts.append(
-                fc.Contact(scene.u, side, fc.HalfSpace(at, normal), law, name=names[1])
-            )
-        self.problem = fc.ContactProblem(F, scene.u, bcs=bcs, contacts=self.contacts, **options)
-        self.fields = [self.plastic]
-
-    def load(self, t: float) -> None:
-        """Set what moves."""
-        down, along = 0.03 * min(t, 1.0), np.interp(t, [1, 2, 4], [0, 0.1, -0.1])
-        if self.moves == "fixed":
-            self.push[-1].value, self.push[0].value = -down, along
-        elif self.moves == "moving":
-            self.shift.value[-1], self.shift.value[0] = down, -along
-        else:
-            self.force.value, self.along.value = 20 * min(t, 1.0), -along
-
-
-class Ramp(Scene):
-    """A block that is dragged up a ramp of another body, its pairs found anew; top held stiffly."""
-
-    tolerance = 1e-7
-
-    def __init__(
-        self,
-        law=None,
-        *,
-        cell="quadrilateral",
-        update="increment",
-        contact=None,
-        n=(10, 4),
-        start=1.1,
-        **options,
-    ):
-        """Make it, unloaded."""
-        mesh, tags = two_blocks(cell, n, (4.0, 1.0), start)
-        d = mesh.geometry.dim
-        mesh.geometry.x[:, d - 1] += 0.1 * mesh.geometry.x[:, 0]
-        V = fem.functionspace(mesh, ("Lagrange", 1, (d,)))
-        self.u, v = fem.Function(V), ufl.TestFunction(V)
-        self.move = [fem.Constant(mesh, 0.0) for _ in range(d)]
-        fixed = fem.Constant(mesh, 0.0)
-        bcs = []
-        for tag, values in ((BOTTOM, [fixed] * d), (TOP, self.move)):
-            for i, value in enumerate(values):
-                dofs = fem.locate_dofs_topological(V.sub(i), d - 1, tags.find(tag))
-                bcs.append(fem.dirichletbc(value, dofs, V.sub(i)))
-        surface = fc.ContactSurface(mesh, tags, UPPER)
-        base = fc.DeformableBody(tags, LOWER, update=update)
-        law = law or fc.Coulomb(0.3, k_n=1e7, k_t=1e7)
-        self.contacts = [fc.Contact(self.u, surface, base, law, **(contact or {}))]
-        F = elasticity(self.u, v, 0.3)
-        self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=self.contacts, **options)
-
-    def load(self, t: float) -> None:
-        """Down, and over one and a half facets of the base and back."""
-        self.move[-1].value = -0.004 * min(t, 1.0)
-        self.move[0].value = np.interp(t, [1, 3, 4], [0, 0.6, 0.4])
-
-
-def shared_folder(tmp_path: Path) -> Path:
-    """Rank 0's folder, on all ranks."""
-    return Path(COMM.bcast(str(tmp_path)))
-
-
-def picture(made: Scene) -> dict[str, np.ndarray]:
-    """All that a state is, in an order that no distribution changes."""
-    problem = made.problem
-    u = problem.u
-    found = {"u": nodal(u), "increment": np.array([problem.increment])}
-    rate = fem.Function(u.function_space)
-    for name, values in (("rate", problem._rate), ("committed", problem._committed)):
-        owned(rate)[:] = values[: problem.unknowns.n_dofs]
-        found[name] = nodal(rate)
-        found[f"{name} of supports"] = problem.unknowns.motions(values)
-    energy = problem._committed_energy
-    forces = energy.forces[problem.full.mark]
-    for name in ("internal", "external"):
-        owned(rate)[:] = getattr(forces, name)[: problem.unknowns.n_dofs]
-        found[f"forces {name}"] = nodal(rate)
-    found["springs"] = np.array([COMM.allreduce(energy.springs)])
-    if problem.solver.condensed:
-        found["kept"] = problem.solver.system.unknowns.kept
-    for c, ways in zip(problem.contacts, energy.contacts, strict=True):
-        found[f"{c.name} history"] = at_points(c, c.history.rows())
-        found[f"{c.name} jump"] = at_points(c, c.committed_jump)
-        found[f"{c.name} ways"] = at_points(c, np.hstack(ways))
-        if c.multipliers is not None:
-            found[f"{c.name} multipliers"] = at_points(c, c.multipliers.fields.rows())
-        for name, values in c.values.arrays.items():
-            found[f"{c.name} {name}"] = at_points(c, np.column_stack([values]))
-        found[f"{c.name} status"] = at_points(c, c.status)
-        r = c.resultants()
-        found[f"{c.name} counts"] = np.array([r.open, r.stick, r.slip, c.n_unpaired])
-        found[f"{c.name} forces"] = np.r_[r.force, r.normal_force, r.tangential_force]
-    return found
-
-
-def differences(a: Scene, b: Scene, tolerance: float) -> list[str]:
-    """What of two states differs; tolerance 0: bit for bit, or else of what is solved for."""
-    one, other = picture(a), picture(b)
-    assert one.keys() == other.keys()
-    if tolerance == 0.0:
-        return [n for n in one if not np.array_equal(one[n], other[n], equal_nan=True)]
-    # Tractions, forces and energies, by the largest of their kind; statuses may hang on a digit.
-    compared = [n for n in one if n.split()[-1] in ("u", "committed", "history", "jump", "forces")]
-    return [n for n in compared if not close(one[n], other[n], tolerance)]
-
-
-def same_energies(a: fc.Step, b: fc.Step, tolerance: float) -> bool:
-    """Of two steps; to round-off where the digits are the same."""
-    size = abs(b.energy.work) + abs(b.energy.elastic)
-    names = ("work", "elastic", "springs", "dissipation", "remainder")
-    pairs = [(getattr(a.energy, n), getattr(b.energy, n)) for n in names]
-    return all(close(x, y, max(tolerance, 1e-12), scale=size) for x, y in pairs)
-
-
-def goes_on(make, folder: Path, *, stop: int, tolerance=None, tamper=None, **options) -> None:
-    """A history broken off after ``stop`` increments and taken up is one that went on."""
-    whole, broken, after, again = (make() for _ in range(4))
-    tolerance = whole.tolerance if tolerance is None else tolerance
-    tolerance = 0.0 if COMM.size == 1 else tolerance
-    for made in (whole, broken, after, again) if tamper else ():
-        tamper(made)
-    expected = list(whole.increments(checkpoint=folder / "whole.npz", **options))
-    path = folder / "broken.npz"
-    n = 0
-    for _ in broken.increments(checkpoint=path, **options):
-        n += 1
-        if n == stop:
-            break
-    rest = list(after.increments(checkpoint=path, **options))
-    assert 0 < len(rest) < len(expected)
-    for step, reference in zip(rest, expected[-len(rest) :], strict=True):
-        assert step.increment == reference.increment
-        assert step.load == reference.load
-        assert step.complete == reference.complete
-        assert same_energies(step, reference, tolerance)
-        if reference.increment_error:
-            for name, error in reference.increment_error.items():
-                assert close(step.increment_error[name], error, max(tolerance, 1e-9))
-        for name, r in reference.contacts.items():
-            scale = np.abs(r.force).max()
-            found = step.contacts[name].force
-            assert close(found, r.force, tolerance, scale=scale), step.increment
-    assert differences(after, whole, tolerance) == []
-    # What is finished is taken up as it ended, results and status included.
-    assert not list(again.increments(checkpoint=path, **options))
-    assert differences(again, after, 0.0 if COMM.size == 1 else 1e-12) == []
-    assert [c.resultants().slip for c in again.contacts] == [
-        c.resultants().slip for c in after.contacts
-    ]
 
 
 # ---- the same digits -----------------------------------------------------------------------------
@@ -402,10 +171,8 @@ def test_errors_are_estimated_of_a_state_taken_up(tmp_path):
 
 
 SCRIPT = """
-import json, sys
-sys.path.insert(0, {tests!r})
-import numpy as np
-from test_restart import Press, Ramp, picture
+import json
+from scenes.histories import Press, Ramp, picture
 made = {scene}
 for step in made.increments(checkpoint={path!r}):
     if step.increment == {stop}:
@@ -419,7 +186,7 @@ if made.problem.u.function_space.mesh.comm.rank == 0:
 
 def run_script(ranks: int, **values) -> dict[str, np.ndarray]:
     """Run a history in a process of its own, and see where it ends."""
-    script = SCRIPT.format(tests=str(Path(__file__).parent), **values)
+    script = SCRIPT.format(**values)
     launch = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks > 1 else []
     done = subprocess.run(
         [*launch, sys.executable, "-c", script],
@@ -528,9 +295,7 @@ def test_other_loads_and_conditions_are_refused(saved):
     load = made.load
     made.load = lambda t: load(1.01 * t)
     raised_everywhere(call, ValueError, "a value prescribed by a Dirichlet condition")
-    made = Press(wall=True)
-    del made.problem._bcs[0]
-    made.problem.constrained[:] = made.problem._constrained_unknowns()
+    made = Press(wall=True, held=[1])
     raised_everywhere(call, ValueError, "Dirichlet conditions", "components of nodes")
 
 
@@ -578,7 +343,7 @@ def test_data_that_the_load_changes_are_no_change(tmp_path):
     class Both(Press):
         def load(self, t):
             super().load(t)
-            self.contacts[0].parameters["friction"].value = 0.1 + 0.1 * t
+            self.problem.contacts[0].parameters["friction"].value = 0.1 + 0.1 * t
 
     made, after = Both(support="moving"), Both(support="moving")
     next(made.increments(checkpoint=path))
@@ -840,7 +605,7 @@ def test_a_load_that_fails_leaves_the_problem(saved):
 
 def more_fields(made: Press) -> list[fem.Function]:
     """Functions of all kinds that can be saved."""
-    mesh, submesh = made.scene.mesh, made.contacts[0].surface.submesh
+    mesh, submesh = made.scene.mesh, made.problem.contacts[0].surface.submesh
     cell = mesh.basix_cell()
     d = mesh.geometry.dim
     spaces = {

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from scenes import block, raised_everywhere
 
 import fenics_contact as fc
 from fenics_contact.checks.rigid_motions import _unbalanced
+from scenes.blocks import block
+from scenes.comparing import raised_everywhere
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 6])

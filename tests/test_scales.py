@@ -6,19 +6,14 @@ this increment (of its own), or of what ``accuracy`` asks for. By methods whose 
 a step that changes nothing it is far less.
 """
 
-import sys
-
 import numpy as np
 import pytest
 from mpi4py import MPI
-from running import ROOT
-from scenes import at_points, block
-
-sys.path.insert(0, str(ROOT / "verification"))
-
-from bodies import Bodies, boxes
 
 import fenics_contact as fc
+from scenes.blocks import block
+from scenes.bodies import Bodies, boxes
+from scenes.comparing import at_points
 
 COMM = MPI.COMM_WORLD
 FLOOR, ROOF, FLOOR_2, ROOF_2 = 1, 2, 3, 4
@@ -120,16 +115,10 @@ def beside(ratio, *, one_contact=False, joined=False, friction=0.5, **options):
         body.F += q * body.v[1] * body.ds(roof) - shear * q * body.v[0] * body.ds(roof)
     floors = [[FLOOR, FLOOR_2]] if one_contact else [FLOOR, FLOOR_2]
     contacts = [
-        fc.Contact(
-            body.u,
-            fc.ContactSurface(body.mesh, body.tags, tags),
-            fc.HalfSpace((0, 0), (0, 1)),
-            fc.Coulomb(friction),
-            name=f"floor {i}",
-        )
+        body.contact(tags, fc.HalfSpace((0, 0), (0, 1)), fc.Coulomb(friction), name=f"floor {i}")
         for i, tags in enumerate(floors)
     ]
-    problem = fc.ContactProblem(body.F, body.u, contacts=contacts, **options)
+    problem = body.problem(*contacts, **options)
     for side in (0.0, 0.2):
         shear.value = side
         step = problem.solve()

@@ -2,50 +2,16 @@
 
 import numpy as np
 import pytest
-import ufl
-from dolfinx import fem
 from mpi4py import MPI
-from scenes import close, gathered, owned, raised_everywhere
-from test_two_bodies import BOTTOM, LOWER, TOP, UPPER, elasticity, two_blocks
 
 import fenics_contact as fc
+from scenes.comparing import close, gathered, owned, raised_everywhere
+from scenes.two_blocks import LOWER, Slider, two_blocks
 
 COMM = MPI.COMM_WORLD
 K_N = 1e7
 
 pytestmark = pytest.mark.mpi
-
-
-class Slider:
-    """A block of width 1 that stands at ``start`` on one of width 4, its top moved."""
-
-    def __init__(
-        self, cell, law, *, start, n=(14, 4), contact=None, update="increment", release=None, **more
-    ):
-        """Make it, unloaded."""
-        mesh, tags = two_blocks(cell, n, (4.0, 1.0), start)
-        d = mesh.geometry.dim
-        V = fem.functionspace(mesh, ("Lagrange", 1, (d,)))
-        self.u, v = fem.Function(V), ufl.TestFunction(V)
-        self.move = [fem.Constant(mesh, 0.0) for _ in range(d)]
-        fixed = fem.Constant(mesh, 0.0)
-        bcs = []
-        for tag, values in ((BOTTOM, [fixed] * d), (TOP, self.move)):
-            for i, value in enumerate(values):
-                dofs = fem.locate_dofs_topological(V.sub(i), d - 1, tags.find(tag))
-                bcs.append(fem.dirichletbc(value, dofs, V.sub(i)))
-        surface = fc.ContactSurface(mesh, tags, UPPER)
-        base = fc.DeformableBody(tags, LOWER, update=update, release=release)
-        self.contact = fc.Contact(self.u, surface, base, law, **(contact or {}))
-        F = elasticity(self.u, v, 0.3)
-        self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=[self.contact], **more)
-
-    def step(self, down, along) -> fc.Step:
-        """Move the top, solve and commit."""
-        self.move[-1].value, self.move[0].value = -down, along
-        step = self.problem.solve()
-        self.problem.commit()
-        return step
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from dolfinx import fem
 from mpi4py import MPI
-from scenes import TOP, at_points, block, close, stress
 
 import fenics_contact as fc
+from scenes.blocks import TOP, block
+from scenes.comparing import at_points, close
+from scenes.elasticity import stress
 
 COMM = MPI.COMM_WORLD
 RADIUS, DEPTH = 4.0, 0.05

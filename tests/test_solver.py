@@ -3,7 +3,6 @@
 import gc
 import logging
 import weakref
-from dataclasses import dataclass
 
 import dolfinx
 import dolfinx.fem.petsc
@@ -13,108 +12,27 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from scenes import (
-    BOTTOM,
-    GRID,
-    LEFT,
-    RIGHT,
-    TOP,
-    Block,
+
+import fenics_contact as fc
+from scenes.blocks import BOTTOM, GRID, RIGHT, TOP, block, kirchhoff, layers
+from scenes.comparing import (
     at_points,
-    block,
     close,
     compiled,
     gathered,
-    layers,
+    identical,
     nodal,
     owned,
     same_field,
-    strain,
 )
-
-import fenics_contact as fc
+from scenes.elasticity import strain
+from scenes.rubbing import PATH, Rub, snapshot, walk
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
 
 # Solver tolerances for comparisons finer than the default of 1e-9 of the forces.
 TIGHT = {"snes_rtol": 1e-13}
-
-
-# ---- a scene with open, sticking and slipping points ---------------------------------------------
-
-
-@dataclass
-class Rub:
-    """A block on a round cushion, its top pushed down and to and fro.
-
-    Attributes:
-        scene: The block.
-        push: Displacement of the top, one constant per component.
-        contact, problem: As made.
-    """
-
-    scene: Block
-    push: list[fem.Constant]
-    contact: fc.Contact
-    problem: fc.ContactProblem
-
-    def move(self, side: float, down: float) -> None:
-        """Set the displacement of the top."""
-        self.push[0].value = side
-        self.push[-1].value = -down
-
-
-def rub(
-    law=None,
-    *,
-    cell: str = "quadrilateral",
-    degree: int = 1,
-    length: float = 1.0,
-    pressure: float = 1.0,
-    mesh: dict | None = None,
-    **kwargs,
-) -> Rub:
-    """Make a `Rub` in units in which lengths and stresses are larger by the factors given."""
-    d = 2 if cell in ("triangle", "quadrilateral") else 3
-    mesh = {"n": 4, "size": length * np.ones(d)} | (mesh or {})
-    scene = block(cell, degree, E=1000 * pressure, **mesh)
-    push = [fem.Constant(scene.mesh, 0.0) for _ in range(d)]
-    bcs = [scene.hold(TOP, i, c) for i, c in enumerate(push)]
-    center = np.full(d, 0.5 * length)
-    center[-1] = -2.0 * length
-    cushion = fc.Ball(center, 2.0 * length)
-    stiffness = pressure / length
-    if law is None:
-        law = fc.Coulomb(0.3, k_n=2e4 * stiffness, k_t=1e4 * stiffness)
-    contact = {"support": cushion} | kwargs.pop("contact", {})
-    problem, contact = scene.problem(law, bcs, contact=contact, **kwargs)
-    return Rub(scene, push, contact, problem)
-
-
-# Down, aside, further, back through zero, up again: (side, down) of the top.
-PATH = [(0.0, 0.02), (0.002, 0.03), (0.02, 0.03), (0.016, 0.03), (-0.01, 0.03), (-0.01, 0.01)]
-
-
-def walk(made: Rub, length: float = 1.0, path=PATH) -> list[fc.Step]:
-    """Solve and commit the whole path."""
-    steps = []
-    for side, down in path:
-        made.move(side * length, down * length)
-        steps.append(made.problem.solve())
-        made.problem.commit()
-    return steps
-
-
-def snapshot(made: Rub) -> tuple[np.ndarray, ...]:
-    history = made.contact.history.function.x.array.copy()
-    return made.scene.u.x.array.copy(), history
-
-
-def identical(a, b) -> bool:
-    """Bit for bit, on all ranks."""
-    same = all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
-    return bool(np.all(COMM.allgather(same)))
 
 
 # ---- equilibrium and patch tests -----------------------------------------------------------------
@@ -161,16 +79,8 @@ def test_two_contacts_and_no_condition(cell, method):
     friction on the floor is what holds the third direction. Tolerances: 1e-10, as in `test_patch`.
     """
     scene = block(cell, up=-2.0, nu=0.0)
-    v = ufl.TestFunction(scene.u.function_space)
-    side = fem.Constant(scene.mesh, scene.vector(side=-1.0))
-    scene.F -= ufl.dot(side, v) * ufl.ds(scene.mesh, subdomain_data=scene.tags)(RIGHT)
-    wall = fc.Contact(
-        scene.u,
-        fc.ContactSurface(scene.mesh, scene.tags, LEFT),
-        fc.HalfSpace(np.zeros(scene.dim), scene.vector(side=1.0)),
-        fc.Frictionless(k_n=500.0),
-        name="wall",
-    )
+    scene.pull(RIGHT, scene.vector(side=-1.0))
+    wall = scene.wall(fc.Frictionless(k_n=500.0))
     floor = scene.contact(fc.Frictionless(k_n=5e3), name="floor")
     bcs = scene.rollers()[1:]
     problem = fc.ContactProblem(
@@ -196,7 +106,7 @@ def test_forces_balance_on_the_whole_path(method):
     Reference: the sum of the bulk residual over the top's dofs. Tolerance 1e-7 of the force: a
     hundred times the solver's, which bounds the norm and not the sum.
     """
-    made = rub(method=method)
+    made = Rub(method=method)
     space = made.scene.u.function_space
     bulk = compiled(made.scene.F)
     seen = np.zeros(3, dtype=int)
@@ -230,7 +140,7 @@ def test_failed_increment_leaves_no_trace(method):
     the last commit; and another on the same u and contact makes the increment, with the result of
     one that never failed. 1e-12: the very same computation, but for sums over ranks.
     """
-    made, twin = rub(method=method), rub(method=method)
+    made, twin = Rub(method=method), Rub(method=method)
     scene, contact = made.scene, made.contact
     bcs = [scene.hold(TOP, i, c) for i, c in enumerate(made.push)]
     limited = fc.ContactProblem(
@@ -269,7 +179,7 @@ def test_failed_increment_leaves_no_trace(method):
 
 def test_increments_restores_the_load():
     """`increments` that fails: load, u and history are those of the last committed increment."""
-    made = rub(method="newton")
+    made = Rub(method="newton")
     steps = fc.increments(made.problem, made.push[1], 0.0, -0.03, steps=3)
     done = []
     before = snapshot(made)
@@ -288,7 +198,7 @@ def test_increments_restores_the_load():
 
 def test_increments_lead_the_load():
     """Loads in equal steps up to the end, each solved and committed, numbered from 1."""
-    made = rub(fc.Frictionless(k_n=2e4))
+    made = Rub(fc.Frictionless(k_n=2e4))
     steps = list(fc.increments(made.problem, made.push[1], 0.0, -0.02, steps=4))
     assert [s.load for s in steps] == pytest.approx([-0.005, -0.01, -0.015, -0.02], rel=1e-14)
     assert [s.increment for s in steps] == [1, 2, 3, 4]
@@ -317,7 +227,7 @@ def test_summary_without_forces(lift):
 def test_why_all_unknowns_is_said_once(caplog):
     """`increments` asks again whether to condense; the log has no news to tell."""
     with caplog.at_level("INFO", logger="fenics_contact"):
-        made = rub(condensation=False)
+        made = Rub(condensation=False)
         list(fc.increments(made.problem, made.push[1], 0.0, -0.01, steps=2))
     said = [r.message for r in caplog.records if "iterating on all unknowns" in r.message]
     assert len(said) == (COMM.rank == 0)
@@ -340,7 +250,7 @@ def test_pairs_do_not_outlive_an_increment():
     second run differs from the first by the pairs of L-BFGS alone, if any were kept. Residual norms
     of every iteration agree to 1e-9: round-off of a sum over ranks, grown over some iterations.
     """
-    made = rub(fc.Frictionless(k_n=1e3), method="lbfgs")
+    made = Rub(fc.Frictionless(k_n=1e3), method="lbfgs")
     runs = []
     for number, (side, down) in enumerate([(0.0, 0.05), (0.01, 0.02), (0.0, 0.05)]):
         made.scene.u.x.array[:] = 0.0
@@ -359,7 +269,7 @@ def test_pairs_do_not_outlive_an_increment():
 
 def test_factorisation_is_kept():
     """Increments that need no refresh of H₀ use the factorisation there is; a new E does not."""
-    made = rub(fc.Frictionless(k_n=1e3))
+    made = Rub(fc.Frictionless(k_n=1e3))
     made.move(0.0, 0.05)
     assert made.problem.solve().factorisations == 1
     made.problem.commit()
@@ -395,7 +305,7 @@ def test_solving_twice_changes_nothing():
 
     Without commit the history is the same, so the state is a solution already.
     """
-    made = rub()
+    made = Rub()
     walk(made, path=PATH[:2])
     made.move(*PATH[2])
     made.problem.solve()
@@ -412,7 +322,7 @@ def test_a_held_load(method):
 
     Round-off only: 1e-12 of the accumulated slip, which is of size 0.01.
     """
-    made = rub(method=method)
+    made = Rub(method=method)
     for move in PATH:
         walk(made, path=[move])
         before = gathered(COMM, made.contact.slip)
@@ -433,7 +343,7 @@ def test_methods_agree(cell, degree):
     """
     fields = []
     for method in ("lbfgs", "newton"):
-        made = rub(cell=cell, degree=degree, method=method)
+        made = Rub(cell=cell, degree=degree, method=method)
         walk(made)
         contact = made.contact
         rows = (at_points(contact, x) for x in (contact.traction, contact.slip))
@@ -455,7 +365,7 @@ def test_units_do_not_matter(method, law):
     path = PATH[:4] if law == "coulomb" else PATH[:1]
     results = []
     for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1.0), (1.0, 1e-9), (1e-9, 1e9)]:
-        made = rub(make, length=length, pressure=pressure, method=method)
+        made = Rub(make, length=length, pressure=pressure, method=method)
         steps = walk(made, length, path)
         results.append(
             (
@@ -486,7 +396,7 @@ def test_any_number_of_ranks(cell):
     """
     resultants = []
     for comm in (COMM, MPI.COMM_SELF):
-        made = rub(cell=cell, mesh=MESHES[cell] | {"comm": comm})
+        made = Rub(cell=cell, mesh=MESHES[cell] | {"comm": comm})
         steps = walk(made, path=PATH[1:5])
         resultants.append([s.contacts["contact"] for s in steps])
     for together, alone in zip(*resultants, strict=True):
@@ -522,7 +432,7 @@ def test_options_reach_the_solver(method):
     """A number of iterations given as an option is the limit; the database is clean afterwards."""
     database = PETSc.Options()
     before = database.getAll()
-    made = rub(method=method, petsc_options={"snes_max_it": 1, "snes_rtol": 1e-5})
+    made = Rub(method=method, petsc_options={"snes_max_it": 1, "snes_rtol": 1e-5})
     assert database.getAll() == before
     assert made.problem.snes.getTolerances()[0] == 1e-5
     made.move(0.02, 0.05)
@@ -538,7 +448,7 @@ def test_options_database_wins():
     database.setValue(key, 1)
     try:
         before = database.getAll()
-        made = rub(petsc_options={"snes_max_it": 500}, prefix="mine_")
+        made = Rub(petsc_options={"snes_max_it": 500}, prefix="mine_")
         assert database.getAll() == before
         made.move(0.02, 0.05)
         with pytest.raises(fc.NotConverged) as caught:
@@ -557,7 +467,7 @@ def test_options_database_changes_the_method():
     for key, value in given.items():
         database.setValue(key, value)
     try:
-        made = rub(prefix="other_")
+        made = Rub(prefix="other_")
     finally:
         for key in given:
             database.delValue(key)
@@ -572,8 +482,8 @@ def test_two_prefixes_do_not_disturb_one_another():
     """Two problems with options of their own, made one after the other and used in turn."""
     database = PETSc.Options()
     before = database.getAll()
-    short = rub(prefix="short_", petsc_options={"snes_max_it": 3})
-    long = rub(prefix="long_")
+    short = Rub(prefix="short_", petsc_options={"snes_max_it": 3})
+    long = Rub(prefix="long_")
     assert database.getAll() == before
     for made in (short, long):
         made.move(0.02, 0.03)
@@ -651,8 +561,8 @@ def test_a_solver_of_ones_own(cell, degree):
 
     1e-8 of the largest value over the whole path: ContactProblem to 1e-11 of the forces.
     """
-    made = rub(cell=cell, degree=degree, petsc_options={"snes_rtol": 1e-11})
-    mine = rub(cell=cell, degree=degree)
+    made = Rub(cell=cell, degree=degree, petsc_options={"snes_rtol": 1e-11})
+    mine = Rub(cell=cell, degree=degree)
     scene = mine.scene
     bcs = [scene.hold(TOP, i, c) for i, c in enumerate(mine.push)]
     own = OwnNewton(scene.F, mine.contact, scene.u, bcs)
@@ -711,7 +621,7 @@ class Changed(fc.Coulomb):
 
 def test_the_changed_law_is_sound_when_nothing_is_changed():
     """The same law with nothing broken passes: what fails below fails for its fault."""
-    made = rub(Changed("nothing"), method="newton")
+    made = Rub(Changed("nothing"), method="newton")
     steps = walk(made, path=PATH[:3])
     assert steps[-1].contacts["contact"].slip > 0
     assert not any(s.verdict.failures for s in steps)
@@ -722,7 +632,7 @@ def test_the_changed_law_is_sound_when_nothing_is_changed():
 )
 def test_a_law_that_lies_is_caught(what):
     """Reactions that break the cone, complementarity or the flow rule do not pass as a solution."""
-    made = rub(Changed(what), method="newton")
+    made = Rub(Changed(what), method="newton")
     before = snapshot(made)
     with pytest.raises(fc.NotConverged) as caught:
         walk(made, path=[PATH[2]])
@@ -736,7 +646,7 @@ def test_a_law_that_lies_is_caught(what):
 @pytest.mark.parametrize("factor", [0.9, 1.0 + 1e-4])
 def test_a_wrong_contact_residual_is_caught(method, factor, monkeypatch):
     """A contact residual that is not the integral of the tractions: forces do not balance."""
-    made = rub(method=method)
+    made = Rub(method=method)
     right = fc.ContactOperator.add_force
 
     def wrong(self, residual, traction=None):
@@ -755,7 +665,7 @@ def test_a_wrong_contact_residual_is_caught(method, factor, monkeypatch):
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_forces_at_wrong_places_are_caught(cell, monkeypatch):
     """Forces of the right sum, each acting where another point of Γc is: moments do not balance."""
-    made = rub(cell=cell)
+    made = Rub(cell=cell)
     right, contact = fc.ContactOperator.add_force, made.contact
 
     def wrong(self, residual, traction=None):
@@ -777,7 +687,7 @@ def test_forces_by_a_second_route(factor, condensation):
 
     What the solver, the laws and the sums of forces make of it agrees, within their tolerances.
     """
-    made = rub(second_route=True, condensation=condensation if COMM.size == 1 else None)
+    made = Rub(second_route=True, condensation=condensation if COMM.size == 1 else None)
     made.contact.pairs.own_map.scale(factor)
     made.move(*PATH[1])
     if factor == 1.0:
@@ -794,7 +704,7 @@ def test_forces_by_a_second_route(factor, condensation):
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_a_premature_end_is_caught(method, monkeypatch):
     """SNES that claims convergence at its first look is not believed; the state is as before."""
-    made = rub(method=method, fallback=False)
+    made = Rub(method=method, fallback=False)
     walk(made, path=PATH[:1])
     before = snapshot(made)
     made.move(*PATH[2])
@@ -808,7 +718,7 @@ def test_a_premature_end_is_caught(method, monkeypatch):
 
 def test_the_verdict_of_a_solution():
     """A step carries its verdict: residual within tolerance, laws to 1e-10, forces balanced."""
-    made = rub()
+    made = Rub()
     for step in walk(made):
         verdict = step.verdict
         assert not verdict.failures
@@ -873,7 +783,7 @@ def test_tresca_friction(cell):
     fields = []
     for method in ("lbfgs", "newton"):
         law = fc.Tresca(0.3, 8.0, k_n=2e4, k_t=1e4)
-        made = rub(law, cell=cell, method=method, mesh={"n": 4 if cell == "quadrilateral" else 2})
+        made = Rub(law, cell=cell, method=method, mesh={"n": 4 if cell == "quadrilateral" else 2})
         steps = walk(made, path=PATH[:4])
         for step in steps:
             r = step.contacts["contact"]
@@ -885,7 +795,7 @@ def test_tresca_friction(cell):
 @pytest.mark.parametrize(("alpha", "phi"), [(1.0, 0.0), (0.5, 0.5), (0.0, 0.0)])
 def test_shares_of_h0_do_not_change_the_solution(alpha, phi):
     """Whatever part of the contact stiffness is in H₀, the state is the same: 1e-7, as above."""
-    reference, made = rub(), rub(alpha=alpha, phi=phi)
+    reference, made = Rub(), Rub(alpha=alpha, phi=phi)
     for m in (reference, made):
         walk(m, path=PATH[:4])
     a, b = (nodal(m.scene.u) for m in (made, reference))
@@ -912,16 +822,8 @@ def test_two_laws_at_once():
     The side load 1 is shared by wall and friction; the floor carries the vertical load 2.
     """
     scene = block("quadrilateral", up=-2.0)
-    v = ufl.TestFunction(scene.u.function_space)
-    ds = ufl.ds(scene.mesh, subdomain_data=scene.tags)
-    scene.F -= ufl.dot(fem.Constant(scene.mesh, scene.vector(side=-1.0)), v) * ds(RIGHT)
-    wall = fc.Contact(
-        scene.u,
-        fc.ContactSurface(scene.mesh, scene.tags, LEFT),
-        fc.HalfSpace((0, 0), (1, 0)),
-        fc.Frictionless(k_n=500.0),
-        name="wall",
-    )
+    scene.pull(RIGHT, scene.vector(side=-1.0))
+    wall = scene.wall(fc.Frictionless(k_n=500.0))
     floor = scene.contact(fc.Coulomb(0.2, k_n=5e3, k_t=1e3), name="floor")
     problem = fc.ContactProblem(scene.F, scene.u, contacts=[wall, floor])
     contacts = problem.solve().contacts
@@ -1179,15 +1081,6 @@ def test_variable_modulus(kind):
     assert same_field(scene.u, exact, 1e-9)
 
 
-def kirchhoff(scene: Block, E: fem.Constant):
-    """St Venant-Kirchhoff with ν = 0: S = E · Green strain."""
-    v = ufl.TestFunction(scene.u.function_space)
-    F = ufl.Identity(scene.dim) + ufl.grad(scene.u)
-    S = E * (F.T * F - ufl.Identity(scene.dim)) / 2
-    ds = ufl.ds(scene.mesh, subdomain_data=scene.tags)
-    return ufl.inner(F * S, ufl.grad(v)) * ufl.dx(scene.mesh) - ufl.dot(scene.traction, v) * ds(TOP)
-
-
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_nonlinear_bulk(cell, method):
@@ -1198,7 +1091,7 @@ def test_nonlinear_bulk(cell, method):
     """
     E, p, k_n = 1000.0, 100.0, 5e4
     scene = block(cell, up=-p)
-    scene.F = kirchhoff(scene, scene.E)
+    scene.F = kirchhoff(scene)
     problem, _ = scene.problem(
         fc.Frictionless(k_n=k_n),
         scene.rollers(),
@@ -1287,14 +1180,14 @@ def test_unsymmetric_bulk():
 def test_silence(caplog):
     """A sound solve logs no warning and prints nothing that the caller did not ask for."""
     with caplog.at_level(logging.WARNING, logger="fenics_contact"):
-        made = rub(fc.Frictionless(k_n=2e4))
+        made = Rub(fc.Frictionless(k_n=2e4))
         walk(made, path=PATH[:1])
     assert not [r for r in caplog.records if r.name.startswith("fenics_contact")]
 
 
 def test_a_problem_is_freed_without_the_garbage_collector() -> None:
     """No cycle of references: ranks free their factorisations together, where the name goes."""
-    made = rub()
+    made = Rub()
     made.move(*PATH[1])
     made.problem.solve()
     gc.collect()
@@ -1310,7 +1203,7 @@ def test_a_problem_is_freed_without_the_garbage_collector() -> None:
 
 def test_restore_drops_what_was_not_committed() -> None:
     """A solved increment that is not committed leaves nothing: u and history of the last commit."""
-    made = rub()
+    made = Rub()
     made.move(*PATH[1])
     made.problem.solve()
     made.problem.commit()
@@ -1330,7 +1223,7 @@ def test_newton_after_an_increment_of_no_iterations(condensation):
     """A first increment without load needs no tangent, and leaves none to start the next from."""
     if condensation is None and COMM.size > 1:
         pytest.skip("condensation takes one rank")
-    made = rub(method="newton", condensation=condensation)
+    made = Rub(method="newton", condensation=condensation)
     made.move(0.0, 0.0)
     made.scene.u.x.array[:] = 0.0
     first = made.problem.solve()
@@ -1349,7 +1242,7 @@ def test_newton_starts_where_the_right_points_slip(condensation):
         pytest.skip("condensation takes one rank")
     taken, states = [], []
     for helped in (True, False):
-        made = rub(method="newton", condensation=condensation, mesh={"n": 12})
+        made = Rub(method="newton", condensation=condensation, mesh={"n": 12})
         taken.append(0)
         for i in range(1, 13):
             made.move(0.004 * i, 0.05)

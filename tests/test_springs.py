@@ -6,23 +6,13 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from scenes import (
-    BOTTOM,
-    CELLS,
-    LEFT,
-    TOP,
-    block,
-    block_mesh,
-    close,
-    dimension,
-    displacement_space,
-    gathered,
-    raised_everywhere,
-)
-from test_two_bodies import LOWER, UPPER, two_blocks
 
 import fenics_contact as fc
 from fenics_contact.checks.verdict import check_laws
+from scenes.blocks import BOTTOM, CELLS, LEFT, TOP, block, block_mesh, dimension
+from scenes.comparing import close, gathered, raised_everywhere
+from scenes.elasticity import displacement_space
+from scenes.two_blocks import LOWER, UPPER, two_blocks
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD

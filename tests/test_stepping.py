@@ -14,38 +14,14 @@ import pytest
 from dolfinx import fem
 from mpi4py import MPI
 from running import environment
-from scenes import TOP, at_points, block, close, nodal, owned, raised_everywhere
 
 import fenics_contact as fc
 from fenics_contact import checkpoint
+from scenes.blocks import TOP, block
+from scenes.comparing import at_points, close, nodal, owned, raised_everywhere, shared_folder
+from scenes.rubbing import Rub
 
 COMM = MPI.COMM_WORLD
-
-
-class Rub:
-    """A block with a moving top, pressed on a cushion and rubbed along it."""
-
-    def __init__(self, cell="quadrilateral", law=None, **kwargs):
-        """Make it, unloaded."""
-        scene = block(cell, 1, n=4)
-        d = scene.dim
-        self.scene = scene
-        self.push = [fem.Constant(scene.mesh, 0.0) for _ in range(d)]
-        bcs = [scene.hold(TOP, i, c) for i, c in enumerate(self.push)]
-        center = np.full(d, 0.5)
-        center[-1] = -2.0
-        law = law or fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
-        support = fc.Ball(center, 2.0)
-        self.problem, self.contact = scene.problem(law, bcs, contact={"support": support}, **kwargs)
-
-    def load(self, t: float) -> None:
-        """Down until 1, along until 2, and back until 4."""
-        self.push[-1].value = -0.03 * min(t, 1.0)
-        self.push[0].value = np.interp(t, [1, 2, 4], [0, 0.1, -0.1])
-
-    def forces(self) -> np.ndarray:
-        """Contact force on the block."""
-        return self.contact.resultants().force
 
 
 def same_states(a: Rub, b: Rub, rtol: float) -> bool:
@@ -65,10 +41,10 @@ def same_states(a: Rub, b: Rub, rtol: float) -> bool:
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_loads_as_a_function(cell):
     """A cycle of two loads by one function: the friction force returns to its opposite."""
-    made = Rub(cell)
+    made = Rub(cell=cell)
     shear = {}
     for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=8):
-        shear[step.load] = made.forces()[0]
+        shear[step.load] = made.contact.resultants().force[0]
     assert list(shear) == pytest.approx(np.arange(1, 9) / 2)
     assert shear[2.0] < 0 < shear[4.0]
     end = made.contact.resultants()
@@ -168,7 +144,7 @@ def test_cutting_has_a_limit():
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_energy_is_balanced(cell, law):
     """Equilibrium at both ends makes the balance exact, up to the solver's tolerance of 1e-9."""
-    made = Rub(cell, law)
+    made = Rub(law, cell=cell)
     for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=8):
         e = step.energy
         size = abs(e.work) + abs(e.elastic)
@@ -210,11 +186,6 @@ def test_energy_of_a_driven_support(field):
 # ---- checkpoints ---------------------------------------------------------------------------------
 
 
-def shared_folder(tmp_path: Path) -> Path:
-    """Rank 0's folder, on all ranks."""
-    return Path(COMM.bcast(str(tmp_path)))
-
-
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 @pytest.mark.parametrize("every", [1, 3])
@@ -226,7 +197,7 @@ def test_going_on_gives_the_same_digits(cell, method, every, tmp_path):
     """
     same = 0.0 if COMM.size == 1 else 1e-7
     folder = shared_folder(tmp_path)
-    whole, broken, after = (Rub(cell, method=method) for _ in range(3))
+    whole, broken, after = (Rub(cell=cell, method=method) for _ in range(3))
     options = {"steps": 8, "checkpoint_every": every}
     history = fc.increments(
         whole.problem, whole.load, 0.0, 4.0, checkpoint=folder / "whole.npz", **options
@@ -243,7 +214,7 @@ def test_going_on_gives_the_same_digits(cell, method, every, tmp_path):
         size = abs(energies[step.load].work) + abs(energies[step.load].elastic)
         assert close(step.energy.work, energies[step.load].work, max(same, 1e-12), scale=size)
     # A third start finds nothing left to do.
-    again = Rub(cell, method=method)
+    again = Rub(cell=cell, method=method)
     assert not list(fc.increments(again.problem, again.load, 0.0, 4.0, checkpoint=path, **options))
     assert same_states(again, whole, same)
 
@@ -253,7 +224,7 @@ def test_a_file_of_another_problem_is_refused(tmp_path):
     path = shared_folder(tmp_path) / "state.npz"
     made = Rub()
     list(fc.increments(made.problem, made.load, 0.0, 1.0, checkpoint=path))
-    other = Rub("triangle", fc.Coulomb(0.3, k_n=2e4, k_t=1e4))
+    other = Rub(cell="triangle")
     raised_everywhere(
         lambda: list(fc.increments(other.problem, other.load, checkpoint=path)), ValueError, "mesh"
     )
@@ -301,10 +272,9 @@ def test_a_failed_write_leaves_the_old_file(said, tmp_path, monkeypatch):
 
 
 SCRIPT = """
-import json, sys
-sys.path.insert(0, {tests!r})
-from test_stepping import Rub
+import json
 import fenics_contact as fc
+from scenes.rubbing import Rub
 made = Rub()
 for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=40, checkpoint={path!r}):
     print(step.increment, flush=True)
@@ -316,7 +286,7 @@ if made.scene.mesh.comm.rank == 0:
 
 def run_script(path: Path, ranks: int, *, kill_after: int | None = None) -> list[str]:
     """Run the history in a process of its own, killed after so many increments."""
-    script = SCRIPT.format(tests=str(Path(__file__).parent), path=str(path))
+    script = SCRIPT.format(path=str(path))
     launch = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks > 1 else []
     process = subprocess.Popen(
         [*launch, sys.executable, "-c", script],
@@ -362,7 +332,7 @@ serial = pytest.mark.skipif(COMM.size > 1, reason="condensation takes one rank")
 
 def lagging(field, tmp_path=None, *, law=None, steps=8, **kwargs):
     """The history with the field found when ``field`` says."""
-    made = Rub("hexahedron", law, condensation=True)
+    made = Rub(law, cell="hexahedron", condensation=True)
     options = {"steps": steps, "field": field} | kwargs
     return made, list(fc.increments(made.problem, made.load, 0.0, 4.0, **options))
 
@@ -395,7 +365,7 @@ def test_field_on_request():
 
     What the contact says of the increment stays: what slipped in it is not said to stick.
     """
-    every, lazy = Rub("triangle", condensation=True), Rub("triangle", condensation=True)
+    every, lazy = Rub(cell="triangle", condensation=True), Rub(cell="triangle", condensation=True)
     compared = 0
     for step in fc.increments(every.problem, every.load, 0.0, 4.0, steps=8):
         made = lazy.problem
@@ -426,13 +396,13 @@ def test_field_every_so_many_increments():
 def test_checkpoint_of_a_field_left_behind(tmp_path):
     """Going on from a file gives the digits of the run that wrote it."""
     whole, _ = lagging("last", checkpoint=tmp_path / "whole.npz", checkpoint_every=3)
-    made = Rub("hexahedron", condensation=True)
+    made = Rub(cell="hexahedron", condensation=True)
     options = {"steps": 8, "field": "last", "checkpoint": tmp_path / "part.npz"}
     options["checkpoint_every"] = 3
     for step in fc.increments(made.problem, made.load, 0.0, 4.0, **options):
         if step.increment == 5:
             break
-    after = Rub("hexahedron", condensation=True)
+    after = Rub(cell="hexahedron", condensation=True)
     rest = list(fc.increments(after.problem, after.load, 0.0, 4.0, **options))
     assert rest[0].increment == 4
     assert same_states(after, whole, 0.0)
@@ -441,7 +411,7 @@ def test_checkpoint_of_a_field_left_behind(tmp_path):
 @serial
 def test_a_failure_leaves_the_field_to_be_completed():
     """After an increment that fails u is completed as that of the last commit."""
-    every, lazy = Rub("triangle", condensation=True), Rub("triangle", condensation=True)
+    every, lazy = Rub(cell="triangle", condensation=True), Rub(cell="triangle", condensation=True)
     limited(lazy, 0.6)
     for made in (every, lazy):
         options = {"steps": [0.5, 4.0] if made is lazy else [0.5], "max_cuts": 0, "field": "last"}
@@ -459,11 +429,12 @@ def test_a_failure_leaves_the_field_to_be_completed():
 @serial
 def test_a_field_that_is_wrong_is_refused(monkeypatch):
     """What is recovered is checked by the product with K, not by what recovered it."""
-    made = Rub("triangle", condensation=True)
+    made = Rub(cell="triangle", condensation=True)
     made.load(1.0)
     made.problem.solve(field=False)
     made.problem.commit()
-    made.problem._pending_field[made.problem._pending_field != 0.0] *= 1.001
+    field = made.problem.solver.system.pending_field
+    field[field != 0.0] *= 1.001
     with pytest.raises(fc.NotConverged, match="residual"):
         made.problem.complete()
 

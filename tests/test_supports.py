@@ -7,19 +7,11 @@ import pytest
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from scenes import (
-    BOTTOM,
-    LEFT,
-    RIGHT,
-    block,
-    block_mesh,
-    close,
-    displacement_space,
-    gathered,
-    raised_everywhere,
-)
 
 import fenics_contact as fc
+from scenes.blocks import BOTTOM, LEFT, RIGHT, block, block_mesh
+from scenes.comparing import close, gathered, raised_everywhere
+from scenes.elasticity import displacement_space
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD

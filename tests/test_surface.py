@@ -8,7 +8,10 @@ import ufl
 from dolfinx import fem
 from dolfinx.mesh import GhostMode
 from mpi4py import MPI
-from scenes import (
+
+import fenics_contact as fc
+from fenics_contact.surface.facets import facet_cells, facet_nodes
+from scenes.blocks import (
     BACK,
     BOTTOM,
     CELLS,
@@ -17,20 +20,19 @@ from scenes import (
     LEFT,
     RIGHT,
     TOP,
-    assemble_number,
     block_mesh,
+    dimension,
+    layers,
+)
+from scenes.comparing import (
+    assemble_number,
     close,
     compiled,
-    dimension,
-    displacement_space,
     gathered,
-    layers,
     raised_everywhere,
     sorted_by_place,
 )
-
-import fenics_contact as fc
-from fenics_contact.surface.facets import facet_cells, facet_nodes
+from scenes.elasticity import displacement_space
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD

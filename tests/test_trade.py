@@ -11,10 +11,7 @@ import pytest
 from mpi4py import MPI
 from running import ROOT, environment
 
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-import trade
-
+from benchmarks import trade
 from fenics_contact.contact.accuracy import PRESETS
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="of one process")

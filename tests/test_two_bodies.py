@@ -2,105 +2,23 @@
 
 from __future__ import annotations
 
-import basix.ufl
 import dolfinx
 import gmsh
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from dolfinx.mesh import CellType
 from mpi4py import MPI
-from scenes import CELLS, dimension
 
 import fenics_contact as fc
 from fenics_contact import compat
+from scenes.blocks import CELLS
+from scenes.elasticity import residual
+from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, E, pressed, two_blocks
 
 COMM = MPI.COMM_WORLD
-BOTTOM, TOP, LOWER, UPPER = 1, 2, 3, 4
-E = 1e6
 
 pytestmark = pytest.mark.mpi
-
-
-def two_blocks(
-    cell: str, n: tuple[int, int], widths: tuple[float, float] = (1.0, 1.0), shift: float = 0.0
-):
-    """Two stacked blocks of height 1/2 whose meshes do not match, and their tags.
-
-    The upper one stands ``shift`` along x, and in its middle across.
-    """
-    d = dimension(cell)
-    x, cells, offset = [], [], 0
-    for count, width, low in zip(n, widths, (0.0, 0.5), strict=True):
-        counts = (count,) * (d - 1) + (max(1, round(count / width) // 2),)
-        make = dolfinx.mesh.create_rectangle if d == 2 else dolfinx.mesh.create_box
-        corners = [np.r_[np.zeros(d - 1), low], np.r_[np.full(d - 1, width), low + 0.5]]
-        block = make(MPI.COMM_SELF, corners, counts, CellType[cell])
-        x.append(block.geometry.x[:, :d].copy())
-        if low > 0 and shift > 0:
-            x[-1][:, 0] += shift
-            x[-1][:, 1 : d - 1] += (widths[0] - width) / 2
-        cells.append(compat.geometry_dofmap(block).astype(np.int64) + offset)
-        offset += len(x[-1])
-    x, cells = np.concatenate(x), np.concatenate(cells)
-    if COMM.rank:
-        x, cells = x[:0], cells[:0]
-    element = ufl.Mesh(basix.ufl.element("Lagrange", cell, 1, shape=(d,)))
-    mesh = dolfinx.mesh.create_mesh(COMM, cells=cells, x=x, e=element)
-    mesh.topology.create_connectivity(d - 1, d)
-    to_cell = mesh.topology.connectivity(d - 1, d)
-    found = {}
-    for tag, height in ((BOTTOM, 0.0), (TOP, 1.0), (LOWER, 0.5)):
-        found[tag] = dolfinx.mesh.locate_entities_boundary(
-            mesh, d - 1, lambda x, h=height: np.isclose(x[d - 1], h)
-        )
-    middle = found[LOWER]
-    owner = np.array([to_cell.links(f)[0] for f in middle], dtype=np.int32)
-    above = dolfinx.mesh.compute_midpoints(mesh, d, owner)[:, d - 1] > 0.5 if len(owner) else []
-    found[LOWER], found[UPPER] = middle[~np.array(above, bool)], middle[np.array(above, bool)]
-    facets = np.concatenate(list(found.values()))
-    values = np.concatenate([np.full(len(f), t, dtype=np.int32) for t, f in found.items()])
-    order = np.argsort(facets)
-    return mesh, dolfinx.mesh.meshtags(mesh, d - 1, facets[order], values[order])
-
-
-def elasticity(u, v, nu: float):
-    """Plane strain or 3D; the residual without loads."""
-    G, lam = E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
-    epsilon = ufl.sym(ufl.grad(u))
-    stress = 2 * G * epsilon + lam * ufl.tr(epsilon) * ufl.Identity(len(u))
-    return ufl.inner(stress, ufl.sym(ufl.grad(v))) * ufl.dx
-
-
-def pressed(
-    cell, degree, nu, law, *, n=(3, 4), surface=LOWER, confined=True, contact=None, **options
-):
-    """Two blocks on rollers, the top moved down by 0.01; the sides held if confined."""
-    mesh, tags = two_blocks(cell, n)
-    d = mesh.geometry.dim
-    V = fem.functionspace(mesh, ("Lagrange", degree, (d,)))
-    u, v = fem.Function(V), ufl.TestFunction(V)
-    down = fem.Constant(mesh, -0.01)
-    fixed = fem.Constant(mesh, 0.0)
-
-    def hold(i, value, facets):
-        return fem.dirichletbc(
-            value, fem.locate_dofs_topological(V.sub(i), d - 1, facets), V.sub(i)
-        )
-
-    bcs = [hold(d - 1, fixed, tags.find(BOTTOM)), hold(d - 1, down, tags.find(TOP))]
-    for i in range(d - 1):
-        for at in (0.0, 1.0) if confined else (0.0,):
-            side = dolfinx.mesh.locate_entities_boundary(
-                mesh, d - 1, lambda x, i=i, at=at: np.isclose(x[i], at)
-            )
-            bcs.append(hold(i, fixed, side))
-    opposite = UPPER if surface == LOWER else LOWER
-    support, arguments = fc.DeformableBody(tags, opposite), contact or {}
-    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, surface), support, law, **arguments)
-    problem = fc.ContactProblem(elasticity(u, v, nu), u, bcs=bcs, contacts=[contact], **options)
-    return problem, contact, down
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.3])
@@ -276,7 +194,7 @@ def test_shrink_fit() -> None:
     V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
     u, v = fem.Function(V), ufl.TestFunction(V)
     steel, nu = 210e3, 0.3
-    F = fem.Constant(mesh, steel / E) * elasticity(u, v, nu)
+    F = residual(u, v, steel, nu)
     zero = fem.Constant(mesh, 0.0)
     bcs = [
         fem.dirichletbc(zero, fem.locate_dofs_topological(V.sub(i), 1, tags.find(tag)), V.sub(i))
@@ -310,7 +228,7 @@ def test_bodies_are_told_apart() -> None:
     surface = fc.ContactSurface(mesh, tags, UPPER)
     contact = fc.Contact(u, surface, fc.DeformableBody(tags, LOWER), fc.Frictionless(k_n=1e6))
     with pytest.raises(ValueError, match="translation along x of body"):
-        fc.ContactProblem(elasticity(u, v, 0.0), u, bcs=[clamp], contacts=[contact])
+        fc.ContactProblem(residual(u, v, E, 0.0), u, bcs=[clamp], contacts=[contact])
 
 
 def test_matrix_reproduces_rigid_motions() -> None:

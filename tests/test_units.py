@@ -7,11 +7,12 @@ import pytest
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from scenes import at_points, close, layers, nodal
-from test_solver import PATH, rub, walk
-from test_two_bodies import BOTTOM, LOWER, TOP, UPPER, two_blocks
 
 import fenics_contact as fc
+from scenes.blocks import layers
+from scenes.comparing import at_points, close, nodal
+from scenes.rubbing import PATH, Rub, walk
+from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, two_blocks
 
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
@@ -40,7 +41,7 @@ def test_there_and_back(cell, degree, n, method, condensation):
     """A block pressed on a ball, rubbed there and back, and lifted."""
     results = []
     for length, pressure in UNITS:
-        made = rub(
+        made = Rub(
             fc.Coulomb(0.3),
             cell=cell,
             degree=degree,
@@ -72,7 +73,7 @@ def test_in_space(law, method):
     """The same in space, with every surface of friction."""
     results = []
     for length, pressure in UNITS:
-        made = rub(
+        made = Rub(
             {
                 "cone": fc.Coulomb(0.3),
                 "multipliers": fc.Coulomb(0.3),

@@ -7,16 +7,10 @@ import sys
 
 import pytest
 from mpi4py import MPI
-from running import ROOT
 
-sys.path.insert(0, str(ROOT / "verification"))
-
-import effectivity
-import half_planes  # noqa: F401
-import report
-import solids  # noqa: F401
-import statics
-from cases import CASES, Case, Outcome, Row
+from verification import effectivity, report, statics
+from verification.cases import Case, Outcome, Row
+from verification.report import CASES
 
 pytestmark = pytest.mark.mpi
 

@@ -1,4 +1,4 @@
-"""What a case of the verification is, how it is measured, and the list of all of them."""
+"""What a case of the verification is, how it is measured, and how modules have some."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from types import ModuleType
 
 import fenics_contact as fc
 
-__all__ = ["CASES", "Case", "Estimate", "Outcome", "Row", "case"]
+__all__ = ["Case", "Estimate", "Outcome", "Row", "case", "cases_of"]
 
 
 @dataclass(frozen=True)
@@ -119,16 +120,21 @@ class Case:
         return dataclasses.replace(made, seconds=time.perf_counter() - start)
 
 
-CASES: list[Case] = []
+_cases: list[Case] = []
 
 
 def case(
     name: str, reason: str, *, slow: bool = False, budget: str = ""
 ) -> Callable[..., Callable[[], Outcome]]:
-    """Put a computation on the list."""
+    """Make a computation a case of its module."""
 
     def enter(compute: Callable[[], Outcome]) -> Callable[[], Outcome]:
-        CASES.append(Case(name, reason, compute, slow, budget))
+        _cases.append(Case(name, reason, compute, slow, budget))
         return compute
 
     return enter
+
+
+def cases_of(*modules: ModuleType) -> list[Case]:
+    """The cases of modules, one module after the other."""
+    return [c for module in modules for c in _cases if c.compute.__module__ == module.__name__]

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cases import Case, Outcome, Row
+
+from verification.cases import Case, Outcome, Row
 
 __all__ = ["DEMOS"]
 

@@ -20,18 +20,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "demos"))
-
-import half_planes
-import hertz
-import solids  # noqa: F401
-import statics  # noqa: F401
-from cases import CASES, Case, Outcome
-from demonstrations import DEMOS, ROOT, run, runs
-
 import fenics_contact as fc
+from demos import hertz
 from fenics_contact.estimates.errors import quantities
+from verification import half_planes
+from verification.cases import Case, Outcome
+from verification.demonstrations import DEMOS, ROOT, run, runs
+from verification.report import CASES
 
 PAGE = ROOT / "docs" / "effectivity.md"
 USEFUL = (0.3, 3.0)

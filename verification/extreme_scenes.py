@@ -19,12 +19,12 @@ from typing import Any
 import dolfinx
 import numpy as np
 import ufl
-from bodies import Bodies, boxes, graded
 from dolfinx import fem
 from mpi4py import MPI
-from statics import near
 
 import fenics_contact as fc
+from scenes.bodies import Bodies, boxes, graded
+from scenes.tags import near
 
 BOTTOM, TOP, LEFT, FRONT, OPPOSITE = 1, 2, 3, 4, 5
 E, NU, PRESSURE = 1000.0, 0.3, 1.0
@@ -524,9 +524,8 @@ def hertz(kappa: float, *, enforcement: str = "penalty") -> tuple[Solve, float]:
         gap = body.x[0] ** 2 / (2 * radius)
         support = fc.Obstacle(gap, (0.0, 1.0), displacement=roller)
         law = fc.Frictionless(k_n)
-        surface = fc.ContactSurface(body.mesh, body.tags, FRONT)
-        contact = fc.Contact(body.u, surface, support, law, enforcement=enforcement)
-        problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact], method=method)
+        contact = body.contact(FRONT, support, law, enforcement=enforcement)
+        problem = body.problem(contact, method=method)
         step = problem.solve()
         return [step], abs(step.contacts["contact"].max_pressure / peak - 1)
 

@@ -21,7 +21,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from extreme_scenes import (
+
+import fenics_contact as fc
+from verification.extreme_scenes import (
     E,
     Solve,
     cycle,
@@ -38,8 +40,6 @@ from extreme_scenes import (
     pressed_pair,
     proportional,
 )
-
-import fenics_contact as fc
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "extremes.md"
 METHODS = ("lbfgs", "newton")

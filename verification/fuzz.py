@@ -155,9 +155,9 @@ def play(
         changed: See `fuzz_scenes.history`.
         spoiled: Changes a record before it is judged, to show that the judge sees it.
     """
-    import fuzz_judge
-    import fuzz_scenes
     from mpi4py import MPI
+
+    from verification import fuzz_judge, fuzz_scenes
 
     comm = comm or MPI.COMM_SELF
     records: list[dict[str, Any]] = []
@@ -215,7 +215,7 @@ def play(
 
 def _ahead(scene: Scene, records: list[dict[str, Any]]) -> tuple[int, float] | None:
     """Stage and load parameter of the next increment that was asked for."""
-    import fuzz_scenes
+    from verification import fuzz_scenes
 
     last = (records[-1]["stage"], records[-1]["load"]) if records else (-1, 0.0)
     return next((p for p in fuzz_scenes.path(scene) if p > (last[0], last[1] + 1e-9)), None)
@@ -255,8 +255,9 @@ def _work(seeds: list[int], arguments: argparse.Namespace) -> None:
     """In a process of its own, on all its ranks: play scenes, a line for each on rank 0."""
     import gc
 
-    from fuzz_scenes import draw
     from mpi4py import MPI
+
+    from verification.fuzz_scenes import draw
 
     comm = MPI.COMM_WORLD
     if comm.size > 1:
@@ -344,7 +345,7 @@ def _batch(seeds: list[int], arguments: argparse.Namespace) -> Iterator[dict[str
 
 def run(arguments: argparse.Namespace) -> Counter[str]:
     """Play scenes that are not in the file of results yet, and add them."""
-    from fuzz_scenes import draw
+    from verification.fuzz_scenes import draw
 
     path = Path(arguments.resume)
     done = set()
@@ -576,8 +577,9 @@ def main() -> int:
         counts = run(arguments)
         return int(counts["wrong"] + counts["crashed"] > 0)
 
-    from fuzz_scenes import draw
     from mpi4py import MPI
+
+    from verification.fuzz_scenes import draw
 
     comm = MPI.COMM_WORLD
     if arguments.replay:

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import fuzz_scenes
 import numpy as np
-import reference_solver as reference
 import scipy.spatial
+
+from verification import fuzz_scenes
+from verification import reference_solver as reference
 
 __all__ = ["Judge"]
 

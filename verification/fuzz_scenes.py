@@ -17,7 +17,6 @@ from typing import Any
 import basix.ufl
 import dolfinx
 import numpy as np
-import reference_solver as reference
 import scipy.spatial
 import ufl
 from dolfinx import fem
@@ -25,6 +24,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import compat
+from verification import reference_solver as reference
 
 __all__ = ["LAWS", "SUPPORTS", "Made", "draw", "frictions", "history", "model", "path"]
 

@@ -8,12 +8,12 @@ import dolfinx
 import gmsh
 import numpy as np
 import ufl
-from bodies import COMM, Bodies, boxes, graded
-from cases import Estimate, Outcome, Row, case
 from dolfinx import fem
-from statics import near
 
 import fenics_contact as fc
+from scenes.bodies import COMM, Bodies, boxes, graded
+from scenes.tags import either, near
+from verification.cases import Estimate, Outcome, Row, case
 
 GROUND, LOAD, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
 
@@ -41,9 +41,8 @@ def flat_punch() -> Outcome:
     body.hold(GROUND, 0, 1)
     body.hold(AXIS, 0)
     punch = fc.HalfSpace((0, 0), (0, -1), displacement=fc.Motion(force=(None, -force / 2)))
-    surface = fc.ContactSurface(body.mesh, body.tags, SURFACE)
-    contact = fc.Contact(body.u, surface, punch, fc.Frictionless(fc.Scaled(100)))
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    contact = body.contact(SURFACE, punch, fc.Frictionless(fc.Scaled(100)))
+    problem = body.problem(contact)
     problem.solve()
     points = contact.gather()
     along, p = points["x"][:, 0], points["pressure"]
@@ -87,16 +86,15 @@ def wavy(n: int = 256) -> Outcome:
     sides = {
         SURFACE: near(1, 0),
         LOAD: near(1, height),
-        AXIS: lambda x, cell: near(0, 0)(x, cell) | near(0, wave / 2)(x, cell),
+        AXIS: either(near(0, 0), near(0, wave / 2)),
     }
     body = Bodies(boxes([[np.linspace(0, wave / 2, n + 1), y]], sides), modulus, nu)
     body.hold(AXIS, 0)
     load = body.constant(0.0)
     body.F += load * body.v[1] * body.ds(LOAD)
     gap = amplitude * (1 - ufl.cos(2 * np.pi / wave * body.x[0]))
-    surface = fc.ContactSurface(body.mesh, body.tags, SURFACE)
-    contact = fc.Contact(body.u, surface, fc.Obstacle(gap, (0, -1)), fc.Frictionless())
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    contact = body.contact(SURFACE, fc.Obstacle(gap, (0, -1)), fc.Frictionless())
+    problem = body.problem(contact)
     rows = []
     for share, width, peak in (
         (0.25, 1 / 6, 4.0),
@@ -203,13 +201,8 @@ def cylinder(h: float = 0.25, stiffness: float = 10.0) -> Outcome:
     width = _integral(body, LOAD)
     load = body.constant(0.0)
     body.F += load / width * body.v[1] * body.ds(LOAD)
-    contact = fc.Contact(
-        body.u,
-        fc.ContactSurface(body.mesh, body.tags, SURFACE),
-        fc.DeformableBody(body.tags, OPPOSITE),
-        fc.Frictionless(fc.Scaled(stiffness)),
-    )
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    contact = body.contact(SURFACE, OPPOSITE, fc.Frictionless(fc.Scaled(stiffness)))
+    problem = body.problem(contact)
     list(fc.increments(problem, load, 0.0, total / 2, steps=2))
     r, points = contact.resultants(), contact.gather()
     rows = (

@@ -523,7 +523,7 @@ class Law:
         )
         sigma = _nearest_in_circle(trial, limit)
         if self.modes is not None:
-            sigma = _nearest_in_polygon(trial, limit, self.modes)
+            sigma = nearest_in_polygon(trial, limit, self.modes)
         return sigma[:, :1] * first + ratio * sigma[:, 1:] * second
 
     def stiffness(self, k_t: Array, n: Array) -> Array:
@@ -551,7 +551,7 @@ def _nearest_in_circle(trial: Array, limit: Array) -> Array:
     return np.where(out[:, None], (limit / np.where(out, size, 1.0))[:, None] * trial, trial)
 
 
-def _nearest_in_polygon(trial: Array, limit: Array, modes: int) -> Array:
+def nearest_in_polygon(trial: Array, limit: Array, modes: int) -> Array:
     """The nearest point of the polygon: of all its sides' nearest points the nearest one."""
     half = np.tan(np.pi / modes)
     inside = np.ones(len(trial), dtype=bool)

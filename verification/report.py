@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 import dolfinx
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
-import half_planes  # noqa: F401
-import solids  # noqa: F401
-import statics  # noqa: F401
-from cases import CASES, Case, Outcome
-from demonstrations import DEMOS, ROOT
 from petsc4py import PETSc
 
 import fenics_contact as fc
+from verification import half_planes, solids, statics
+from verification.cases import Case, Outcome, cases_of
+from verification.demonstrations import DEMOS, ROOT
 
+CASES = cases_of(statics, half_planes, solids)
 PAGE = ROOT / "docs" / "verification.md"
 
 

@@ -8,7 +8,7 @@ The exit code is 1 if a quantity misses its reference or a case fails.
 
 import sys
 
-from report import main
+from verification.report import main
 
 if __name__ == "__main__":
     sys.exit(main())

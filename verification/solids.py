@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from bodies import Bodies, boxes, graded
-from cases import Outcome, Row, case
-from statics import near
 
 import fenics_contact as fc
+from scenes.bodies import Bodies, boxes, graded
+from scenes.tags import near
+from verification.cases import Outcome, Row, case
 
 GROUND, TOP, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
 
@@ -47,14 +47,10 @@ def spheres() -> Outcome:
     body.hold(TOP, 1)
     body.hold(AXIS, 1)
     x = body.x
-    contact = fc.Contact(
-        body.u,
-        fc.ContactSurface(body.mesh, body.tags, SURFACE),
-        fc.DeformableBody(body.tags, OPPOSITE),
-        fc.Coulomb(friction, k_n=fc.Scaled(20), k_t=fc.Scaled(20)),
-        gap=(x[0] ** 2 + x[1] ** 2) / (2 * radius),
-    )
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    law = fc.Coulomb(friction, k_n=fc.Scaled(20), k_t=fc.Scaled(20))
+    gap = (x[0] ** 2 + x[1] ** 2) / (2 * radius)
+    contact = body.contact(SURFACE, OPPOSITE, law, gap=gap)
+    problem = body.problem(contact)
     down.value = -0.085
     problem.solve()
     problem.commit()

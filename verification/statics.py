@@ -7,18 +7,14 @@ from typing import Any
 
 import numpy as np
 import ufl
-from bodies import COMM, Bodies, boxes
-from cases import Estimate, Outcome, Row, case
 from dolfinx import fem
 
 import fenics_contact as fc
+from scenes.bodies import COMM, Bodies, boxes
+from scenes.tags import between, either, near
+from verification.cases import Estimate, Outcome, Row, case
 
 BASE, TOP, LEFT, RIGHT, SEAT = 1, 2, 3, 4, 5
-
-
-def near(i: int, value: float):
-    """Facets whose midpoint has the coordinate ``i`` near ``value``."""
-    return lambda x, cell: np.abs(x[:, i] - value) < 1e-9
 
 
 def block(n: tuple[int, int], size: tuple[float, float] = (1.0, 1.0), **kwargs):
@@ -41,10 +37,9 @@ def contact_spring() -> Outcome:
     body = Bodies(block((1, 1)), 1000.0, 0.3)
     force = body.constant([0.0, 0.0])
     body.F += ufl.dot(body.u - force, body.v) * body.ds(BASE)
-    surface = fc.ContactSurface(body.mesh, body.tags, BASE)
     law = fc.Coulomb(0.5, k_n=1.0, k_t=0.5)
-    contact = fc.Contact(body.u, surface, fc.HalfSpace((0, 0), (0, 1)), law, gap=0.5)
-    problem = fc.ContactProblem(body.F, body.u, contacts=[contact])
+    contact = body.contact(BASE, fc.HalfSpace((0, 0), (0, 1)), law, gap=0.5)
+    problem = body.problem(contact)
     history = [
         # N, T, component, reference
         (0.5, 0.0, 1, -0.5),
@@ -96,8 +91,8 @@ def wedge() -> Outcome:
 
         sides = {
             BASE: near(1, 0),
-            SEAT: lambda x, cell: near(1, 1)(x, cell) & (cell[:, 1] < 1),
-            TOP: lambda x, cell: near(1, 1)(x, cell) & (cell[:, 1] > 1),
+            SEAT: between(1, 1, above=False),
+            TOP: between(1, 1, above=True),
             LEFT: lambda x, cell: near(0, 200)(x, cell) & (cell[:, 1] > 1),
         }
         body = Bodies(boxes([[long, low], [short, high]], sides, bend=bend), 206e3, 0.3)
@@ -109,21 +104,10 @@ def wedge() -> Outcome:
         body.F += WEIGHT / area * marked * body.v[1] * ufl.dx
         move = body.constant([0.0, 0.0])
         law = fc.Coulomb(friction) if friction else fc.Frictionless()
-        slope = fc.Contact(
-            body.u,
-            fc.ContactSurface(body.mesh, body.tags, TOP),
-            fc.DeformableBody(body.tags, SEAT),
-            law,
-            name="slope",
-        )
-        plate = fc.Contact(
-            body.u,
-            fc.ContactSurface(body.mesh, body.tags, LEFT),
-            fc.HalfSpace((200, 0), (1, 0), displacement=move),
-            fc.Frictionless(),
-            name="plate",
-        )
-        problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[slope, plate])
+        slope = body.contact(TOP, SEAT, law, name="slope")
+        rigid = fc.HalfSpace((200, 0), (1, 0), displacement=move)
+        plate = body.contact(LEFT, rigid, fc.Frictionless(), name="plate")
+        problem = body.problem(slope, plate)
         for along in (0.0, 0.05, 0.1, 0.2):
             move.value[0] = along
             problem.solve()
@@ -157,9 +141,8 @@ def capstan() -> Outcome:
         pull, draw = body.constant(0.0), body.constant(0.0)
         body.hold(LEFT, 1, value=draw)  # at the angle 0 the belt runs along y
         body.F += pull * body.v[1] * body.ds(RIGHT)
-        surface = fc.ContactSurface(body.mesh, body.tags, BASE)
         law = fc.Coulomb(friction, k_n=20.0, k_t=20.0)
-        contact = fc.Contact(body.u, surface, fc.Cylinder((0, 0), radius), law)
+        contact = body.contact(BASE, fc.Cylinder((0, 0), radius), law)
         problem = fc.ContactProblem(
             body.F, body.u, bcs=body.bcs, contacts=[contact], method="newton"
         )
@@ -193,8 +176,8 @@ def incline() -> Outcome:
     ]
     sides = {
         BASE: near(1, -1),
-        SEAT: lambda x, cell: near(1, 0)(x, cell) & (cell[:, 1] < 0),
-        TOP: lambda x, cell: near(1, 0)(x, cell) & (cell[:, 1] > 0),
+        SEAT: between(1, 0, above=False),
+        TOP: between(1, 0, above=True),
     }
     body = Bodies(boxes(axes, sides), 1000.0, 0.3)
     body.hold(BASE, 0, 1)
@@ -203,10 +186,8 @@ def incline() -> Outcome:
     marked.x.array[:] = marked.function_space.tabulate_dof_coordinates()[:, 1] > 0
     pull = ufl.sin(tilt) * body.v[0] - ufl.cos(tilt) * body.v[1]
     body.F -= weight / 0.4 * marked * pull * ufl.dx
-    surface = fc.ContactSurface(body.mesh, body.tags, TOP)
-    support = fc.DeformableBody(body.tags, SEAT)
-    contact = fc.Contact(body.u, surface, support, fc.Coulomb(friction))
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+    contact = body.contact(TOP, SEAT, fc.Coulomb(friction))
+    problem = body.problem(contact)
     holds, slides, worst = 0.0, 2.0, 0.0
     trials = [0.0, 0.5, 0.9]
     while slides - holds > 1e-4:
@@ -267,8 +248,7 @@ def _sheared(made: Any, method: str, load: float, steps: int) -> tuple[np.ndarra
     body.hold(RIGHT, 0)
     grow = body.constant(0.0)
     body.F += 50 * grow * body.v[1] * body.ds(TOP) - 150 * grow * body.v[0] * body.ds(LEFT)
-    surface = fc.ContactSurface(body.mesh, body.tags, BASE)
-    contact = fc.Contact(body.u, surface, fc.HalfSpace((0, 0), (0, 1)), fc.Coulomb(1.0))
+    contact = body.contact(BASE, fc.HalfSpace((0, 0), (0, 1)), fc.Coulomb(1.0))
     problem = fc.ContactProblem(
         body.F,
         body.u,
@@ -304,18 +284,17 @@ def patch() -> Outcome:
         sides = {
             BASE: near(1, 0),
             TOP: near(1, 1),
-            LEFT: lambda x, cell: near(0, 0)(x, cell) | near(0, 1)(x, cell),
-            SEAT: lambda x, cell: near(1, 0.5)(x, cell) & (cell[:, 1] < 0.5),
-            RIGHT: lambda x, cell: near(1, 0.5)(x, cell) & (cell[:, 1] > 0.5),
+            LEFT: either(near(0, 0), near(0, 1)),
+            SEAT: between(1, 0.5, above=False),
+            RIGHT: between(1, 0.5, above=True),
         }
         body = Bodies(boxes(axes, sides), 1e6, nu, degree=2)
         body.hold(BASE, 1)
         body.hold(LEFT, 0)
         body.hold(TOP, 1, value=-0.01)
-        surface = fc.ContactSurface(body.mesh, body.tags, SEAT)
         law = fc.Coulomb(0.3, k_n=k_n, k_t=1e6)
-        contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, RIGHT), law)
-        problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
+        contact = body.contact(SEAT, RIGHT, law)
+        problem = body.problem(contact)
         problem.solve()
         give = (1 + nu) * (1 - 2 * nu) / (1 - nu) / 1e6
         solved.append((problem, body.stress, 0.01 / give))
@@ -333,10 +312,8 @@ def patch() -> Outcome:
     body.hold(BASE, 1)
     body.hold(LEFT, 0)
     body.hold(TOP, 1, value=-0.01)
-    surface = fc.ContactSurface(body.mesh, body.tags, SEAT)
-    stiff = fc.Frictionless(1e12)
-    contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, RIGHT), stiff)
-    problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact], method="newton")
+    contact = body.contact(SEAT, RIGHT, fc.Frictionless(1e12))
+    problem = body.problem(contact, method="newton")
     problem.solve()
     rows.append(
         Row("pressure, k_n = 1e12", contact.resultants().normal_force, 1e4, "E·0.01/H", 2e-6)

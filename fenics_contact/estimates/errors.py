@@ -8,7 +8,6 @@ increments from halves of themselves (`increments`).
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -160,7 +159,6 @@ def estimate_errors(
     *,
     strain: Any = None,
     increment_error: Mapping[str, float] | None = None,
-    increments: Mapping[str, float] | None = None,
 ) -> ErrorBudget:
     """Estimate the errors of the last solution, before or after its commit. Collective.
 
@@ -172,20 +170,10 @@ def estimate_errors(
         stress: σ(u) of the bulk (UFL), shape (d, d) or (3, 3).
         strain: ε(u), of the shape of the stress; by default the symmetric gradient.
         increment_error: Errors by the size of the increments, ``Step.increment_error``.
-        increments: What ``increment_error`` was called before; to be left out.
 
     Raises:
-        ValueError: Shapes that do not fit, or both names of one argument.
+        ValueError: Shapes that do not fit.
     """
-    if increments is not None:
-        if increment_error is not None:
-            raise ValueError("increments is what increment_error was called before; give that one")
-        warnings.warn(
-            "increments= of estimate_errors takes their errors, and is increment_error= now",
-            FutureWarning,
-            stacklevel=2,
-        )
-        increment_error = increments
     problem.complete()
     u = problem.u
     stress = ufl.as_ufl(stress)

@@ -5,22 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import basix.ufl
 import dolfinx
 import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
-__all__ = [
-    "Bodies",
-    "Where",
-    "boxes",
-    "graded",
-]
+import fenics_contact as fc
+from scenes.elasticity import displacement_space, hold, strain, stress
+from scenes.meshes import mesh_of
+from scenes.tags import Where, tagged
 
 Array = np.ndarray
-Where = Callable[[Array, Array], Array]
 COMM = MPI.COMM_WORLD
 
 
@@ -47,8 +43,7 @@ def boxes(
 
     Args:
         axes: Of every box, its coordinates along each direction, ascending.
-        sides: Tags of facets, each by a function of the facets' midpoints and of the midpoints of
-            the cells they bound, both (n, d), that tells which ones; before ``bend``.
+        sides: Tags of facets and which ones have them, before ``bend``.
         simplex: Triangles (in the plane) instead of quadrilaterals and hexahedra.
         bend: Moves the nodes, (n, d).
         degree: Of the cells' geometry.
@@ -69,40 +64,20 @@ def boxes(
             found.append(number[cut].ravel())
         cells.append(np.column_stack(found))
         first += len(corners[-1])
-    x, quads = np.concatenate(corners), np.concatenate(cells).astype(np.int64)
+    x, quads = np.concatenate(corners), np.concatenate(cells)
     kind = "quadrilateral" if d == 2 else "hexahedron"
     if simplex:
         kind, quads = "triangle", np.concatenate([quads[:, [0, 1, 3]], quads[:, [0, 3, 2]]])
     if degree > 1:
-        serial = dolfinx.mesh.create_mesh(
-            MPI.COMM_SELF, cells=quads, x=x, e=ufl.Mesh(basix.ufl.element("P", kind, 1, shape=(d,)))
-        )
+        serial = mesh_of(kind, x, quads, comm=MPI.COMM_SELF)
         nodes = fem.functionspace(serial, ("Lagrange", degree))
         x = nodes.tabulate_dof_coordinates()[:, :d]
-        quads = nodes.dofmap.list.astype(np.int64)
-    if COMM.rank:
-        x, quads = x[:0], quads[:0]
-    element = ufl.Mesh(basix.ufl.element("Lagrange", kind, degree, shape=(d,)))
-    mesh = dolfinx.mesh.create_mesh(COMM, cells=quads, x=x, e=element, partitioner=partitioner)
-    tags = _tagged(mesh, sides)
+        quads = nodes.dofmap.list
+    mesh = mesh_of(kind, x, quads, degree=degree, partitioner=partitioner)
+    tags = tagged(mesh, sides)
     if bend is not None:
         mesh.geometry.x[:, :d] = bend(mesh.geometry.x[:, :d])
     return mesh, tags
-
-
-def _tagged(mesh: dolfinx.mesh.Mesh, sides: Mapping[int, Where]) -> dolfinx.mesh.MeshTags:
-    d = mesh.topology.dim
-    mesh.topology.create_connectivity(d - 1, d)
-    to_cell = mesh.topology.connectivity(d - 1, d)
-    exterior = dolfinx.mesh.exterior_facet_indices(mesh.topology)
-    owner = np.array([to_cell.links(f)[0] for f in exterior], dtype=np.int32)
-    middle = dolfinx.mesh.compute_midpoints(mesh, d - 1, exterior).reshape(-1, 3)[:, :d]
-    cell = dolfinx.mesh.compute_midpoints(mesh, d, owner).reshape(-1, 3)[:, :d]
-    values = np.zeros(len(exterior), dtype=np.int32)
-    for tag, where in sides.items():
-        values[where(middle, cell)] = tag
-    kept = values > 0
-    return dolfinx.mesh.meshtags(mesh, d - 1, exterior[kept], values[kept])
 
 
 class Bodies:
@@ -127,16 +102,13 @@ class Bodies:
     ) -> None:
         """Make displacement and residual. Collective."""
         self.mesh, self.tags = made
-        self.d = d = self.mesh.geometry.dim
-        space = fem.functionspace(self.mesh, ("Lagrange", degree, (d,)))
+        self.d = self.mesh.geometry.dim
+        space = displacement_space(self.mesh, degree)
         self.u, self.v = fem.Function(space, name="displacement"), ufl.TestFunction(space)
         if not isinstance(E, ufl.core.expr.Expr):
             E = fem.Constant(self.mesh, float(E))
-        ratio = fem.Constant(self.mesh, float(nu))
-        strain = ufl.sym(ufl.grad(self.u))
-        lame = E * ratio / ((1 + ratio) * (1 - 2 * ratio))
-        self.stress = E / (1 + ratio) * strain + lame * ufl.tr(strain) * ufl.Identity(d)
-        self.F = ufl.inner(self.stress, ufl.sym(ufl.grad(self.v))) * ufl.dx(self.mesh)
+        self.stress = stress(self.u, E, fem.Constant(self.mesh, float(nu)))
+        self.F = ufl.inner(self.stress, strain(self.v)) * ufl.dx(self.mesh)
         self.bcs: list[fem.DirichletBC] = []
 
     @property
@@ -160,9 +132,29 @@ class Bodies:
 
     def hold(self, tag: int, *components: int, value: Any = 0.0) -> None:
         """Prescribe components of the displacement on a side. Collective."""
-        if not isinstance(value, fem.Constant):
+        if not isinstance(value, fem.Constant):  # one for all components
             value = self.constant(value)
-        space = self.u.function_space
-        for i in components:
-            dofs = fem.locate_dofs_topological(space.sub(i), self.d - 1, self.tags.find(tag))
-            self.bcs.append(fem.dirichletbc(value, dofs, space.sub(i)))
+        self.bcs += [hold(self.u, self.tags, tag, i, value) for i in components]
+
+    def contact(self, tag: Any, support: Any, law: Any, **options: Any) -> fc.Contact:
+        """Contact of a side with a support, or with the sides of a tag or tags. Collective."""
+        if not isinstance(support, fc.Support):
+            support = fc.DeformableBody(self.tags, support)
+        surface = fc.ContactSurface(self.mesh, self.tags, tag)
+        return fc.Contact(self.u, surface, support, law, **options)
+
+    def problem(self, *contacts: fc.Contact, **options: Any) -> fc.ContactProblem:
+        """The problem with these contacts. Collective."""
+        return fc.ContactProblem(self.F, self.u, bcs=self.bcs, contacts=list(contacts), **options)
+
+    def cells(self, where: Callable[[Array], Array]) -> Array:
+        """Cells of this rank, ghosts included, whose midpoints (n, d) are chosen."""
+        index_map = self.mesh.topology.index_map(self.d)
+        cells = np.arange(index_map.size_local + index_map.num_ghosts, dtype=np.int32)
+        middle = dolfinx.mesh.compute_midpoints(self.mesh, self.d, cells).reshape(-1, 3)
+        return cells[where(middle[:, : self.d])]
+
+    def displace(self, field: Callable[[Array], Array], where: Callable[[Array], Array]) -> None:
+        """Give chosen cells, which share no node with the others, a displacement. Collective."""
+        self.u.interpolate(field, cells0=self.cells(where))
+        self.u.x.scatter_forward()

@@ -1,7 +1,4 @@
-"""Small meshes and scenes that the tests share, and comparisons that fail on all ranks together.
-
-Every assertion looks at gathered data: a rank that failed alone would leave the others waiting.
-"""
+"""Boxes of every kind of cell, their sides tagged, and an elastic block in contact."""
 
 from __future__ import annotations
 
@@ -9,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import basix.ufl
 import dolfinx
 import dolfinx.fem.petsc
 import numpy as np
@@ -17,10 +13,12 @@ import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode
 from mpi4py import MPI
-from petsc4py import PETSc
 
 import fenics_contact as fc
 from fenics_contact import compat
+from scenes.elasticity import displacement_space, hold, strain, stress
+from scenes.meshes import mesh_of
+from scenes.tags import sides
 
 CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 GRID = [(cell, degree) for cell in CELLS for degree in (1, 2)]
@@ -33,6 +31,7 @@ Array = np.ndarray
 
 
 def dimension(cell: str) -> int:
+    """2 or 3."""
     return 2 if cell in ("triangle", "quadrilateral") else 3
 
 
@@ -62,21 +61,17 @@ def block_mesh(
     else:
         serial = dolfinx.mesh.create_unit_cube(MPI.COMM_SELF, *n, kind)
     x = serial.geometry.x[:, :d].copy()
-    cells = compat.geometry_dofmap(serial).astype(np.int64)
+    cells = compat.geometry_dofmap(serial)
     if shuffled:
         x, cells = _shuffle(x, cells, cell)
     if bend is not None:
         nodes = fem.functionspace(serial, ("Lagrange", 2))
         x = nodes.tabulate_dof_coordinates()[:, :d]
-        cells = nodes.dofmap.list.astype(np.int64)
-    element = basix.ufl.element("Lagrange", cell, 1 if bend is None else 2, shape=(d,))
-    if comm.rank:
-        x, cells = x[:0], cells[:0]
+        cells = nodes.dofmap.list
     if partitioner is None:
         partitioner = compat.cell_partitioner(ghost_mode)
-    mesh = dolfinx.mesh.create_mesh(
-        comm, cells=cells, x=x * size, e=ufl.Mesh(element), partitioner=partitioner
-    )
+    degree = 1 if bend is None else 2
+    mesh = mesh_of(cell, x * size, cells, degree=degree, comm=comm, partitioner=partitioner)
     tags = side_tags(mesh, size)
     if bend is not None:  # when the sides are found
         mesh.geometry.x[:, :d] = bend(mesh.geometry.x[:, :d])
@@ -124,23 +119,16 @@ def _shuffle(x: Array, cells: Array, cell: str) -> tuple[Array, Array]:
 def side_tags(mesh: dolfinx.mesh.Mesh, size: Sequence[float]) -> dolfinx.mesh.MeshTags:
     """Tags BOTTOM, TOP, LEFT, RIGHT and, in 3D, FRONT, BACK."""
     d = mesh.geometry.dim
-    sides = {BOTTOM: (d - 1, 0.0), TOP: (d - 1, size[d - 1]), LEFT: (0, 0.0), RIGHT: (0, size[0])}
+    ends = {BOTTOM: (d - 1, 0.0), TOP: (d - 1, size[d - 1]), LEFT: (0, 0.0), RIGHT: (0, size[0])}
     if d == 3:
-        sides |= {FRONT: (1, 0.0), BACK: (1, size[1])}
-    facets, values = [], []
-    for tag, (i, at) in sides.items():
-        found = dolfinx.mesh.locate_entities_boundary(
-            mesh, d - 1, lambda x, i=i, at=at: np.abs(x[i] - at) < 1e-8 * max(size)
-        )
-        facets.append(found)
-        values.append(np.full(found.size, tag, dtype=np.int32))
-    facets, values = np.concatenate(facets), np.concatenate(values)
-    order = np.argsort(facets)
-    return dolfinx.mesh.meshtags(mesh, d - 1, facets[order], values[order])
+        ends |= {FRONT: (1, 0.0), BACK: (1, size[1])}
+    off = 1e-8 * max(size)
+    return sides(
+        mesh, {t: lambda x, i=i, at=at: np.abs(x[i] - at) < off for t, (i, at) in ends.items()}
+    )
 
 
-def displacement_space(mesh: dolfinx.mesh.Mesh, degree: int) -> fem.FunctionSpace:
-    return fem.functionspace(mesh, ("Lagrange", degree, (mesh.geometry.dim,)))
+# ---- fields --------------------------------------------------------------------------------------
 
 
 def polynomial(d: int, degree: int, seed: int, size: float) -> Callable[[Array], Array]:
@@ -163,135 +151,7 @@ def wave(d: int, seed: int) -> Callable[[Array], Array]:
     return lambda x: np.sin(waves @ x[:d] + phases)
 
 
-# ---- assembly ------------------------------------------------------------------------------------
-
-
-def compiled(form: ufl.Form, contact: fc.Contact | None = None) -> fem.Form:
-    return compat.compile_form(form, contact.entity_maps if contact else None)
-
-
-def assemble_number(form: fem.Form, comm: MPI.Comm) -> float:
-    return comm.allreduce(fem.assemble_scalar(form))
-
-
-def assemble_owned(form: fem.Form, space: fem.FunctionSpace) -> Array:
-    """Assembled linear form at this rank's owned dofs."""
-    f = fem.Function(space)
-    fem.assemble_vector(f.x.array, form)
-    f.x.scatter_reverse(dolfinx.la.InsertMode.add)
-    return owned(f).copy()
-
-
-def assemble_matrix(form: fem.Form) -> PETSc.Mat:
-    matrix = fem.petsc.create_matrix(form)
-    fem.petsc.assemble_matrix(matrix, form)
-    matrix.assemble()
-    return matrix
-
-
-def owned(f: fem.Function) -> Array:
-    """Values at this rank's owned dofs."""
-    dofmap = f.function_space.dofmap
-    return f.x.array[: dofmap.index_map.size_local * dofmap.index_map_bs]
-
-
-def set_owned(f: fem.Function, values: Array) -> None:
-    owned(f)[:] = values
-    f.x.scatter_forward()
-
-
-# ---- comparisons ---------------------------------------------------------------------------------
-
-
-def gathered(comm: MPI.Comm, rows: Array) -> Array:
-    """The rows of all ranks on all ranks."""
-    return np.concatenate(comm.allgather(np.asarray(rows)), axis=0)
-
-
-def sorted_by_place(places: Array, *columns: Array) -> Array:
-    """Rows (place, columns) in the order of the places, to 1e-9 of their extent.
-
-    For comparisons between meshes: two equal ones may be distributed differently.
-    """
-    size = float(np.abs(places).max(initial=0.0)) or 1.0
-    order = np.lexsort(np.round(places / size, 9).T)
-    return np.column_stack([places, *columns])[order]
-
-
-def nodal(u: fem.Function) -> Array:
-    """Values (all nodes, bs) at the owned nodes of all ranks, in the order of their places."""
-    space = u.function_space
-    d, bs = space.mesh.geometry.dim, space.dofmap.index_map_bs
-    n = space.dofmap.index_map.size_local
-    x, values = space.tabulate_dof_coordinates()[:n, :d], u.x.array.reshape(-1, bs)[:n]
-    comm = space.mesh.comm
-    return sorted_by_place(gathered(comm, x), gathered(comm, values))[:, d:]
-
-
-def at_points(contact: fc.Contact, rows: Array) -> Array:
-    """Rows (points, …) of all ranks, in the order of the points' places."""
-    comm = contact.surface.mesh.comm
-    d = contact.points.shape[1]
-    return sorted_by_place(gathered(comm, contact.points), gathered(comm, rows))[:, d:]
-
-
-def close(actual: Any, expected: Any, rtol: float, *, scale: float | None = None) -> bool:
-    """Largest difference within ``rtol`` of the largest expected entry (or ``scale``)."""
-    actual, expected = np.asarray(actual, dtype=float), np.asarray(expected, dtype=float)
-    assert actual.shape == expected.shape
-    if not actual.size:
-        return True
-    scale = float(np.abs(expected).max()) if scale is None else scale
-    error = float(np.abs(actual - expected).max())
-    if not error <= rtol * scale:
-        print(f"largest difference {error:.3e} at scale {scale:.3e}: {error / scale:.3e}")
-        return False
-    return True
-
-
-def raised_everywhere(
-    call: Callable[[], Any],
-    kind: type[Exception] | tuple[type[Exception], ...],
-    *words: str,
-    comm: MPI.Comm = MPI.COMM_WORLD,
-) -> str:
-    """Assert that every rank raises ``kind`` and that the text names all of ``words``."""
-    error: Exception | None = None
-    try:
-        call()
-    except Exception as caught:
-        error = caught
-    reports = comm.allgather(None if error is None else (type(error).__name__, str(error)))
-    assert all(report is not None for report in reports), f"not raised on all ranks: {reports}"
-    flags = comm.allgather(isinstance(error, kind))
-    assert all(flags), f"wrong kind of error: {reports}"
-    for word in words:
-        assert all(word in text for _, text in reports), f"{word!r} is not named in {reports}"
-    assert len({text for _, text in reports}) == 1, f"the ranks tell different stories: {reports}"
-    return reports[0][1]
-
-
-def same_field(
-    f: fem.Function, expected: Callable[[Array], Array], rtol: float, *, scale: float | None = None
-) -> bool:
-    """Whether ``f`` is the interpolant of ``expected``, all ranks together."""
-    reference = fem.Function(f.function_space)
-    reference.interpolate(expected)
-    comm = f.function_space.mesh.comm
-    return close(gathered(comm, owned(f)), gathered(comm, owned(reference)), rtol, scale=scale)
-
-
 # ---- a block in contact --------------------------------------------------------------------------
-
-
-def strain(u: Any) -> Any:
-    return ufl.sym(ufl.grad(u))
-
-
-def stress(u: Any, E: Any, nu: Any) -> Any:
-    """Linear elasticity; in two dimensions plane strain."""
-    mu, lam = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
-    return 2 * mu * strain(u) + lam * ufl.tr(strain(u)) * ufl.Identity(len(u))
 
 
 @dataclass
@@ -337,6 +197,13 @@ class Block:
         """Set the traction on the top."""
         self.traction.value[:] = self.vector(side=side, up=up)
 
+    def pull(self, tag: int, traction: Array) -> fem.Constant:
+        """Add a traction on another side to the residual, and return it."""
+        given = fem.Constant(self.mesh, traction)
+        v = ufl.TestFunction(self.u.function_space)
+        self.F -= ufl.dot(given, v) * ufl.ds(self.mesh, subdomain_data=self.tags)(tag)
+        return given
+
     def facet_dofs(self, tag: int, component: int | None = None) -> Array:
         """Dofs of a side, of all components or of one."""
         space = self.u.function_space
@@ -347,10 +214,7 @@ class Block:
 
     def hold(self, tag: int, component: int, value: Any = 0.0) -> fem.DirichletBC:
         """Prescribe one component on a side."""
-        if not isinstance(value, fem.Constant):
-            value = fem.Constant(self.mesh, float(value))
-        dofs = self.facet_dofs(tag, component)
-        return fem.dirichletbc(value, dofs, self.u.function_space.sub(component))
+        return hold(self.u, self.tags, tag, component, value)
 
     def rollers(self) -> list[fem.DirichletBC]:
         """No displacement across the planes x = 0 and, in 3D, y = 0."""
@@ -365,6 +229,12 @@ class Block:
         """Contact of the bottom, by default with the floor."""
         support = kwargs.pop("support", None) or self.floor(displacement=displacement)
         return fc.Contact(self.u, self.surface, support, law, **kwargs)
+
+    def wall(self, law: Any) -> fc.Contact:
+        """Contact of the left side with a wall that it just touches."""
+        surface = fc.ContactSurface(self.mesh, self.tags, LEFT)
+        support = fc.HalfSpace((0.0,) * self.dim, self.vector(side=1.0))
+        return fc.Contact(self.u, surface, support, law, name="wall")
 
     def problem(
         self,
@@ -405,3 +275,12 @@ def block(
     )
     made.load(side=side, up=up)
     return made
+
+
+def kirchhoff(scene: Block) -> ufl.Form:
+    """Another bulk form of a block, St Venant-Kirchhoff's with ν = 0: S = E · Green strain."""
+    v = ufl.TestFunction(scene.u.function_space)
+    F = ufl.Identity(scene.dim) + ufl.grad(scene.u)
+    S = scene.E * (F.T * F - ufl.Identity(scene.dim)) / 2
+    ds = ufl.ds(scene.mesh, subdomain_data=scene.tags)
+    return ufl.inner(F * S, ufl.grad(v)) * ufl.dx(scene.mesh) - ufl.dot(scene.traction, v) * ds(TOP)

@@ -1,0 +1,1 @@
+"""Scripts that measure what contact costs; `run.py` starts them and joins what they find."""

@@ -1,0 +1,232 @@
+"""Histories to be broken off and taken up from a file, and what their states have to have alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from scenes.blocks import RIGHT, TOP, block
+from scenes.comparing import at_points, close, nodal, owned
+from scenes.elasticity import strain
+from scenes.two_blocks import Slider
+
+COMM = MPI.COMM_WORLD
+Array = np.ndarray
+
+
+# ---- scenes --------------------------------------------------------------------------------------
+
+
+class History:
+    """Something pressed and rubbed: down until t = 1, along until 2, back until 4."""
+
+    tolerance = 1e-7  # between two solutions of the same increments
+    problem: fc.ContactProblem
+
+    def load(self, t: float) -> None:
+        """Set the loads."""
+        raise NotImplementedError
+
+    def increments(self, end: float = 4.0, start: float = 0.0, **options: Any) -> Iterable[fc.Step]:
+        """Lead ``t``, 0.5 an increment by default."""
+        options.setdefault("steps", round(abs(end - start) / 0.5))
+        return fc.increments(self.problem, self.load, start, end, **options)
+
+
+class Press(History):
+    """A block on a ball, by default with friction: the top moves, or the ball does."""
+
+    def __init__(
+        self,
+        law: Any = None,
+        *,
+        cell: str = "quadrilateral",
+        support: str = "fixed",
+        bulk: str = "linear",
+        wall: bool = False,
+        surface: dict | None = None,
+        contact: dict | None = None,
+        n: int = 4,
+        E: float = 1000.0,
+        radius: float = 2.0,
+        tilt: float = 0.0,
+        degree: int = 1,
+        names: tuple[str, str] = ("floor", "wall"),
+        held: Sequence[int] | None = None,
+        **options: Any,
+    ) -> None:
+        """Make it, unloaded; ``held`` are the components of the top that are, by default all."""
+        scene = self.scene = block(cell, degree, n=n, E=E, surface=surface)
+        mesh, d = scene.mesh, scene.dim
+        law = law or fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
+        self.push = [fem.Constant(mesh, 0.0) for _ in range(d)]
+        self.shift = fem.Constant(mesh, np.zeros(d))
+        self.force = fem.Constant(mesh, 0.0)
+        self.plastic = fem.Function(fem.functionspace(mesh, ("DG", 0)), name="plastic")
+        self.moves = support
+        displacement: Any = None
+        if support == "moving":
+            displacement = self.shift
+        elif support == "force":
+            self.along = fem.Constant(mesh, 0.0)
+            displacement = fc.Motion(
+                force=(*(None,) * (d - 1), self.force),
+                displacement=(self.along, *(0.0,) * (d - 2), None),
+            )
+        center = np.full(d, 0.5)
+        center[-1] = -radius
+        center[0] += tilt
+        ball = fc.Ball(center, radius, displacement=displacement)
+        bcs = [scene.hold(TOP, i, self.push[i]) for i in (range(d) if held is None else held)]
+        F = scene.F
+        if bulk != "linear":
+            eps = strain(scene.u) - self.plastic * ufl.Identity(d)
+            v = ufl.TestFunction(scene.u.function_space)
+            stiffening = 1e3 if bulk == "nonlinear" else 900.0
+            if bulk != "linear with plastic":
+                F += scene.E * stiffening * ufl.tr(eps) ** 3 * ufl.tr(strain(v)) * ufl.dx
+            F += scene.E * ufl.tr(eps) * ufl.tr(strain(v)) * ufl.dx
+        contacts = [scene.contact(law, support=ball, name=names[0], **(contact or {}))]
+        if wall:
+            side = fc.ContactSurface(mesh, scene.tags, RIGHT)
+            at = np.full(d, 0.5)
+            at[0] = 1.01
+            rigid = fc.HalfSpace(at, scene.vector(side=-1.0))
+            contacts.append(fc.Contact(scene.u, side, rigid, law, name=names[1]))
+        self.problem = fc.ContactProblem(F, scene.u, bcs=bcs, contacts=contacts, **options)
+
+    def load(self, t: float) -> None:
+        """Set what moves."""
+        down, along = 0.03 * min(t, 1.0), np.interp(t, [1, 2, 4], [0, 0.1, -0.1])
+        if self.moves == "fixed":
+            self.push[-1].value, self.push[0].value = -down, along
+        elif self.moves == "moving":
+            self.shift.value[-1], self.shift.value[0] = down, -along
+        else:
+            self.force.value, self.along.value = 20 * min(t, 1.0), -along
+
+
+class Ramp(Slider, History):
+    """A block that is dragged up a ramp of another body, its pairs found anew; top held stiffly."""
+
+    def __init__(
+        self,
+        law: Any = None,
+        *,
+        cell: str = "quadrilateral",
+        n: tuple[int, int] = (10, 4),
+        start: float = 1.1,
+        **options: Any,
+    ) -> None:
+        """Make it, unloaded."""
+        law = law or fc.Coulomb(0.3, k_n=1e7, k_t=1e7)
+        super().__init__(cell, law, start=start, slope=0.1, n=n, **options)
+
+    def load(self, t: float) -> None:
+        """Down, and over one and a half facets of the base and back."""
+        self.move[-1].value = -0.004 * min(t, 1.0)
+        self.move[0].value = np.interp(t, [1, 3, 4], [0, 0.6, 0.4])
+
+
+# ---- states --------------------------------------------------------------------------------------
+
+
+def picture(made: History) -> dict[str, Array]:
+    """All that a state is, in an order that no distribution changes."""
+    problem = made.problem
+    found = {"u": nodal(problem.u), "increment": np.array([problem.increment])}
+    field = fem.Function(problem.u.function_space)
+    rows, _ = problem.committed_state()
+    names = ("committed", "rate", "forces internal", "forces external")
+    for name, values in zip(names, rows[:4], strict=True):
+        owned(field)[:] = values[: problem.unknowns.n_dofs]
+        found[name] = nodal(field)
+    for name, values in zip(names[:2], rows[:2], strict=True):
+        found[f"{name} of supports"] = problem.unknowns.motions(values)
+    energy = problem._committed_energy
+    found["springs"] = np.array([COMM.allreduce(energy.springs)])
+    if problem.solver.condensed:
+        found["kept"] = problem.solver.system.unknowns.kept
+    for c, ways in zip(problem.contacts, energy.contacts, strict=True):
+        found[f"{c.name} history"] = at_points(c, c.history.rows())
+        found[f"{c.name} jump"] = at_points(c, c.committed_jump)
+        found[f"{c.name} ways"] = at_points(c, np.hstack(ways))
+        if c.multipliers is not None:
+            found[f"{c.name} multipliers"] = at_points(c, c.multipliers.fields.rows())
+        for name, values in c.values.arrays.items():
+            found[f"{c.name} {name}"] = at_points(c, np.column_stack([values]))
+        found[f"{c.name} status"] = at_points(c, c.status)
+        r = c.resultants()
+        found[f"{c.name} counts"] = np.array([r.open, r.stick, r.slip, c.n_unpaired])
+        found[f"{c.name} forces"] = np.r_[r.force, r.normal_force, r.tangential_force]
+    return found
+
+
+def differences(a: History, b: History, tolerance: float) -> list[str]:
+    """What of two states differs; tolerance 0: bit for bit, or else of what is solved for."""
+    one, other = picture(a), picture(b)
+    assert one.keys() == other.keys()
+    if tolerance == 0.0:
+        return [n for n in one if not np.array_equal(one[n], other[n], equal_nan=True)]
+    # Tractions, forces and energies, by the largest of their kind; statuses may hang on a digit.
+    compared = [n for n in one if n.split()[-1] in ("u", "committed", "history", "jump", "forces")]
+    return [n for n in compared if not close(one[n], other[n], tolerance)]
+
+
+def same_energies(a: fc.Step, b: fc.Step, tolerance: float) -> bool:
+    """Of two steps; to round-off where the digits are the same."""
+    size = abs(b.energy.work) + abs(b.energy.elastic)
+    names = ("work", "elastic", "springs", "dissipation", "remainder")
+    pairs = [(getattr(a.energy, n), getattr(b.energy, n)) for n in names]
+    return all(close(x, y, max(tolerance, 1e-12), scale=size) for x, y in pairs)
+
+
+def goes_on(
+    make: Callable[[], History],
+    folder: Path,
+    *,
+    stop: int,
+    tolerance: float | None = None,
+    tamper: Callable[[History], None] | None = None,
+    **options: Any,
+) -> None:
+    """A history broken off after ``stop`` increments and taken up is one that went on."""
+    whole, broken, after, again = (make() for _ in range(4))
+    tolerance = whole.tolerance if tolerance is None else tolerance
+    tolerance = 0.0 if COMM.size == 1 else tolerance
+    for made in (whole, broken, after, again) if tamper else ():
+        tamper(made)
+    expected = list(whole.increments(checkpoint=folder / "whole.npz", **options))
+    path = folder / "broken.npz"
+    n = 0
+    for _ in broken.increments(checkpoint=path, **options):
+        n += 1
+        if n == stop:
+            break
+    rest = list(after.increments(checkpoint=path, **options))
+    assert 0 < len(rest) < len(expected)
+    for step, reference in zip(rest, expected[-len(rest) :], strict=True):
+        assert step.increment == reference.increment
+        assert step.load == reference.load
+        assert step.complete == reference.complete
+        assert same_energies(step, reference, tolerance)
+        if reference.increment_error:
+            for name, error in reference.increment_error.items():
+                assert close(step.increment_error[name], error, max(tolerance, 1e-9))
+        for name, r in reference.contacts.items():
+            scale = np.abs(r.force).max()
+            found = step.contacts[name].force
+            assert close(found, r.force, tolerance, scale=scale), step.increment
+    assert differences(after, whole, tolerance) == []
+    # What is finished is taken up as it ended, results and status included.
+    assert not list(again.increments(checkpoint=path, **options))
+    assert differences(again, after, 0.0 if COMM.size == 1 else 1e-12) == []
+    slips = ([c.resultants().slip for c in m.problem.contacts] for m in (again, after))
+    assert len({tuple(found) for found in slips}) == 1

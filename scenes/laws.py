@@ -1,0 +1,94 @@
+"""Laws of a user's own: an exponential overclosure, friction on it, and friction with a bound."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import ufl
+
+import fenics_contact as fc
+from fenics_contact.laws.return_maps import positive_part
+
+
+@dataclass(frozen=True)
+class Overclosure(fc.Law):
+    """Pressure p0 exp(δ/h) at the overclosure δ = u_n - s: asperities that touch at a distance."""
+
+    p0: Any
+    h: Any
+
+    @property
+    def positive(self):
+        """Both."""
+        return frozenset({"p0", "h"})
+
+    def pressure(self, closing, parameters):
+        """p0 exp(δ/h)."""
+        return parameters["p0"] * ufl.exp(closing / parameters["h"])
+
+    def response(self, kinematics, parameters):
+        """The pressure, nothing along Γc."""
+        closing = kinematics.normal_displacement - kinematics.gap
+        pressure = self.pressure(closing, parameters)
+        return fc.Response(-pressure, positive_part(-closing), positive_part(closing))
+
+    def normal_potential(self, kinematics, parameters):
+        """∫ p dδ."""
+        closing = kinematics.normal_displacement - kinematics.gap
+        return parameters["h"] * self.pressure(closing, parameters)
+
+
+@dataclass(frozen=True)
+class Asperities(fc.FrictionLaw):
+    """Coulomb's friction on a pressure p0 (exp(δ/h) - 1) of the penetration δ alone."""
+
+    friction: Any
+    p0: Any
+    h: Any
+    k_t: Any
+
+    @property
+    def positive(self):
+        """All but friction."""
+        return frozenset({"p0", "h", "k_t"})
+
+    def response(self, kinematics, parameters):
+        """The pressure, and friction up to μ times it."""
+        closing = kinematics.normal_displacement - kinematics.gap
+        penetration = positive_part(closing)
+        pressure = parameters["p0"] * (ufl.exp(penetration / parameters["h"]) - 1)
+        limit = parameters["friction"] * pressure
+        traction, slip = self.slide(kinematics, limit, parameters)
+        return fc.Response(-pressure, positive_part(-closing), penetration, traction, limit, slip)
+
+    def normal_potential(self, kinematics, parameters):
+        """∫ p dδ."""
+        p0, h = parameters["p0"], parameters["h"]
+        penetration = positive_part(kinematics.normal_displacement - kinematics.gap)
+        return p0 * h * (ufl.exp(penetration / h) - 1) - p0 * penetration
+
+
+@dataclass(frozen=True)
+class Saturating(fc.FrictionLaw):
+    """Friction that a weak layer bounds: τ ≤ s (1 - exp(-μ p/s)), nearly Coulomb's for p ≪ s/μ."""
+
+    friction: Any
+    strength: Any
+    k_n: Any
+    k_t: Any
+
+    def limit(self, pressure, parameters):
+        """The bound."""
+        s = parameters["strength"]
+        return s * (1 - ufl.exp(-parameters["friction"] * pressure / s))
+
+    def response(self, kinematics, parameters):
+        """Unilateral contact, and friction up to the limit."""
+        penetration = positive_part(kinematics.normal_displacement - kinematics.gap)
+        opening = positive_part(kinematics.gap - kinematics.normal_displacement)
+        pressure = parameters["k_n"] * penetration
+        limit = self.limit(pressure, parameters)
+        traction, slip = self.slide(kinematics, limit, parameters)
+        slip = tuple(ufl.conditional(ufl.gt(pressure, 0), mode, 0) for mode in slip)
+        return fc.Response(-pressure, opening, penetration, traction, limit, slip)

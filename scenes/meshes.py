@@ -1,0 +1,40 @@
+"""Meshes of given nodes and cells."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import basix.ufl
+import dolfinx
+import numpy as np
+import ufl
+from mpi4py import MPI
+
+Array = np.ndarray
+
+
+def mesh_of(
+    cell: str,
+    x: Array,
+    cells: Array,
+    *,
+    degree: int = 1,
+    comm: MPI.Comm = MPI.COMM_WORLD,
+    partitioner: Any = None,
+) -> dolfinx.mesh.Mesh:
+    """Distribute nodes (n, d) and cells, all of which the first rank has. Collective.
+
+    Args:
+        cell: Kind of the cells.
+        x: Places of the nodes.
+        cells: Numbers of the nodes of each, in DOLFINx's order.
+        degree: Of the geometry.
+        comm: The ranks.
+        partitioner: DOLFINx's.
+    """
+    if comm.rank:
+        x, cells = x[:0], cells[:0]
+    element = basix.ufl.element("Lagrange", cell, degree, shape=(x.shape[1],))
+    return dolfinx.mesh.create_mesh(
+        comm, cells=cells.astype(np.int64), x=x, e=ufl.Mesh(element), partitioner=partitioner
+    )

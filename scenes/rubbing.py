@@ -1,0 +1,120 @@
+"""A block on a round cushion, its top pushed down, to and fro: open, sticking, slipping points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+
+import fenics_contact as fc
+from scenes.blocks import TOP, Block, block, dimension
+
+Array = np.ndarray
+
+
+def cushion(d: int, displacement: Any = None, *, length: float = 1.0) -> fc.Ball:
+    """A ball, or disc, twice as large as a block and just below the middle of its bottom."""
+    center = np.full(d, 0.5 * length)
+    center[-1] = -2.0 * length
+    return fc.Ball(center, 2.0 * length, displacement=displacement)
+
+
+class Rub:
+    """The block, unloaded.
+
+    Attributes:
+        scene: The block.
+        push: Displacement of the top, one constant per component.
+        contact, problem: As made.
+    """
+
+    def __init__(
+        self,
+        law: Any = None,
+        *,
+        cell: str = "quadrilateral",
+        degree: int = 1,
+        length: float = 1.0,
+        pressure: float = 1.0,
+        reach: float = 0.1,
+        mesh: dict | None = None,
+        contact: dict | None = None,
+        **options: Any,
+    ) -> None:
+        """Make it in units in which lengths and stresses are larger by the factors given.
+
+        ``reach`` is how far `load` goes to and fro; ``mesh``, ``contact`` and the other options are
+        arguments of `block_mesh`, of the contact, and of the problem.
+        """
+        d = dimension(cell)
+        mesh = {"n": 4, "size": length * np.ones(d)} | (mesh or {})
+        self.scene: Block = block(cell, degree, E=1000 * pressure, **mesh)
+        self.push = [fem.Constant(self.scene.mesh, 0.0) for _ in range(d)]
+        self.reach = reach
+        bcs = [self.scene.hold(TOP, i, c) for i, c in enumerate(self.push)]
+        stiffness = pressure / length
+        if law is None:
+            law = fc.Coulomb(0.3, k_n=2e4 * stiffness, k_t=1e4 * stiffness)
+        contact = (contact or {}) | {"support": cushion(d, length=length)}
+        self.problem, self.contact = self.scene.problem(law, bcs, contact=contact, **options)
+
+    def move(self, side: float, down: float) -> None:
+        """Set the displacement of the top."""
+        self.push[0].value = side
+        self.push[-1].value = -down
+
+    def load(self, t: float) -> None:
+        """Down until 1, along until 2, and back until 4."""
+        self.move(np.interp(t, [1, 2, 4], [0, self.reach, -self.reach]), 0.03 * min(t, 1.0))
+
+
+class Aslant(Rub):
+    """The same, led down and half as far to the side in proportion."""
+
+    def load(self, t: float) -> None:
+        """All of it at 1."""
+        self.move(0.015 * t, 0.03 * t)
+
+    def run(self, **options: Any) -> list[fc.Step]:
+        """All steps up to 1."""
+        return list(fc.increments(self.problem, self.load, **options))
+
+
+# Down, aside, further, back through zero, up again: (side, down) of the top.
+PATH = [(0.0, 0.02), (0.002, 0.03), (0.02, 0.03), (0.016, 0.03), (-0.01, 0.03), (-0.01, 0.01)]
+
+
+def walk(
+    made: Rub, length: float = 1.0, path: Sequence[tuple[float, float]] = PATH
+) -> list[fc.Step]:
+    """Solve and commit the whole path."""
+    steps = []
+    for side, down in path:
+        made.move(side * length, down * length)
+        steps.append(made.problem.solve())
+        made.problem.commit()
+    return steps
+
+
+def snapshot(made: Rub) -> tuple[Array, ...]:
+    """Displacement and history of this rank."""
+    history = made.contact.history.function.x.array.copy()
+    return made.scene.u.x.array.copy(), history
+
+
+def pressed(
+    cell: str,
+    law: Any,
+    method: str,
+    *,
+    side: float = 0.01,
+    down: float = 0.03,
+    n: int = 4,
+    **options: Any,
+) -> tuple[Block, fc.ContactProblem, fc.Contact]:
+    """A `Rub` that is loaded, not solved, taken apart."""
+    made = Rub(law, cell=cell, mesh={"n": n}, method=method, **options)
+    made.move(side, down)
+    return made.scene, made.problem, made.contact

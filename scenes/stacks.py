@@ -1,0 +1,127 @@
+"""Bodies of unequal meshes in one mesh: blocks one on the other, rings one in the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from scenes.bodies import Bodies, boxes
+from scenes.comparing import close, gathered
+from scenes.tags import Where, between, either, near
+
+COMM = MPI.COMM_WORLD
+FLOOR, ROOF, LOWER, UPPER, WALL, SIDES, OUTSIDE = 1, 2, 3, 4, 5, 6, 9
+E = 1e6
+Array = np.ndarray
+
+
+# ---- blocks --------------------------------------------------------------------------------------
+
+
+def stack(
+    cell: str,
+    counts: Sequence[int],
+    heights: Sequence[float],
+    *,
+    widths: Sequence[float] | None = None,
+    apart: float = 0.0,
+    degree: int = 1,
+    nu: float = 0.0,
+    tags: Mapping[int, Where] | None = None,
+) -> Bodies:
+    """Blocks one on the other, ``counts`` cells along x in each, ``apart`` from each other.
+
+    Tags: FLOOR, ROOF, SIDES (all upright faces), and both faces of joint j, counted from 1 at the
+    top of the lowest block: 10 j + LOWER and 10 j + UPPER.
+    """
+    d = 3 if cell == "hexahedron" else 2
+    widths = widths or [1.0] * len(counts)
+    axes, low, marks = [], 0.0, {}
+    for j, (n, height, width) in enumerate(zip(counts, heights, widths, strict=True)):
+        across = np.linspace((1 - width) / 2, (1 + width) / 2, n + 1)
+        up = np.linspace(low, low + height, max(1, round(n * height / width)) + 1)
+        axes.append([across] * (d - 1) + [up])
+        if j:
+            marks[10 * j + UPPER] = between(d - 1, low, above=True)
+        low += height
+        if j + 1 < len(counts):
+            marks[10 * (j + 1) + LOWER] = between(d - 1, low, above=False)
+            low += apart
+    ends = [near(i, v) for i in range(d - 1) for v in (0.0, 1.0)]
+    marks = {FLOOR: near(d - 1, 0), ROOF: near(d - 1, low), SIDES: either(*ends), **marks}
+    made = boxes(axes, marks | (tags or {}), simplex=cell == "triangle")
+    return Bodies(made, E, nu, degree=degree)
+
+
+def joint(body: Bodies, j: int, law: Any, *, swap: bool = False, **options: Any) -> fc.Contact:
+    """Contact of the blocks over and under joint ``j``."""
+    here, there = (LOWER, UPPER) if swap else (UPPER, LOWER)
+    name = f"joint {j}"
+    return body.contact(10 * j + here, 10 * j + there, law, name=name, **options)
+
+
+def floor(body: Bodies, law: Any, tag: int = FLOOR, **options: Any) -> fc.Contact:
+    """Contact of a side with a floor that it just touches."""
+    up = np.eye(body.d)[-1]
+    return body.contact(tag, fc.HalfSpace(0 * up, up), law, name="floor", **options)
+
+
+# ---- rings ---------------------------------------------------------------------------------------
+
+
+def rings(counts: tuple[int, int], *, degree: int = 2, angle: float = 1.5) -> Bodies:
+    """Sectors of two rings, 10/20 and 20/40, of as many cells along the angle, curved if quadratic.
+
+    Tags: LOWER and UPPER, their joint; FLOOR and ROOF, their cuts; OUTSIDE.
+    """
+    axes = [
+        [np.linspace(0, angle, n + 1), np.linspace(*radii, 4)]
+        for n, radii in zip(counts, ((10, 20), (20, 40)), strict=True)
+    ]
+
+    def bend(x: Array) -> Array:
+        return np.column_stack([x[:, 1] * np.cos(x[:, 0]), x[:, 1] * np.sin(x[:, 0])])
+
+    sides = {
+        LOWER: between(1, 20, above=False),
+        UPPER: between(1, 20, above=True),
+        FLOOR: near(0, 0),
+        ROOF: near(0, angle),
+        OUTSIDE: near(1, 40),
+    }
+    return Bodies(boxes(axes, sides, bend=bend, degree=degree), E, 0.3, degree=degree)
+
+
+# ---- what acts -----------------------------------------------------------------------------------
+
+
+def nodal_forces(contact: fc.Contact) -> tuple[Array, Array]:
+    """Contact's forces at the nodes of this rank and where these are, (n, d) each."""
+    space = contact.u.function_space
+    force = fem.Function(space)
+    fc.ContactOperator(contact).add_force(force.x.petsc_vec)
+    d, n = len(contact.u), space.dofmap.index_map.size_local
+    return -force.x.array.reshape(-1, d)[:n], space.tabulate_dof_coordinates()[:n, :d]
+
+
+def balance(contact: fc.Contact) -> tuple[Array, float, float]:
+    """Sum of the forces, of their moments about the origin, and of their sizes."""
+    f, x = nodal_forces(contact)
+    i = contact.surface.mesh.geometry.dim - 1
+    moment = x[:, 0] * f[:, i] - x[:, i] * f[:, 0]
+    return (
+        COMM.allreduce(f.sum(axis=0)),
+        COMM.allreduce(moment.sum()),
+        COMM.allreduce(np.abs(f).sum()),
+    )
+
+
+def uniform(values: Array, expected: float, rtol: float = 1e-9) -> bool:
+    """Whether values are everywhere what is expected, on all ranks."""
+    values = gathered(COMM, values)
+    return close(values, np.full(values.shape, expected), rtol)

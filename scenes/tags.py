@@ -1,0 +1,69 @@
+"""Tags of the facets of the boundary, by where their nodes or their midpoints lie."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import dolfinx
+import numpy as np
+
+Array = np.ndarray
+# Which ones of facets: of their midpoints and of those of the cells that they bound, both (n, d).
+Where = Callable[[Array, Array], Array]
+
+
+# ---- by nodes ------------------------------------------------------------------------------------
+
+
+def sides(
+    mesh: dolfinx.mesh.Mesh, where: Mapping[int, Callable[[Array], Array]]
+) -> dolfinx.mesh.MeshTags:
+    """Tags of the facets whose nodes (3, n) all lie where it is said. Collective."""
+    dim = mesh.topology.dim - 1
+    mesh.topology.create_entities(dim)
+    found = {t: dolfinx.mesh.locate_entities_boundary(mesh, dim, at) for t, at in where.items()}
+    facets = np.concatenate(list(found.values()))
+    values = np.repeat(np.array(list(found), dtype=np.int32), [len(f) for f in found.values()])
+    # A facet of several sides has the tag of the last.
+    facets, first = np.unique(facets[::-1], return_index=True)
+    return dolfinx.mesh.meshtags(mesh, dim, facets, values[::-1][first])
+
+
+def plane(i: int, value: float) -> Callable[[Array], Array]:
+    """Nodes at the coordinate ``i``."""
+    return lambda x: np.isclose(x[i], value)
+
+
+# ---- by midpoints --------------------------------------------------------------------------------
+
+
+def tagged(mesh: dolfinx.mesh.Mesh, where: Mapping[int, Where]) -> dolfinx.mesh.MeshTags:
+    """Tags of the facets that functions of midpoints choose; of several the last. Collective."""
+    d = mesh.topology.dim
+    mesh.topology.create_connectivity(d - 1, d)
+    to_cell = mesh.topology.connectivity(d - 1, d)
+    exterior = dolfinx.mesh.exterior_facet_indices(mesh.topology)
+    owner = np.array([to_cell.links(f)[0] for f in exterior], dtype=np.int32)
+    middle = dolfinx.mesh.compute_midpoints(mesh, d - 1, exterior).reshape(-1, 3)[:, :d]
+    cell = dolfinx.mesh.compute_midpoints(mesh, d, owner).reshape(-1, 3)[:, :d]
+    values = np.zeros(len(exterior), dtype=np.int32)
+    for tag, chosen in where.items():
+        values[chosen(middle, cell)] = tag
+    kept = values > 0
+    return dolfinx.mesh.meshtags(mesh, d - 1, exterior[kept], values[kept])
+
+
+def near(i: int, value: float) -> Where:
+    """Facets whose midpoint lies at the coordinate ``i``."""
+    return lambda x, cell: np.abs(x[:, i] - value) < 1e-9
+
+
+def between(i: int, value: float, *, above: bool) -> Where:
+    """The same, of the cells on one side."""
+    side = 1 if above else -1
+    return lambda x, cell: near(i, value)(x, cell) & (side * (cell[:, i] - value) > 0)
+
+
+def either(*choices: Where) -> Where:
+    """Facets that one of several chooses."""
+    return lambda x, cell: np.any([choice(x, cell) for choice in choices], axis=0)

@@ -1,0 +1,1 @@
+"""Scripts that compare the package with references, at extremes, and with a second solver."""
