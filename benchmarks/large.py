@@ -20,10 +20,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import statistics
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -34,6 +32,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from benchmarks import costs, problems, timing
+from scenes.processes import command, environment
 
 COMM = MPI.COMM_WORLD
 FRICTION = 0.3
@@ -131,12 +130,9 @@ def events() -> np.ndarray:
 
 def start(run: str, cells: int, ranks: int, repeat: int) -> dict[str, Any]:
     """The row of a run in new processes."""
-    command = [sys.executable, str(Path(__file__).resolve()), "--child", run]
-    command += ["--cells", str(cells), "--repeat", str(repeat)]
-    if ranks > 1:
-        command = ["mpirun", "--oversubscribe", "-n", str(ranks), *command]
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
-    done = subprocess.run(command, env=kept, stdout=subprocess.PIPE, text=True)
+    words = command(ranks, Path(__file__).resolve(), "--child", run)
+    words += ["--cells", str(cells), "--repeat", str(repeat)]
+    done = subprocess.run(words, env=environment(), stdout=subprocess.PIPE, text=True)
     if done.returncode:
         return {"run": run, "ranks": ranks, "iterations": "failed", "seconds": float("nan")}
     return json.loads(done.stdout.strip().splitlines()[-1])

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import statistics
 import subprocess
 import sys
@@ -35,6 +34,7 @@ from mpi4py import MPI
 
 from benchmarks import large, timing
 from fenics_contact import plotting
+from scenes.processes import command, environment
 
 RUNS = ("linear, multigrid", "contact, multigrid", "contact, multigrid, Newton")
 CELLS = (24, 32, 47)
@@ -274,10 +274,8 @@ def draw(path: Path, rows: Sequence[Row], machine: Machine) -> None:
 
 def launch_machine() -> Machine:
     """`measure_machine` in two new processes."""
-    command = ["mpirun", "--oversubscribe", "-n", "2", sys.executable]
-    command += [str(Path(__file__).resolve()), "--machine"]
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
-    done = subprocess.run(command, env=kept, stdout=subprocess.PIPE, text=True, check=True)
+    words = command(2, Path(__file__).resolve(), "--machine")
+    done = subprocess.run(words, env=environment(), stdout=subprocess.PIPE, text=True, check=True)
     return Machine(**json.loads(done.stdout.strip().splitlines()[-1]))
 
 

@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parent.parent
-
-
-def environment() -> dict[str, str]:
-    """What a new process gets: what mpirun left here would make another mpirun join it."""
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
-    return kept | {"PYTHONPATH": str(ROOT)}
+from scenes.processes import ROOT, command, environment
 
 
 def run_demo(name: str, folder: Path, *options: str, ranks: int = 1) -> dict[str, Any]:
     """Run ``demos/NAME.py``; it must end with 0 and stay silent on stderr. Its result.json."""
-    command = [sys.executable, str(ROOT / "demos" / f"{name}.py"), *options]
-    command += ["--output", str(folder)]
-    if ranks > 1:
-        command = ["mpirun", "--oversubscribe", "-n", str(ranks), *command]
-    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=300)
+    words = command(ranks, ROOT / "demos" / f"{name}.py", *options, "--output", folder)
+    done = subprocess.run(words, env=environment(), capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "%|" not in done.stderr, "the progress bar must be silent when not on a terminal"
     return {"stdout": done.stdout} | json.loads(next(folder.glob("*.json")).read_text())
+
+
+def values(result: dict[str, Any]) -> dict[str, float]:
+    """What a demo found of all that it has references for."""
+    return {name: entry["value"] for name, entry in result["references"].items()}

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 from mpi4py import MPI
-from running import ROOT, environment
 
 from benchmarks import large, parallel, run, targets, timing
+from scenes.processes import ROOT, environment
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="of one process")
 

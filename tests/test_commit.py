@@ -7,11 +7,11 @@ MUMPS adds in the order in which messages come: 1e-10.
 import numpy as np
 import pytest
 from mpi4py import MPI
-from test_pairs import FLOOR, LOWER, ROOF, UPPER, stack
 
 import fenics_contact as fc
 from scenes.blocks import block
 from scenes.comparing import at_points, close, nodal
+from scenes.stacks import FLOOR, LOWER, ROOF, UPPER, stack
 
 COMM = MPI.COMM_WORLD
 EXACT = 0.0 if COMM.size == 1 else 1e-10

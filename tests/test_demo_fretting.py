@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import pytest
 from mpi4py import MPI
-from running import run_demo
+from running import run_demo, values
 
 pytestmark = [
     pytest.mark.demo,
     pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own"),
 ]
-
-
-def values(result: dict[str, Any]) -> dict[str, float]:
-    return {name: entry["value"] for name, entry in result["references"].items()}
 
 
 def energy(share: float) -> float:

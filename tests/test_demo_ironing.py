@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from running import run_demo
+from running import run_demo, values
 
 pytestmark = [
     pytest.mark.demo,
     pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own"),
 ]
 OPTIONS = ("--cells", "6", "--increments", "12")
-
-
-def values(run: dict[str, Any]) -> dict[str, float]:
-    return {name: entry["value"] for name, entry in run["references"].items()}
 
 
 def test_sliding(tmp_path: Path) -> None:

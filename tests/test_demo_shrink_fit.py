@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 from mpi4py import MPI
-from running import run_demo
+from running import run_demo, values
 
 pytestmark = [
     pytest.mark.demo,
     pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own"),
 ]
 PRESSURE = "pressure [MPa]"
-
-
-def values(run: dict[str, Any]) -> dict[str, float]:
-    return {name: entry["value"] for name, entry in run["references"].items()}
 
 
 def test_lame(tmp_path: Path) -> None:

@@ -19,7 +19,6 @@ import pytest
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from running import ROOT, environment
 
 import fenics_contact as fc
 from fenics_contact import output, parallel, plotting
@@ -27,6 +26,7 @@ from fenics_contact.surface import surface
 from fenics_contact.systems import dense
 from scenes.comparing import close, identical, nodal, raised_everywhere, shared_folder
 from scenes.elasticity import stress
+from scenes.processes import command, environment
 from scenes.rubbing import PATH, Rub, snapshot, walk
 
 COMM = MPI.COMM_WORLD
@@ -265,8 +265,8 @@ made.problem.solve()
 @pytest.mark.parametrize("name", ["residual_at", "solved"])
 def test_one_rank_fails_alone(name):
     """Where nothing tells the other ranks, which wait: all are ended, with the error shown."""
-    script = ["mpirun", "--oversubscribe", "-n", "2", sys.executable, "-c", ALONE.format(name=name)]
-    done = subprocess.run(script, env=environment(), cwd=ROOT, capture_output=True, timeout=60)
+    words = command(2, "-c", ALONE.format(name=name))
+    done = subprocess.run(words, env=environment(), capture_output=True, timeout=60)
     said = done.stderr.decode(errors="replace")
     assert done.returncode != 0
     assert "rank 1 failed alone" in said and "ZeroDivisionError" in said

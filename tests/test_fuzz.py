@@ -12,8 +12,8 @@ import sys
 import numpy as np
 import pytest
 from mpi4py import MPI
-from running import ROOT, environment
 
+from scenes.processes import ROOT, environment
 from verification import fuzz, fuzz_scenes
 from verification import reference_solver as reference
 

@@ -8,8 +8,8 @@ import sys
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from running import ROOT, environment
 
+from scenes.processes import command, environment
 from scenes.rubbing import Rub, walk
 
 COMM = MPI.COMM_WORLD
@@ -43,11 +43,9 @@ def command_line(monkeypatch):
 @pytest.mark.parametrize("arguments", ["", "condensation=False"])
 def test_a_script_with_options(ranks: int, arguments: str) -> None:
     """Monitors print, whichever method solves the first increment, and values are taken."""
-    command = [sys.executable, "-c", SCRIPT.format(arguments=arguments), "mesh.msh", "-n", "3"]
-    command += ["-contact_snes_monitor", "-contact_snes_max_it", "737"]
-    if ranks > 1:
-        command = ["mpirun", "--oversubscribe", "-n", str(ranks), *command]
-    done = subprocess.run(command, env=environment(), cwd=ROOT, capture_output=True, text=True)
+    words = command(ranks, "-c", SCRIPT.format(arguments=arguments), "mesh.msh", "-n", "3")
+    words += ["-contact_snes_monitor", "-contact_snes_max_it", "737"]
+    done = subprocess.run(words, env=environment(), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "SNES Function norm" in done.stdout
     assert "at most 737" in done.stdout

@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -13,12 +12,12 @@ import numpy as np
 import pytest
 from dolfinx import fem
 from mpi4py import MPI
-from running import environment
 
 import fenics_contact as fc
 from fenics_contact import checkpoint
 from scenes.blocks import TOP, block
 from scenes.comparing import at_points, close, nodal, owned, raised_everywhere, shared_folder
+from scenes.processes import command, environment
 from scenes.rubbing import Rub
 
 COMM = MPI.COMM_WORLD
@@ -287,13 +286,8 @@ if made.scene.mesh.comm.rank == 0:
 def run_script(path: Path, ranks: int, *, kill_after: int | None = None) -> list[str]:
     """Run the history in a process of its own, killed after so many increments."""
     script = SCRIPT.format(path=str(path))
-    launch = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks > 1 else []
-    process = subprocess.Popen(
-        [*launch, sys.executable, "-c", script],
-        env=environment(),
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    words = command(ranks, "-c", script)
+    process = subprocess.Popen(words, env=environment(), stdout=subprocess.PIPE, text=True)
     lines = []
     for line in process.stdout:
         lines.append(line.strip())

@@ -9,7 +9,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.blocks import BOTTOM, LEFT, RIGHT, block, block_mesh
+from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block, block_mesh
 from scenes.comparing import close, gathered, raised_everywhere
 from scenes.elasticity import displacement_space
 
@@ -290,3 +290,23 @@ def test_bad_support_in_space(support, words):
     raised_everywhere(
         lambda: fc.Contact(u, surface, support, fc.Frictionless(k_n=1.0)), ValueError, *words
     )
+
+
+def test_friction_feels_the_displacement_alone():
+    """A floor raised and drawn along: in a gap or a point what is along Γc is felt by nothing."""
+    force = {}
+    for way in ("displacement", "point", "gap"):
+        made = block("quadrilateral", n=4)
+        motion, up = fem.Constant(made.mesh, np.zeros(2)), np.array([0.0, 1.0])
+        place = motion if way == "point" else np.zeros(2)
+        support = fc.HalfSpace(place, up, displacement=motion if way == "displacement" else None)
+        gap = -ufl.dot(motion, ufl.as_vector(up)) if way == "gap" else None
+        held = [made.hold(TOP, i) for i in range(2)]
+        law, contact = fc.Coulomb(0.3), {"support": support, "gap": gap}
+        problem, contact = made.problem(law, held, contact=contact)
+        motion.value[:] = 0.01, 0.01
+        problem.solve()
+        force[way] = contact.resultants().force
+    assert force["displacement"][0] > 0.2 * force["displacement"][1]
+    assert close(force["gap"], force["point"], 1e-9)
+    assert abs(force["gap"][0]) < 1e-8 * force["gap"][1]

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 from mpi4py import MPI
-from running import ROOT, environment
 
 from benchmarks import trade
 from fenics_contact.contact.accuracy import PRESETS
+from scenes.processes import ROOT, environment
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="of one process")
 

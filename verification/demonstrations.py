@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from scenes.processes import ROOT, command, environment
 from verification.cases import Case, Outcome, Row
 
 __all__ = ["DEMOS"]
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 def run(name: str, *options: str) -> dict[str, Any]:
@@ -27,11 +24,8 @@ def run(name: str, *options: str) -> dict[str, Any]:
         RuntimeError: It wrote nothing.
     """
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, str(ROOT / "demos" / f"{name}.py"), *options]
-        environment = os.environ | {"PYTHONPATH": str(ROOT)}
-        done = subprocess.run(
-            [*command, "--output", folder], capture_output=True, text=True, env=environment
-        )
+        words = command(1, ROOT / "demos" / f"{name}.py", *options, "--output", folder)
+        done = subprocess.run(words, capture_output=True, text=True, env=environment())
         written = Path(folder) / "result.json"
         if not written.exists():
             raise RuntimeError(

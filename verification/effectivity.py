@@ -23,9 +23,10 @@ from typing import Any
 import fenics_contact as fc
 from demos import hertz
 from fenics_contact.estimates.errors import quantities
+from scenes.processes import ROOT
 from verification import half_planes
 from verification.cases import Case, Outcome
-from verification.demonstrations import DEMOS, ROOT, run, runs
+from verification.demonstrations import DEMOS, run, runs
 from verification.report import CASES
 
 PAGE = ROOT / "docs" / "effectivity.md"

@@ -7,7 +7,6 @@ the steps made and the error against its reference, relative.
 from __future__ import annotations
 
 import functools
-import os
 import pickle
 import subprocess
 import sys
@@ -24,6 +23,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.bodies import Bodies, boxes, graded
+from scenes.processes import command, environment
 from scenes.tags import near
 
 BOTTOM, TOP, LEFT, FRONT, OPPOSITE = 1, 2, 3, 4, 5
@@ -587,9 +587,8 @@ def on_one_rank(ranks: int, kind: str, kappa: float, mu: float) -> Solve:
     def solve(method: str) -> tuple[list[fc.Step], float]:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "state"
-            command = ["mpirun", "--oversubscribe", "-n", str(ranks), sys.executable, __file__]
-            command += [kind, str(kappa), str(mu), method, str(path)]
-            done = subprocess.run(command, env=environment(), capture_output=True, timeout=120)
+            words = command(ranks, __file__, kind, kappa, mu, method, path)
+            done = subprocess.run(words, env=environment(), capture_output=True, timeout=120)
             if done.returncode:
                 raise RuntimeError(done.stderr.decode(errors="replace")[-300:])
             step, rows, n_facets = pickle.loads(path.read_bytes())
@@ -599,11 +598,6 @@ def on_one_rank(ranks: int, kind: str, kappa: float, mu: float) -> Solve:
         return [step], float(np.abs(rows - alone).max() / np.abs(alone[:, 2:]).max())
 
     return solve
-
-
-def environment() -> dict[str, str]:
-    """What new ranks get: what mpirun left here would make another mpirun join it."""
-    return {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 import fenics_contact as fc
+from scenes.processes import ROOT
 from verification.extreme_scenes import (
     E,
     Solve,
@@ -41,7 +42,7 @@ from verification.extreme_scenes import (
     proportional,
 )
 
-PAGE = Path(__file__).resolve().parent.parent / "docs" / "extremes.md"
+PAGE = ROOT / "docs" / "extremes.md"
 METHODS = ("lbfgs", "newton")
 
 

@@ -38,6 +38,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from scenes.processes import command, environment
+
 __all__ = ["Outcome", "features", "minimise", "play", "table"]
 
 Scene = dict[str, Any]
@@ -276,32 +278,17 @@ def _work(seeds: list[int], arguments: argparse.Namespace) -> None:
             print(json.dumps({"seed": seed} | vars(outcome)), flush=True)
 
 
-def _environment() -> dict[str, str]:
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
-    return kept | {"OMP_NUM_THREADS": "1"}
-
-
 def _batch(seeds: list[int], arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Results of scenes solved in one process; ends early where it hangs or dies."""
-    command = [sys.executable, __file__, "--work", ",".join(map(str, seeds))]
-    command += ["--limit", str(arguments.limit)]
-    command += [v for name in arguments.without for v in ("--without", name)]
-    if arguments.ranks > 1:
-        command = [
-            "mpirun",
-            "--allow-run-as-root",
-            "--oversubscribe",
-            "-n",
-            str(arguments.ranks),
-            *command,
-        ]
+    words = ["--work", ",".join(map(str, seeds)), "--limit", arguments.limit]
+    words += [v for name in arguments.without for v in ("--without", name)]
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
-            command,
+            command(arguments.ranks, __file__, *words),
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
-            env=_environment(),
+            env=environment() | {"OMP_NUM_THREADS": "1"},
             start_new_session=True,
         )
         late: list[bool] = []

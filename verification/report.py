@@ -9,9 +9,10 @@ import dolfinx
 from petsc4py import PETSc
 
 import fenics_contact as fc
+from scenes.processes import ROOT
 from verification import half_planes, solids, statics
 from verification.cases import Case, Outcome, cases_of
-from verification.demonstrations import DEMOS, ROOT
+from verification.demonstrations import DEMOS
 
 CASES = cases_of(statics, half_planes, solids)
 PAGE = ROOT / "docs" / "verification.md"

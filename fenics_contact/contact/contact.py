@@ -131,7 +131,10 @@ class Contact:
             support: What it presses on.
             law: The reactions.
             gap: Initial gap s (length) prescribed independently of the support's geometry (paper,
-                footnote 1): a number, constant or UFL. The support's motion is added to it.
+                footnote 1): a number, constant or UFL. The support's motion is added to it, and
+                belongs into ``displacement`` of the support: a constant in the gap that is changed
+                opens and closes it, as an interference that grows does, and no more. Friction feels
+                nothing of what moves along Γc with it, and does no work on it.
             weight: Factor of the surface measure where the bulk form carries one: a thickness, or
                 2πr for axisymmetric problems.
             modulus: Young's modulus near Γc (stress), a number or function with one value per

@@ -82,6 +82,11 @@ class Support:
     Args to all of them: ``displacement``, the prescribed rigid translation (gdim numbers, a
     ``fem.Constant`` to be changed between increments, or a UFL vector), or a `Motion` where the
     force on the support is given; none means fixed.
+
+    A support that moves is moved by this alone. Where its place or gap is changed instead (a
+    constant in ``point``, ``center`` or ``gap``), contact opens and closes as it should, but
+    friction does not feel the part along Γc, nor do the energies count work: nothing tells such a
+    change from one of shape.
     """
 
     displacement: Any = None

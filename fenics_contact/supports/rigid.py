@@ -108,7 +108,7 @@ class Obstacle(Support):
 
     Args to the constructor:
         gap: Distance that is open along ``normal`` before any displacement, in length; negative
-            is a penetration.
+            is a penetration. A motion of the obstacle is no part of it: see `Support`.
         normal: From the body to the obstacle, of any length greater than zero, shape (gdim,).
         displacement: See `Support`; its part along ``normal`` adds to the gap.
     """

@@ -1,0 +1,22 @@
+"""New processes that find this checkout, and are no part of the ranks that start them."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def environment() -> dict[str, str]:
+    """What a new process gets: what mpirun left here would make another mpirun join it."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
+    paths = [str(ROOT), *filter(None, [kept.get("PYTHONPATH")])]
+    return kept | {"PYTHONPATH": os.pathsep.join(paths)}
+
+
+def command(ranks: int, *words: object) -> list[str]:
+    """Python with these words, on several ranks by mpirun."""
+    launch = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks > 1 else []
+    return [*launch, sys.executable, *map(str, words)]

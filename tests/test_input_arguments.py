@@ -1,0 +1,334 @@
+"""What is no argument at all: swapped, missing, of another mesh or kind; named, on every rank."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+
+import basix.ufl
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from scenes.blocks import BOTTOM, TOP, Block, block
+from scenes.comparing import raised_everywhere
+from scenes.elasticity import displacement_space, strain, stress
+from scenes.processes import environment
+from scenes.sound import MESH, coulomb, pressed
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+COMM = MPI.COMM_WORLD
+
+
+# ---- the displacement ----------------------------------------------------------------------------
+
+
+def contact_with(u, scene: Block) -> Callable:
+    return lambda: fc.Contact(u, scene.surface, scene.floor(), coulomb())
+
+
+@pytest.mark.parametrize(
+    ("element", "words"),
+    [
+        (("Lagrange", 1), ("u has shape ()",)),
+        (("Lagrange", 1, (3,)), ("u has shape (3,)",)),
+        (("Lagrange", 1, (2, 2)), ("u has shape (2, 2)",)),
+        (("RT", 1), ("Lagrange",)),
+        (("N1curl", 1), ("Lagrange",)),
+        (("DG", 0, (2,)), ("degree 0",)),
+        (("DG", 1, (2,)), ("Lagrange",)),
+    ],
+    ids=["scalar", "three components", "tensor", "RT", "N1curl", "DG0", "DG1"],
+)
+def test_displacement_of_a_wrong_space(element, words):
+    """A u that is no continuous vector-valued Lagrange function of the mesh's dimension."""
+    scene = block("triangle", **MESH)
+    u = fem.Function(fem.functionspace(scene.mesh, element))
+    raised_everywhere(contact_with(u, scene), ValueError, "u ", *words)
+
+
+def test_displacement_of_crouzeix_raviart():
+    """Continuity at the middle of facets alone is not enough for a displacement on Γc."""
+    scene = block("triangle", **MESH)
+    u = fem.Function(fem.functionspace(scene.mesh, ("CR", 1, (2,))))
+    raised_everywhere(contact_with(u, scene), ValueError, "u ", "Lagrange")
+
+
+def test_displacement_on_another_mesh():
+    """A u of a mesh that is not that of the surface."""
+    scene, other = pressed(), pressed()
+    raised_everywhere(contact_with(other.u, scene), ValueError, "mesh")
+
+
+def test_displacement_that_is_no_function():
+    """A trial function, an expression or an array is no u."""
+    scene = pressed()
+    for u in (ufl.TrialFunction(scene.u.function_space), 2 * scene.u, scene.u.x.array):
+        raised_everywhere(contact_with(u, scene), ValueError, "u is a")
+
+
+def test_displacement_of_another_problem():
+    """The contact's u and the problem's are the same function, not two of one space."""
+    scene = pressed()
+    other = fem.Function(scene.u.function_space)
+    contact = fc.Contact(other, scene.surface, scene.floor(), coulomb())
+    raised_everywhere(
+        lambda: fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=[contact]),
+        ValueError,
+        "contact: its u",
+    )
+
+
+def test_displacement_in_a_mixed_element():
+    """A pressure beside it, whole or in part, or scalars for its components: the reason is told."""
+    scene = pressed()
+    line = basix.ufl.element("P", "quadrilateral", 1)
+    vector = basix.ufl.element("P", "quadrilateral", 2, shape=(2,))
+    both = fem.Function(fem.functionspace(scene.mesh, basix.ufl.mixed_element([vector, line])))
+    scalars = fem.Function(fem.functionspace(scene.mesh, basix.ufl.mixed_element([line, line])))
+    for u in (both, both.sub(0), scalars):
+        raised_everywhere(contact_with(u, scene), ValueError, "contact: u is in a mixed element")
+    v = ufl.TestFunction(both.function_space)
+    F = ufl.inner(ufl.grad(both), ufl.grad(v)) * ufl.dx
+    raised_everywhere(lambda: fc.ContactProblem(F, both), ValueError, "u is in a mixed element")
+
+
+# ---- what is no argument at all ------------------------------------------------------------------
+
+
+def test_arguments_of_a_contact():
+    """Swapped, missing, a class for an object: named, with the order there is."""
+    scene = pressed()
+    u, surface, floor, law = scene.u, scene.surface, scene.floor(), coulomb()
+    for arguments, words in (
+        ((u, surface, law, floor), ("support is a Coulomb", "must be a Support", "(u, surface,")),
+        ((surface, u, floor, law), ("u is a ContactSurface", "must be a Function")),
+        ((u, scene.mesh, floor, law), ("surface is a Mesh", "must be a ContactSurface")),
+        ((u, surface, None, law), ("support is a NoneType",)),
+        ((u, surface, floor, 0.3), ("law is a float", "must be a Law")),
+        ((u, surface, floor, fc.Frictionless), ("law is the class Frictionless", "(...)")),
+        ((u, surface, fc.HalfSpace, law), ("support is the class HalfSpace",)),
+    ):
+        raised_everywhere(lambda a=arguments: fc.Contact(*a), ValueError, "contact: ", *words)
+    raised_everywhere(lambda: scene.contact(law, name=3), ValueError, "name is a int")
+    raised_everywhere(lambda: scene.contact(law, tolerance="1e-3"), ValueError, "tolerance is '1e-")
+
+
+def test_arguments_of_a_problem():
+    """One contact or condition for a list of them, other things in the list, no mapping."""
+    scene = pressed()
+    contact, bcs = scene.contact(coulomb()), scene.rollers()
+    for arguments, words in (
+        ({"contacts": contact}, ("contacts is a single Contact", "contacts=[...]")),
+        ({"contacts": None}, ("contacts is None", "list of Contact")),
+        ({"contacts": [coulomb()]}, ("contacts[0] is a Coulomb",)),
+        ({"bcs": bcs[0]}, ("bcs is a single DirichletBC", "bcs=[...]")),
+        ({"bcs": [*bcs, 0]}, (f"bcs[{len(bcs)}] is a int",)),
+        ({"petsc_options": "-snes_monitor"}, ("petsc_options is a str", "Mapping")),
+        ({"prefix": None}, ("prefix is a NoneType",)),
+        ({"method": ["newton"]}, ("method is ['newton']",)),
+    ):
+        call = {"bcs": bcs, "contacts": [contact]} | arguments
+        raised_everywhere(
+            lambda c=call: fc.ContactProblem(scene.F, scene.u, **c), ValueError, *words
+        )
+    raised_everywhere(lambda: fc.ContactProblem(scene.u, scene.F), ValueError, "u is a Form")
+
+
+def test_arguments_of_a_surface():
+    """Mesh and tags swapped, facets for tags, a tag that is no whole number."""
+    scene = pressed()
+    mesh, tags = scene.mesh, scene.tags
+    for arguments, word in (
+        ((tags, mesh, BOTTOM), "mesh is a MeshTags"),
+        ((mesh, tags.find(BOTTOM), BOTTOM), "facet_tags is a ndarray"),
+        ((mesh, tags, "bottom"), "tags is 'bottom'"),
+        ((mesh, tags, 1.5), "tags is 1.5"),
+        ((mesh, tags, None), "tags is None"),
+        ((mesh, tags, []), "Γc is empty"),
+    ):
+        raised_everywhere(lambda a=arguments: fc.ContactSurface(*a), ValueError, word)
+    for body, word in (((TOP, tags), "facet_tags is a int"), ((tags, "top"), "tags is 'top'")):
+        support = fc.DeformableBody(*body)
+        raised_everywhere(lambda s=support: scene.contact(coulomb(), support=s), ValueError, word)
+    raised_everywhere(
+        lambda: fc.DeformableBody(tags, TOP, search_distance="far"),
+        ValueError,
+        "search_distance is 'f",
+    )
+
+
+@pytest.mark.parametrize("degree", [2.5, 2.0, "2", True, 0, -1])
+def test_quadrature_degree(degree):
+    """A degree is a whole number from 1."""
+    scene = pressed()
+    raised_everywhere(
+        lambda: fc.ContactSurface(scene.mesh, scene.tags, BOTTOM, quadrature_degree=degree),
+        ValueError,
+        f"quadrature_degree is {degree!r}",
+        "whole number",
+    )
+
+
+def test_numbers_of_supports():
+    """Texts for numbers in points, radii and forces; no list where one is wanted."""
+    scene = pressed()
+    for support, word in (
+        (fc.HalfSpace("origin", (0, 1)), "point of the HalfSpace is 'origin'"),
+        (fc.HalfSpace((0, "0"), (0, 1)), "point of the HalfSpace is (0, '0')"),
+        (fc.Ball((0, -1), "1"), "radius of the Ball is '1'"),
+        (scene.floor(displacement=fc.Motion(5.0)), "Motion has 0 forces"),
+        (scene.floor(displacement=fc.Motion((None, "5"))), "force 1 of the Motion is '5'"),
+    ):
+        raised_everywhere(
+            lambda s=support: scene.contact(coulomb(), support=s), (ValueError, TypeError), word
+        )
+    raised_everywhere(
+        lambda: fc.elasticity.LinearElastic(scene.u, "E", 0.3, "plane strain"),
+        ValueError,
+        "E is 'E",
+    )
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_support_turned_round(held, caplog):
+    """The normal of a floor points down, a ball is outside of what it should surround.
+
+    The body is inside: refused. A floor that just touches is one that the body leaves: warned.
+    """
+    scene = pressed()
+    bcs = [*scene.rollers(), scene.hold(TOP, 1)] if held else scene.rollers()
+    for support in (fc.HalfSpace((0, -0.5), (0, -1)), fc.Ball((0.5, 0.5), 2.0)):
+        raised_everywhere(
+            lambda s=support: scene.problem(coulomb(), bcs, contact={"support": s}),
+            ValueError,
+            "contact: the normal from the body to the support points into the body",
+            "inside of the support",
+        )
+    with caplog.at_level("WARNING", logger="fenics_contact"):
+        scene.problem(coulomb(), bcs, contact={"support": fc.HalfSpace((0, 0), (0, -1))})
+    assert ("points into the body" in caplog.text) == (COMM.rank == 0)
+    caplog.clear()
+    scene.problem(coulomb(), bcs, contact={"support": fc.Ball((0.5, 0.5), 2.0, inside=True)})
+    assert "points into the body" not in caplog.text
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="starts a process of its own")
+@pytest.mark.parametrize("version", ["0.8.0", "0.5.2.dev0"])
+def test_a_release_that_is_too_old(version):
+    """One sentence at import, with what to do."""
+    script = f"import dolfinx; dolfinx.__version__ = {version!r}; import fenics_contact"
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True)
+    last = done.stderr.strip().splitlines()[-1]
+    assert "ImportError: fenics_contact needs DOLFINx 0.9 or later" in last and version in last
+
+
+# ---- the form ------------------------------------------------------------------------------------
+
+
+def with_form(scene: Block, F) -> Callable:
+    return lambda: fc.ContactProblem(
+        F, scene.u, bcs=scene.rollers(), contacts=[scene.contact(coulomb())]
+    )
+
+
+def test_forms_with_wrong_arguments():
+    """F is a residual in u and one test function of u's space; everything else is named."""
+    scene = pressed()
+    space = scene.u.function_space
+    v, du = ufl.TestFunction(space), ufl.TrialFunction(space)
+    dx = ufl.dx(scene.mesh)
+    bilinear = ufl.inner(stress(du, scene.E, scene.nu), strain(v)) * dx
+    energy = ufl.inner(stress(scene.u, scene.E, scene.nu), strain(scene.u)) * dx
+    load = ufl.dot(scene.traction, v) * dx
+    raised_everywhere(with_form(scene, bilinear), ValueError, "F ", "2 arguments")
+    raised_everywhere(with_form(scene, energy), ValueError, "F ", "0 arguments")
+    raised_everywhere(with_form(scene, load), ValueError, "F ", "does not depend on u")
+    raised_everywhere(with_form(scene, 0), ValueError, "F ", "int")
+    raised_everywhere(with_form(scene, ufl.lhs(bilinear) == load), ValueError, "F ")
+    other = ufl.TestFunction(displacement_space(scene.mesh, 2))
+    mixed = ufl.inner(stress(scene.u, scene.E, scene.nu), strain(other)) * dx
+    raised_everywhere(with_form(scene, mixed), ValueError, "TestFunction")
+
+
+def test_form_in_another_function():
+    """F written with a function of the same space that is not u."""
+    scene = pressed()
+    other = fem.Function(scene.u.function_space)
+    raised_everywhere(
+        with_form(scene, ufl.replace(scene.F, {scene.u: other})), ValueError, "depend on u"
+    )
+
+
+def test_condition_on_another_space():
+    """A Dirichlet condition of another, larger space is refused."""
+    scene = pressed()
+    other = displacement_space(scene.mesh, 3)
+    facets = scene.tags.find(TOP)
+    dofs = fem.locate_dofs_topological(other, 1, facets)
+    bc = fem.dirichletbc(np.zeros(2), dofs, other)
+    raised_everywhere(lambda: scene.problem(coulomb(), [bc]), ValueError, "Dirichlet", "space")
+
+
+# ---- the problem ---------------------------------------------------------------------------------
+
+
+def test_two_contacts_of_one_name():
+    """Results are by name, so names are unique."""
+    scene = pressed()
+    contacts = [scene.contact(coulomb(), name="foot") for _ in range(2)]
+    raised_everywhere(
+        lambda: fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=contacts),
+        ValueError,
+        "foot",
+        "name",
+    )
+
+
+def test_unknown_method():
+    """The message lists the methods there are."""
+    scene = pressed()
+    raised_everywhere(
+        lambda: scene.problem(coulomb(), scene.rollers(), method="bfgs"),
+        ValueError,
+        "'bfgs'",
+        "lbfgs",
+        "newton",
+    )
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.1, np.nan, "1"])
+@pytest.mark.parametrize("name", ["alpha", "phi"])
+def test_shares_out_of_range(name, value):
+    """α and φ are shares, 0 to 1 (section 5)."""
+    scene = pressed()
+    raised_everywhere(
+        lambda: scene.problem(coulomb(), scene.rollers(), **{name: value}), ValueError, name
+    )
+
+
+@pytest.mark.parametrize("value", [0, -0.1, np.nan, "20 %", True])
+def test_share_of_the_kinematics_out_of_range(value):
+    """A positive number, infinite included."""
+    scene = pressed()
+    raised_everywhere(
+        lambda: scene.problem(coulomb(), scene.rollers(), kinematics=value),
+        ValueError,
+        "kinematics",
+        "infinite",
+    )
+
+
+def test_increments_out_of_range():
+    """`increments` needs a scalar constant and at least one step."""
+    scene = pressed()
+    problem, _ = scene.problem(coulomb(), scene.rollers())
+    raised_everywhere(
+        lambda: list(fc.increments(problem, scene.traction, 0, 1)), ValueError, "load"
+    )
+    raised_everywhere(
+        lambda: list(fc.increments(problem, scene.E, 1, 2, steps=0)), ValueError, "steps"
+    )

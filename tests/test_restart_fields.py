@@ -1,0 +1,151 @@
+"""Fields of the caller in the file: all kinds of them, and those that are forgotten."""
+
+from __future__ import annotations
+
+import warnings
+
+import basix.ufl
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+from fenics_contact import checkpoint, compat
+from scenes.comparing import close, gathered, owned, raised_everywhere, shared_folder
+from scenes.elasticity import strain
+from scenes.histories import Press, differences
+
+COMM = MPI.COMM_WORLD
+
+pytestmark = pytest.mark.mpi
+
+
+def more_fields(made: Press) -> list[fem.Function]:
+    """Functions of all kinds that can be saved."""
+    mesh, submesh = made.scene.mesh, made.problem.contacts[0].surface.submesh
+    cell = mesh.basix_cell()
+    d = mesh.geometry.dim
+    spaces = {
+        "strain": (mesh, basix.ufl.quadrature_element(cell, value_shape=(d, d), degree=2)),
+        "hardening": (mesh, basix.ufl.quadrature_element(cell, degree=2)),
+        "stress": (
+            mesh,
+            basix.ufl.element("DG", mesh.basix_cell(), 1, shape=(d, d), symmetry=True),
+        ),
+        "temperature": (mesh, basix.ufl.element("Lagrange", cell, 2)),
+        "velocity": (mesh, basix.ufl.element("Lagrange", cell, 3, shape=(d,))),
+        "wear": (submesh, basix.ufl.element("DG", submesh.basix_cell(), 0)),
+    }
+    return [fem.Function(fem.functionspace(m, e), name=n) for n, (m, e) in spaces.items()]
+
+
+def wave(x: np.ndarray, k: float) -> np.ndarray:
+    """Something that is nowhere the same, (n,)."""
+    return np.sin(3.0 * k + x @ np.array([2.3, 5.1, 3.7]))
+
+
+def fill(fields: list[fem.Function], k: float) -> None:
+    """Values that follow from the place, the component, the cell beside and ``k``."""
+    for i, field in enumerate(fields):
+        places = checkpoint._node_places(field.function_space)
+        d = places.shape[1] // 2
+        x = np.zeros((len(places), 3))
+        x[:, :d] = places[:, :d] + 0.1 * places[:, d:]
+        values = checkpoint._rows(field)
+        for j in range(values.shape[1]):
+            values[:, j] = wave(x, k + i + 0.3 * j)
+        field.x.scatter_forward()
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_fields_of_every_kind(cell, tmp_path):
+    """Saved as the loop leaves them and set when the history goes on, ghosts included."""
+    path = shared_folder(tmp_path) / "state.npz"
+    made, after = Press(cell=cell, n=2), Press(cell=cell, n=2)
+    fields = more_fields(made)
+    for step in made.increments(checkpoint=path, fields=fields):
+        fill(fields, step.increment)
+        if step.increment == 3:
+            break
+    fields, expected = more_fields(after), more_fields(after)
+    # The third was left in the middle of the loop: the file has the second.
+    fill(expected, 2)
+    steps = after.increments(checkpoint=path, fields=fields)
+    assert next(steps).increment == 3
+    for field, reference in zip(fields, expected, strict=True):
+        found, wanted = field.x.array, reference.x.array
+        assert close(gathered(COMM, found), gathered(COMM, wanted), 1e-12), field.name
+    other = Press(cell=cell, n=2)
+    fields = more_fields(other)
+    for wrong in (fields[:-1], [], fields[::-1], [*fields, other.plastic]):
+        call = lambda wrong=wrong: next(  # noqa: E731
+            other.increments(checkpoint=path, fields=wrong, changed="continue")
+        )
+        raised_everywhere(call, ValueError, str(path))
+
+
+@pytest.mark.parametrize("bulk", ["linear with plastic", "nonlinear"])
+def test_plastic_strains_go_on(bulk, tmp_path):
+    """A strain that the loop lets grow with the compression: same digits with it in the file."""
+    folder = shared_folder(tmp_path)
+
+    def run(made, path, stop=0):
+        grown = fem.Expression(
+            made.plastic + 0.1 * ufl.tr(strain(made.scene.u)),
+            compat.interpolation_points(made.plastic.function_space.element),
+        )
+        for step in made.increments(2.0, checkpoint=path, fields=[made.plastic]):
+            held = fem.Function(made.plastic.function_space)
+            held.interpolate(grown)
+            made.plastic.x.array[:] = held.x.array
+            if step.increment == stop:
+                break
+
+    whole, broken, after = (Press(bulk=bulk, n=4) for _ in range(3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*taken as small")
+        run(whole, folder / "whole.npz")
+        run(broken, folder / "part.npz", stop=3)
+        run(after, folder / "part.npz")
+    assert np.abs(gathered(COMM, owned(whole.plastic))).max() > 1e-4
+    tolerance = 0.0 if COMM.size == 1 else 1e-7
+    assert differences(after, whole, tolerance) == []
+    assert close(gathered(COMM, owned(after.plastic)), gathered(COMM, owned(whole.plastic)), 1e-7)
+
+
+def test_fields_that_are_forgotten(tmp_path):
+    """Changed by the loop and not in the file: a warning, once; going on is refused."""
+    path = shared_folder(tmp_path) / "state.npz"
+    made = Press(bulk="nonlinear")
+    with pytest.warns(UserWarning, match="plastic in the bulk form") as warned:
+        for step in made.increments(checkpoint=path):
+            made.plastic.x.array[:] = -1e-3 * step.increment
+            if step.increment == 4:
+                break
+    assert len([w for w in warned if "plastic" in str(w.message)]) == 1
+    after = Press(bulk="nonlinear")
+    raised_everywhere(lambda: next(after.increments(checkpoint=path)), ValueError, "bulk")
+
+
+def test_fields_that_cannot_be_saved(tmp_path):
+    """Refused at the call, by name."""
+    path = shared_folder(tmp_path) / "state.npz"
+    made = Press()
+    mesh = made.scene.mesh
+    edges = fem.Function(fem.functionspace(mesh, ("RTCE", 1)), name="edges")
+    mixed = basix.ufl.mixed_element(
+        [basix.ufl.element("Lagrange", mesh.basix_cell(), k) for k in (1, 2)]
+    )
+    mixed = fem.Function(fem.functionspace(mesh, mixed), name="mixed")
+    for field, word in (
+        (edges, "edges"),
+        (mixed, "mixed"),
+        (mixed.sub(0), "fields[0]"),
+        (made.scene.u, "displacement"),
+        (made.scene.E, "Constant"),
+    ):
+        call = lambda field=field: made.increments(checkpoint=path, fields=[field])  # noqa: E731
+        raised_everywhere(call, ValueError, word)
+    raised_everywhere(lambda: made.increments(fields=[made.plastic]), ValueError, "checkpoint")
