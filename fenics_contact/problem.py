@@ -470,6 +470,8 @@ class ContactProblem:
             ahead=ahead, rate=self._rate, cold=self._cold, stiffness_changed=stiffness_changed
         )
         lags = not field and self._may_lag()
+        if lags:
+            self._begin_energy_kept()
         judge = self._judge_kept if lags else self._judge_all
         verdict = judge(kinematics=reason > 0)  # a solver that failed may have no factors for it
         if reason <= 0 or verdict.failures:
@@ -504,11 +506,15 @@ class ContactProblem:
         """Whether u can stay behind: energies and pairs must be found without it. Collective."""
         if not (self.solver.condensed and self.bulk.symmetric):
             return False
-        if self.increment == 0 and not self._committed.any():
-            nothing = Forces.none(np.zeros(1))
-            self._committed_energy.forces.setdefault(self.solver.system.mark, nothing)
-        follows = any(contact.pairs_anew for contact in self.contacts)
-        return self.solver.system.mark in self._committed_energy.forces and not follows
+        if any(contact.pairs_anew for contact in self.contacts):
+            return False
+        at_rest = self.increment == 0 and not self._committed.any()
+        return at_rest or self.solver.system.mark in self._committed_energy.forces
+
+    def _begin_energy_kept(self) -> None:
+        """Have the committed forces in the coordinates of the unknowns kept; at rest are none."""
+        nothing = Forces.none(np.zeros(1))
+        self._committed_energy.forces.setdefault(self.solver.system.mark, nothing)
 
     def complete(self) -> Verdict | None:
         """Bring all of u up to the increment solved last, if it is behind. Collective.

@@ -20,17 +20,21 @@ def run(folder: Path, *options: str, ranks: int = 1) -> dict[str, Any]:
     return run_demo("hertz", folder, *options, ranks=ranks)
 
 
+FIGURES = (
+    "peak_pressure half_width tangential_resultant stick_half_width max_tangential_traction "
+    "top_centre_displacement top_corner_displacement"
+).split()
+
+
 def test_paper_mesh_writes_everything(tmp_path: Path) -> None:
-    """The plain command: both frictions, pictures, ParaView files, the documented keys."""
+    """The plain command: the paper's method, both frictions, pictures, files, documented keys."""
     result = run(tmp_path)
-    keys = (
-        "peak_pressure half_width tangential_resultant stick_half_width max_tangential_traction "
-        "top_centre_displacement top_corner_displacement iterations converged_reasons "
-        "wall_seconds dofs references"
-    ).split()
+    keys = "iterations converged_reasons solve_seconds wall_seconds dofs references".split()
+    keys += FIGURES
     assert [case["friction"] for case in result["runs"]] == [0.0, 0.2]
     for case in result["runs"]:
         assert set(keys) <= set(case)
+        assert (case["solver"], case["methods"]) == ("lbfgs", ["lbfgs"])
         assert all(reason > 0 for reason in case["converged_reasons"])
         assert all(entry["passed"] for entry in case["references"].values())
     for friction in ("0", "0.2"):
@@ -39,6 +43,29 @@ def test_paper_mesh_writes_everything(tmp_path: Path) -> None:
             assert (folder / name).read_bytes()[:4] == b"\x89PNG"
         for name in ("displacement", "stress", "contact"):
             assert (folder / f"{name}.pvd").exists()
+
+
+def test_by_the_own_choice(tmp_path: Path) -> None:
+    """``--solver auto``, both frictions: the same figures, in fewer iterations."""
+    result = run(tmp_path / "auto", "--solver", "auto")
+    paper = run(tmp_path / "lbfgs")
+    for case, same in zip(result["runs"], paper["runs"], strict=True):
+        assert case["solver"] == "auto" and set(case["methods"]) <= {"continuation", "newton"}
+        assert all(entry["passed"] for entry in case["references"].values())
+        assert sum(case["iterations"]) < sum(same["iterations"])
+        for name in FIGURES:
+            assert case[name] == pytest.approx(same[name], rel=1e-6, abs=1e-9), name
+
+
+@pytest.mark.parametrize("solver", ["newton", "continuation", "alternating"])
+def test_other_solvers(tmp_path: Path, solver: str) -> None:
+    """They find the state that the paper's method finds, and are what the result says."""
+    options = ("--friction", "0.2", "--increments", "5")
+    paper = run(tmp_path / "lbfgs", *options)
+    result = run(tmp_path / solver, *options, "--solver", solver)
+    assert (result["solver"], result["methods"]) == (solver, [solver])
+    for name in FIGURES:
+        assert result[name] == pytest.approx(paper[name], rel=1e-6, abs=1e-9), name
 
 
 def test_frictionless_against_exact_contact(tmp_path: Path) -> None:
@@ -95,9 +122,6 @@ def test_ranks_agree(tmp_path: Path, ranks: int) -> None:
     options = ("--h", "0.2", "--degree", "2", "--friction", "0.2", "--increments", "3")
     serial = run(tmp_path / "serial", *options)
     parallel = run(tmp_path / "parallel", *options, ranks=ranks)
-    for name in (
-        "peak_pressure half_width tangential_resultant stick_half_width max_tangential_traction "
-        "top_centre_displacement top_corner_displacement"
-    ).split():
+    for name in FIGURES:
         assert parallel[name] == pytest.approx(serial[name], rel=1e-6, abs=1e-9), name
     assert parallel["dofs"] == serial["dofs"]
