@@ -21,7 +21,8 @@ from functools import partial
 import numpy as np
 from mpi4py import MPI
 
-from benchmarks import costs, problems, timing
+from benchmarks import costs, timing
+from scenes import problems
 
 
 def runs(case: costs.Case, friction: float) -> dict[str, Callable[[], costs.Row]]:

@@ -19,9 +19,11 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from benchmarks import problems, timing
+from benchmarks import timing
 from fenics_contact.surface.surface import PointEvaluator
 from fenics_contact.systems import linear
+from scenes import problems
+from scenes.elasticity import hold
 
 YARDSTICK = "one linear solve"
 PLAIN = {"direct": "plain DOLFINx, LU", "multigrid": "plain DOLFINx, GMRES + GAMG"}
@@ -132,7 +134,7 @@ def linear_solve(body: problems.Body, degree: int, kind: str = "direct") -> Row:
     load.value = body.end
     if body.pressed:
         residual -= body.pressed(ufl.TestFunction(u.function_space), body.ds)
-    bcs += [problems.hold(u, body.tags, i, tag) for tag in body.glued for i in range(len(u))]
+    bcs += [hold(u, body.tags, tag, i) for tag in body.glued for i in range(len(u))]
     bilinear = fem.form(ufl.derivative(residual, u))
     matrix = fem.petsc.assemble_matrix(bilinear, bcs)
     matrix.assemble()

@@ -29,10 +29,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from benchmarks import problems, timing
-from benchmarks.problems import Body
-from fenics_contact.elasticity import LinearElastic
+from benchmarks import timing
 from fenics_contact.surface.surface import PointEvaluator
+from scenes import problems
+from scenes.problems import Body
 
 PENALTIES = (1.0, 10.0, 100.0, 1e3, 1e4, 1e6)
 NITSCHE = {
@@ -107,7 +107,7 @@ def by_nitsche(body: Body, factor: float, share: float) -> Found:
     V = u.function_space
     v = ufl.TestFunction(V)
     gamma = factor * body.E / body.h
-    elastic = LinearElastic(u, body.E, body.nu, body.kind)
+    elastic = body.elastic(u)
     theta = fem.Constant(body.mesh, share)
     surface = fc.ContactSurface(body.mesh, body.tags, body.surface)
     quadrature = surface.quadrature(2)

@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from benchmarks import costs, problems, timing
-from benchmarks.problems import hertz
+from benchmarks import costs, timing
+from scenes import problems
+from scenes.problems import hertz
 
 # The fewest increments whose solution is that of the reference's history.
 MANY = 40

@@ -31,7 +31,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from benchmarks import costs, problems, timing
+from benchmarks import costs, timing
+from scenes import problems
 from scenes.processes import command, environment
 
 COMM = MPI.COMM_WORLD

@@ -23,8 +23,11 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from benchmarks import problems, timing
+from benchmarks import timing
 from demos import ironing
+from scenes import problems
+from scenes.elasticity import displacement_space, hold
+from scenes.tags import plane, sides
 
 METHODS = ("lbfgs", "newton", "continuation", "alternating")
 STIFFNESSES = (10.0, 1000.0)
@@ -47,19 +50,13 @@ def half_cylinder(method: str, stiffness: float) -> Loading:
 def dragged_cylinder(method: str, stiffness: float) -> Loading:
     """The ironing demo's scene; the cylinder is moved down by what its force made of it there."""
     mesh, tags = ironing.make_mesh(6)
-    V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
-    u, v = fem.Function(V), ufl.TestFunction(V)
+    u = fem.Function(displacement_space(mesh, 2))
     body = fc.elasticity.LinearElastic(u, ironing.E, ironing.NU, "plane strain")
-    held = fem.locate_dofs_topological(V, 1, tags.find(ironing.BOTTOM))
-    bcs = [fem.dirichletbc(np.zeros(2), held, V)]
     move = fem.Constant(mesh, np.zeros(2))
     cylinder = fc.Cylinder((-1.0, ironing.R), ironing.R, displacement=move)
     k = fc.Scaled(stiffness)
-    surface = fc.ContactSurface(mesh, tags, ironing.TOP)
-    contact = fc.Contact(u, surface, cylinder, fc.Coulomb(ironing.MU, k, k))
-    problem = fc.ContactProblem(
-        body.residual(v), u, bcs=bcs, contacts=[contact], method=method, fallback=False
-    )
+    law = fc.Coulomb(ironing.MU, k, k)
+    problem = dragged(body, tags, (ironing.BOTTOM, ironing.TOP), cylinder, law, method)
 
     def load(t: float) -> None:
         move.value[:] = 2.0 * max(t - 0.2, 0.0), -0.0143 * min(5 * t, 1.0)
@@ -72,25 +69,34 @@ def dragged_ball(method: str, stiffness: float) -> Loading:
     mesh = dolfinx.mesh.create_box(
         MPI.COMM_WORLD, [[-1, -1, -1], [1, 1, 0]], (16, 16, 8), dolfinx.mesh.CellType.hexahedron
     )
-    ends = {1: lambda x: np.isclose(x[2], -1), 2: lambda x: np.isclose(x[2], 0)}
-    tags = problems.sides(mesh, ends)
-    V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
-    u, v = fem.Function(V), ufl.TestFunction(V)
+    u = fem.Function(displacement_space(mesh, 1))
     body = fc.elasticity.LinearElastic(u, 1000.0, 0.3, "3D")
-    held = fem.locate_dofs_topological(V, 2, tags.find(1))
-    bcs = [fem.dirichletbc(np.zeros(3), held, V)]
     move = fem.Constant(mesh, np.zeros(3))
-    k = fc.Scaled(stiffness)
     ball = fc.Ball((0, 0, 2.0), 2.0, displacement=move)
-    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, 2), ball, fc.Coulomb(0.3, k, k))
-    problem = fc.ContactProblem(
-        body.residual(v), u, bcs=bcs, contacts=[contact], method=method, fallback=False
-    )
+    k = fc.Scaled(stiffness)
+    tags = sides(mesh, {1: plane(2, -1), 2: plane(2, 0)})
+    problem = dragged(body, tags, (1, 2), ball, fc.Coulomb(0.3, k, k), method)
 
     def load(t: float) -> None:
         move.value[:] = 0.2 * max(t - 0.2, 0.0), 0.0, -0.05 * min(5 * t, 1.0)
 
     return problem, load, 5
+
+
+def dragged(
+    body: fc.elasticity.LinearElastic,
+    tags: dolfinx.mesh.MeshTags,
+    ends: tuple[int, int],
+    support: fc.Support,
+    law: fc.Coulomb,
+    method: str,
+) -> fc.ContactProblem:
+    """A body clamped at one end, its other one touched by a support."""
+    u, (held, touched) = body.u, ends
+    bcs = [hold(u, tags, held, i) for i in range(len(u))]
+    contact = fc.Contact(u, fc.ContactSurface(u.function_space.mesh, tags, touched), support, law)
+    F = body.residual(ufl.TestFunction(u.function_space))
+    return fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method=method, fallback=False)
 
 
 SCENES = {

@@ -21,7 +21,8 @@ import numpy as np
 from mpi4py import MPI
 
 import fenics_contact as fc
-from benchmarks import problems, timing
+from benchmarks import timing
+from scenes import problems
 
 ENFORCEMENTS: dict[str, tuple[float, str]] = {
     "penalty 10": (10.0, "penalty"),

@@ -29,7 +29,7 @@ from benchmarks import targets, timing
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
-HELPERS = ("__init__", "run", "timing", "costs", "problems", "targets")
+HELPERS = ("__init__", "run", "timing", "costs", "targets")
 # Long, and with pages of their own in docs/.
 BY_NAME_ONLY = ("methods", "trade")
 STAMP = "stamp.json"

@@ -35,20 +35,20 @@ from tqdm import tqdm
 
 import fenics_contact as fc
 from benchmarks import costs, timing
-from benchmarks.problems import (
+from fenics_contact import plotting
+from fenics_contact.contact.accuracy import PRESETS
+from scenes import problems
+from scenes.problems import (
     Body,
     ball_on_half_space,
     greco,
     greco_block,
     half_cylinder,
     hertz,
-    parts,
     rings,
     shrink_fit,
     sphere,
 )
-from fenics_contact import plotting
-from fenics_contact.contact.accuracy import PRESETS
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
@@ -289,7 +289,7 @@ def sweep(one: Scene, short: bool) -> list[Setting]:
 
 def solve(body: Body, setting: Setting, limit: float = LIMIT) -> Row:
     """Make the contact problem and lead the load to its end: what its row has, but the time."""
-    u, residual, load, bcs = parts(body, setting.degree)
+    made = problems.parts(body, setting.degree)
     rule: dict[str, Any] = {}
     if setting.quadrature == "vertex":
         rule["quadrature_scheme"] = "vertex"
@@ -311,21 +311,16 @@ def solve(body: Body, setting: Setting, limit: float = LIMIT) -> Row:
         law = fc.Coulomb(body.friction, **stiffness)
     else:
         law = fc.Frictionless(**stiffness)
-    row: Row = {"dofs": len(u) * u.function_space.dofmap.index_map.size_global}
+    row: Row = {"dofs": problems.count(made[0].function_space)}
     steps: list[fc.Step] = []
     try:
-        contact = fc.Contact(
-            u,
-            fc.ContactSurface(body.mesh, body.tags, body.surface, **rule),
-            law=law,
-            **choices,
-            **body.contact(load),
-        )
-        problem = fc.ContactProblem(
-            residual,
-            u,
-            bcs=bcs,
-            contacts=[contact],
+        problem, contact, u, load = problems.problem(
+            body,
+            setting.degree,
+            law,
+            made=made,
+            choices=choices,
+            rule=rule,
             method=None if setting.solver == "default" else setting.solver,
             petsc_options=options,
         )

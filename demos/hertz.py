@@ -212,7 +212,7 @@ def solve(arguments: argparse.Namespace, friction: float) -> tuple[Scene, dict[s
     }
     if arguments.errors:
         budget = fc.estimate_errors(
-            scene.problem, scene.stress, increments=made[-1].increment_error
+            scene.problem, scene.stress, increment_error=made[-1].increment_error
         )
         result["errors"] = budget.numbers()
     return scene, result

@@ -131,8 +131,3 @@ def gmsh_data(model: Any, comm: Any, rank: int, gdim: int) -> tuple[dolfinx.mesh
     if isinstance(data, tuple):  # a named one from 0.10 on, which has more behind these
         return data[0], data[1], data[2]
     return data.mesh, data.cell_tags, data.facet_tags
-
-
-def model_to_mesh(model: Any, comm: Any, rank: int, gdim: int) -> tuple[Any, Any]:
-    """Mesh and facet tags of `gmsh_data`. Collective."""
-    return gmsh_data(model, comm, rank, gdim)[::2]

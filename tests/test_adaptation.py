@@ -15,43 +15,9 @@ from scenes.blocks import BOTTOM as INSIDE
 from scenes.blocks import TOP as OUTSIDE
 from scenes.blocks import block_mesh, side_tags
 from scenes.comparing import raised_everywhere
+from scenes.indented import AXIS, BASE, TOP, half_block, press
 
 COMM = MPI.COMM_WORLD
-BASE, TOP, AXIS = 1, 2, 3
-K = 1e5
-
-
-def half_block(n: int):
-    """[0, 1] x [-1, 0] in triangles, with tags."""
-    mesh = dolfinx.mesh.create_rectangle(COMM, [(0, -1), (1, 0)], (n, n), ghost_mode=GhostMode.none)
-    sides = ((BASE, 1, -1), (TOP, 1, 0), (AXIS, 0, 0))
-    found = [
-        dolfinx.mesh.locate_entities_boundary(mesh, 1, lambda x, i=i, at=at: np.isclose(x[i], at))
-        for _, i, at in sides
-    ]
-    facets = np.concatenate(found)
-    values = np.concatenate(
-        [np.full(f.size, t, dtype=np.int32) for f, (t, *_) in zip(found, sides, strict=True)]
-    )
-    order = np.argsort(facets)
-    return mesh, dolfinx.mesh.meshtags(mesh, 1, facets[order], values[order])
-
-
-def pressed(mesh, tags, friction=0.0):
-    """A rigid cylinder pressed 0.01 into the block, R = 4."""
-    V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
-    u, v = fem.Function(V), ufl.TestFunction(V)
-    body = LinearElastic(u, 1000.0, 0.3, "plane strain")
-    base = fem.locate_dofs_topological(V, 1, tags.find(BASE))
-    axis = fem.locate_dofs_topological(V.sub(0), 1, tags.find(AXIS))
-    bcs = [fem.dirichletbc(np.zeros(2), base, V), fem.dirichletbc(0.0, axis, V.sub(0))]
-    down = fem.Constant(mesh, 0.0)
-    cylinder = fc.Cylinder((0.0, 4.0), 4.0, displacement=ufl.as_vector([0, down]))
-    law = fc.Coulomb(friction, K, K) if friction else fc.Frictionless(K)
-    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, TOP), cylinder, law)
-    problem = fc.ContactProblem(body.residual(v), u, bcs=bcs, contacts=[contact], method="newton")
-    list(fc.increments(problem, down, 0.0, -0.01, steps=2 if friction else 1))
-    return problem, body.stress, body.strain(u)
 
 
 def slope(levels: list[fc.Level]) -> float:
@@ -68,8 +34,8 @@ def test_error_over_dofs():
     uniform mesh of 128 x 128 squares (3.494689, made once): within three times the estimate, with a
     seventh of the dofs of the uniform mesh that is as good.
     """
-    adapted = list(fc.adapt(*half_block(4), pressed, levels=9))
-    uniform = list(fc.adapt(*half_block(4), pressed, levels=4, share=1.0))
+    adapted = list(fc.adapt(*half_block(4), press, levels=9))
+    uniform = list(fc.adapt(*half_block(4), press, levels=4, share=1.0))
     assert slope(adapted[1:]) == pytest.approx(-1.0, abs=0.15)
     assert slope(uniform) > -0.78
     as_good = next(a for a in adapted if a.budget.energy <= uniform[-1].budget.energy)
@@ -81,7 +47,7 @@ def test_error_over_dofs():
 
 def test_tags_and_history():
     """Tags are handed down, lengths kept to round-off; friction goes through all increments."""
-    levels = list(fc.adapt(*half_block(4), lambda m, t: pressed(m, t, 0.3), levels=3))
+    levels = list(fc.adapt(*half_block(4), lambda m, t: press(m, t, 0.3, 2), levels=3))
     for level in levels:
         ds = ufl.Measure("ds", domain=level.mesh, subdomain_data=level.facet_tags)
         one = fem.Constant(level.mesh, 1.0)
@@ -130,10 +96,10 @@ def test_curved_sides():
 def test_input():
     """Cells that cannot be split, and numbers without sense, on all ranks."""
     mesh, tags = block_mesh("quadrilateral")
-    raised_everywhere(lambda: list(fc.adapt(mesh, tags, pressed)), ValueError, "quadrilateral")
+    raised_everywhere(lambda: list(fc.adapt(mesh, tags, press)), ValueError, "quadrilateral")
     mesh, tags = half_block(2)
-    raised_everywhere(lambda: list(fc.adapt(mesh, tags, pressed, share=0.0)), ValueError, "share")
-    raised_everywhere(lambda: list(fc.adapt(mesh, tags, pressed, levels=0)), ValueError, "levels")
+    raised_everywhere(lambda: list(fc.adapt(mesh, tags, press, share=0.0)), ValueError, "share")
+    raised_everywhere(lambda: list(fc.adapt(mesh, tags, press, levels=0)), ValueError, "levels")
     mesh, tags = block_mesh("triangle", ghost_mode=GhostMode.shared_facet)
     if COMM.size > 1:
-        raised_everywhere(lambda: list(fc.adapt(mesh, tags, pressed)), ValueError, "GhostMode.none")
+        raised_everywhere(lambda: list(fc.adapt(mesh, tags, press)), ValueError, "GhostMode.none")

@@ -11,10 +11,9 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from demos import hertz
-from fenics_contact import checkpoint, output
+from fenics_contact import checkpoint
 from fenics_contact.methods import solver as module
-from scenes import two_blocks
+from scenes import problems, two_blocks
 from scenes.blocks import GRID, TOP, Block, block, wave
 from scenes.comparing import at_points, close, gathered, raised_everywhere, shared_folder
 
@@ -156,27 +155,13 @@ def test_half_cylinder() -> None:
     u_y by the penalty at 1e6 E/h on the same mesh, which leaves nothing to its springs either, to
     5e-5, where that at 10 E/h is off by 1e-3. One and a half times the iterations of that.
     """
-    mesh, tags = hertz.make_mesh(0.1, 1.3 * hertz.hertz(30.0)[0], 0.1, 0.5)
-    V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
-    axis = fem.locate_dofs_topological(V.sub(0), 1, tags.find(hertz.AXIS))
-    ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
+    body = problems.half_cylinder(0.0, 0.1, grading=0.1, coarsest=0.5)
     found = []
     for k, options in ((10.0, {}), (10.0, AUGMENTED), (1e6, {})):
-        u, v = fem.Function(V), ufl.TestFunction(V)
-        body = fc.elasticity.LinearElastic(u, hertz.E, hertz.NU, "plane strain")
-        F = body.residual(v) + 30.0 * v[1] * ds(hertz.TOP)
-        contact = fc.Contact(
-            u,
-            fc.ContactSurface(mesh, tags, hertz.CONTACT),
-            fc.HalfSpace((0, 0), (0, 1)),
-            fc.Frictionless(fc.Scaled(k)),
-            **options,
-        )
-        bcs = [fem.dirichletbc(0.0, axis, V.sub(0))]
-        problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
+        problem, _, u, load = problems.problem(body, 2, k, choices=options)
+        load.value = body.end
         step = problem.solve()
-        top = output.at_node(u, (0.0, hertz.R))[1]
-        found.append((top, step.contacts["contact"].max_pressure, step.iterations))
+        found.append((body.displacement(u), step.contacts["contact"].max_pressure, step.iterations))
     penalty, augmented, rigid = found
     assert augmented[0] == pytest.approx(-0.5181, abs=1e-4)
     assert augmented[1] == pytest.approx(142.6, abs=0.1)

@@ -11,7 +11,6 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact import compat
 from scenes.blocks import CELLS
 from scenes.elasticity import residual
 from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, E, pressed, two_blocks
@@ -183,7 +182,7 @@ def rings(h: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
             gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
             gmsh.model.mesh.generate(2)
             gmsh.model.mesh.setOrder(2)
-        return compat.model_to_mesh(gmsh.model, COMM, 0, 2)
+        return fc.model_to_mesh(gmsh.model, COMM, gdim=2)[::2]
     finally:
         gmsh.finalize()
 

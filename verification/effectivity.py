@@ -23,6 +23,8 @@ from typing import Any
 import fenics_contact as fc
 from demos import hertz
 from fenics_contact.estimates.errors import quantities
+from scenes import problems
+from scenes.elasticity import stress
 from scenes.processes import ROOT
 from verification import half_planes
 from verification.cases import Case, Outcome
@@ -65,17 +67,17 @@ def half_cylinder(
     rtol: float = 1e-9,
 ) -> tuple[dict[str, float], fc.ErrorBudget]:
     """Quantities and error budget; stiffness ``factor`` E/h with h = 0.21 whatever the mesh."""
-    stiffness = factor * hertz.E / 0.21
-    options = argparse.Namespace(
-        h=h, degree=degree, k_n=stiffness, k_t=stiffness, solver="lbfgs", accuracy=None
+    body = problems.half_cylinder(friction, h)
+    k = factor * body.E / 0.21
+    law = fc.Coulomb(friction, k, k) if friction else fc.Frictionless(k)
+    problem, _, u, load = problems.problem(
+        body, degree, law, method="lbfgs", petsc_options={"snes_rtol": rtol}
     )
-    scene = hertz.build(options, friction, h, hertz.PAPER_LOAD, snes_rtol=rtol)
-    history = fc.increments(
-        scene.problem, scene.pressure, 0.0, hertz.PAPER_LOAD, steps=steps, estimate=True
+    *_, last = fc.increments(problem, load, 0.0, body.end, steps=steps, estimate=True)
+    budget = fc.estimate_errors(
+        problem, stress(u, body.E, body.nu), increment_error=last.increment_error
     )
-    last = list(history)[-1]
-    budget = fc.estimate_errors(scene.problem, scene.stress, increment_error=last.increment_error)
-    return quantities(scene.problem), budget
+    return quantities(problem), budget
 
 
 def part(

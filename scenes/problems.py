@@ -1,4 +1,4 @@
-"""What the benchmarks solve: bodies, what they touch and how they are loaded.
+"""Bodies, what they touch and how they are loaded: the demos' and two that only benchmarks have.
 
 A `Body` says it all apart from how it is solved: `parts` makes its displacement, residual and
 conditions, `contact` and `problem` what this package needs of it, `penalty` the boundary form that
@@ -25,9 +25,10 @@ from demos import greco_block as greco
 from demos import hertz, shrink_fit, sphere
 from fenics_contact import output
 from fenics_contact.elasticity import LinearElastic
+from scenes.elasticity import displacement_space, hold
+from scenes.tags import plane, sides
 
 Parts = tuple[fem.Function, ufl.Form, fem.Constant, list[fem.DirichletBC]]
-Sides = Mapping[int, Callable[[np.ndarray], np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -80,25 +81,22 @@ class Body:
         """Measure of the boundary, by tag."""
         return ufl.Measure("ds", domain=self.mesh, subdomain_data=self.tags)
 
+    def elastic(self, u: fem.Function) -> LinearElastic:
+        """Its elasticity, for a displacement."""
+        return LinearElastic(u, self.E, self.nu, self.kind)
+
 
 # ---- what is made of a body ----------------------------------------------------------------------
 
 
 def parts(body: Body, degree: int) -> Parts:
     """Displacement, residual without contact, load parameter (0), Dirichlet conditions."""
-    V = fem.functionspace(body.mesh, ("Lagrange", degree, (body.mesh.geometry.dim,)))
-    u, v = fem.Function(V), ufl.TestFunction(V)
+    space = displacement_space(body.mesh, degree)
+    u, v = fem.Function(space), ufl.TestFunction(space)
     load = fem.Constant(body.mesh, PETSc.ScalarType(0.0))
-    residual = LinearElastic(u, body.E, body.nu, body.kind).residual(v)
+    residual = body.elastic(u).residual(v)
     residual -= body.work(v, load, body.ds)
-    return u, residual, load, [hold(u, body.tags, i, tag) for i, tag in body.held]
-
-
-def hold(u: fem.Function, tags: dolfinx.mesh.MeshTags, component: int, tag: int) -> fem.DirichletBC:
-    """No displacement of one component on a side."""
-    part = u.function_space.sub(component)
-    dofs = fem.locate_dofs_topological(part, tags.dim, tags.find(tag))
-    return fem.dirichletbc(PETSc.ScalarType(0.0), dofs, part)
+    return u, residual, load, [hold(u, body.tags, tag, i) for i, tag in body.held]
 
 
 def law(body: Body, stiffness: float) -> fc.Coulomb | fc.Frictionless:
@@ -110,8 +108,9 @@ def law(body: Body, stiffness: float) -> fc.Coulomb | fc.Frictionless:
 def problem(
     body: Body,
     degree: int,
-    stiffness: float,
+    stiffness: float | fc.Law,
     *,
+    made: Parts | None = None,
     choices: Mapping[str, Any] | None = None,
     rule: Mapping[str, Any] | None = None,
     **options: Any,
@@ -121,18 +120,18 @@ def problem(
     Args:
         body: The body.
         degree: Of the displacement.
-        stiffness: k_n and k_t in units of E/h.
+        stiffness: k_n and k_t in units of E/h, or the law.
+        made: What `parts` made of it, if it is there.
         choices: More arguments of `fc.Contact`.
         rule: Of `fc.ContactSurface`.
         **options: Of `fc.ContactProblem`.
     """
-    u, residual, load, bcs = parts(body, degree)
+    u, residual, load, bcs = made or parts(body, degree)
     surface = fc.ContactSurface(body.mesh, body.tags, body.surface, **(rule or {}))
-    contact = fc.Contact(
-        u, surface, law=law(body, stiffness), **(choices or {}), **body.contact(load)
-    )
-    made = fc.ContactProblem(residual, u, bcs=bcs, contacts=[contact], **options)
-    return made, contact, u, load
+    given = stiffness if isinstance(stiffness, fc.Law) else law(body, stiffness)
+    contact = fc.Contact(u, surface, law=given, **(choices or {}), **body.contact(load))
+    problem = fc.ContactProblem(residual, u, bcs=bcs, contacts=[contact], **options)
+    return problem, contact, u, load
 
 
 def penalty(body: Body, u: fem.Function, load: Any, stiffness: float) -> tuple[Any, Any]:
@@ -157,18 +156,6 @@ def penalty(body: Body, u: fem.Function, load: Any, stiffness: float) -> tuple[A
     return pressure, -pressure * n + ufl.conditional(ufl.lt(size, limit), 1.0, limit / size) * trial
 
 
-def sides(mesh: dolfinx.mesh.Mesh, where: Sides) -> dolfinx.mesh.MeshTags:
-    """Tags of the facets of the boundary whose nodes lie where it is said. Collective."""
-    dim = mesh.topology.dim - 1
-    mesh.topology.create_entities(dim)
-    found = {t: dolfinx.mesh.locate_entities_boundary(mesh, dim, at) for t, at in where.items()}
-    facets = np.concatenate(list(found.values()))
-    values = np.repeat(np.array(list(found), dtype=np.int32), [len(f) for f in found.values()])
-    # A facet of several sides has the tag of the last.
-    facets, first = np.unique(facets[::-1], return_index=True)
-    return dolfinx.mesh.meshtags(mesh, dim, facets, values[::-1][first])
-
-
 def count(space: fem.FunctionSpace) -> int:
     """Number of unknowns."""
     return int(space.dofmap.index_map.size_global * space.dofmap.bs)
@@ -185,15 +172,15 @@ def count_on(space: fem.FunctionSpace, facets: np.ndarray) -> int:
 
 
 @cache
-def half_cylinder(friction: float, h: float, *, smooth: bool = False) -> Body:
+def half_cylinder(friction: float, h: float, *, smooth: bool = False, **growth: float) -> Body:
     """The demo's half-cylinder on a plane; ``smooth``: cells away from Γc shrink with those on it.
 
-    Smooth meshes have an error below 1e-6 in the displacement of the top at h = 0.02.
+    Smooth meshes have an error below 1e-6 in the displacement of the top at h = 0.02. By ``growth``
+    cells away from Γc are as the demo's mesh is told.
     """
-    growth = {"grading": min(0.3, 2.5 * h), "coarsest": min(hertz.R / 4, 12.5 * h)}
-    mesh, tags = hertz.make_mesh(
-        h, 1.3 * hertz.hertz(hertz.PAPER_LOAD)[0], **(growth if smooth else {})
-    )
+    if smooth:
+        growth = {"grading": min(0.3, 2.5 * h), "coarsest": min(hertz.R / 4, 12.5 * h)}
+    mesh, tags = hertz.make_mesh(h, 1.3 * hertz.hertz(hertz.PAPER_LOAD)[0], **growth)
     return Body(
         mesh=mesh,
         tags=tags,
@@ -322,14 +309,11 @@ def ball_on_block(cells: int, friction: float = 0.3) -> Body:
     x[:] = np.interp(x, np.linspace(0, 1, cells + 1), graded(cells))
     x[:, 2] *= -1
     where: dict[int, Any] = {
-        tag: lambda x, i=i, at=at: np.isclose(x[i], at)
-        for tag, i, at in (
-            (AT_X, 0, 0.0),
-            (AT_Y, 1, 0.0),
-            (AT_Z, 2, -1.0),
-            (FAR_X, 0, 1.0),
-            (FAR_Y, 1, 1.0),
-        )
+        AT_X: plane(0, 0.0),
+        AT_Y: plane(1, 0.0),
+        AT_Z: plane(2, -1.0),
+        FAR_X: plane(0, 1.0),
+        FAR_Y: plane(1, 1.0),
     }
     where[TOUCHING] = lambda x: np.isclose(x[2], 0) & (np.max(x[:2], axis=0) < WIDTH + 1e-9)
     far = [(i, tag) for tag in (AT_Z, FAR_X, FAR_Y) for i in range(3)]
