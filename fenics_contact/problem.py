@@ -277,7 +277,11 @@ class ContactProblem:
 
     @property
     def snes(self) -> PETSc.SNES:
-        """The main PETSc solver."""
+        """The main PETSc solver.
+
+        `expect`, and with it `increments`, may make it anew before the first solution: monitors
+        that were set on it are kept; anything else is better said by options.
+        """
         return self.solver.snes
 
     @property

@@ -293,3 +293,27 @@ def test_memory_of_factors(cell, n, symmetric):
     taken = 1e6 * pc.getFactorMatrix().getMumpsInfog(22)
     estimate = linear.factor_bytes(problem.unknowns.n_local, scene.dim, symmetric=symmetric)
     assert taken / 1.5 < estimate < 1.5 * taken
+
+
+@pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="condensation takes one rank")
+def test_monitors_outlive_the_choice_of_the_solver(monkeypatch):
+    """`increments` may make SNES anew: what watches it is called all the same, as it was set."""
+    scene = block("hexahedron", n=2, up=-1.0)
+    problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
+    monkeypatch.setattr(linear, "_MANY", 0)
+    monkeypatch.setattr(linear, "_MANY_PER_INCREMENT", problem.unknowns.n_local / 2.5)
+    before, seen = problem.snes, []
+
+    def watch(snes, iteration, norm, name, *, unit):
+        seen.append((iteration, norm, name, unit))
+
+    def count(snes, iteration, norm):
+        seen.append((iteration, norm, "count", 1))
+
+    before.setMonitor(watch, ("a name",), {"unit": 2.0})
+    before.setMonitor(count)
+    (step,) = fc.increments(problem, lambda share: None, steps=1)
+    assert problem.snes is not before and not problem.solver.condensed
+    for name, unit in (("a name", 2.0), ("count", 1)):
+        iterations = [it for it, norm, n, u in seen if (n, u) == (name, unit)]
+        assert len(iterations) > step.iterations > 0  # and where a round begins

@@ -18,7 +18,8 @@ import ufl
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.comparing import close, raised_everywhere, shared_folder
+from fenics_contact import checkpoint
+from scenes.comparing import at_points, close, raised_everywhere, shared_folder
 from scenes.elasticity import strain
 from scenes.histories import Press, Ramp, differences, goes_on
 from scenes.processes import command, environment
@@ -269,3 +270,37 @@ def test_a_loop_that_was_left_goes_on(tmp_path):
     assert [s.load for s in rest] == [1.25, 1.5, 2.0]
     list(whole.increments(2.0, steps=[0.5, 1.0, 1.25, 1.5, 2.0]))
     assert differences(made, whole, 1e-7) == []
+
+
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+@pytest.mark.parametrize("support", ["rigid", "body", "body, pairs found anew"])
+def test_results_of_a_finished_history(support, enforcement, tmp_path):
+    """Counts of open, sticking and slipping points are those of the last increment.
+
+    At its end they all stick: to be told how they came there takes what was evaluated before the
+    commit. By the same call of `increments`, and by `checkpoint.load`.
+    """
+
+    def make():
+        given = {"contact": {"enforcement": enforcement}}
+        if support == "rigid":
+            return Press(**given)
+        return Ramp(update="increment" if "anew" in support else "never", **given)
+
+    path = shared_folder(tmp_path) / "state.npz"
+    one, called, loaded = make(), make(), make()
+    *_, step = one.increments(2.0, checkpoint=path)
+    assert not list(called.increments(2.0, checkpoint=path))
+    loaded.load(2.0)
+    checkpoint.load(loaded.problem, path)
+    (last,) = step.contacts.values()
+    assert last.slip > 0
+    tolerance = 0.0 if COMM.size == 1 else 1e-12
+    slid = at_points(one.contacts[0], one.contacts[0].slip_increment)
+    for made in (one, called, loaded):
+        (contact,) = made.contacts
+        found = contact.resultants()
+        assert (found.open, found.stick, found.slip) == (last.open, last.stick, last.slip)
+        for name in ("force", "normal_force", "tangential_force", "area", "max_pressure"):
+            assert close(getattr(found, name), getattr(last, name), tolerance), name
+        assert close(at_points(contact, contact.slip_increment), slid, tolerance)

@@ -235,11 +235,17 @@ class Solver:
         equations.rtol = snes.getTolerances()[0]
 
     def expect(self, increments: int) -> None:
-        """Choose for a number of increments, before the first is solved. Collective."""
+        """Choose for a number of increments, before the first is solved. Collective.
+
+        SNES may be made anew, with the monitors that the one before had got.
+        """
         if self.expected != increments:
             self.expected = increments
             if self._choose_condensation() != self.condensed:
+                monitors = self.snes.getMonitor() or ()
                 self._configure()
+                for monitor, arguments, keywords in monitors:
+                    self.snes.setMonitor(monitor, arguments, keywords)
 
     def _choose_condensation(self) -> bool:
         """Whether to iterate on the unknowns that contact touches alone. Collective."""
