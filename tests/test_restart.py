@@ -296,9 +296,10 @@ def test_results_of_a_finished_history(support, enforcement, tmp_path):
     (last,) = step.contacts.values()
     assert last.slip > 0
     tolerance = 0.0 if COMM.size == 1 else 1e-12
-    slid = at_points(one.contacts[0], one.contacts[0].slip_increment)
+    (first,) = one.problem.contacts
+    slid = at_points(first, first.slip_increment)
     for made in (one, called, loaded):
-        (contact,) = made.contacts
+        (contact,) = made.problem.contacts
         found = contact.resultants()
         assert (found.open, found.stick, found.slip) == (last.open, last.stick, last.slip)
         for name in ("force", "normal_force", "tangential_force", "area", "max_pressure"):
