@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from fenics_contact.methods.callbacks import Callbacks
 from fenics_contact.methods.equations import Equations
+from fenics_contact.methods.method import InnerSnes
 from fenics_contact.methods.options import Defaults
 from fenics_contact.types import Array
 
@@ -78,37 +78,30 @@ class Alternation:
             solver: Options of the linear solver; none: it is that of H₀.
         """
         self._equations = equations
-        self._function: PETSc.Vec | None = None
-        self._shares_solver = not solver
-        comm = equations.full.unknowns.comm
-        self.snes = defaults.make_snes(comm, prefix, "alternating_", OPTIONS | solver)
-        self._finish = defaults.make_snes(comm, prefix, "finishing_", _FINISH | solver)
-        self._callbacks = Callbacks(comm)
+        self._search = InnerSnes(
+            equations, defaults, (prefix, "alternating_"), OPTIONS, solver, consistent=False
+        )
+        self._finish = InnerSnes(
+            equations, defaults, (prefix, "finishing_"), _FINISH, solver, consistent=False
+        )
+        self.snes = self._search.snes
         self._goal = 0.0
         # Potential at the state asked for last, and where it was last found to have fallen.
         self._energy = self._reached = np.inf
 
     def _attach(self) -> None:
-        """Take the vectors, matrices and solver of H₀ of the present system."""
-        equations = self._equations
-        new = self._function is not equations.function
-        self._function = equations.function
+        """Let both take the present system."""
         this: Alternation = weakref.proxy(self)
-        for snes in (self.snes, self._finish):
-            if new:
-                snes.reset()
-            if self._shares_solver:
-                snes.setKSP(equations.solvers[False])
-            self._callbacks.attach(
-                snes,
-                lambda x, f: this._compute_residual(x, f),
-                self._function,
-                lambda x, J: this._assemble(x, J),
-                equations.matrix(False),
-                (lambda: this._falls()) if snes is self.snes else (lambda: this._test()),
-            )
-        if equations.full.bulk.linear:
-            self._callbacks.set_objective(self.snes, lambda x: this._compute_energy(x))
+
+        def assemble(x: PETSc.Vec, matrix: PETSc.Mat) -> None:
+            this._assemble(x, matrix)
+
+        def energy(x: PETSc.Vec) -> float:
+            return this._compute_energy(x)
+
+        linear = self._equations.full.bulk.linear
+        self._search.attach(assemble, lambda: this._falls(), energy if linear else None)
+        self._finish.attach(assemble, lambda: this._test())
 
     def solve(self) -> tuple[int, int]:
         """Solve; see `Method`. Iterations are Newton's, in all."""
@@ -169,16 +162,12 @@ class Alternation:
 
     def _minimise(self) -> int:
         """Newton's method with the line search on the energy, then without any."""
-        solution = self._equations.solution
         self._energy = self._reached = np.inf
-        made, reason = self._callbacks.solve(self.snes, solution)
+        made, reason = self._search.solve()
         if reason <= 0:
             # The last digits of the residual are below the rounding of the energy.
-            made += self._callbacks.solve(self._finish, solution)[0]
+            made += self._finish.solve()[0]
         return made
-
-    def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        self._equations.residual(x, f)
 
     def _test(self) -> int:
         reasons, equations = PETSc.SNES.ConvergedReason, self._equations

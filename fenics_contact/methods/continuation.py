@@ -17,9 +17,8 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact import compat
-from fenics_contact.methods.callbacks import Callbacks
 from fenics_contact.methods.equations import Equations
-from fenics_contact.methods.method import Method
+from fenics_contact.methods.method import InnerSnes, Method
 from fenics_contact.methods.options import Defaults
 
 __all__ = ["OPTIONS", "Continuation"]
@@ -71,35 +70,19 @@ class Continuation:
             solver: Options of the linear solver; none: it is that of the consistent tangent.
         """
         self._equations, self._otherwise = equations, otherwise
-        self._function: PETSc.Vec | None = None
-        comm = equations.full.unknowns.comm
-        self.snes = defaults.make_snes(comm, prefix, "continuation_", OPTIONS | solver)
-        self._shares_solver = not solver
-        self._callbacks = Callbacks(comm)
-        self._coarse = 0.0
-
-    def _attach(self) -> None:
-        """Take the vectors, matrices and solver of the present system."""
-        equations, snes = self._equations, self.snes
-        if self._function is not equations.function:
-            snes.reset()
-        self._function = equations.function
-        if self._shares_solver:
-            snes.setKSP(equations.solvers[True])
-        this: Continuation = weakref.proxy(self)
-        self._callbacks.attach(
-            snes,
-            lambda x, f: this._compute_residual(x, f),
-            self._function,
-            lambda x, J: this._equations.assemble_tangent(x, J),
-            equations.matrix(True),
-            lambda: this._test(),
+        self._newton = InnerSnes(
+            equations, defaults, (prefix, "continuation_"), OPTIONS, solver, consistent=True
         )
+        self.snes = self._newton.snes
+        self._coarse = 0.0
 
     def solve(self) -> tuple[int, int]:
         """Solve; see `Method`. Iterations are Newton's, in all."""
         equations = self._equations
-        self._attach()
+        this: Continuation = weakref.proxy(self)
+        self._newton.attach(
+            lambda x, J: this._equations.assemble_tangent(x, J), lambda: this._test()
+        )
         share = min(1.0, 1.0 / max(equations.hardness(), 1.0))
         iterations, solved, factor, kept = 0, 0.0, _FACTOR, equations.solution.copy()
         try:
@@ -140,10 +123,7 @@ class Continuation:
     def _solve_one(self) -> tuple[int, int]:
         """Iterations and reason of Newton's method for the present stiffness. Collective."""
         self._equations.watch.start()
-        return self._callbacks.solve(self.snes, self._equations.solution)
-
-    def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        self._equations.residual(x, f)
+        return self._newton.solve()
 
     def _test(self) -> int:
         reasons = PETSc.SNES.ConvergedReason

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
 from petsc4py import PETSc
 
 from fenics_contact.methods.callbacks import Callbacks
 from fenics_contact.methods.equations import Equations
+from fenics_contact.methods.options import Defaults
 
-__all__ = ["Method", "Newton", "SnesMethod"]
+__all__ = ["InnerSnes", "Method", "Newton", "SnesMethod"]
 
 # Iterations without a lower residual after which another method takes over.
 _PATIENCE = 20
@@ -30,6 +31,79 @@ class Method(Protocol):
             Iterations, and the reason as SNES has them (positive: converged).
         """
         ...
+
+
+class InnerSnes:
+    """A SNES of a method's own, for the problems that it solves one after another.
+
+    Attributes:
+        snes: The solver.
+    """
+
+    def __init__(
+        self,
+        equations: Equations,
+        defaults: Defaults,
+        prefix: tuple[str, str],
+        options: Mapping[str, Any],
+        solver: Mapping[str, Any],
+        *,
+        consistent: bool,
+    ) -> None:
+        """Make it. Collective.
+
+        Args:
+            equations: What to solve.
+            defaults: What takes the options.
+            prefix: Of the problem's options, and what follows it in that of this one.
+            options: Those of SNES.
+            solver: Those of a linear solver of its own; none: it is that of the matrix.
+            consistent: Whether the matrix is that of the consistent tangent, or else of H₀.
+        """
+        self._equations, self._consistent = equations, consistent
+        self._shares_solver = not solver
+        self._function: PETSc.Vec | None = None
+        comm = equations.full.unknowns.comm
+        self.snes = defaults.make_snes(comm, *prefix, {**options, **solver})
+        self._callbacks = Callbacks(comm)
+
+    def attach(
+        self,
+        assemble: Callable[[PETSc.Vec, PETSc.Mat], None],
+        converged: Callable[[], int],
+        energy: Callable[[PETSc.Vec], float] | None = None,
+    ) -> None:
+        """Take vectors, matrix and solver of the present system. Collective.
+
+        Args:
+            assemble: Fills the matrix at x. It must not keep this object, which keeps it.
+            converged: Whether to end, and why; likewise.
+            energy: What the line search is to lower; none: it looks at the residual.
+        """
+        equations = self._equations
+        if self._function is not equations.function:
+            self.snes.reset()
+        self._function = equations.function
+        if self._shares_solver:
+            self.snes.setKSP(equations.solvers[self._consistent])
+        this: InnerSnes = weakref.proxy(self)
+        self._callbacks.attach(
+            self.snes,
+            lambda x, f: this._compute_residual(x, f),
+            self._function,
+            assemble,
+            equations.matrix(self._consistent),
+            converged,
+        )
+        if energy is not None:
+            self._callbacks.set_objective(self.snes, energy)
+
+    def solve(self) -> tuple[int, int]:
+        """Iterations and reason, from ``solution`` of the equations on. Collective."""
+        return self._callbacks.solve(self.snes, self._equations.solution)
+
+    def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        self._equations.residual(x, f)
 
 
 class SnesMethod(ABC):
