@@ -19,7 +19,8 @@ from fenics_contact.checks.energy import Energy, EnergyState
 from fenics_contact.checks.judge import Judge
 from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.verdict import Attempt, NotConverged, Verdict
-from fenics_contact.contact.contact import Contact, Found, displacement_degree
+from fenics_contact.contact.contact import Contact, Found
+from fenics_contact.contact.inputs import displacement_degree
 from fenics_contact.contact.values import Resultants, Status
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
 from fenics_contact.methods.solver import METHODS, Settings, Solver
@@ -173,7 +174,7 @@ class ContactProblem:
                 usual limit on iterations.
             condensation: Whether to iterate on the unknowns that contact touches alone, all others
                 eliminated: for a linear bulk on one rank. By default where it can be done and is
-                worth it (`condense.worthwhile`), unless an option names a linear solver.
+                worth it (`condensed.worthwhile`), unless an option names a linear solver.
             linear_solver: How systems over all unknowns are solved: "direct" (MUMPS) or "multigrid"
                 (GAMG: a V-cycle as H₀ of L-BFGS, or inside CG and GMRES for Newton's method). By
                 default multigrid for three-dimensional problems that it solves sooner, and where

@@ -4,7 +4,7 @@ It shares nothing with the package but DOLFINx's stiffness and load vector: poin
 normals of Γc, pairs of surfaces, L2 projection, laws, history, condensation and solver are made
 here, dense and by brute force, for problems of some hundred unknowns. What is solved is what the
 package's docstrings define: laws at quadrature points (`laws`), supports (`supports`), pairs
-(`pairing`), multipliers (`augmented`).
+(`pairing`), multipliers (`multipliers`).
 
 Arrays are those of one rank. Numbers of nodes are those of the displacement element.
 """

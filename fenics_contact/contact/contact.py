@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import basix
 import numpy as np
 import numpy.typing as npt
 import ufl
@@ -18,22 +17,17 @@ from fenics_contact import compat
 from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.deformed import DeformedPlaces
-from fenics_contact.contact.inputs import Inputs
+from fenics_contact.contact.inputs import Inputs, displacement_degree
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
 from fenics_contact.contact.multipliers import Multipliers, TraceProjection
 from fenics_contact.contact.pairs import Pairs, PairsState
 from fenics_contact.contact.point_data import PointData
 from fenics_contact.contact.point_law import PointLaw, PointTangent
-from fenics_contact.contact.values import PointValues, Resultants, Status
+from fenics_contact.contact.results import PointResults
+from fenics_contact.contact.values import PointValues, Status
 from fenics_contact.laws.base import Law
 from fenics_contact.laws.stiffness import Springs
-from fenics_contact.parallel import (
-    collective_errors,
-    gather_rows,
-    global_max,
-    global_min,
-    global_sum,
-)
+from fenics_contact.parallel import global_max, global_min
 from fenics_contact.supports.base import Placement, Support
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.fields import PointFields
@@ -41,7 +35,7 @@ from fenics_contact.surface.mass import assembled
 from fenics_contact.surface.surface import ContactSurface
 from fenics_contact.types import Array, Mask
 
-__all__ = ["Committed", "Contact", "Found", "displacement_degree", "passing"]
+__all__ = ["Committed", "Contact", "Found", "passing"]
 
 
 logger = logging.getLogger("fenics_contact")
@@ -83,7 +77,7 @@ class Committed:
     pairs: PairsState
 
 
-class Contact:
+class Contact(PointResults):
     """Frictional contact of Γc with a support, as a boundary form and a committed history.
 
     Attributes:
@@ -145,7 +139,7 @@ class Contact:
                 solver's tolerance and the number of increments; see `Accuracy`.
             enforcement: By default "penalty": k_n and k_t alone hold the body, which penetrates by
                 p/k_n and creeps by τ/k_t before it slips. "augmented": multipliers take the forces
-                over from these springs, round by round, until neither is left (`augmented`); k_n
+                over from these springs, round by round, until neither is left (`multipliers`); k_n
                 and k_t set how fast.
             tolerance: Of augmented enforcement, by default 1e-5: how much of the largest traction
                 the springs may still bear, between 0 and 1, see `enforcement_error`. To the
@@ -476,8 +470,7 @@ class Contact:
         self._data.update()
 
     def _evaluate(self) -> PointValues:
-        """Everything at the points, with the jump as it was updated last. Collective."""
-        self._data.update()
+        """Everything at the points, as they were updated last. Collective."""
         arrays = {**self._data.values, **self._point_law.evaluate()}
         if not self.rigid:
             arrays["paired"] = self.paired.astype(np.float64)
@@ -790,7 +783,7 @@ class Contact:
     def borne_by_springs(self) -> Array:
         """What of the traction the springs bear in place of rigid contact: (n_points, gdim).
 
-        As far as displacements of Γc can answer it, see `augmented`: (stress). Zero where the
+        As far as displacements of Γc can answer it, see `multipliers`: (stress). Zero where the
         stiffness is physical. Collective.
         """
         values = self.values
@@ -849,11 +842,10 @@ class Contact:
         return Committed(self.history.rows(), self.committed_jump, self.pairs.state())
 
     def set_committed(self, state: Committed) -> None:
-        """Make a state the committed one again, after a commit that failed. Collective."""
+        """Make a state the committed one again; `restore` drops what came after it. Collective."""
         self.history.set_rows(state.history)
         self.committed_jump = state.jump
         self.pairs.set_state(state.pairs)
-        self.restore()
 
     def take_up(self, history: Array, values: Mapping[str, Array]) -> None:
         """Make a state of another run the committed one, at the u that it has. Collective.
@@ -880,142 +872,6 @@ class Contact:
             assert self._values is not None
         return self._values
 
-    # ---- results, at the last evaluated state ----------------------------------------------------
-
-    @property
-    def points(self) -> Array:
-        """Coordinates of this rank's quadrature points, shape (n_points, gdim), in length."""
-        return self.values.x
-
-    @property
-    def gap(self) -> Array:
-        """Open distance s - u_n = δ₊ - δ₋ (eq. 6), shape (n_points,), in length.
-
-        NaN at points without an opposite.
-        """
-        return np.where(self.values.paired > 0, self.values.gap, np.nan)
-
-    @property
-    def pressure(self) -> Array:
-        """-r_n, shape (n_points,), in stress; negative only where the law bears tension."""
-        return -self.values.normal_traction
-
-    @property
-    def tangential_traction(self) -> Array:
-        """τ on the body, shape (n_points, gdim), in stress; zeros if the law gives none."""
-        return self.values.traction
-
-    @property
-    def traction(self) -> Array:
-        """r_n n + τ on the body, shape (n_points, gdim), in stress."""
-        return self.values.total_traction
-
-    @property
-    def normal_stiffness(self) -> Array:
-        """-∂r_n/∂u_n where closed, (n_points,), in stress/length; see `Law.normal_stiffness`."""
-        return self.values.normal_stiffness
-
-    @property
-    def tangential_stiffness(self) -> Array:
-        """K_t of the law, shape (n_points, gdim, gdim), in stress/length; zeros without any."""
-        return self.values.tangential_stiffness
-
-    @property
-    def tangential_displacement(self) -> Array:
-        """u_t (eq. 21), shape (n_points, gdim), in length; zeros if the law has no use for it."""
-        if not self.law.has_tangential:
-            return np.zeros_like(self.points)
-        return self.values.tangential(self.values.jump)
-
-    def slip_vector(self) -> Array:
-        """Slip Δu_t + K_t⁻¹ Δτ of the increment, as a vector, (n_points, gdim), in length.
-
-        Where the gap opens the way beyond what the springs give back counts, too. Collective.
-        """
-        with collective_errors(self.surface.mesh.comm):  # singular, where k_t is next to nothing
-            return self.values.slip_vector
-
-    @property
-    def slip_increment(self) -> Array:
-        """Δβ of every mode since the last commit, shape (n_points, n_modes), in length."""
-        return self.values.slip_increment
-
-    @property
-    def slip(self) -> Array:
-        """Accumulated slip β of every mode, committed, shape (n_points, n_modes), in length."""
-        if self.law.has_friction:
-            return self.history.values("slip")
-        return np.zeros((self.quadrature.n_points, 0))
-
-    @property
-    def status(self) -> npt.NDArray[np.int8]:
-        """`Status` in the last evaluated increment, shape (n_points,).
-
-        Without tangential tractions a closed point counts as slip: nothing holds it. Where the law
-        bears tension no point with an opposite is open; one without is, always.
-        """
-        law = self.law
-        return self.values.status(tension=law.has_tension, sticks=law.has_tangential)
-
-    @property
-    def measure(self) -> Array:
-        """Area that each point stands for, the contact's weight included, shape (n_points,)."""
-        return self.quadrature.weights * self.values.weight
-
-    def resultants(self) -> Resultants:
-        """Forces, area and counts. Collective."""
-        comm = self.surface.mesh.comm
-        measure, status = self.measure, self.status
-        tangential = np.linalg.norm(self.tangential_traction, axis=1)
-        force = global_sum(comm, measure @ self.traction)
-        sums = global_sum(
-            comm,
-            [
-                measure @ self.pressure,
-                measure @ tangential,
-                measure @ (status != Status.OPEN),
-                *(np.count_nonzero(status == s) for s in Status),
-            ],
-        )
-        return Resultants(
-            force=force,
-            normal_force=float(sums[0]),
-            tangential_force=float(sums[1]),
-            area=float(sums[2]),
-            open=int(sums[3]),
-            stick=int(sums[4]),
-            slip=int(sums[5]),
-            max_pressure=global_max(comm, self.pressure),
-            max_penetration=global_max(comm, self.values.penetration),
-        )
-
-    def gather(self) -> dict[str, Array]:
-        """All of Γc on every rank, for pictures and tables, ordered by coordinates. Collective.
-
-        Returns:
-            Arrays over all points: x, normal, gap, pressure, tangential_traction, slip (sum of the
-            modes), status, measure.
-        """
-        d = self._gdim
-        rows = np.column_stack(
-            [
-                self.points,
-                self.values.normal,
-                self.tangential_traction,
-                self.gap,
-                self.pressure,
-                self.slip.sum(axis=1),
-                self.status,
-                self.measure,
-            ]
-        )
-        rows = gather_rows(self.surface.mesh.comm, rows)
-        rows = rows[np.lexsort(rows[:, :d].T[::-1])]
-        vectors = {"x": rows[:, :d], "normal": rows[:, d : 2 * d]}
-        vectors["tangential_traction"] = rows[:, 2 * d : 3 * d]
-        names = ("gap", "pressure", "slip", "status", "measure")
-        return vectors | {n: rows[:, 3 * d + i] for i, n in enumerate(names)}
-
 
 def passing(contacts: Sequence[Contact]) -> dict[str, tuple[float, list[float]]]:
     """`Contact.unseen_penetration` by the names of the contacts that have any. Collective."""
@@ -1026,34 +882,3 @@ def passing(contacts: Sequence[Contact]) -> dict[str, tuple[float, list[float]]]
         if not depth <= 0:
             found[contact.name] = depth, [float(x) for x in place]
     return found
-
-
-def displacement_degree(u: fem.Function, mesh: Any, name: str) -> int:
-    """Check that ``u`` is a displacement of ``mesh`` and return its element's degree."""
-    gdim, space = mesh.geometry.dim, u.function_space
-    if space.component() or (space.num_sub_spaces and space.dofmap.index_map_bs == 1):
-        raise ValueError(
-            f"{name}: u is in a mixed element, or a part of one; u must be in a space of its own, "
-            f'functionspace(mesh, ("Lagrange", degree, ({gdim},))): mixed formulations are not '
-            "supported; for bodies that are nearly incompressible take degree 2 or higher"
-        )
-    if u.ufl_shape != (gdim,):
-        raise ValueError(
-            f"{name}: u has shape {u.ufl_shape}; a displacement on this mesh has shape ({gdim},): "
-            f'make its space with functionspace(mesh, ("Lagrange", degree, ({gdim},)))'
-        )
-    if u.function_space.mesh is not mesh and u.function_space.mesh != mesh:
-        raise ValueError(f"{name}: u lives on another mesh than the contact surface")
-    element = u.function_space.ufl_element()
-    if u.function_space.dofmap.bs != gdim or element.pullback != ufl.identity_pullback:
-        raise ValueError(
-            f"{name}: u is in {element}; it must be in a vector-valued Lagrange space, "
-            f'functionspace(mesh, ("Lagrange", degree, ({gdim},)))'
-        )
-    basis = u.function_space.element.basix_element
-    if basis.family != basix.ElementFamily.P or basis.discontinuous or basis.degree < 1:
-        raise ValueError(
-            f"{name}: u is in {element}, of degree {basis.degree}; it must be continuous, a "
-            "Lagrange element of degree 1 or higher"
-        )
-    return int(basis.degree)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,10 +18,10 @@ from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.verdict import Attempt
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.methods.alternating import Alternation
-from fenics_contact.methods.callbacks import interrupts_held
 from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.method import Method, Newton, SnesMethod
+from fenics_contact.methods.neighbourhood import linearised, respond
 from fenics_contact.methods.options import Defaults, take_command_line
 from fenics_contact.methods.quasi_newton import QuasiNewton
 from fenics_contact.systems import dense, linear
@@ -43,10 +43,6 @@ _MAX_ROUNDS = 60
 _FIRST_ROUND, _INNER, _NEARLY = 1e-4, 1e-2, 10.0
 # A start with up to this many times the residual of the best is taken first if its points slip.
 _FAR = 100.0
-# Residual to which systems near the one factored last are solved.
-_NEARBY = 1e-4
-# Residual with which they are not solved at all.
-_ROUGHLY = 1e-2
 # Increments expected where nothing is said.
 _EXPECTED = 4
 
@@ -490,102 +486,21 @@ class Solver:
 
     # ---- the neighbourhood of a solution ---------------------------------------------------------
 
-    @contextmanager
     def linearised(
         self, springs: Sequence[Array], load: Array
-    ) -> Iterator[Callable[[Sequence[Array] | None], Array]]:
-        """See `ContactProblem.linearised`, about a complete state under a load."""
+    ) -> AbstractContextManager[Callable[[Sequence[Array] | None], Array]]:
+        """See `ContactProblem.linearised`, about a complete state under a load. Collective."""
         # After a history that was taken up and is at its end nothing has been assembled yet.
         self.update_system(self._full.update_stiffness())
         self.predicts = False  # by the matrix that is about to be used
-        equations, system = self.equations, self.system
-        system.begin(load)
-        right, left = system.vector(), system.vector()
-        ksp = PETSc.KSP().create(self._comm)
-
-        def solve(tractions: Sequence[Array] | None) -> Array:
-            right.set(0.0)
-            if tractions is None:
-                right.array[:] = system.bulk_force() + system.contact_force()
-            else:
-                for operator, traction in zip(system.operators, tractions, strict=True):
-                    operator.add_force(right, traction)
-            right.array[system.constrained] = 0.0
-            right.scale(-1.0 / system.bulk.scale)
-            with interrupts_held():
-                ksp.solve(right, left)
-            dense.raise_kept(ksp)
-            if ksp.getConvergedReason() < 0:
-                raise RuntimeError(
-                    "the linearised problem at the solution was not solved (KSP reason "
-                    f"{ksp.getConvergedReason()}); use linear_solver='direct'"
-                )
-            return system.extended(left.array_r.copy())
-
-        try:
-            matrices = (o.springs(s) for o, s in zip(system.operators, springs, strict=True))
-            equations.assemble(equations.matrix(True), matrices)
-            # The tangent's own solver may be a V-cycle and no more; after a factorisation GMRES
-            # ends with its first iteration.
-            ksp.setOperators(equations.matrix(True))
-            ksp.setType(PETSc.KSP.Type.GMRES)
-            ksp.setPC(equations.solvers[True].getPC())
-            ksp.setTolerances(rtol=1e-8, max_it=1000)
-            yield solve
-        finally:
-            for item in (ksp, right, left):
-                item.destroy()
+        self.system.begin(load)
+        return linearised(self.equations, springs)
 
     def respond(self, springs: Sequence[Array], tractions: Sequence[Array]) -> list[Array]:
-        """Changes of the relative displacements at the points of every contact. Collective.
-
-        To some digits: with the matrix factored last, which is the tangent near the solution.
-
-        Args:
-            springs: Stiffness at the points of every contact, (n_points, gdim, gdim) each
-                (stress/length).
-            tractions: What is added on the body, (n_points, gdim) each (stress).
-        """
-        equations, system = self.equations, self.system
-        consistent = self.main.consistent or equations.filled(True) or not equations.filled(False)
-        right, left, diagonal = system.vector(), system.vector(), system.diagonal
-        matrix = system.matrix(symmetric=False)
-        ksp = PETSc.KSP().create(self._comm)
-        try:
-            if not equations.filled(consistent):  # nothing was iterated yet
-                equations.assemble(equations.matrix(consistent), equations.tangents())
-            parts = (o.springs(k) for o, k in zip(system.operators, springs, strict=True))
-            system.fill(matrix, parts)
-            for operator, traction in zip(system.operators, tractions, strict=True):
-                operator.add_force(right, traction)
-            right.array[system.constrained] = 0.0
-            right.scale(-1.0 / system.bulk.scale)
-            ksp.setOperators(matrix)
-            ksp.setType(PETSc.KSP.Type.FGMRES)
-            ksp.getPC().setType("python")
-            ksp.getPC().setPythonContext(_Nearby(equations.solvers[consistent]))
-            ksp.setTolerances(rtol=_NEARBY, max_it=100)
-            ksp.solve(right, left)
-            dense.raise_kept(equations.solvers[consistent])
-            if ksp.getResidualNorm() > _ROUGHLY * right.norm():
-                left.set(np.nan)  # nothing is known
-            return [operator.jump(left.array_r) for operator in system.operators]
-        finally:
-            system.diagonal = diagonal
-            for item in (ksp, matrix, right, left):
-                item.destroy()
-
-
-class _Nearby:
-    """A preconditioner: the solver of a matrix that differs by the status of some points."""
-
-    def __init__(self, ksp: PETSc.KSP) -> None:
-        ksp.setUp()
-        self._pc = ksp.getPC()
-
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """For PETSc."""
-        self._pc.apply(x, y)
+        """`neighbourhood.respond`, by the matrix factored last. Collective."""
+        made = self.equations.filled
+        consistent = self.main.consistent or made(True) or not made(False)
+        return respond(self.equations, springs, tractions, consistent=consistent)
 
 
 def _append(attempts: list[Attempt], tried: Sequence[Attempt]) -> None:

@@ -1,0 +1,175 @@
+"""The results of a contact at the state that was evaluated last."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+import numpy.typing as npt
+
+from fenics_contact.contact.values import PointValues, Resultants, Status
+from fenics_contact.laws.base import Law
+from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_sum
+from fenics_contact.surface.fields import PointFields
+from fenics_contact.surface.surface import ContactSurface, SurfaceQuadrature
+from fenics_contact.types import Array
+
+__all__ = ["PointResults"]
+
+
+class PointResults(ABC):
+    """What is read off the points of Γc.
+
+    After `ContactProblem.solve` and `Contact.evaluate` these are arrays at hand. Where nothing has
+    been evaluated since the last change of the state (`Contact.forget`, `restore`), the first
+    of them evaluates the present displacement, which is collective.
+
+    Attributes:
+        surface, law: What was given.
+        quadrature: The points of Γc.
+        history: The committed state.
+    """
+
+    surface: ContactSurface
+    law: Law
+    quadrature: SurfaceQuadrature
+    history: PointFields
+
+    @property
+    @abstractmethod
+    def values(self) -> PointValues:
+        """All fields of the last evaluation at this rank's points."""
+
+    @property
+    def points(self) -> Array:
+        """Coordinates of this rank's quadrature points, shape (n_points, gdim), in length."""
+        return self.values.x
+
+    @property
+    def gap(self) -> Array:
+        """Open distance s - u_n = δ₊ - δ₋ (eq. 6), shape (n_points,), in length.
+
+        NaN at points without an opposite.
+        """
+        return np.where(self.values.paired > 0, self.values.gap, np.nan)
+
+    @property
+    def pressure(self) -> Array:
+        """-r_n, shape (n_points,), in stress; negative only where the law bears tension."""
+        return -self.values.normal_traction
+
+    @property
+    def tangential_traction(self) -> Array:
+        """τ on the body, shape (n_points, gdim), in stress; zeros if the law gives none."""
+        return self.values.traction
+
+    @property
+    def traction(self) -> Array:
+        """r_n n + τ on the body, shape (n_points, gdim), in stress."""
+        return self.values.total_traction
+
+    @property
+    def normal_stiffness(self) -> Array:
+        """-∂r_n/∂u_n where closed, (n_points,), in stress/length; see `Law.normal_stiffness`."""
+        return self.values.normal_stiffness
+
+    @property
+    def tangential_stiffness(self) -> Array:
+        """K_t of the law, shape (n_points, gdim, gdim), in stress/length; zeros without any."""
+        return self.values.tangential_stiffness
+
+    @property
+    def tangential_displacement(self) -> Array:
+        """u_t (eq. 21), shape (n_points, gdim), in length; zeros if the law has no use for it."""
+        if not self.law.has_tangential:
+            return np.zeros_like(self.points)
+        return self.values.tangential(self.values.jump)
+
+    def slip_vector(self) -> Array:
+        """Slip Δu_t + K_t⁻¹ Δτ of the increment, as a vector, (n_points, gdim), in length.
+
+        Where the gap opens the way beyond what the springs give back counts, too. Collective.
+        """
+        with collective_errors(self.surface.mesh.comm):  # singular, where k_t is next to nothing
+            return self.values.slip_vector
+
+    @property
+    def slip_increment(self) -> Array:
+        """Δβ of every mode since the last commit, shape (n_points, n_modes), in length."""
+        return self.values.slip_increment
+
+    @property
+    def slip(self) -> Array:
+        """Accumulated slip β of every mode, committed, shape (n_points, n_modes), in length."""
+        if self.law.has_friction:
+            return self.history.values("slip")
+        return np.zeros((self.quadrature.n_points, 0))
+
+    @property
+    def status(self) -> npt.NDArray[np.int8]:
+        """`Status` in the last evaluated increment, shape (n_points,).
+
+        Without tangential tractions a closed point counts as slip: nothing holds it. Where the law
+        bears tension no point with an opposite is open; one without is, always.
+        """
+        law = self.law
+        return self.values.status(tension=law.has_tension, sticks=law.has_tangential)
+
+    @property
+    def measure(self) -> Array:
+        """Area that each point stands for, the contact's weight included, shape (n_points,)."""
+        return self.quadrature.weights * self.values.weight
+
+    def resultants(self) -> Resultants:
+        """Forces, area and counts. Collective."""
+        comm = self.surface.mesh.comm
+        measure, status = self.measure, self.status
+        tangential = np.linalg.norm(self.tangential_traction, axis=1)
+        force = global_sum(comm, measure @ self.traction)
+        sums = global_sum(
+            comm,
+            [
+                measure @ self.pressure,
+                measure @ tangential,
+                measure @ (status != Status.OPEN),
+                *(np.count_nonzero(status == s) for s in Status),
+            ],
+        )
+        return Resultants(
+            force=force,
+            normal_force=float(sums[0]),
+            tangential_force=float(sums[1]),
+            area=float(sums[2]),
+            open=int(sums[3]),
+            stick=int(sums[4]),
+            slip=int(sums[5]),
+            max_pressure=global_max(comm, self.pressure),
+            max_penetration=global_max(comm, self.values.penetration),
+        )
+
+    def gather(self) -> dict[str, Array]:
+        """All of Γc on every rank, for pictures and tables, ordered by coordinates. Collective.
+
+        Returns:
+            Arrays over all points: x, normal, gap, pressure, tangential_traction, slip (sum of the
+            modes), status, measure.
+        """
+        d = self.surface.mesh.geometry.dim
+        rows = np.column_stack(
+            [
+                self.points,
+                self.values.normal,
+                self.tangential_traction,
+                self.gap,
+                self.pressure,
+                self.slip.sum(axis=1),
+                self.status,
+                self.measure,
+            ]
+        )
+        rows = gather_rows(self.surface.mesh.comm, rows)
+        rows = rows[np.lexsort(rows[:, :d].T[::-1])]
+        vectors = {"x": rows[:, :d], "normal": rows[:, d : 2 * d]}
+        vectors["tangential_traction"] = rows[:, 2 * d : 3 * d]
+        names = ("gap", "pressure", "slip", "status", "measure")
+        return vectors | {n: rows[:, 3 * d + i] for i, n in enumerate(names)}
