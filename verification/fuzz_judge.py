@@ -82,6 +82,8 @@ class Judge:
             for c, o, r in zip(problem.contacts, self._old, record["contacts"], strict=True)
         ]
         found = problem.respond(u, motion, load, old)
+        for c, f, r in zip(problem.contacts, found, record["contacts"], strict=True):
+            self._decide(c, f, r)
         now = self._forces(u, load, found)
         rtol = record["rtol"]
 
@@ -145,6 +147,22 @@ class Judge:
         if contact.law.slips:
             traction = record["lambda_t"][row]
         return reference.State(old.jump, traction, record["lambda_n"][row])
+
+    def _decide(self, contact: Any, found: dict, record: dict[str, Any]) -> None:
+        """Let points that only round-off opens or closes be what they were told to be.
+
+        Where a foundation bears no tension τ jumps there: both are solutions.
+        """
+        if contact.law.kind != "foundation" or contact.law.tension:
+            return
+        doubtful = contact.k_n * np.abs(found["closing"]) <= self._traction_rounding(contact, found)
+        doubtful &= contact.paired
+        n = found["normal"]
+        across = found["relative"] - np.sum(found["relative"] * n, axis=1)[:, None] * n
+        told = np.linalg.norm(record["tangential"][self._rows(contact, record)], axis=1) > 0
+        tau = np.where(told[:, None], -contact.k_t[:, None] * across, 0.0)
+        found["tau"] = np.where(doubtful[:, None], tau, found["tau"])
+        found["traction"] = found["r_n"][:, None] * n + found["tau"]
 
     def _rows(self, contact: Any, record: dict[str, Any]) -> Array:
         distance, row = scipy.spatial.cKDTree(record["points"]).query(contact.x)
@@ -279,8 +297,10 @@ class Judge:
             if contact.back is None or not contact.law.has_normal:
                 continue
             pushed = float(contact.k_n.mean() * contact.back(u))
-            # Coarse bodies overlap between the points by elastic deformation: that has its force.
-            allowed = 1e4 * now["contacts"][i]["normal"]
+            # Coarse bodies overlap between the points by elastic deformation: that has its force,
+            # in this contact or in one that looks the other way.
+            same = [j for j in range(len(found)) if self._between(j) == self._between(i)]
+            allowed = 1e4 * max(now["contacts"][j]["normal"] for j in same)
             # So do surfaces that are not flat, unloaded, by a little of what they differ, and what
             # a facet bulges between its corners is not seen from these.
             differ = 0.1 * float(np.ptp(found[i]["closing"]))
@@ -289,6 +309,12 @@ class Judge:
             allowed += float(contact.k_n.mean() * contact.weights.sum()) * differ
             allowed += 1e3 * sum(b["rounding"] for b in now["bodies"])
             self._check(f"{name}, contact {i}", "passed through", pushed, allowed)
+
+    def _between(self, i: int) -> set[tuple[Any, Any]]:
+        """The two surfaces of a contact, as body and side."""
+        given = self.scene["contacts"][i]
+        support = given["support"]
+        return {(given["body"], given["side"]), (support.get("body"), support.get("side"))}
 
     def _check_energy(
         self,

@@ -22,8 +22,9 @@ Labels = npt.NDArray[np.intp]
 
 # Sums of squares from here on, and up to one over it, have lost none of their terms.
 _SMALL = 1e-200
-# Round-off of a product K u by the size of its terms, summed up row by row.
-_ROUND_OFF = 10 * np.finfo(float).eps
+# Round-off of a product K u by the size of its terms, summed up row by row. A body that is carried
+# along shows it: up to 14 eps on random tetrahedra of degree 2, 34 on a distorted mesh.
+_ROUND_OFF = 40 * np.finfo(float).eps
 # Round-off excuses a residual up to this share of the forces on a body that has a load, not more: a
 # displacement grown without bounds would excuse anything.
 _MOST = 1e-5
