@@ -90,7 +90,7 @@ def collective_errors(comm: MPI.Comm) -> Iterator[None]:
     kind, text = first
     if issubclass(kind, OSError):
         raise OSError(text)
-    raise (kind(text) if kind in (ValueError, TypeError) else RuntimeError(text))
+    raise (kind(text) if kind in (ValueError, TypeError, MemoryError) else RuntimeError(text))
 
 
 def warn(comm: MPI.Comm, text: str) -> None:

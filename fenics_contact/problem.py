@@ -173,7 +173,7 @@ class ContactProblem:
             fallback: Whether to go on by continuation where the method fails with no less than its
                 usual limit on iterations.
             condensation: Whether to iterate on the unknowns that contact touches alone, all others
-                eliminated: for a linear bulk on one rank. By default where it can be done and is
+                eliminated: for a linear bulk. By default where it can be done and is
                 worth it (`condensed.worthwhile`), unless an option names a linear solver.
             linear_solver: How systems over all unknowns are solved: "direct" (MUMPS) or "multigrid"
                 (GAMG: a V-cycle as H₀ of L-BFGS, or inside CG and GMRES for Newton's method). By

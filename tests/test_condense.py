@@ -10,15 +10,16 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from fenics_contact.systems.condensed import Condensation, touched, worthwhile
+from fenics_contact.systems.condensation import Condensation
+from fenics_contact.systems.condensed import touched, worthwhile
+from fenics_contact.systems.unknowns import Selection
 from scenes.blocks import CELLS, GRID, LEFT, RIGHT, TOP, block, kirchhoff
-from scenes.comparing import close, owned, raised_everywhere
+from scenes.comparing import close, gathered, owned, raised_everywhere
 from scenes.rubbing import PATH, Rub, cushion, walk
 from scenes.two_blocks import Slider
 
 pytestmark = pytest.mark.timeout(240)
 COMM = MPI.COMM_WORLD
-serial = pytest.mark.skipif(COMM.size > 1, reason="condensation takes one rank")
 
 # Both spaces solve to 1e-9 of the forces; a path adds up.
 SAME = 1e-7
@@ -41,13 +42,13 @@ def assert_same(condensed, whole, rtol=SAME):
 
 
 def dense(matrix):
+    """All of a matrix, on every rank."""
     pointers, columns, values = matrix.getValuesCSR()
-    result = np.zeros(matrix.getSize())
+    result = np.zeros((pointers.size - 1, matrix.getSize()[1]))
     result[np.repeat(np.arange(len(result)), np.diff(pointers)), columns] = values
-    return result
+    return gathered(COMM, result)
 
 
-@serial
 @pytest.mark.parametrize("symmetric", [True, False])
 @pytest.mark.parametrize(("cell", "degree"), GRID)
 def test_schur_complement(cell, degree, symmetric):
@@ -56,55 +57,71 @@ def test_schur_complement(cell, degree, symmetric):
     if not symmetric:
         v = ufl.TestFunction(scene.u.function_space)
         turn = np.zeros((scene.dim, scene.dim))
-        turn[0, 1] = 30.0
+        turn[0, 1], turn[1, 0] = 300.0, -300.0
         scene.F += ufl.dot(fem.Constant(scene.mesh, turn) * scene.u, v) * ufl.dx(scene.mesh)
     aside = fem.Constant(scene.mesh, 0.01)
     bcs = [scene.hold(LEFT, i, aside) for i in range(scene.dim)]
     problem, _ = scene.problem(fc.Frictionless(), bcs)
     assert problem.bulk.symmetric == symmetric
     K = dense(problem.bulk.stiffness)
-    n = len(K)
-    kept = touched(problem.operators, problem.unknowns)
+    n, whole = len(K), problem.unknowns
+    touches = touched(problem.operators, whole)
     # All components of all nodes of the bottom, no others.
     y = scene.u.function_space.tabulate_dof_coordinates()[:, scene.dim - 1]
-    assert np.array_equal(kept, np.flatnonzero(np.repeat(np.abs(y) < 1e-12, scene.dim)))
-    held = np.zeros(n, dtype=bool)
+    bottom = np.flatnonzero(np.repeat(np.abs(y) < 1e-12, scene.dim))
+    assert np.array_equal(touches, bottom[bottom < whole.n_local])
+    mine = np.zeros(whole.n_local, dtype=bool)
     for i in range(scene.dim):
-        held[scene.facet_dofs(LEFT, i)] = True
+        dofs = scene.facet_dofs(LEFT, i)
+        mine[dofs[dofs < whole.n_local]] = True
+    selection = Selection(whole, touches)
+    made = Condensation(problem.bulk.stiffness, problem.bulk, selection, mine)
+    held, kept = gathered(COMM, mine) > 0.5, gathered(COMM, whole.first + touches)
+    assert np.array_equal(kept, selection.numbers)
     inside = np.setdiff1d(np.flatnonzero(~held), kept)
-    made = Condensation(problem.bulk.stiffness, held, kept, symmetric=symmetric)
     inverse = np.linalg.inv(K[np.ix_(inside, inside)])
     away = K[np.ix_(kept, inside)] @ inverse
     schur = K[np.ix_(kept, kept)] - away @ K[np.ix_(inside, kept)]
-    assert close(made.schur, schur, 1e-10)
+    first = COMM.rank == 0
+    assert made.schur.shape == ((kept.size, kept.size) if first else (0, 0))
+    assert not first or close(made.schur, schur, 1e-10)
+
+    def part(values):
+        return values[whole.first : whole.first + whole.n_local].copy()
 
     rng = np.random.default_rng(3)
-    first, second = rng.normal(size=(2, n))
+    one, other = rng.normal(size=(2, n))
     # The third is a combination of those before.
-    for force in (first, second, 2.5 * first - second, rng.normal(size=n)):
+    for force in (one, other, 2.5 * one - other, rng.normal(size=n)):
         state = rng.normal(size=n)
-        if force is not second:
+        if force is not other:
             state[held] = 0.0
-        made.set_load(force, state)
+        made.set_load(part(force), part(state))
         prescribed = np.where(held & ~np.isin(np.arange(n), kept), state, 0.0)
         lifted = force - K @ prescribed
-        assert close(made.response.load, lifted[kept] - away @ lifted[inside], 1e-10)
+        load = lifted[kept] - away @ lifted[inside]
+        assert not first or close(made.response.load, load, 1e-10)
         field = prescribed + 0.0
         field[kept] = state[kept]
         field[inside] = inverse @ (force - K @ field)[inside]
-        assert close(made.recover(state[kept], made.response.field), field, 1e-10)
+        given = state[kept] if first else np.zeros(0)
+        found = gathered(COMM, made.recover(given, made.response.field))
+        assert close(found, field, 1e-10)
 
 
-@serial
 def test_nothing_holds_a_part():
-    """A stiffness that is singular with the kept unknowns held is refused."""
+    """A stiffness that is singular with the kept unknowns held is refused, on all ranks."""
     scene = block("triangle")
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
-    none = np.zeros(0, dtype=np.int32)
-    with pytest.raises(RuntimeError, match="singular"):
-        stiffness = problem.bulk.stiffness.copy()
-        stiffness.zeroEntries()
-        Condensation(stiffness, np.zeros(18, dtype=bool), none + 1, symmetric=True)
+    none = Selection(problem.unknowns, np.zeros(0, dtype=np.int32))
+    free = np.zeros(problem.unknowns.n_local, dtype=bool)
+    scene.E.value = 0.0
+    problem.bulk.update()
+    raised_everywhere(
+        lambda: Condensation(problem.bulk.stiffness, problem.bulk, none, free),
+        RuntimeError,
+        "singular",
+    )
 
 
 # ---- the same results ----------------------------------------------------------------------------
@@ -126,7 +143,6 @@ LAWS = {
 }
 
 
-@serial
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize(("cell", "degree"), [("quadrilateral", 1), ("triangle", 2)])
@@ -151,7 +167,6 @@ def test_path(cell, degree, law, method):
     assert iterations[True] <= 1.5 * iterations[False]
 
 
-@serial
 @pytest.mark.parametrize(("cell", "degree"), GRID)
 def test_every_cell(cell, degree):
     """The start of the path with Coulomb friction on all cells and degrees."""
@@ -163,7 +178,6 @@ def test_every_cell(cell, degree):
     assert_same(*both(make, lambda made: fields(made, walk(made, path=PATH[:4]))))
 
 
-@serial
 @pytest.mark.parametrize("cell", CELLS)
 def test_deformable_support(cell):
     """A block slid over another, pairs found anew: the same, whatever was touched before."""
@@ -185,7 +199,6 @@ def test_deformable_support(cell):
     assert_same(*results)
 
 
-@serial
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_driven_support(cell, method):
@@ -215,7 +228,6 @@ def test_driven_support(cell, method):
     assert_same(*results)
 
 
-@serial
 def test_several_contacts_and_loads():
     """A floor with friction and a wall, side and top loads in turn, nothing else that holds."""
     results = []
@@ -241,7 +253,6 @@ def test_several_contacts_and_loads():
     assert_same(*results)
 
 
-@serial
 def test_modulus_changed():
     """A new modulus between increments: a new factorisation, and the results with it."""
 
@@ -257,7 +268,6 @@ def test_modulus_changed():
     assert_same(*both(Rub, run))
 
 
-@serial
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_units(method):
     """The same iterations and digits in other units, 1e-9 of the fields."""
@@ -275,7 +285,6 @@ def test_units(method):
         assert close(traction, results[0][2], 1e-9)
 
 
-@serial
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_failure_leaves_no_trace(method):
     """An increment that fails leaves u, history and what comes next as if it had not been."""
@@ -298,7 +307,6 @@ def test_failure_leaves_no_trace(method):
     assert_same(fields(made), fields(twin))
 
 
-@serial
 def test_an_indefinite_bulk():
     """A bulk that gives way: neither K nor S is definite, and all is as on all unknowns."""
     results = []
@@ -319,14 +327,14 @@ def test_an_indefinite_bulk():
 
 
 def test_the_choice(caplog):
-    """By default on one rank, for a linear bulk; it is logged; True where it cannot be raises."""
+    """By default for a linear bulk; it is logged; True where it cannot be raises."""
     scene = block("triangle", n=4, up=-1.0)
     law = fc.Frictionless(k_n=5e3)
     with caplog.at_level(logging.INFO, logger="fenics_contact"):
         problem, contact = scene.problem(law, scene.rollers())
-    assert problem.solver.condensed == (COMM.size == 1)
+    assert problem.solver.condensed
     if COMM.rank == 0:
-        said = "condensed onto 10 of 50" if COMM.size == 1 else "takes one rank"
+        said = "condensed onto 10 of 50"
         assert any(said in record.getMessage() for record in caplog.records)
     assert not scene.problem(law, scene.rollers(), condensation=False)[0].solver.condensed
 
@@ -344,13 +352,10 @@ def test_the_choice(caplog):
     raised_everywhere(without_contact, ValueError, "condensation", "no contact")
     F = kirchhoff(scene)
     raised_everywhere(lambda: condensed(F, [contact]), ValueError, "condensation", "not linear")
-    if COMM.size > 1:
-        raised_everywhere(lambda: condensed(scene.F, [contact]), ValueError, "one rank")
-    else:
-        given = {"pc_type": "lu"}
-        raised_everywhere(
-            lambda: condensed(scene.F, [contact], petsc_options=given), ValueError, "pc_type"
-        )
+    given = {"pc_type": "lu"}
+    raised_everywhere(
+        lambda: condensed(scene.F, [contact], petsc_options=given), ValueError, "pc_type"
+    )
     assert PETSc.Options().getAll() == options
 
 

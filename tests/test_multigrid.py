@@ -212,13 +212,12 @@ def test_chosen_where_it_is_quicker():
     assert not linear.quicker(1_000_000, 2)
 
 
-@pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="condensation takes one rank")
 def test_chosen_by_the_number_of_increments(monkeypatch):
     """Multigrid for few increments, condensed for many; settled with the first solution."""
     scene = block("hexahedron", n=2)
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
     monkeypatch.setattr(linear, "_MANY", 0)
-    monkeypatch.setattr(linear, "_MANY_PER_INCREMENT", problem.unknowns.n_local / 2.5)
+    monkeypatch.setattr(linear, "_MANY_PER_INCREMENT", problem.unknowns.n_global / 2.5)
     assert problem.solver.condensed
     problem.expect(2)
     assert not problem.solver.condensed and problem.full.linear_kind == "multigrid"
@@ -295,13 +294,12 @@ def test_memory_of_factors(cell, n, symmetric):
     assert taken / 1.5 < estimate < 1.5 * taken
 
 
-@pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="condensation takes one rank")
 def test_monitors_outlive_the_choice_of_the_solver(monkeypatch):
     """`increments` may make SNES anew: what watches it is called all the same, as it was set."""
     scene = block("hexahedron", n=2, up=-1.0)
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
     monkeypatch.setattr(linear, "_MANY", 0)
-    monkeypatch.setattr(linear, "_MANY_PER_INCREMENT", problem.unknowns.n_local / 2.5)
+    monkeypatch.setattr(linear, "_MANY_PER_INCREMENT", problem.unknowns.n_global / 2.5)
     before, seen = problem.snes, []
 
     def watch(snes, iteration, norm, name, *, unit):

@@ -440,8 +440,6 @@ def test_restore_drops_what_was_not_committed() -> None:
 @pytest.mark.parametrize("condensation", [None, False])
 def test_newton_after_an_increment_of_no_iterations(condensation):
     """A first increment without load needs no tangent, and leaves none to start the next from."""
-    if condensation is None and COMM.size > 1:
-        pytest.skip("condensation takes one rank")
     made = Rub(method="newton", condensation=condensation)
     made.move(0.0, 0.0)
     made.scene.u.x.array[:] = 0.0
@@ -457,8 +455,6 @@ def test_newton_starts_where_the_right_points_slip(condensation):
 
     And lead to the same state: both solve to 1e-9 of the forces, 1e-7 over the path.
     """
-    if condensation is None and COMM.size > 1:
-        pytest.skip("condensation takes one rank")
     taken, states = [], []
     for helped in (True, False):
         made = Rub(method="newton", condensation=condensation, mesh={"n": 12})

@@ -321,9 +321,6 @@ def test_killed_and_started_again(ranks, tmp_path):
 # ---- the field left behind -----------------------------------------------------------------------
 
 
-serial = pytest.mark.skipif(COMM.size > 1, reason="condensation takes one rank")
-
-
 def lagging(field, tmp_path=None, *, law=None, steps=8, **kwargs):
     """The history with the field found when ``field`` says."""
     made = Rub(law, cell="hexahedron", condensation=True)
@@ -331,7 +328,6 @@ def lagging(field, tmp_path=None, *, law=None, steps=8, **kwargs):
     return made, list(fc.increments(made.problem, made.load, 0.0, 4.0, **options))
 
 
-@serial
 @pytest.mark.parametrize("law", [fc.Frictionless(k_n=2e4), fc.Coulomb(0.3, k_n=2e4, k_t=1e4)])
 def test_field_at_the_last_increment(law):
     """The same forces, energies and final field as with all fields found.
@@ -353,7 +349,6 @@ def test_field_at_the_last_increment(law):
         assert a.verdict.failures == [] and a.verdict.laws.keys() == {"contact"}
 
 
-@serial
 def test_field_on_request():
     """`complete` brings u to what it is where all fields are found (1e-7), and then has no work.
 
@@ -379,14 +374,12 @@ def test_field_on_request():
     assert compared == 2
 
 
-@serial
 def test_field_every_so_many_increments():
     """Every third and the last; a checkpoint has all of u."""
     _, steps = lagging(3)
     assert [s.complete for s in steps] == [False, False, True, False, False, True, False, True]
 
 
-@serial
 def test_checkpoint_of_a_field_left_behind(tmp_path):
     """Going on from a file gives the digits of the run that wrote it."""
     whole, _ = lagging("last", checkpoint=tmp_path / "whole.npz", checkpoint_every=3)
@@ -402,7 +395,6 @@ def test_checkpoint_of_a_field_left_behind(tmp_path):
     assert same_states(after, whole, 0.0)
 
 
-@serial
 def test_a_failure_leaves_the_field_to_be_completed():
     """After an increment that fails u is completed as that of the last commit."""
     every, lazy = Rub(cell="triangle", condensation=True), Rub(cell="triangle", condensation=True)
@@ -420,7 +412,6 @@ def test_a_failure_leaves_the_field_to_be_completed():
     assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
 
 
-@serial
 def test_a_field_that_is_wrong_is_refused(monkeypatch):
     """What is recovered is checked by the product with K, not by what recovered it."""
     made = Rub(cell="triangle", condensation=True)

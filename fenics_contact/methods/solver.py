@@ -282,12 +282,12 @@ class Solver:
         system: System = self._full
         if self.condensed:
             kept = touched(self._full.operators, self._full.unknowns) if kept is None else kept
-            system = CondensedSystem(
-                self._full,
-                Selection(self._full.unknowns, kept),
-                prefix=self._settings.prefix + "interior_",
-            )
-            logger.info("condensed onto %d of %d unknowns", kept.size, self._full.unknowns.n_local)
+            selection = Selection(self._full.unknowns, kept)
+            prefix = self._settings.prefix + "interior_"
+            system = CondensedSystem(self._full, selection, prefix=prefix)
+            if self._comm.rank == 0:
+                n = self._full.unknowns.n_global
+                logger.info("condensed onto %d of %d unknowns", selection.n_global, n)
         self._pairings = self._present_pairings()
         self.equations.take(system)
 
@@ -307,7 +307,7 @@ class Solver:
                 # A body that slides comes back to places where it was: what is kept grows only.
                 before = self.system.unknowns.kept
                 kept = np.union1d(before, touched(self._full.operators, self._full.unknowns))
-                if kept.size > before.size:
+                if self._comm.allreduce(int(kept.size > before.size)):
                     self._set_system(kept.astype(np.int32))
                 self._pairings = self._present_pairings()
             self.snes.reset()

@@ -24,6 +24,7 @@ class Bulk:
 
     Attributes:
         form: The residual, UFL.
+        space: Of ``u``.
         tangent_form: Its derivative by ``u``, UFL.
         linear: Whether F is affine in ``u``: then its tangent is assembled once, a residual is a
             product with it, and loads are assembled once an increment.
@@ -57,7 +58,7 @@ class Bulk:
                 "F does not depend on u: write the residual with the Function u itself"
             )
         self._u = u
-        self.form = form
+        self.form, self.space = form, u.function_space
         derivative = ufl.derivative(form, u, ufl.TrialFunction(u.function_space))
         self.tangent_form = ufl.algorithms.expand_derivatives(derivative)
         self.linear = u not in self.tangent_form.coefficients()
@@ -128,6 +129,19 @@ class Bulk:
             yield matrix
         finally:
             matrix.destroy()
+
+    def own_stiffness(self) -> PETSc.Mat:
+        """The tangent of this rank's cells alone, ghosts behind its own dofs. Collective.
+
+        On one rank that is `stiffness`, and otherwise a new matrix: the ranks' add up to it.
+        """
+        if self.space.mesh.comm.size == 1:
+            return self.stiffness
+        # Entries of rows of ghosts are still here, not where their owners would add them up.
+        rows = fem.assemble_matrix(self._compiled_tangent).to_scipy(ghosted=True).tocsr()
+        rows.sort_indices()
+        csr = (rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType), rows.data)
+        return PETSc.Mat().createAIJ(rows.shape, csr=csr, comm=PETSc.COMM_SELF)
 
     def check_elastic(self) -> None:
         """Refuse a tangent without stiffness, after `update`.

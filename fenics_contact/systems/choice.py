@@ -37,8 +37,6 @@ def obstacle_to_condensation(
         obstacle = "there is no contact"
     elif not full.bulk.linear:
         obstacle = "the bulk is not linear in u"
-    elif unknowns.comm.size > 1:
-        obstacle = f"it takes one rank, and there are {unknowns.comm.size}"
     elif named:
         obstacle = f"the options name a linear solver ({', '.join(named)})"
     elif linear_solver == "multigrid":
@@ -51,7 +49,8 @@ def obstacle_to_condensation(
         return "the caller wants none"
     if wanted or obstacle:
         return obstacle
-    n, n_touched = unknowns.n_local, touched(full.operators, unknowns).size
+    n = unknowns.n_global
+    n_touched = unknowns.comm.allreduce(touched(full.operators, unknowns).size)
     if n_touched == n or not worthwhile(n, n_touched, gdim):
         return f"contact touches {n_touched} of {n} unknowns, too many to gain by it"
     if unknowns.n_motions or linear_solver is not None:

@@ -1,18 +1,30 @@
-"""Elimination of unknowns: a stiffness condensed onto some of its unknowns (Schur complement)."""
+"""Elimination of unknowns: a stiffness condensed onto some of its unknowns (Schur complement).
+
+By substructures: every rank eliminates what its own cells alone have (`Substructure`). The first
+rank adds up what is left, dense, and eliminates the interface, which is where pieces of several
+ranks meet. On one rank there is one piece, and no interface.
+"""
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Sequence
+import contextlib
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import dolfinx
 import numpy as np
-import petsc4py
+import numpy.typing as npt
+import scipy.linalg
+from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact.systems import linear
-from fenics_contact.types import Array, Indices, Mask
+from fenics_contact.parallel import collective_errors, global_sum
+from fenics_contact.systems.bulk import Bulk
+from fenics_contact.systems.substructure import Substructure
+from fenics_contact.systems.unknowns import Selection
+from fenics_contact.types import Array, Index, Indices, Mask
 
 __all__ = ["Condensation", "Response"]
 
@@ -24,91 +36,55 @@ _SAME = 1e-14
 
 
 class Condensation:
-    """A stiffness with all but some of its unknowns eliminated. One rank only.
+    """A stiffness with all but some of its unknowns eliminated.
 
     Prescribed unknowns that are not kept are held at the values they have.
 
     Attributes:
-        schur: The condensed stiffness, (n_kept, n_kept), Fortran order (force/length).
+        schur: The condensed stiffness, (n_kept, n_kept) on the first rank, Fortran order
+            (force/length).
         response: What the load of `set_load` makes of the body with the unknowns kept at rest.
     """
 
     def __init__(
         self,
         stiffness: PETSc.Mat,
+        bulk: Bulk,
+        unknowns: Selection,
         constrained: Mask,
-        kept: Indices,
         *,
-        symmetric: bool,
         prefix: str = "",
     ) -> None:
-        """Factor.
+        """Factor. Collective.
 
         Args:
-            stiffness: Over all unknowns, without conditions, (n, n).
-            constrained: Mask of the prescribed unknowns, (n,).
-            kept: The unknowns to keep, ascending, (n_kept,).
-            symmetric: Whether the stiffness is.
+            stiffness: Over all unknowns, without conditions.
+            bulk: The form that it is of.
+            unknowns: The unknowns to keep.
+            constrained: Mask of the prescribed unknowns among all of this rank, (n_local,).
             prefix: Of the options of the factorisation.
 
         Raises:
             RuntimeError: The stiffness is singular even with the kept unknowns held.
             MemoryError: There is not enough.
         """
-        self._stiffness, self._kept = stiffness, kept
+        self._stiffness, self._unknowns, self._comm = stiffness, unknowns, unknowns.comm
         outside = np.ones(constrained.size, dtype=np.bool_)
-        outside[kept] = False
+        outside[unknowns.kept] = False
         self._held = np.flatnonzero(outside & constrained).astype(np.int32)
-        self._eliminated = np.flatnonzero(outside & ~constrained).astype(np.int32)
         self._right, self._left = stiffness.createVecs()
         self._directions: list[tuple[Array, Response]] = []
-        matrix = stiffness.copy()
-        diagonal = matrix.getDiagonal()
-        self._scale = scale = diagonal.norm(PETSc.NormType.NORM_INFINITY)
-        matrix.zeroRowsColumns(self._held, diag=scale)
-        matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
-        self._pc = PETSc.PC().create(stiffness.comm)
-        self._pc.setOptionsPrefix(prefix)
-        self._pc.setOperators(matrix)
-        self._pc.setType("cholesky" if symmetric else "lu")
-        self._pc.setFactorSolverType("mumps")
-        self._pc.setFromOptions()
-        self._pc.setFactorSetUpSolverType()
-        self._factor = self._pc.getFactorMatrix()
-        # MUMPS' estimate of its workspace is short where the Schur complement is most of it.
-        self._factor.setMumpsIcntl(14, 400)
-        chosen = PETSc.IS().createGeneral(kept, comm=PETSc.COMM_SELF)
-        _call("MatFactorSetSchurIS", _object(self._factor), _object(chosen))
-        self._pc.setUp()
-        error = self._factor.getMumpsInfog(1)
-        if linear.refused_memory(self._pc):
-            raise MemoryError(
-                f"condensing {constrained.size} unknowns onto {kept.size} was refused its memory "
-                f"(MUMPS error {error}): use condensation=False, or several ranks"
+        self._scale = bulk.scale
+        own = _Piece.of(bulk, unknowns, constrained)
+        self._piece = own
+        with collective_errors(self._comm):
+            self._substructure = Substructure(
+                own.stiffness, own.boundary, symmetric=bulk.symmetric, prefix=prefix
             )
-        self.schur = self._schur_complement()
-        if error < 0 or not np.all(np.isfinite(self.schur)):
-            raise RuntimeError(
-                f"the bulk stiffness cannot be condensed onto the {kept.size} unknowns that "
-                f"contact touches (MUMPS error {error}): with these held it is still singular. A "
-                "part of the body may be held by nothing; or use condensation=False"
-            )
-        # Solutions with the kept unknowns at rest, and not of the whole.
-        self._factor.setMumpsIcntl(26, 0)
-        self.response = Response.none(constrained.size, kept.size)
-
-    def _schur_complement(self) -> Array:
-        n = self._kept.size
-        result = PETSc.Mat().createDense((n, n), comm=PETSc.COMM_SELF)
-        result.assemble()
-        found, status = ctypes.c_void_p(), ctypes.c_int()
-        factor = _object(self._factor)
-        _call("MatFactorCreateSchurComplement", factor, ctypes.byref(found), ctypes.byref(status))
-        _call("MatCopy", found, _object(result), ctypes.c_int(0))
-        _call("MatDestroy", ctypes.byref(found))
-        array = np.array(result.getDenseArray(readonly=True), order="F")
-        result.destroy()
-        return array
+        self._interface = _Interface(own, unknowns)
+        self.schur = self._interface.merge(self._substructure.schur, symmetric=bulk.symmetric)
+        self._substructure.schur = np.zeros((0, 0))  # its memory is wanted elsewhere
+        self.response = Response.none(constrained.size, unknowns.n_local)
 
     def _product(self, state: Array) -> Array:
         self._right.array[:] = state
@@ -117,30 +93,35 @@ class Condensation:
 
     def _solve(self, force: Array) -> Array:
         """Displacement of the unknowns eliminated under a force on them; zero at the others."""
-        self._left.array[:] = 0.0
-        self._left.array[self._eliminated] = force[self._eliminated]
-        self._factor.solve(self._left, self._right)
+        own, at_rest = self._piece, self._interface.at_rest
+        applied = np.zeros(own.size)
+        applied[own.inner] = force[own.unknowns[own.inner]]
+        state = self._substructure.at_rest(applied)
         result = np.zeros_like(force)
-        result[self._eliminated] = self._right.array_r[self._eliminated]
+        if self._interface.any:
+            pushed = -self._substructure.reaction(state)
+            boundary, result[own.interface] = at_rest(pushed, force[own.interface])
+            state += self._substructure.carried(boundary)
+        result[own.unknowns[own.inner]] = state[own.inner]
         return result
 
     def set_load(self, force: Array, state: Array) -> None:
-        """Condense a load and the values prescribed.
+        """Condense a load and the values prescribed. Collective.
 
         Args:
-            force: External force on all unknowns, (n,) (force).
-            state: Displacements, of which those prescribed outside of the kept count, (n,).
+            force: External force on all unknowns, (n_local,) (force).
+            state: Displacements, of which those prescribed outside of the kept count, (n_local,).
         """
         # The loads of a history are a few fields, each times a number: what was found for earlier
         # ones serves as far as the new one is a combination of them.
         rest: Array = np.concatenate([force, self._scale * state[self._held]])
-        size = float(np.linalg.norm(rest))
+        size = self._norm(rest)
         shares: list[float] = []
         for direction, _ in self._directions:
-            shares.append(float(direction @ rest))
+            shares.append(float(global_sum(self._comm, direction @ rest)))
             rest -= shares[-1] * direction
         responses = [response for _, response in self._directions]
-        remainder = float(np.linalg.norm(rest))
+        remainder = self._norm(rest)
         if remainder > _SAME * size:
             known = bool(np.isfinite(remainder))
             shares.append(remainder if known else 1.0)
@@ -149,25 +130,32 @@ class Condensation:
             if known:
                 self._directions.append((scaled, responses[-1]))
                 del self._directions[:-_DIRECTIONS]
-        self.response = Response.none(force.size, self._kept.size).plus(shares, responses)
+        nothing = Response.none(force.size, self._unknowns.n_local)
+        self.response = nothing.plus(shares, responses)
+
+    def _norm(self, values: Array) -> float:
+        """Over all ranks, without overflow. Collective."""
+        return float(np.linalg.norm(self._comm.allgather(float(np.linalg.norm(values)))))
 
     def _respond(self, given: Array) -> Response:
         """By one back-substitution, and one more if values are prescribed and the force is none."""
-        force, values = np.split(given, [self._right.getSize()])
+        force, values = np.split(given, [self._right.getLocalSize()])
+        has_values, has_force = global_sum(self._comm, [values.any(), force.any()]) > 0
         prescribed: Array = np.zeros_like(force)
         prescribed[self._held] = values / self._scale
-        lift = self._product(prescribed) if values.any() else np.zeros_like(force)
+        lift = self._product(prescribed) if has_values else np.zeros_like(force)
         field = prescribed + self._solve(force - lift)
         image = self._product(field)
-        load = (force - image)[self._kept]
+        kept = self._unknowns.kept
+        load = self._unknowns.gathered((force - image)[kept])
         # Apart: the share of the prescribed values in the condensed load.
         by_values = np.zeros_like(load)
-        if values.any():
-            still = field if not force.any() else prescribed - self._solve(lift)
-            by_values = -self._product(still)[self._kept]
+        if has_values:
+            still = field if not has_force else prescribed - self._solve(lift)
+            by_values = -self._unknowns.gathered(self._product(still)[kept])
         at_field = force.copy()
         at_field[self._held] = image[self._held]
-        at_field[self._kept] = 0.0
+        at_field[kept] = 0.0
         return Response(field, at_field, load, by_values)
 
     def forget(self) -> None:
@@ -175,19 +163,236 @@ class Condensation:
         self._directions = []
 
     def recover(self, kept: Array, particular: Array) -> Array:
-        """All unknowns, (n,).
+        """All unknowns, (n_local,). Collective.
 
         Args:
-            kept: Those kept, (n_kept,).
-            particular: The displacement with these at rest, (n,); see `Response`.
+            kept: Those kept, on the first rank, (n_kept,).
+            particular: The displacement with these at rest, (n_local,); see `Response`.
         """
         return particular + self.extended(kept)
 
     def extended(self, kept: Array) -> Array:
-        """All unknowns without load, (n,), that follow from those kept, (n_kept,)."""
-        state = np.zeros(self._right.getSize())
-        state[self._kept] = kept
-        return state - self._solve(self._product(state))
+        """All unknowns without load, (n_local,), that follow from those kept. Collective."""
+        own, result = self._piece, np.zeros(self._right.getLocalSize())
+        boundary, result[own.interface] = self._interface.carried(kept)
+        state = self._substructure.carried(boundary)
+        result[own.unknowns[own.inner]] = state[own.inner]
+        result[self._unknowns.kept] = self._unknowns.scattered(kept)
+        return result
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """This rank's cells: the unknowns that are free there, numbered apart.
+
+    Attributes:
+        stiffness: Of these cells alone, (size, size), without conditions.
+        size: Unknowns of the piece.
+        unknowns: Their numbers among those of this rank, ghosts behind its own, (size,).
+        inner: Those that no other rank has and that are not kept, as numbers in the piece.
+        boundary: The others, likewise.
+        numbers: Global numbers of these, (n_boundary,).
+        interface: Unknowns of this rank, by its numbers, at which pieces meet and that are neither
+            kept nor prescribed.
+    """
+
+    stiffness: PETSc.Mat
+    unknowns: Indices
+    inner: Indices
+    boundary: Indices
+    numbers: npt.NDArray[np.int64]
+    interface: Indices
+
+    @property
+    def size(self) -> int:
+        """Unknowns of the piece."""
+        return int(self.unknowns.size)
+
+    @classmethod
+    def of(cls, bulk: Bulk, unknowns: Selection, constrained: Mask) -> _Piece:
+        """That of the present tangent. Collective."""
+        n = unknowns.whole.n_dofs
+        space = bulk.space
+        kept = np.zeros(unknowns.whole.n_local, dtype=np.bool_)
+        kept[unknowns.kept] = True
+        kept, constrained = kept[:n], constrained[:n]
+        stiffness = bulk.own_stiffness()
+        if unknowns.comm.size == 1:
+            here = np.ones(n, dtype=np.bool_)
+            shared = np.zeros(n, dtype=np.bool_)
+        else:
+            here = _acted_on(stiffness)
+            shared = _over_ranks(space, here.astype(np.float64), add=True) > 1.5
+            kept, constrained = (
+                _over_ranks(space, np.resize(mask.astype(np.float64), here.size)) > 0.5
+                for mask in (kept, constrained)
+            )
+            here[:n] |= ~shared[:n]  # what has no stiffness at all is told by the factorisation
+        free = here & (kept | ~constrained)
+        chosen = np.flatnonzero(free).astype(np.int32)
+        stays = (kept | shared)[chosen]
+        places = PETSc.IS().createGeneral(chosen, comm=PETSc.COMM_SELF)
+        dofmap = space.dofmap
+        d = dofmap.index_map_bs
+        boundary = np.flatnonzero(stays).astype(np.int32)
+        nodes = dofmap.index_map.local_to_global((chosen[boundary] // d).astype(np.int32))
+        interface = (shared & ~kept & ~constrained)[:n]
+        return cls(
+            stiffness=stiffness.createSubMatrix(places, places),
+            unknowns=chosen,
+            inner=np.flatnonzero(~stays).astype(np.int32),
+            boundary=boundary,
+            numbers=nodes.astype(np.int64) * d + chosen[boundary] % d,
+            interface=np.flatnonzero(interface).astype(np.int32),
+        )
+
+
+def _acted_on(stiffness: PETSc.Mat) -> Mask:
+    """Which rows have an entry that is not zero."""
+    pointers, _, values = stiffness.getValuesCSR()
+    row = np.repeat(np.arange(pointers.size - 1), np.diff(pointers))
+    return np.bincount(row, values != 0.0, minlength=pointers.size - 1) > 0
+
+
+def _over_ranks(space: fem.FunctionSpace, values: Array, *, add: bool = False) -> Array:
+    """Values at the dofs of this rank and its ghosts, as their owners have them. Collective.
+
+    Args:
+        space: Of the dofs.
+        values: (n,), ghosts behind.
+        add: Whether the owners add up what all ranks have there.
+    """
+    dofmap = space.dofmap
+    vector = dolfinx.la.vector(dofmap.index_map, dofmap.index_map_bs)
+    vector.array[:] = values
+    if add:
+        vector.scatter_reverse(dolfinx.la.InsertMode.add)
+    vector.scatter_forward()
+    return vector.array.copy()
+
+
+class _Interface:
+    """What the first rank makes of the pieces: sums at the unknowns kept and at the interface.
+
+    Attributes:
+        any: Whether pieces meet anywhere.
+    """
+
+    def __init__(self, piece: _Piece, unknowns: Selection) -> None:
+        """Number. Collective."""
+        self._unknowns, self._comm = unknowns, unknowns.comm
+        shares = self._comm.allgather(unknowns.whole.first + piece.interface.astype(np.int64))
+        self._counts = [share.size for share in shares]
+        between = np.concatenate(shares)
+        self.any = bool(between.size)
+        self._n_kept = unknowns.n_global
+        self._n_between = int(between.size)
+        self._size = self._n_kept + self._n_between
+        dofs = unknowns.numbers[: unknowns.first_motion]
+        place = np.searchsorted(dofs, piece.numbers)
+        found = np.zeros(place.size, dtype=np.bool_)
+        inside = place < dofs.size
+        found[inside] = dofs[place[inside]] == piece.numbers[inside]
+        place[~found] = self._n_kept + np.searchsorted(between, piece.numbers[~found])
+        # Of every piece where its boundary is among the unknowns kept and the interface behind.
+        self._places: list[Index] = self._comm.gather(place) or [place]
+        # Displacement of the interface under forces there, the unknowns kept at rest.
+        self._between: Callable[[Array], Array] = np.zeros_like
+        self._coupling: Array = np.zeros((0, 0))
+
+    def merge(self, schur: Array, *, symmetric: bool) -> Array:
+        """Add up the pieces and eliminate the interface; what is left, on the first rank.
+
+        Collective.
+        """
+        first = self._comm.rank == 0
+        if not first:
+            self._comm.Send(np.asfortranarray(schur).T, 0)
+            with collective_errors(self._comm):
+                pass
+            return np.zeros((0, 0), order="F")
+        total: Array = schur
+        if self._comm.size > 1 or schur.shape[0] < self._size:
+            total = np.zeros((self._size, self._size), order="F")
+            total[np.ix_(self._places[0], self._places[0])] = schur
+        for rank in range(1, self._comm.size):
+            place = self._places[rank]
+            part = np.zeros((place.size, place.size), order="F")
+            self._comm.Recv(part.T, rank)
+            total[np.ix_(place, place)] += part
+        with collective_errors(self._comm):
+            return self._eliminate(total, symmetric)
+
+    def _eliminate(self, total: Array, symmetric: bool) -> Array:
+        if not self.any:
+            return total
+        n = self._n_kept
+        self._coupling = total[n:, :n].copy(order="F")
+        self._between = _solver(total[n:, n:], symmetric)
+        left = total[:n, :n] - total[:n, n:] @ self._between(self._coupling)
+        if not np.all(np.isfinite(left)):
+            raise RuntimeError(
+                "the bulk stiffness cannot be condensed onto the unknowns that contact touches: "
+                "with these held it is still singular. A part of the body may be held by nothing; "
+                "or use condensation=False"
+            )
+        return np.asfortranarray(left)
+
+    def at_rest(self, pushed: Array, force: Array) -> tuple[Array, Array]:
+        """Displacement of boundary and interface with the unknowns kept at rest. Collective.
+
+        Args:
+            pushed: What the inner unknowns do to the boundary of this piece, (n_boundary,).
+            force: What acts at this rank's part of the interface.
+
+        Returns:
+            Of the boundary of this piece, (n_boundary,), and of this rank's part of the interface.
+        """
+        parts, applied = self._comm.gather(pushed), np.zeros(self._n_between)
+        self._comm.Gatherv(force, (applied, self._counts))
+        state: Array = np.zeros(self._size)
+        if parts is not None:
+            total: Array = np.zeros(self._size)
+            for place, part in zip(self._places, parts, strict=True):
+                total[place] += part
+            state[self._n_kept :] = self._between(applied + total[self._n_kept :])
+        return self._spread(state)
+
+    def carried(self, kept: Array) -> tuple[Array, Array]:
+        """The same as `at_rest` without load, for the unknowns kept, (n_kept,) on the first rank.
+
+        Collective.
+        """
+        state: Array = np.zeros(self._size)
+        if self._comm.rank == 0:
+            state[: self._n_kept] = kept
+            if self.any:
+                state[self._n_kept :] = -self._between(self._coupling @ kept)
+        return self._spread(state)
+
+    def _spread(self, state: Array) -> tuple[Array, Array]:
+        """From the first rank to the pieces, and to the owners of the interface. Collective."""
+        if self._comm.size == 1:
+            return state[self._places[0]], state[self._n_kept :]
+        first = self._comm.rank == 0
+        parts = [state[place] for place in self._places] if first else None
+        boundary = self._comm.scatter(parts)
+        mine: Array = np.zeros(self._counts[self._comm.rank])
+        self._comm.Scatterv((state[self._n_kept :].copy(), self._counts), mine)
+        return boundary, mine
+
+
+def _solver(matrix: Array, symmetric: bool) -> Callable[[Array], Array]:
+    """Solves systems of a dense matrix; what is no number comes of a singular one."""
+    factors: Any
+    if symmetric:
+        with contextlib.suppress(np.linalg.LinAlgError):  # it need not be positive definite
+            factors = scipy.linalg.cho_factor(matrix, check_finite=False)
+            return lambda force: scipy.linalg.cho_solve(factors, force, check_finite=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
+        factors = scipy.linalg.lu_factor(matrix, check_finite=False)
+    return lambda force: scipy.linalg.lu_solve(factors, force, check_finite=False)
 
 
 @dataclass
@@ -195,10 +400,10 @@ class Response:
     """Of a body to its loads and prescribed values, linear in them; the unknowns kept at rest.
 
     Attributes:
-        field: Displacement p of all unknowns, zero at those kept, (n,).
-        forces: K p at the unknowns eliminated, zero at those kept, (n,) (force).
-        load: The condensed external force g, (n_kept,) (force).
-        by_values: The part of it that the prescribed values make, (n_kept,) (force).
+        field: Displacement p of all unknowns, zero at those kept, (n_local,).
+        forces: K p at the unknowns eliminated, zero at those kept, (n_local,) (force).
+        load: The condensed external force g, on the first rank, (n_kept,) (force).
+        by_values: The part of it that the prescribed values make, likewise (force).
     """
 
     field: Array
@@ -217,21 +422,3 @@ class Response:
             for name in ("field", "forces", "load", "by_values"):
                 getattr(self, name)[:] += share * getattr(other, name)
         return self
-
-
-def _object(item: PETSc.Object) -> ctypes.c_void_p:
-    return ctypes.c_void_p(item.handle)
-
-
-def _call(name: str, *arguments: Any) -> None:
-    """A function of PETSc that petsc4py does not wrap.
-
-    Raises:
-        RuntimeError: It failed, or this PETSc does not have it.
-    """
-    function = getattr(ctypes.CDLL(petsc4py.PETSc.__file__), name, None)
-    if function is None:
-        raise RuntimeError(f"this PETSc has no {name}; use condensation=False")
-    code = function(*arguments)
-    if code:
-        raise RuntimeError(f"PETSc's {name} failed with error {code}; use condensation=False")

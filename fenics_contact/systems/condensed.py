@@ -52,7 +52,7 @@ def worthwhile(n: int, n_kept: int, dimension: int) -> bool:
 
 
 def touched(operators: Sequence[ContactOperator], unknowns: Unknowns) -> Indices:
-    """The unknowns that contact feels or acts on, ascending. One rank only."""
+    """This rank's unknowns that contact feels or acts on, ascending. Collective."""
     found = np.zeros(unknowns.n_local, dtype=np.bool_)
     found[unknowns.n_dofs :] = True
     for operator in operators:
@@ -61,35 +61,37 @@ def touched(operators: Sequence[ContactOperator], unknowns: Unknowns) -> Indices
 
 
 class CondensedSystem(System):
-    """The unknowns that contact touches, all others eliminated. One rank only."""
+    """The unknowns that contact touches, on the first rank; all others are eliminated."""
 
     # A dense factorisation costs no more than ten iterations. With fewer in a round L-BFGS is
     # Newton's method without a globalisation, and fails at a stiffness of 100 E/h.
     iterations_per_round = 8
 
     def __init__(self, full: FullSystem, unknowns: Selection, *, prefix: str = "") -> None:
-        """Select.
+        """Select. Collective.
 
         Args:
             full: All unknowns of a problem.
             unknowns: All of those that contact touches.
             prefix: Of the options of the factorisation.
         """
+        kept = unknowns.kept
         super().__init__(
             full.u,
             unknowns,
             full.bulk,
             full.contacts,
-            full.constrained[unknowns.kept],
-            full.label[unknowns.kept],
+            unknowns.gathered(full.constrained[kept].astype(np.float64)) > 0.5,
+            unknowns.gathered(full.label[kept].astype(np.float64)).astype(np.intp),
             full.n_bodies,
         )
         self.ready = False
         self.mark = object()
         self._fixed: Array | None = None  # the constant part of the matrices
         self._places: Array | None = None
-        self._full, self._prefix = full, prefix
-        self._kept_dofs = unknowns.kept[: unknowns.n_dofs]
+        self._full, self._prefix, self._selection = full, prefix, unknowns
+        # This rank's dofs among those kept; motions are behind all of them.
+        self._kept_dofs = kept[kept < unknowns.whole.n_dofs]
         self._condensation: Condensation | None = None
 
     def linear_solver(self, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
@@ -97,17 +99,13 @@ class CondensedSystem(System):
         return {"ksp_type": "preonly"}
 
     def update(self) -> int:
-        """Factor and condense the bulk's tangent."""
+        """Factor and condense the bulk's tangent. Collective."""
         stiffness = self._full.stiffness
         assert stiffness is not None
         self._condensation = self._fixed = None  # their memory first
         self.ready = False
         self._condensation = Condensation(
-            stiffness,
-            self._full.constrained,
-            self.unknowns.kept,
-            symmetric=self.bulk.symmetric,
-            prefix=self._prefix,
+            stiffness, self.bulk, self._selection, self._full.constrained, prefix=self._prefix
         )
         self.mark = object()
         self.ready = True
@@ -123,24 +121,28 @@ class CondensedSystem(System):
         return self._condensation
 
     def state(self) -> Array:
-        """The present values of the unknowns kept; a copy."""
-        return np.concatenate([self.u.x.array[self._kept_dofs], self.motions()])
+        """The present values of the unknowns kept; a copy. Collective."""
+        whole = self.unknowns.whole
+        mine = whole.joined(self.u.x.array[self._kept_dofs], self.motions())
+        return self.unknowns.gathered(mine)
 
     def set_state(self, state: Array) -> None:
-        """Set the unknowns kept; the others stay behind until `complete`."""
-        self.u.x.array[self._kept_dofs] = state[: self.unknowns.n_dofs]
+        """Set the unknowns kept; the others stay behind until `complete`. Collective."""
+        mine = self.unknowns.scattered(state)
+        self.u.x.array[self._kept_dofs] = mine[: self._kept_dofs.size]
+        self.u.x.scatter_forward()
         self.set_motions(state)
 
     def part(self, state: Array) -> Array:
-        """What of a state of all unknowns is kept."""
-        return state[self.unknowns.kept]
+        """What of a state of all unknowns is kept. Collective."""
+        return self.unknowns.gathered(state[self.unknowns.kept])
 
     def begin(self, load: Array) -> None:
-        """Condense the load and the values prescribed."""
+        """Condense the load and the values prescribed. Collective."""
         self._full.begin(load)
         state = self._full.state()
         self.condensation.set_load(load, state)
-        self.load = load[self.unknowns.kept]
+        self.load = self.part(load)
         self.prescribed = self.state()[self.constrained]
         outside = load.copy(), self._full.terms(state)
         for vector in outside:
@@ -195,7 +197,8 @@ class CondensedSystem(System):
     def matrix(self, *, symmetric: bool) -> PETSc.Mat:
         """A new operator, S and contact side by side."""
         n = self.unknowns.n_local
-        matrix = PETSc.Mat().createPython((n, n), Sum(), comm=self.unknowns.comm)
+        size = (n, None)
+        matrix = PETSc.Mat().createPython((size, size), Sum(), comm=self.unknowns.comm)
         matrix.setUp()
         return matrix
 
@@ -203,9 +206,11 @@ class CondensedSystem(System):
         """Have a solver factor a matrix of `matrix` where contact acts, and the rest once."""
         if self._places is None:
             gdim, space = len(self.u), self.u.function_space
-            self._places = np.full((self.unknowns.n_local, gdim), np.nan)
-            nodes = space.tabulate_dof_coordinates()[:, :gdim]
-            self._places[: self.unknowns.n_dofs] = nodes[self._kept_dofs // gdim]
+            nodes = space.tabulate_dof_coordinates()[self._kept_dofs // gdim]
+            nowhere = np.full(self.unknowns.n_motions, np.nan)
+            whole, gathered = self.unknowns.whole, self.unknowns.gathered
+            columns = [gathered(whole.joined(nodes[:, i], nowhere)) for i in range(gdim)]
+            self._places = np.stack(columns, axis=1)
         ksp.setOperators(matrix)
         ksp.pc.setType("python")
         ksp.pc.setPythonContext(PartlyFactored(self._places))
@@ -227,7 +232,8 @@ class CondensedSystem(System):
         on = rows == columns
         added = np.bincount(rows[on], values[on], minlength=len(fixed))
         self.diagonal = scale * (np.diag(fixed) + added)
-        self._full.diagonal[self.unknowns.kept] = self.diagonal  # for the round-off of contact
+        # For the round-off of contact.
+        self._full.diagonal[self.unknowns.kept] = self.unknowns.scattered(self.diagonal)
         return 0
 
 

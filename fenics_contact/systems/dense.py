@@ -1,4 +1,7 @@
-"""Solver for dense matrices S + C of which C changes, and acts on some of the unknowns only."""
+"""Solver for dense matrices S + C of which C changes, and acts on some of the unknowns only.
+
+All of it is on the first rank; the others have no unknowns, and wait.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import scipy.linalg
 import scipy.spatial
 from petsc4py import PETSc
 
+from fenics_contact.parallel import agreed, collective_errors
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["PartlyFactored", "Sum", "raise_kept"]
@@ -134,10 +138,13 @@ class PartlyFactored:
         except BaseException as error:
             self.error, regular = self.error or error, False
             self._factored = None
+        regular = agreed(pc.comm.tompi4py(), regular)
         pc.setFailedReason(reasons.NOERROR if regular else reasons.FACTOR_NUMERIC_ZEROPIVOT)
 
     def _set_up(self) -> bool:
         """Do so for the present operator; whether it is regular."""
+        if not len(self._places):
+            return True
         if self._operator.fixed is not self._fixed:
             self._fixed = self._operator.fixed
             self._forget()
@@ -237,6 +244,8 @@ class PartlyFactored:
             y.set(np.nan)
 
     def _apply(self, right: Array, solution: Array) -> None:
+        if not len(self._places):
+            return
         if not self._out.size:
             solution[:] = self._solve(right)
             return
@@ -270,7 +279,11 @@ def _factors(matrix: Array) -> tuple[Array, Index]:
 
 
 def raise_kept(ksp: PETSc.KSP) -> None:
-    """Raise what the contexts of a solver ran into when PETSc called them last, if it has any."""
+    """Raise what the contexts of a solver ran into when PETSc called them last, if it has any.
+
+    Collective: all ranks raise what one has.
+    """
     context = ksp.getPC().getPythonContext() if ksp.getPC().getType() == "python" else None
     if isinstance(context, PartlyFactored):
-        context.raise_kept()
+        with collective_errors(ksp.comm.tompi4py()):
+            context.raise_kept()

@@ -12,23 +12,26 @@ __all__ = ["PointProduct"]
 
 
 class PointProduct:
-    """DᵀBD for blocks B, one per point: every entry is a sum over fixed places of B. One rank only.
+    """DᵀBD for blocks B, one per point: every entry is a sum over fixed places of B.
 
-    What depends on D alone is found once; then a product costs a tenth of PETSc's.
+    The unknowns are all on the first rank, the points where they are. What depends on D alone is
+    found once; then a product costs a tenth of PETSc's.
     """
 
     def __init__(self, felt_map: PETSc.Mat, gdim: int) -> None:
-        """Find which places of B go where.
+        """Find which places of B go where. Collective.
 
         Args:
             felt_map: D, from the unknowns to the points, (n_points gdim, n).
             gdim: Rows of a point.
         """
+        self._comm = felt_map.comm.tompi4py()
         pointers, columns, values = felt_map.getValuesCSR()
-        shape = felt_map.getSize()
+        self._rows, n = felt_map.getSizes()[1]
+        shape = felt_map.getLocalSize()[0], n
         whole = scipy.sparse.csr_matrix((values, columns, pointers), shape)
         whole.eliminate_zeros()
-        n_points, n = shape[0] // gdim, shape[1]
+        n_points = shape[0] // gdim
         places, sources, factors = [], [], []
         for i in range(gdim):
             for j in range(gdim):
@@ -43,20 +46,27 @@ class PointProduct:
                 places.append(left.indices[first].astype(np.int64) * n + right.indices[second])
                 sources.append((row[first] * gdim + i) * gdim + j)
                 factors.append(left.data[first] * right.data[second])
-        entries, entry = np.unique(np.concatenate(places), return_inverse=True)
+        mine, entry = np.unique(np.concatenate(places), return_inverse=True)
         self._sum = scipy.sparse.csr_matrix(
             (np.concatenate(factors), (entry.ravel(), np.concatenate(sources))),
-            (entries.size, n_points * gdim * gdim),
+            (mine.size, n_points * gdim * gdim),
         )
-        counts = np.bincount(entries // n, minlength=n)
+        # On the first rank the entries of all ranks, and where those of each go.
+        shares = self._comm.gather(mine) or [mine[:0]]
+        self._counts = [share.size for share in shares]
+        entries, self._entry = np.unique(np.concatenate(shares), return_inverse=True)
+        counts = np.bincount(entries // n, minlength=self._rows)
         self._pointers = np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType)
         self._columns = (entries % n).astype(PETSc.IntType)
-        self._size = n
 
     def __call__(self, blocks: Array) -> PETSc.Mat:
-        """The product, a new matrix (n, n), for blocks (n_points, gdim, gdim)."""
+        """The product, a new matrix (n, n), for blocks (n_points, gdim, gdim). Collective."""
+        values = self._sum @ blocks.ravel()
+        if self._comm.size > 1:
+            parts = np.zeros(self._entry.size)
+            self._comm.Gatherv(values, (parts, self._counts))
+            values = np.bincount(self._entry, parts, minlength=self._columns.size)
+        size = (self._rows, None)
         return PETSc.Mat().createAIJ(
-            (self._size, self._size),
-            csr=(self._pointers, self._columns, self._sum @ blocks.ravel()),
-            comm=PETSc.COMM_SELF,
+            (size, size), csr=(self._pointers, self._columns, values), comm=self._comm
         )

@@ -23,7 +23,10 @@ class Unknowns:
         n_dofs: Dofs of the displacement that this rank owns.
         n_motions: Free motions of supports, in all.
         n_local: Unknowns of this rank: its dofs, and the motions on the last one.
+        n_global: Unknowns of all ranks.
+        first: Global number of the first one of this rank.
         first_motion: Global number of the first motion.
+        motions_on: The rank that has them.
         whole: All unknowns, of which these may be a `Selection`.
         kept: Numbers of these among this rank's share of all, ascending.
     """
@@ -35,9 +38,12 @@ class Unknowns:
         self.whole: Unknowns = self
         self.n_dofs = dofmap.index_map.size_local * dofmap.index_map_bs
         self.n_motions = n_motions
-        self.has_motions_here = n_motions > 0 and self.comm.rank == self.comm.size - 1
+        self.motions_on = self.comm.size - 1
+        self.has_motions_here = n_motions > 0 and self.comm.rank == self.motions_on
         self.n_local = self.n_dofs + (n_motions if self.has_motions_here else 0)
+        self.first = dofmap.index_map.local_range[0] * dofmap.index_map_bs
         self.first_motion = dofmap.index_map.size_global * dofmap.index_map_bs
+        self.n_global = self.first_motion + n_motions
         self.kept: npt.NDArray[np.int32] = np.arange(self.n_local, dtype=np.int32)
 
     def vector(self) -> PETSc.Vec:
@@ -53,7 +59,18 @@ class Unknowns:
         if self.n_motions == 0:
             return np.zeros(0)
         mine = values[self.n_dofs :] if self.has_motions_here else None
-        return np.asarray(self.comm.bcast(mine, root=self.comm.size - 1), dtype=np.float64)
+        return np.asarray(self.comm.bcast(mine, root=self.motions_on), dtype=np.float64)
+
+    def gathered(self, values: Array) -> Array:
+        """Of values at the unknowns `kept` on every rank those at this rank's unknowns. Collective.
+
+        The same, but for a `Selection`.
+        """
+        return values
+
+    def scattered(self, values: Array) -> Array:
+        """The inverse of `gathered`. Collective."""
+        return values
 
     def widened(self, matrix: PETSc.Mat, *, rows: bool = False) -> PETSc.Mat:
         """A matrix over the dofs as one over the unknowns, zero at the motions. Collective.
@@ -84,27 +101,52 @@ class Unknowns:
 
 
 class Selection(Unknowns):
-    """Some of the dofs and all of the motions, on one rank.
+    """Some of the dofs and all of the motions, all of them on the first rank.
 
-    Attributes are those of `Unknowns`.
+    Attributes are those of `Unknowns`, and
+        numbers: Of these unknowns among all of all ranks, ascending; the same on every rank.
     """
 
     def __init__(self, whole: Unknowns, kept: npt.NDArray[np.int32]) -> None:
-        """Select.
+        """Select. Collective.
 
         Args:
-            whole: All unknowns, those of one rank.
-            kept: Numbers of the dofs and motions, ascending.
+            whole: All unknowns.
+            kept: Numbers of the dofs and motions among this rank's, ascending.
         """
-        self.whole, self.kept = whole, kept
-        self.comm = whole.comm
-        self.n_local = kept.size
-        self.n_motions = whole.n_motions
-        self.n_dofs = self.first_motion = self.n_local - self.n_motions
-        self.has_motions_here = whole.has_motions_here
+        self.whole, self.kept, self.comm = whole, kept, whole.comm
+        shares = self.comm.allgather(whole.first + kept.astype(np.int64))
+        self._counts = [share.size for share in shares]
+        self.numbers: npt.NDArray[np.int64] = np.concatenate(shares)
+        self.first = 0
+        self.n_motions, self.motions_on = whole.n_motions, 0
+        self.has_motions_here = self.n_motions > 0 and self.comm.rank == 0
+        self.n_global = self.numbers.size
+        self.first_motion = self.n_global - self.n_motions
+        here = self.comm.rank == 0
+        self.n_local = self.n_global if here else 0
+        self.n_dofs = self.first_motion if here else 0
+
+    def gathered(self, values: Array) -> Array:
+        """See `Unknowns.gathered`: on the first rank, (n_local,)."""
+        if self.comm.size == 1:
+            return values
+        result = np.zeros(self.n_local)
+        self.comm.Gatherv(np.ascontiguousarray(values, dtype=np.float64), (result, self._counts))
+        return result
+
+    def scattered(self, values: Array) -> Array:
+        """See `Unknowns.scattered`: to the ranks whose they are."""
+        if self.comm.size == 1:
+            return values
+        result = np.zeros(self.kept.size)
+        self.comm.Scatterv((np.ascontiguousarray(values, dtype=np.float64), self._counts), result)
+        return result
 
     def widened(self, matrix: PETSc.Mat, *, rows: bool = False) -> PETSc.Mat:
         """Of a matrix over the dofs the columns selected; zero at the motions; a new matrix.
+
+        Collective.
 
         Raises:
             NotImplementedError: With ``rows``.
@@ -112,14 +154,13 @@ class Selection(Unknowns):
         if rows:
             raise NotImplementedError("rows of a selection")
         pointers, columns, values = matrix.getValuesCSR()
-        position = np.full(self.whole.n_local, -1, dtype=PETSc.IntType)
-        position[self.kept] = np.arange(self.n_local)
-        columns = position[columns]
-        found = columns >= 0
+        position = np.searchsorted(self.numbers, columns)
+        position[position == self.n_global] = 0
+        found = self.numbers[position] == columns
         pointers = np.concatenate([[0], np.cumsum(found)])[pointers].astype(PETSc.IntType)
         n_rows = matrix.getLocalSize()[0]
         return PETSc.Mat().createAIJ(
             ((n_rows, None), (self.n_local, None)),
-            csr=(pointers, columns[found], values[found]),
+            csr=(pointers, position[found].astype(PETSc.IntType), values[found]),
             comm=self.comm,
         )

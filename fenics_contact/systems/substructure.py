@@ -1,0 +1,142 @@
+"""A piece of a body with its inner unknowns eliminated: the stiffness that its boundary feels.
+
+Every rank has one, of its own cells alone, and factors it for itself. MUMPS leaves the dense Schur
+complement of the boundary with the factors of the inner unknowns.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+import petsc4py
+from petsc4py import PETSc
+
+from fenics_contact.systems import linear
+from fenics_contact.types import Array, Indices
+
+__all__ = ["Substructure"]
+
+
+class Substructure:
+    """A stiffness whose inner unknowns are factored. Of this rank alone: nothing is collective.
+
+    Attributes:
+        schur: What is left for the boundary, (n_boundary, n_boundary), Fortran order
+            (force/length).
+    """
+
+    def __init__(
+        self, stiffness: PETSc.Mat, boundary: Indices, *, symmetric: bool, prefix: str = ""
+    ) -> None:
+        """Factor.
+
+        Args:
+            stiffness: Of this rank alone, (n, n); used.
+            boundary: Numbers of the unknowns that stay, ascending, (n_boundary,).
+            symmetric: Whether the stiffness is.
+            prefix: Of the options of the factorisation.
+
+        Raises:
+            RuntimeError: The stiffness is singular even with the boundary held.
+            MemoryError: There is not enough.
+        """
+        n = stiffness.getSize()[0]
+        self._stiffness, self._boundary = stiffness, boundary
+        self._inner = np.setdiff1d(np.arange(n), boundary, assume_unique=True)
+        self._right, self._left = stiffness.createVecs()
+        if not self._inner.size:
+            pointers, columns, values = stiffness.getValuesCSR()
+            self.schur: Array = np.zeros((n, n), order="F")
+            rows = np.repeat(np.arange(n), np.diff(pointers))
+            np.add.at(self.schur, (rows, columns), values)
+            return
+        stiffness.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+        self._pc = PETSc.PC().create(stiffness.comm)
+        self._pc.setOptionsPrefix(prefix)
+        self._pc.setOperators(stiffness)
+        self._pc.setType("cholesky" if symmetric else "lu")
+        self._pc.setFactorSolverType("mumps")
+        self._pc.setFromOptions()
+        self._pc.setFactorSetUpSolverType()
+        self._factor = self._pc.getFactorMatrix()
+        # MUMPS' estimate of its workspace is short where the Schur complement is most of it.
+        self._factor.setMumpsIcntl(14, 400)
+        chosen = PETSc.IS().createGeneral(boundary, comm=PETSc.COMM_SELF)
+        if boundary.size:
+            _call("MatFactorSetSchurIS", _object(self._factor), _object(chosen))
+        self._pc.setUp()
+        error = self._factor.getMumpsInfog(1)
+        if linear.refused_memory(self._pc):
+            raise MemoryError(
+                "the factorisation that condenses onto the unknowns that contact touches was "
+                f"refused its memory (MUMPS error {error}): use condensation=False, or more ranks"
+            )
+        self.schur = self._schur_complement() if boundary.size else np.zeros((0, 0), order="F")
+        if error < 0 or not np.all(np.isfinite(self.schur)):
+            raise RuntimeError(
+                "the bulk stiffness cannot be condensed onto the unknowns that contact touches "
+                f"(MUMPS error {error}): with these held it is still singular. A part of the body "
+                "may be held by nothing; or use condensation=False"
+            )
+        # Solutions with the boundary at rest, and not of the whole.
+        self._factor.setMumpsIcntl(26, 0)
+
+    def _schur_complement(self) -> Array:
+        n = self._boundary.size
+        result = PETSc.Mat().createDense((n, n), comm=PETSc.COMM_SELF)
+        result.assemble()
+        found, status = ctypes.c_void_p(), ctypes.c_int()
+        factor = _object(self._factor)
+        _call("MatFactorCreateSchurComplement", factor, ctypes.byref(found), ctypes.byref(status))
+        _call("MatCopy", found, _object(result), ctypes.c_int(0))
+        _call("MatDestroy", ctypes.byref(found))
+        array = np.array(result.getDenseArray(readonly=True), order="F")
+        result.destroy()
+        return array
+
+    def at_rest(self, force: Array) -> Array:
+        """Displacement under forces on the inner unknowns, (n,), with the boundary at rest."""
+        result = np.zeros_like(force)
+        inner = force[self._inner]
+        if inner.any():
+            self._left.array[:] = 0.0
+            self._left.array[self._inner] = inner
+            self._factor.solve(self._left, self._right)
+            result[self._inner] = self._right.array_r[self._inner]
+        return result
+
+    def carried(self, boundary: Array) -> Array:
+        """Displacement that the boundary's, (n_boundary,), brings along, without load, (n,)."""
+        state = np.zeros(self._right.getSize())
+        state[self._boundary] = boundary
+        return state - self.at_rest(self.product(state))
+
+    def reaction(self, state: Array) -> Array:
+        """Force at the boundary, (n_boundary,), for displacements, (n,)."""
+        return self.product(state)[self._boundary]
+
+    def product(self, state: Array) -> Array:
+        """The stiffness times displacements, (n,)."""
+        self._right.array[:] = state
+        self._stiffness.mult(self._right, self._left)
+        return self._left.array_r.copy()
+
+
+def _object(item: PETSc.Object) -> ctypes.c_void_p:
+    return ctypes.c_void_p(item.handle)
+
+
+def _call(name: str, *arguments: Any) -> None:
+    """A function of PETSc that petsc4py does not wrap.
+
+    Raises:
+        RuntimeError: It failed, or this PETSc does not have it.
+    """
+    function = getattr(ctypes.CDLL(petsc4py.PETSc.__file__), name, None)
+    if function is None:
+        raise RuntimeError(f"this PETSc has no {name}; use condensation=False")
+    code = function(*arguments)
+    if code:
+        raise RuntimeError(f"PETSc's {name} failed with error {code}; use condensation=False")
