@@ -355,7 +355,7 @@ class Judge:
         scale = np.abs(outside) @ np.abs(way) + abs(springs) + abs(slid)
         if before is not None:
             scale += np.abs(before["outside"]) @ np.abs(way)
-        allowed = max(1e-6, 300 * record["rtol"]) * scale
+        allowed = max(1e-6, 300 * record["rtol"], self._curved) * scale
         rounding = sum(b["rounding"] for b in now["bodies"])
         allowed += 10 * rounding * max(np.abs(u).max(), np.abs(self._u).max(initial=0.0))
         for c, f in zip(problem.contacts, found, strict=True):
@@ -374,7 +374,7 @@ class Judge:
 
     def _tolerance(self, record: dict[str, Any], base: float) -> float:
         """Of forces, by what was asked for."""
-        found = max(base, 300 * record["rtol"])
+        found = max(base, 300 * record["rtol"], self._curved)
         for contact in record["contacts"]:
             if contact["lambda_n"] is not None:
                 found = max(found, 30 * contact["tolerance"])

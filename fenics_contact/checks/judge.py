@@ -110,7 +110,7 @@ class Judge:
             enforcement={c.name: c.enforcement_error() for c in augmented},
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
             # Of the opposite only what Γc meets is known before u is complete.
-            unseen=passing(self._contacts) if system is self._full else {},
+            unseen=self._passing() if system is self._full else {},
             kinematics=self._linearisation(respond) if respond else {},
             kinematics_allowed=self.kinematics,
             displacement=global_max(self._comm, np.abs(self._full.u.x.array)) / self._imposed,
@@ -129,6 +129,11 @@ class Judge:
                     "undeformed body; where it has moved to, the contact force would differ by "
                     f"{100 * found.force:.2g} % and the pressure by {100 * found.pressure:.2g} %",
                 )
+
+    def _passing(self) -> dict[str, tuple[float, list[float]]]:
+        """How deep bodies pass through between the points, by contact. Collective."""
+        by_area = self._cell_size ** (1 - len(self._full.u))
+        return passing(self._contacts, self._full.bulk.scale * by_area)
 
     def _linearisation(self, respond: Respond) -> dict[str, Linearisation]:
         """What taking displacements as small changes at this state, by contact. Collective."""

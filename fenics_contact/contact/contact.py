@@ -682,7 +682,9 @@ class Contact(PointResults):
             raise ValueError(f"{self.name}: the support is no DeformableBody; see `gap`")
         return self.pairs.true_gap(self.values)
 
-    def unseen_penetration(self, others: Sequence[Contact] = ()) -> tuple[float, Array]:
+    def unseen_penetration(
+        self, others: Sequence[Contact] = (), *, stiffness: float = 0.0
+    ) -> tuple[float, Array]:
         """How deep the opposite passes through Γc between the points of Γc. Collective.
 
         Corners and middles of the opposite's facets are followed back to Γc, with the pairs as they
@@ -692,6 +694,8 @@ class Contact(PointResults):
 
         Args:
             others: Further contacts, whose points see the opposite where it is their Γc.
+            stiffness: Of the bodies by area, about E/h (stress/length): what bears less than a
+                millionth of it times the depth holds nothing up.
 
         Returns:
             The largest such depth (length), 0 if there is none or the support is rigid, and the
@@ -706,6 +710,7 @@ class Contact(PointResults):
             max(global_max(comm, c.values.penetration) for c in (self, *others)),
             [c.pairs for c in others],
             gap_prescribed=self.gap_prescribed,
+            stiffness=stiffness,
         )
 
     def _traces(self) -> TraceProjection:
@@ -873,12 +878,20 @@ class Contact(PointResults):
         return self._values
 
 
-def passing(contacts: Sequence[Contact]) -> dict[str, tuple[float, list[float]]]:
-    """`Contact.unseen_penetration` by the names of the contacts that have any. Collective."""
+def passing(contacts: Sequence[Contact], stiffness: float) -> dict[str, tuple[float, list[float]]]:
+    """`Contact.unseen_penetration` by the names of the contacts that have any. Collective.
+
+    Args:
+        contacts: The contacts.
+        stiffness: Of the bodies by area, their weight included (force/length by area).
+    """
     found = {}
     for contact in contacts:
+        if contact.rigid:
+            continue
         others = [c for c in contacts if c is not contact]
-        depth, place = contact.unseen_penetration(others)
+        weight = global_max(contact.surface.mesh.comm, contact.values.weight)
+        depth, place = contact.unseen_penetration(others, stiffness=stiffness / weight)
         if not depth <= 0:
             found[contact.name] = depth, [float(x) for x in place]
     return found

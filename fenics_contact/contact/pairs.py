@@ -22,6 +22,8 @@ __all__ = ["Pairs", "PairsState"]
 
 # Share of the approach of two bodies that is no penetration between the points yet.
 _UNSEEN = 0.01
+# A pressure below this share of what the depth would take of the bodies, E/h times it, is none.
+_BEARS = 1e-6
 
 
 @dataclass(frozen=True)
@@ -178,6 +180,7 @@ class Pairs:
         others: Sequence[Pairs],
         *,
         gap_prescribed: bool,
+        stiffness: float,
     ) -> tuple[float, Array]:
         """See `Contact.unseen_penetration`. Collective.
 
@@ -187,6 +190,7 @@ class Pairs:
             deepest: Penetration at the deepest point of all contacts (length).
             others: Pairs of the other contacts.
             gap_prescribed: Whether the gap was given apart from the geometry.
+            stiffness: See `Contact.unseen_penetration`.
         """
         comm, search = self._mesh.comm, self.search
         nowhere = 0.0, np.zeros(self._gdim)
@@ -212,7 +216,11 @@ class Pairs:
                 mutual = search.facets_among(pairs.search)[back.facet]
                 own = pairs.search.surface.facets
                 deep[mutual & np.isin(back.source, own)] = -1.0
-        deep[search.facets_near(closed)[back.facet]] = -1.0
+        # A body that turns about a point bears next to nothing there, and is not deep.
+        depth = global_max(comm, np.where(deep > 0, approach - distance, 0.0))
+        bears = np.linalg.norm(values.total_traction, axis=1) >= _BEARS * stiffness * depth
+        holds = closed & (bears | (values.penetration >= _UNSEEN * depth))
+        deep[search.facets_near(holds)[back.facet]] = -1.0
         rows = np.column_stack([approach - distance, back.place])[deep > 0]
         rows = gather_rows(comm, rows)
         if not len(rows):
