@@ -513,7 +513,8 @@ class ContactProblem:
             return False
         if any(contact.pairs_anew for contact in self.contacts):
             return False
-        at_rest = self.increment == 0 and not self._committed.any()
+        moved = self._comm.allreduce(int(self._committed.any()))
+        at_rest = self.increment == 0 and not moved
         return at_rest or self.solver.system.mark in self._committed_energy.forces
 
     def _begin_energy_kept(self) -> None:
@@ -620,7 +621,7 @@ class ContactProblem:
         return verdict
 
     def _judge_kept(self, *, kinematics: bool) -> Verdict:
-        """Judge the condensed equations; u stays behind. One rank only."""
+        """Judge the condensed equations; u stays behind. Collective."""
         self._pending_field = self.solver.system.pending_field
         for contact in self.contacts:
             contact.evaluate()
@@ -762,7 +763,7 @@ class ContactProblem:
         increment, expected = (int(value) for value in numbers)
         self.expect(expected)
         self._fresh, self._solved = False, None
-        if self.solver.condensed and kept.any():
+        if self.solver.condensed and self._comm.allreduce(int(kept.any())):
             self.solver.keep(np.flatnonzero(kept).astype(np.int32))
         self.increment = increment
         self._committed, self._rate = state.copy(), rate.copy() if increment else None
