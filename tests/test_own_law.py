@@ -32,7 +32,7 @@ EXACT = 1e-7
 METHODS = ("lbfgs", "newton", "continuation", "alternating")
 
 
-@pytest.mark.parametrize("condensation", [None, False] if COMM.size == 1 else [None])
+@pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_overclosure(cell, method, condensation):
@@ -71,7 +71,7 @@ def test_any_units():
     assert close(found[1], found[0], EXACT) and close(found[2], found[0], EXACT)
 
 
-@pytest.mark.parametrize("condensation", [None, False] if COMM.size == 1 else [None])
+@pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_overclosure_with_friction(cell, method, condensation):
@@ -114,7 +114,7 @@ def dragged(law, cell="quadrilateral", **options):
     return scene, problem, contact
 
 
-@pytest.mark.parametrize("condensation", [None, False] if COMM.size == 1 else [None])
+@pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
 def test_friction_that_does_not_grow_as_the_pressure(cell, method, condensation):
@@ -223,6 +223,18 @@ def test_a_limit_of_another_law():
     _, problem, _ = dragged(Wrong(0.5, 4.0, fc.Scaled(), fc.Scaled()))
     with pytest.raises(fc.NotConverged, match="limit violated by"):
         problem.solve()
+
+
+def test_a_parameter_with_a_name_of_the_contact():
+    """The weight of the contact would be that of the law, and the other way round."""
+
+    @dataclass(frozen=True)
+    class Weighed(Overclosure):
+        weight: Any = 1.0
+
+    raised_everywhere(
+        lambda: block().contact(Weighed(P0, H)), ValueError, "contact", "Weighed", "'weight'"
+    )
 
 
 @pytest.mark.parametrize(("name", "value"), [("p0", 0.0), ("h", -1.0), ("h", np.nan)])

@@ -147,7 +147,7 @@ def test_cut_increments(make, tmp_path):
 def test_errors_are_estimated_of_a_state_taken_up(tmp_path):
     """The budget of a finished history is that of the run that solved it (1e-6, as solved)."""
     path, budgets = shared_folder(tmp_path) / "state.npz", []
-    for condensation in (True, True, False) if COMM.size == 1 else (False, False):
+    for condensation in (True, True, False):
         made = Press(condensation=condensation)
         list(made.increments(checkpoint=path))
         scene = made.scene

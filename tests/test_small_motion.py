@@ -100,7 +100,6 @@ def test_a_stiffness_in_other_units_fails(condensation):
 
     Who says so gets the solution; and a top that is moved by as much takes the block along.
     """
-    condensation = condensation if COMM.size == 1 else False
 
     def pushed(E, top=0.0, **options):
         scene = block("quadrilateral", n=4, E=E, up=-1.0)

@@ -21,7 +21,7 @@ METHODS = (None, "lbfgs", "newton", "continuation", "alternating")
 # Factors of lengths and of stresses: N-mm, SI, and two without round numbers, whose products have
 # other round-off in every digit.
 UNITS = [(1.0, 1.0), (1e-3, 1e6), (0.7, 3.3)]
-CONDENSATION = [None, False] if COMM.size == 1 else [None]
+CONDENSATION = [None, False]
 
 
 def same(results) -> None:

@@ -114,7 +114,7 @@ def test_forces_by_a_second_route(factor, condensation):
 
     What the solver, the laws and the sums of forces make of it agrees, within their tolerances.
     """
-    made = Rub(second_route=True, condensation=condensation if COMM.size == 1 else None)
+    made = Rub(second_route=True, condensation=condensation)
     made.contact.pairs.own_map.scale(factor)
     made.move(*PATH[1])
     if factor == 1.0:

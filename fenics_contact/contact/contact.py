@@ -89,7 +89,8 @@ class Contact(PointResults):
         accuracy: What was chosen for the accuracy wanted, None if none was said.
         tolerance: What `enforcement_error` must come below, with multipliers.
         parameters: Every parameter of law and support given by a number, as a ``fem.Constant``
-            by name ("friction", "k_n", "displacement" …): set ``.value`` to change it.
+            by name ("friction", "k_n", "displacement" …): set ``.value`` to change it. Of a
+            `Scaled` stiffness that is the multiple of E/h.
         entity_maps: For compiling `form` in a problem of one's own.
         name: In messages and files.
         free_motion: Components of the support's displacement that follow from the force on it, as

@@ -24,6 +24,8 @@ from fenics_contact.types import Array
 __all__ = ["Inputs", "displacement_degree"]
 
 
+# What a contact itself is given by these names, among which a law's parameters stand.
+_OWN = ("displacement", "gap", "support", "weight")
 # A direction with no more than this share across the normal counts as parallel to it.
 _PARALLEL = 1e-6
 
@@ -74,6 +76,11 @@ class Inputs:
         self._tributary: VertexAreas | None = None  # if a stiffness is that of Springs
         self.constants: dict[str, fem.Constant] = {}
         self.weight = self.scalar("weight", 1.0 if weight is None else weight)
+        for own in set(_OWN) & set(law.parameters()):
+            raise ValueError(
+                f"{name}: {type(law).__name__} has a parameter {own!r}, as the contact itself has "
+                "one; give it another name"
+            )
         self.law = {n: self._parameter(n, v) for n, v in law.parameters().items()}
         self.stiffness_factor = fem.Constant(self._surface.mesh, 1.0)
         for n in {"k_n", "k_t"} & set(self.law):
