@@ -175,8 +175,6 @@ def main() -> None:
             if run in FACTORED and n_dofs > MANY:
                 continue
             for ranks in arguments.ranks:
-                if ranks > 1 and run == "contact, condensed":
-                    continue
                 repeat = 1 if n_dofs > MANY else arguments.repeat
                 some.append(start(run, cells, ranks, repeat))
                 print(

@@ -112,6 +112,12 @@ def _all() -> list[Target]:
     one = ratio("contact", "linear, multigrid", million)
     found.append(Target(scene, "time / multigrid linear solve", large, one, 6.0))
     found.append(Target(scene, "memory [GiB]", large, memory("contact", million), 20.0))
+    for friction, increments in (("0", 1), ("0.2", 1), ("0.2", 40)):
+        scene = f"half-cylinder, μ = {friction}, {increments} increments"
+        two = speed_up(f"μ = {friction}, {increments} increments", 100_000)
+        found.append(
+            Target(scene, "speed-up of two ranks", "ranks/ranks.csv", two, 1.5, above=True)
+        )
     for size in (100_000, 300_000):
         scene = f"ball on a block, {size} dofs and more"
         two = speed_up("contact, multigrid", size)

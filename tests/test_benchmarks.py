@@ -77,7 +77,13 @@ def made_up(folder: Path, slower: float) -> None:
         for dofs in (46_875, 107_811, 331_776)
         for p, time in ((1, 10.0), (2, 6.0 * slower))
     ]
-    for name, rows in (("half_cylinder", cylinder), ("ball", ball), ("large", big)):
+    plane = [
+        {"run": run, "dofs": 122_630, "ranks": p, "iterations": 9, "seconds": time}
+        for run in ("μ = 0, 1 increments", "μ = 0.2, 1 increments", "μ = 0.2, 40 increments")
+        for p, time in ((1, 10.0), (2, 5.0 * slower))
+    ]
+    tables = {"half_cylinder": cylinder, "ball": ball, "large": big, "ranks": plane}
+    for name, rows in tables.items():
         (folder / name).mkdir(exist_ok=True)
         timing.save(folder / name / f"{name}.csv", rows)
     (folder / "parallel").mkdir(exist_ok=True)
@@ -89,7 +95,8 @@ def test_targets(tmp_path: Path) -> None:
     assert {row["met"] for row in targets.table(tmp_path)} == {targets.NOT_MEASURED}
     made_up(tmp_path, 1.0)
     rows = targets.table(tmp_path)
-    expected = [0.9, 0.1, 1.2, 0.1, 1.9, 2.4, 0.16, 0.5, 5.0, 5.4, 10 / 6, 10 / 6]
+    expected = [0.9, 0.1, 1.2, 0.1, 1.9, 2.4, 0.16, 0.5, 5.0, 5.4, 2, 2, 2]
+    expected += [10 / 6, 10 / 6]
     assert [row["measured"] for row in rows] == pytest.approx(expected)
     assert {row["met"] for row in rows} == {"yes"}
     assert "error of peak [%] 1" in next(r["with"] for r in rows if r["scene"].startswith("ball"))
@@ -194,6 +201,21 @@ def test_large_runs(tmp_path: Path) -> None:
     forces = [float(row["force"]) for row in rows.values() if row["force"]]
     assert len(forces) == 6
     assert forces == pytest.approx(forces[:1] * 6, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_ranks_run(tmp_path: Path) -> None:
+    """On one rank and on two: the same iterations of the package, the same forces to 1e-8."""
+    command = [sys.executable, str(ROOT / "benchmarks" / "ranks.py"), "--short"]
+    command += ["--repeat", "1", "--output", str(tmp_path)]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = timing.read(tmp_path / "ranks.csv")
+    for name in {row["run"] for row in rows if "increments" in row["run"]}:
+        for dofs in {row["dofs"] for row in rows}:
+            one, two = (r for r in rows if (r["run"], r["dofs"]) == (name, dofs))
+            assert one["iterations"] == two["iterations"]
+            assert float(one["force"]) == pytest.approx(float(two["force"]), rel=1e-8)
 
 
 @pytest.mark.slow

@@ -1,0 +1,110 @@
+"""Half-cylinder on one rank and on several: what each gains, and what plain DOLFINx does there.
+
+The scene of ``half_cylinder.py``, without friction and with, in one increment and in forty, by this
+package as it chooses by itself; one linear solve of the same body glued to the plane (MUMPS'
+Cholesky factorisation on as many ranks); and a penalty form written by hand in DOLFINx with
+Newton's method and MUMPS' LU. Meshes and compiled forms are not counted. Times are those of the
+slowest rank, in units of one linear solve on one rank; on several ranks, of one on as many, too.
+
+    OMP_NUM_THREADS=1 python benchmarks/ranks.py                 # five minutes
+    OMP_NUM_THREADS=1 python benchmarks/ranks.py --ranks 1 2 4 --h 0.0115
+    OMP_NUM_THREADS=1 python benchmarks/ranks.py --short
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+
+from benchmarks import costs, timing
+from scenes import problems
+from scenes.processes import command, environment
+
+# k_n h/E = k_t h/E, and the degree of the displacement.
+STIFFNESS, DEGREE = 10.0, 2
+# Friction and increments.
+HISTORIES = ((0.0, 1), (0.2, 1), (0.2, 40))
+Row = timing.Row
+
+
+def runs(case: costs.Case) -> dict[str, Callable[[], Row]]:
+    """What to time, by name."""
+    found: dict[str, Callable[[], Row]] = {costs.YARDSTICK: case.linear}
+    for friction in dict.fromkeys(friction for friction, _ in HISTORIES):
+        name = f"μ = {friction:g}: {costs.PLAIN['direct']}"
+        found[name] = partial(case.plain, friction)
+    for friction, steps in HISTORIES:
+        found[f"μ = {friction:g}, {steps} increments"] = partial(case.package, friction, steps)
+    return found
+
+
+def child(h: float, repeat: int) -> None:
+    """All runs in these processes; their rows as JSON, the last line of rank 0. Collective."""
+    small, case = (
+        costs.Case(problems.half_cylinder(0.0, size), DEGREE, STIFFNESS) for size in (0.25, h)
+    )
+    rows = timing.measure(runs(case), repeat=repeat, first=runs(small), once=costs.ONCE)
+    rows = [{"dofs": case.n_dofs, "ranks": MPI.COMM_WORLD.size} | row for row in rows]
+    if MPI.COMM_WORLD.rank == 0:
+        print(json.dumps(rows), flush=True)
+
+
+def start(h: float, ranks: int, repeat: int) -> list[Row]:
+    """The rows of a size in new processes."""
+    words = command(ranks, Path(__file__).resolve(), "--child", "--h", h, "--repeat", repeat)
+    done = subprocess.run(words, env=environment(), stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+def compared(rows: list[Row]) -> list[Row]:
+    """Times in linear solves and speed-ups, of rows of one size."""
+
+    def seconds(run: str, ranks: int) -> float:
+        return next((r["seconds"] for r in rows if (r["run"], r["ranks"]) == (run, ranks)), np.nan)
+
+    found = []
+    for row in rows:
+        new = {name: row[name] for name in ("dofs", "run", "ranks", "iterations", "seconds")}
+        new["linear solves on one rank"] = row["seconds"] / seconds(costs.YARDSTICK, 1)
+        new["on as many"] = row["seconds"] / seconds(costs.YARDSTICK, row["ranks"])
+        new["speed-up"] = seconds(row["run"], 1) / row["seconds"]
+        # The same scene, whatever its number of ranks: these do not differ.
+        new |= {name: row[name] for name in ("force", "peak") if name in row}
+        found.append(new)
+    return found
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = timing.parser(__doc__, "ranks")
+    parser.add_argument("--h", type=float, nargs="*", default=[0.0165], help="cell size on Γc")
+    parser.add_argument("--ranks", type=int, nargs="*", default=[1, 2])
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.child:
+        child(arguments.h[0], arguments.repeat)
+        return
+    everything: list[Row] = []
+    for h in [0.25, 0.12] if arguments.short else arguments.h:
+        rows: list[Row] = []
+        for ranks in arguments.ranks:
+            rows += start(h, ranks, arguments.repeat)
+            print(f"h = {h:g}, {ranks} ranks: done", flush=True)
+        everything += compared(rows)
+    if any(row["iterations"] == "none" for row in everything):
+        sys.exit(f"failed: {everything}")
+    title = f"Half-cylinder on several ranks, degree {DEGREE}, k h/E = {STIFFNESS:g}"
+    timing.write(arguments.output, "ranks", title, everything)
+
+
+if __name__ == "__main__":
+    np.seterr(all="ignore")
+    main()
