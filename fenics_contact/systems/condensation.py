@@ -1,28 +1,24 @@
 """Elimination of unknowns: a stiffness condensed onto some of its unknowns (Schur complement).
 
-By substructures: every rank eliminates what its own cells alone have (`Substructure`). The first
-rank adds up what is left, dense, and eliminates the interface, which is where pieces of several
-ranks meet. On one rank there is one piece, and no interface.
+By substructures: every rank eliminates what its own cells alone have (`Dissection`). The first rank
+adds up what is left, dense, and eliminates the interface, which is where pieces of several ranks
+meet. On one rank there is one piece, and no interface.
 """
 
 from __future__ import annotations
 
-import contextlib
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import dolfinx
 import numpy as np
 import numpy.typing as npt
-import scipy.linalg
 from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.parallel import collective_errors, global_sum
 from fenics_contact.systems.bulk import Bulk
-from fenics_contact.systems.substructure import Substructure
+from fenics_contact.systems.dissection import Dissection, Eliminated
 from fenics_contact.systems.unknowns import Selection
 from fenics_contact.types import Array, Index, Indices, Mask
 
@@ -78,12 +74,11 @@ class Condensation:
         own = _Piece.of(bulk, unknowns, constrained)
         self._piece = own
         with collective_errors(self._comm):
-            self._substructure = Substructure(
-                own.stiffness, own.boundary, symmetric=bulk.symmetric, prefix=prefix
+            self._dissection = Dissection(
+                own.stiffness, own.boundary, own.places, symmetric=bulk.symmetric, prefix=prefix
             )
         self._interface = _Interface(own, unknowns)
-        self.schur = self._interface.merge(self._substructure.schur, symmetric=bulk.symmetric)
-        self._substructure.schur = np.zeros((0, 0))  # its memory is wanted elsewhere
+        self.schur = self._interface.merge(self._dissection.release(), symmetric=bulk.symmetric)
         self.response = Response.none(constrained.size, unknowns.n_local)
 
     def _product(self, state: Array) -> Array:
@@ -93,15 +88,17 @@ class Condensation:
 
     def _solve(self, force: Array) -> Array:
         """Displacement of the unknowns eliminated under a force on them; zero at the others."""
-        own, at_rest = self._piece, self._interface.at_rest
+        own = self._piece
         applied = np.zeros(own.size)
         applied[own.inner] = force[own.unknowns[own.inner]]
-        state = self._substructure.at_rest(applied)
+        partial = self._dissection.push(applied)
+        boundary: Array = np.zeros(own.boundary.size)
         result = np.zeros_like(force)
         if self._interface.any:
-            pushed = -self._substructure.reaction(state)
-            boundary, result[own.interface] = at_rest(pushed, force[own.interface])
-            state += self._substructure.carried(boundary)
+            boundary, result[own.interface] = self._interface.at_rest(
+                partial.pushed[own.boundary], force[own.interface]
+            )
+        state = self._dissection.complete(boundary, partial)
         result[own.unknowns[own.inner]] = state[own.inner]
         return result
 
@@ -175,7 +172,7 @@ class Condensation:
         """All unknowns without load, (n_local,), that follow from those kept. Collective."""
         own, result = self._piece, np.zeros(self._right.getLocalSize())
         boundary, result[own.interface] = self._interface.carried(kept)
-        state = self._substructure.carried(boundary)
+        state = self._dissection.complete(boundary)
         result[own.unknowns[own.inner]] = state[own.inner]
         result[self._unknowns.kept] = self._unknowns.scattered(kept)
         return result
@@ -192,6 +189,7 @@ class _Piece:
         inner: Those that no other rank has and that are not kept, as numbers in the piece.
         boundary: The others, likewise.
         numbers: Global numbers of these, (n_boundary,).
+        places: Of all of them, (size, gdim).
         interface: Unknowns of this rank, by its numbers, at which pieces meet and that are neither
             kept nor prescribed.
     """
@@ -201,6 +199,7 @@ class _Piece:
     inner: Indices
     boundary: Indices
     numbers: npt.NDArray[np.int64]
+    places: Array
     interface: Indices
 
     @property
@@ -243,6 +242,7 @@ class _Piece:
             inner=np.flatnonzero(~stays).astype(np.int32),
             boundary=boundary,
             numbers=nodes.astype(np.int64) * d + chosen[boundary] % d,
+            places=space.tabulate_dof_coordinates()[chosen // d, : space.mesh.geometry.dim],
             interface=np.flatnonzero(interface).astype(np.int32),
         )
 
@@ -288,17 +288,15 @@ class _Interface:
         self._n_kept = unknowns.n_global
         self._n_between = int(between.size)
         self._size = self._n_kept + self._n_between
-        dofs = unknowns.numbers[: unknowns.first_motion]
-        place = np.searchsorted(dofs, piece.numbers)
+        place = np.searchsorted(between, piece.numbers)
         found = np.zeros(place.size, dtype=np.bool_)
-        inside = place < dofs.size
-        found[inside] = dofs[place[inside]] == piece.numbers[inside]
-        place[~found] = self._n_kept + np.searchsorted(between, piece.numbers[~found])
-        # Of every piece where its boundary is among the unknowns kept and the interface behind.
+        inside = place < between.size
+        found[inside] = between[place[inside]] == piece.numbers[inside]
+        dofs = unknowns.numbers[: unknowns.first_motion]
+        place[~found] = between.size + np.searchsorted(dofs, piece.numbers[~found])
+        # Of every piece where its boundary is among the interface and the unknowns kept behind.
         self._places: list[Index] = self._comm.gather(place) or [place]
-        # Displacement of the interface under forces there, the unknowns kept at rest.
-        self._between: Callable[[Array], Array] = np.zeros_like
-        self._coupling: Array = np.zeros((0, 0))
+        self._between: Eliminated | None = None  # on the first rank
 
     def merge(self, schur: Array, *, symmetric: bool) -> Array:
         """Add up the pieces and eliminate the interface; what is left, on the first rank.
@@ -314,29 +312,20 @@ class _Interface:
         total: Array = schur
         if self._comm.size > 1 or schur.shape[0] < self._size:
             total = np.zeros((self._size, self._size), order="F")
-            total[np.ix_(self._places[0], self._places[0])] = schur
+            total.T[np.ix_(self._places[0], self._places[0])] = schur.T
         for rank in range(1, self._comm.size):
             place = self._places[rank]
             part = np.zeros((place.size, place.size), order="F")
             self._comm.Recv(part.T, rank)
-            total[np.ix_(place, place)] += part
+            total.T[np.ix_(place, place)] += part.T
         with collective_errors(self._comm):
             return self._eliminate(total, symmetric)
 
     def _eliminate(self, total: Array, symmetric: bool) -> Array:
         if not self.any:
             return total
-        n = self._n_kept
-        self._coupling = total[n:, :n].copy(order="F")
-        self._between = _solver(total[n:, n:], symmetric)
-        left = total[:n, :n] - total[:n, n:] @ self._between(self._coupling)
-        if not np.all(np.isfinite(left)):
-            raise RuntimeError(
-                "the bulk stiffness cannot be condensed onto the unknowns that contact touches: "
-                "with these held it is still singular. A part of the body may be held by nothing; "
-                "or use condensation=False"
-            )
-        return np.asfortranarray(left)
+        self._between = Eliminated(total, self._n_between, symmetric=symmetric)
+        return self._between.release()
 
     def at_rest(self, pushed: Array, force: Array) -> tuple[Array, Array]:
         """Displacement of boundary and interface with the unknowns kept at rest. Collective.
@@ -355,7 +344,9 @@ class _Interface:
             total: Array = np.zeros(self._size)
             for place, part in zip(self._places, parts, strict=True):
                 total[place] += part
-            state[self._n_kept :] = self._between(applied + total[self._n_kept :])
+            n = self._n_between
+            if self._between is not None:
+                state[:n] = self._between.at_rest(applied + total[:n])
         return self._spread(state)
 
     def carried(self, kept: Array) -> tuple[Array, Array]:
@@ -365,34 +356,22 @@ class _Interface:
         """
         state: Array = np.zeros(self._size)
         if self._comm.rank == 0:
-            state[: self._n_kept] = kept
-            if self.any:
-                state[self._n_kept :] = -self._between(self._coupling @ kept)
+            n = self._n_between
+            state[n:] = kept
+            if self._between is not None:
+                state[:n] = self._between.carried(kept)
         return self._spread(state)
 
     def _spread(self, state: Array) -> tuple[Array, Array]:
         """From the first rank to the pieces, and to the owners of the interface. Collective."""
         if self._comm.size == 1:
-            return state[self._places[0]], state[self._n_kept :]
+            return state[self._places[0]], state[: self._n_between]
         first = self._comm.rank == 0
         parts = [state[place] for place in self._places] if first else None
         boundary = self._comm.scatter(parts)
         mine: Array = np.zeros(self._counts[self._comm.rank])
-        self._comm.Scatterv((state[self._n_kept :].copy(), self._counts), mine)
+        self._comm.Scatterv((state[: self._n_between].copy(), self._counts), mine)
         return boundary, mine
-
-
-def _solver(matrix: Array, symmetric: bool) -> Callable[[Array], Array]:
-    """Solves systems of a dense matrix; what is no number comes of a singular one."""
-    factors: Any
-    if symmetric:
-        with contextlib.suppress(np.linalg.LinAlgError):  # it need not be positive definite
-            factors = scipy.linalg.cho_factor(matrix, check_finite=False)
-            return lambda force: scipy.linalg.cho_solve(factors, force, check_finite=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
-        factors = scipy.linalg.lu_factor(matrix, check_finite=False)
-    return lambda force: scipy.linalg.lu_solve(factors, force, check_finite=False)
 
 
 @dataclass

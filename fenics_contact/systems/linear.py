@@ -89,6 +89,8 @@ def options(kind: str, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
             "ksp_type": "preonly",
             "pc_type": "cholesky" if symmetric else "lu",
             "pc_factor_mat_solver_type": "mumps",
+            # On several ranks MUMPS distributes work as it goes, and may want more than it thought.
+            "mat_mumps_icntl_14": 100,
         }
     if not accurate:
         return {"ksp_type": "preonly"} | _MULTIGRID

@@ -1,7 +1,6 @@
 """A piece of a body with its inner unknowns eliminated: the stiffness that its boundary feels.
 
-Every rank has one, of its own cells alone, and factors it for itself. MUMPS leaves the dense Schur
-complement of the boundary with the factors of the inner unknowns.
+MUMPS leaves the dense Schur complement of the boundary with the factors of the inner unknowns.
 """
 
 from __future__ import annotations
@@ -85,16 +84,19 @@ class Substructure:
 
     def _schur_complement(self) -> Array:
         n = self._boundary.size
-        result = PETSc.Mat().createDense((n, n), comm=PETSc.COMM_SELF)
-        result.assemble()
-        found, status = ctypes.c_void_p(), ctypes.c_int()
+        found, status, values = ctypes.c_void_p(), ctypes.c_int(), ctypes.POINTER(ctypes.c_double)()
         factor = _object(self._factor)
         _call("MatFactorCreateSchurComplement", factor, ctypes.byref(found), ctypes.byref(status))
-        _call("MatCopy", found, _object(result), ctypes.c_int(0))
+        _call("MatDenseGetArrayRead", found, ctypes.byref(values))
+        array = np.ctypeslib.as_array(values, (n, n)).T.copy(order="F")
+        _call("MatDenseRestoreArrayRead", found, ctypes.byref(values))
         _call("MatDestroy", ctypes.byref(found))
-        array = np.array(result.getDenseArray(readonly=True), order="F")
-        result.destroy()
         return array
+
+    def release(self) -> Array:
+        """`schur`, which is not kept any more."""
+        schur, self.schur = self.schur, np.zeros((0, 0))
+        return schur
 
     def at_rest(self, force: Array) -> Array:
         """Displacement under forces on the inner unknowns, (n,), with the boundary at rest."""
