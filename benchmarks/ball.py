@@ -51,7 +51,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="runs whose name contains this")
     arguments = parser.parse_args()
     if MPI.COMM_WORLD.size > 1:
-        parser.error("times here are of one rank; ranks.py compares several")
+        parser.error("times here are of one rank; large.py takes several (--ranks)")
     sizes, finer = arguments.cells, arguments.reference
     if arguments.short:
         sizes, finer = [6, 8, 11], 14

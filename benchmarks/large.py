@@ -33,7 +33,7 @@ from petsc4py import PETSc
 
 from benchmarks import costs, timing
 from scenes import problems
-from scenes.processes import command, environment
+from scenes.processes import answer
 
 COMM = MPI.COMM_WORLD
 FRICTION = 0.3
@@ -131,12 +131,11 @@ def events() -> np.ndarray:
 
 def start(run: str, cells: int, ranks: int, repeat: int) -> dict[str, Any]:
     """The row of a run in new processes."""
-    words = command(ranks, Path(__file__).resolve(), "--child", run)
-    words += ["--cells", str(cells), "--repeat", str(repeat)]
-    done = subprocess.run(words, env=environment(), stdout=subprocess.PIPE, text=True)
-    if done.returncode:
+    words = ["--child", run, "--cells", cells, "--repeat", repeat]
+    try:
+        return answer(ranks, Path(__file__).resolve(), *words)
+    except subprocess.CalledProcessError:
         return {"run": run, "ranks": ranks, "iterations": "failed", "seconds": float("nan")}
-    return json.loads(done.stdout.strip().splitlines()[-1])
 
 
 def in_units(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

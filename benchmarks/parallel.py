@@ -22,7 +22,6 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -34,7 +33,7 @@ from mpi4py import MPI
 
 from benchmarks import large, timing
 from fenics_contact import plotting
-from scenes.processes import command, environment
+from scenes.processes import answer
 
 RUNS = ("linear, multigrid", "contact, multigrid", "contact, multigrid, Newton")
 CELLS = (24, 32, 47)
@@ -274,9 +273,7 @@ def draw(path: Path, rows: Sequence[Row], machine: Machine) -> None:
 
 def launch_machine() -> Machine:
     """`measure_machine` in two new processes."""
-    words = command(2, Path(__file__).resolve(), "--machine")
-    done = subprocess.run(words, env=environment(), stdout=subprocess.PIPE, text=True, check=True)
-    return Machine(**json.loads(done.stdout.strip().splitlines()[-1]))
+    return Machine(**answer(2, Path(__file__).resolve(), "--machine"))
 
 
 def report(folder: Path, rows: list[Row], machine: Machine) -> None:

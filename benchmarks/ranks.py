@@ -6,7 +6,7 @@ Cholesky factorisation on as many ranks); and a penalty form written by hand in 
 Newton's method and MUMPS' LU. Meshes and compiled forms are not counted. Times are those of the
 slowest rank, in units of one linear solve on one rank; on several ranks, of one on as many, too.
 
-    OMP_NUM_THREADS=1 python benchmarks/ranks.py                 # five minutes
+    OMP_NUM_THREADS=1 python benchmarks/ranks.py                 # two minutes
     OMP_NUM_THREADS=1 python benchmarks/ranks.py --ranks 1 2 4 --h 0.0115
     OMP_NUM_THREADS=1 python benchmarks/ranks.py --short
 """
@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -26,7 +25,7 @@ from mpi4py import MPI
 
 from benchmarks import costs, timing
 from scenes import problems
-from scenes.processes import command, environment
+from scenes.processes import answer
 
 # k_n h/E = k_t h/E, and the degree of the displacement.
 STIFFNESS, DEGREE = 10.0, 2
@@ -59,9 +58,7 @@ def child(h: float, repeat: int) -> None:
 
 def start(h: float, ranks: int, repeat: int) -> list[Row]:
     """The rows of a size in new processes."""
-    words = command(ranks, Path(__file__).resolve(), "--child", "--h", h, "--repeat", repeat)
-    done = subprocess.run(words, env=environment(), stdout=subprocess.PIPE, text=True, check=True)
-    return json.loads(done.stdout.strip().splitlines()[-1])
+    return answer(ranks, Path(__file__).resolve(), "--child", "--h", h, "--repeat", repeat)
 
 
 def compared(rows: list[Row]) -> list[Row]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -20,3 +23,15 @@ def command(ranks: int, *words: object) -> list[str]:
     """Python with these words, on several ranks by mpirun."""
     launch = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks > 1 else []
     return [*launch, sys.executable, *map(str, words)]
+
+
+def answer(ranks: int, *words: object) -> Any:
+    """The last line that Python prints with these words, on several ranks by mpirun, as JSON.
+
+    Raises:
+        subprocess.CalledProcessError: It failed.
+    """
+    done = subprocess.run(
+        command(ranks, *words), env=environment(), stdout=subprocess.PIPE, text=True, check=True
+    )
+    return json.loads(done.stdout.strip().splitlines()[-1])

@@ -695,8 +695,8 @@ class Contact(PointResults):
 
         Args:
             others: Further contacts, whose points see the opposite where it is their Γc.
-            stiffness: Of the bodies by area, about E/h (stress/length): what bears less than a
-                millionth of it times the depth holds nothing up.
+            stiffness: Of the bodies by area, about E/h times the contact's weight (force/length by
+                area): what bears less than a millionth of it times the depth holds nothing up.
 
         Returns:
             The largest such depth (length), 0 if there is none or the support is rigid, and the
@@ -711,7 +711,7 @@ class Contact(PointResults):
             max(global_max(comm, c.values.penetration) for c in (self, *others)),
             [c.pairs for c in others],
             gap_prescribed=self.gap_prescribed,
-            stiffness=stiffness,
+            stiffness=stiffness / global_max(comm, self.values.weight),
         )
 
     def _traces(self) -> TraceProjection:
@@ -884,15 +884,12 @@ def passing(contacts: Sequence[Contact], stiffness: float) -> dict[str, tuple[fl
 
     Args:
         contacts: The contacts.
-        stiffness: Of the bodies by area, their weight included (force/length by area).
+        stiffness: See there.
     """
     found = {}
     for contact in contacts:
-        if contact.rigid:
-            continue
         others = [c for c in contacts if c is not contact]
-        weight = global_max(contact.surface.mesh.comm, contact.values.weight)
-        depth, place = contact.unseen_penetration(others, stiffness=stiffness / weight)
+        depth, place = contact.unseen_penetration(others, stiffness=stiffness)
         if not depth <= 0:
             found[contact.name] = depth, [float(x) for x in place]
     return found

@@ -76,7 +76,7 @@ class Inputs:
         self._tributary: VertexAreas | None = None  # if a stiffness is that of Springs
         self.constants: dict[str, fem.Constant] = {}
         self.weight = self.scalar("weight", 1.0 if weight is None else weight)
-        for own in set(_OWN) & set(law.parameters()):
+        for own in [n for n in _OWN if n in law.parameters()]:
             raise ValueError(
                 f"{name}: {type(law).__name__} has a parameter {own!r}, as the contact itself has "
                 "one; give it another name"

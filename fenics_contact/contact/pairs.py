@@ -190,7 +190,7 @@ class Pairs:
             deepest: Penetration at the deepest point of all contacts (length).
             others: Pairs of the other contacts.
             gap_prescribed: Whether the gap was given apart from the geometry.
-            stiffness: See `Contact.unseen_penetration`.
+            stiffness: Of the bodies by area, about E/h (stress/length).
         """
         comm, search = self._mesh.comm, self.search
         nowhere = 0.0, np.zeros(self._gdim)

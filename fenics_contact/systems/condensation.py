@@ -71,11 +71,16 @@ class Condensation:
         self._right, self._left = stiffness.createVecs()
         self._directions: list[tuple[Array, Response]] = []
         self._scale = bulk.scale
-        own = _Piece.of(bulk, unknowns, constrained)
-        self._piece = own
+        own_stiffness = bulk.own_stiffness()
+        own = self._piece = _Piece.of(own_stiffness, bulk.space, unknowns, constrained)
+        free = PETSc.IS().createGeneral(own.unknowns, comm=PETSc.COMM_SELF)
         with collective_errors(self._comm):
             self._dissection = Dissection(
-                own.stiffness, own.boundary, own.places, symmetric=bulk.symmetric, prefix=prefix
+                own_stiffness.createSubMatrix(free, free),
+                own.boundary,
+                own.places,
+                symmetric=bulk.symmetric,
+                prefix=prefix,
             )
         self._interface = _Interface(own, unknowns)
         self.schur = self._interface.merge(self._dissection.release(), symmetric=bulk.symmetric)
@@ -183,7 +188,6 @@ class _Piece:
     """This rank's cells: the unknowns that are free there, numbered apart.
 
     Attributes:
-        stiffness: Of these cells alone, (size, size), without conditions.
         size: Unknowns of the piece.
         unknowns: Their numbers among those of this rank, ghosts behind its own, (size,).
         inner: Those that no other rank has and that are not kept, as numbers in the piece.
@@ -194,7 +198,6 @@ class _Piece:
             kept nor prescribed.
     """
 
-    stiffness: PETSc.Mat
     unknowns: Indices
     inner: Indices
     boundary: Indices
@@ -208,36 +211,42 @@ class _Piece:
         return int(self.unknowns.size)
 
     @classmethod
-    def of(cls, bulk: Bulk, unknowns: Selection, constrained: Mask) -> _Piece:
-        """That of the present tangent. Collective."""
+    def of(
+        cls,
+        stiffness: PETSc.Mat,
+        space: fem.FunctionSpace,
+        unknowns: Selection,
+        constrained: Mask,
+    ) -> _Piece:
+        """Number. Collective.
+
+        Args:
+            stiffness: See `Bulk.own_stiffness`.
+            space: Of its dofs.
+            unknowns: Those to keep.
+            constrained: Mask of the prescribed unknowns among all of this rank.
+        """
         n = unknowns.whole.n_dofs
-        space = bulk.space
         kept = np.zeros(unknowns.whole.n_local, dtype=np.bool_)
         kept[unknowns.kept] = True
         kept, constrained = kept[:n], constrained[:n]
-        stiffness = bulk.own_stiffness()
         if unknowns.comm.size == 1:
             here = np.ones(n, dtype=np.bool_)
             shared = np.zeros(n, dtype=np.bool_)
         else:
             here = _acted_on(stiffness)
-            shared = _over_ranks(space, here.astype(np.float64), add=True) > 1.5
-            kept, constrained = (
-                _over_ranks(space, np.resize(mask.astype(np.float64), here.size)) > 0.5
-                for mask in (kept, constrained)
-            )
+            shared = _over_ranks(space, here, add=True) > 1.5
+            kept, constrained = (_over_ranks(space, mask) > 0.5 for mask in (kept, constrained))
             here[:n] |= ~shared[:n]  # what has no stiffness at all is told by the factorisation
         free = here & (kept | ~constrained)
         chosen = np.flatnonzero(free).astype(np.int32)
         stays = (kept | shared)[chosen]
-        places = PETSc.IS().createGeneral(chosen, comm=PETSc.COMM_SELF)
         dofmap = space.dofmap
         d = dofmap.index_map_bs
         boundary = np.flatnonzero(stays).astype(np.int32)
         nodes = dofmap.index_map.local_to_global((chosen[boundary] // d).astype(np.int32))
         interface = (shared & ~kept & ~constrained)[:n]
         return cls(
-            stiffness=stiffness.createSubMatrix(places, places),
             unknowns=chosen,
             inner=np.flatnonzero(~stays).astype(np.int32),
             boundary=boundary,
@@ -254,17 +263,17 @@ def _acted_on(stiffness: PETSc.Mat) -> Mask:
     return np.bincount(row, values != 0.0, minlength=pointers.size - 1) > 0
 
 
-def _over_ranks(space: fem.FunctionSpace, values: Array, *, add: bool = False) -> Array:
-    """Values at the dofs of this rank and its ghosts, as their owners have them. Collective.
+def _over_ranks(space: fem.FunctionSpace, marks: Mask, *, add: bool = False) -> Array:
+    """Marks at the dofs of this rank and its ghosts, as their owners have them. Collective.
 
     Args:
         space: Of the dofs.
-        values: (n,), ghosts behind.
+        marks: At this rank's own, and at its ghosts behind if they count.
         add: Whether the owners add up what all ranks have there.
     """
     dofmap = space.dofmap
     vector = dolfinx.la.vector(dofmap.index_map, dofmap.index_map_bs)
-    vector.array[:] = values
+    vector.array[: marks.size] = marks
     if add:
         vector.scatter_reverse(dolfinx.la.InsertMode.add)
     vector.scatter_forward()
@@ -280,14 +289,13 @@ class _Interface:
 
     def __init__(self, piece: _Piece, unknowns: Selection) -> None:
         """Number. Collective."""
-        self._unknowns, self._comm = unknowns, unknowns.comm
+        self._comm = unknowns.comm
         shares = self._comm.allgather(unknowns.whole.first + piece.interface.astype(np.int64))
         self._counts = [share.size for share in shares]
         between = np.concatenate(shares)
         self.any = bool(between.size)
-        self._n_kept = unknowns.n_global
         self._n_between = int(between.size)
-        self._size = self._n_kept + self._n_between
+        self._size = self._n_between + unknowns.n_global
         place = np.searchsorted(between, piece.numbers)
         found = np.zeros(place.size, dtype=np.bool_)
         inside = place < between.size
@@ -303,13 +311,20 @@ class _Interface:
 
         Collective.
         """
-        first = self._comm.rank == 0
-        if not first:
-            self._comm.Send(np.asfortranarray(schur).T, 0)
-            with collective_errors(self._comm):
-                pass
-            return np.zeros((0, 0), order="F")
-        total: Array = schur
+        total: Array = np.zeros((0, 0), order="F")
+        if self._comm.rank == 0:
+            total = self._added_up(schur)
+        else:
+            self._comm.Send(schur.T, 0)
+        with collective_errors(self._comm):
+            if self._comm.rank == 0 and self.any:
+                self._between = Eliminated(total, self._n_between, symmetric=symmetric)
+                return self._between.release()
+        return total
+
+    def _added_up(self, schur: Array) -> Array:
+        """On the first rank the pieces of all, of which it has one."""
+        total = schur
         if self._comm.size > 1 or schur.shape[0] < self._size:
             total = np.zeros((self._size, self._size), order="F")
             total.T[np.ix_(self._places[0], self._places[0])] = schur.T
@@ -318,14 +333,7 @@ class _Interface:
             part = np.zeros((place.size, place.size), order="F")
             self._comm.Recv(part.T, rank)
             total.T[np.ix_(place, place)] += part.T
-        with collective_errors(self._comm):
-            return self._eliminate(total, symmetric)
-
-    def _eliminate(self, total: Array, symmetric: bool) -> Array:
-        if not self.any:
-            return total
-        self._between = Eliminated(total, self._n_between, symmetric=symmetric)
-        return self._between.release()
+        return total
 
     def at_rest(self, pushed: Array, force: Array) -> tuple[Array, Array]:
         """Displacement of boundary and interface with the unknowns kept at rest. Collective.

@@ -63,6 +63,7 @@ def touched(operators: Sequence[ContactOperator], unknowns: Unknowns) -> Indices
 class CondensedSystem(System):
     """The unknowns that contact touches, on the first rank; all others are eliminated."""
 
+    unknowns: Selection
     # A dense factorisation costs no more than ten iterations. With fewer in a round L-BFGS is
     # Newton's method without a globalisation, and fails at a stiffness of 100 E/h.
     iterations_per_round = 8
@@ -89,7 +90,7 @@ class CondensedSystem(System):
         self.mark = object()
         self._fixed: Array | None = None  # the constant part of the matrices
         self._places: Array | None = None
-        self._full, self._prefix, self._selection = full, prefix, unknowns
+        self._full, self._prefix = full, prefix
         # This rank's dofs among those kept; motions are behind all of them.
         self._kept_dofs = kept[kept < unknowns.whole.n_dofs]
         self._condensation: Condensation | None = None
@@ -105,7 +106,7 @@ class CondensedSystem(System):
         self._condensation = self._fixed = None  # their memory first
         self.ready = False
         self._condensation = Condensation(
-            stiffness, self.bulk, self._selection, self._full.constrained, prefix=self._prefix
+            stiffness, self.bulk, self.unknowns, self._full.constrained, prefix=self._prefix
         )
         self.mark = object()
         self.ready = True

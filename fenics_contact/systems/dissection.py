@@ -1,8 +1,8 @@
 """A rank's cells, cut into substructures that are eliminated one after another and merged in pairs.
 
 MUMPS orders badly where a Schur complement is asked for, the worse the larger the piece. In space
-small pieces, merged by dense algebra as in nested dissection, take less than half of the operations
-of one large piece, and less than a plain factorisation.
+small pieces, merged by dense algebra as in nested dissection, take fewer operations than a large
+one.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import scipy.linalg
 import scipy.sparse
 from petsc4py import PETSc
 
-from fenics_contact.systems.substructure import Substructure
+from fenics_contact.systems.substructure import SINGULAR, Substructure
 from fenics_contact.types import Array, Index, Indices, Mask
 
 __all__ = ["Dissection", "Eliminated", "Partial"]
@@ -79,11 +79,7 @@ class Eliminated:
             taken = np.asfortranarray(self._felt @ self.at_rest(self._feel))
         self._left: Array = matrix[n:, n:] - taken
         if not np.all(np.isfinite(self._left)):
-            raise RuntimeError(
-                "the bulk stiffness cannot be condensed onto the unknowns that contact touches: "
-                "with these held it is still singular. A part of the body may be held by nothing; "
-                "or use condensation=False"
-            )
+            raise RuntimeError(SINGULAR)
 
     def _half_solved(self, force: Array, *, back: bool = False) -> Array:
         """L⁻¹ times it, or L⁻ᵀ."""
@@ -190,14 +186,13 @@ class Dissection:
         if depth == 0:
             whole = Substructure(stiffness, boundary, symmetric=symmetric, prefix=prefix)
             self._leaves = [_Leaf(np.arange(n), boundary, whole)]
-            self.schur: Array = whole.schur
+            self.schur: Array = whole.release()
             return
         pointers, columns, values = stiffness.getValuesCSR()
         matrix = scipy.sparse.csr_matrix((values, columns, pointers), (n, n))
         stays = np.zeros(n, dtype=np.bool_)
         stays[boundary] = True
         part, level = _dissected(matrix, places, stays, depth)
-        self._position = np.zeros(n, dtype=np.int32)
         left = [
             self._add_leaf(matrix, np.flatnonzero((part == p) & (level == 0)), level)
             for p in range(2**depth)
@@ -209,10 +204,15 @@ class Dissection:
                 for i, chosen in zip(range(0, len(left), 2), between, strict=True)
             ]
         [(others, schur)] = left
-        self._position[boundary] = np.arange(boundary.size)
-        place = self._position[others]
+        place = np.searchsorted(boundary, others)
         self.schur = np.asfortranarray(matrix[boundary][:, boundary].toarray())
         self.schur.T[np.ix_(place, place)] += schur.T
+
+    def _positions(self, chosen: Index) -> Index:
+        """Where unknowns of the piece are among those chosen; of others anything."""
+        position = np.zeros(self._n, dtype=np.int32)
+        position[chosen] = np.arange(chosen.size)
+        return position
 
     def _add_leaf(
         self, matrix: scipy.sparse.csr_matrix, inner: Index, level: Index
@@ -225,7 +225,7 @@ class Dissection:
             return around, np.zeros((0, 0))
         unknowns = np.concatenate([inner, around])
         n, size = inner.size, unknowns.size
-        self._position[unknowns] = np.arange(size)
+        position = self._positions(unknowns)
         back = matrix[around]
         inside = np.zeros(level.size, dtype=np.bool_)
         inside[inner] = True
@@ -236,7 +236,7 @@ class Dissection:
         own = scipy.sparse.csr_matrix(
             (
                 np.concatenate([rows.data, back.data[mine]]),
-                self._position[columns],
+                position[columns],
                 np.concatenate([rows.indptr, rows.indptr[-1] + counts[1:]]),
             ),
             (size, size),
@@ -271,15 +271,14 @@ class Dissection:
         around = np.unique(np.concatenate([rows.indices, *(ids for ids, _ in parts)]))
         others = np.setdiff1d(around[present[around]], eliminated, assume_unique=True)
         n, size = eliminated.size, eliminated.size + others.size
-        self._position[eliminated] = np.arange(n)
-        self._position[others] = np.arange(n, size)
+        position = self._positions(np.concatenate([eliminated, others]))
         total = np.zeros((size, size), order="F")
         for ids, left in parts:
-            place = self._position[ids]
+            place = position[ids]
             total.T[np.ix_(place, place)] += left.T  # in the order in which they are in memory
         now = present[rows.indices]
         row = np.repeat(np.arange(n), np.diff(rows.indptr))[now]
-        total[row, self._position[rows.indices[now]]] += rows.data[now]
+        total[row, position[rows.indices[now]]] += rows.data[now]
         back = matrix[others][:, eliminated].tocoo()
         total[n + back.row, back.col] += back.data
         made = Eliminated(total, n, symmetric=self._symmetric)
@@ -289,8 +288,6 @@ class Dissection:
     def release(self) -> Array:
         """`schur`, which is not kept any more."""
         schur, self.schur = self.schur, np.zeros((0, 0))
-        for leaf in self._leaves:
-            leaf.made.release()
         return schur
 
     def push(self, force: Array) -> Partial:

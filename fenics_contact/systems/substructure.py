@@ -15,7 +15,13 @@ from petsc4py import PETSc
 from fenics_contact.systems import linear
 from fenics_contact.types import Array, Indices
 
-__all__ = ["Substructure"]
+__all__ = ["SINGULAR", "Substructure"]
+
+SINGULAR = (
+    "the bulk stiffness cannot be condensed onto the unknowns that contact touches: with these "
+    "held it is still singular. A part of the body may be held by nothing; or use "
+    "condensation=False"
+)
 
 
 class Substructure:
@@ -62,8 +68,8 @@ class Substructure:
         self._factor = self._pc.getFactorMatrix()
         # MUMPS' estimate of its workspace is short where the Schur complement is most of it.
         self._factor.setMumpsIcntl(14, 400)
-        chosen = PETSc.IS().createGeneral(boundary, comm=PETSc.COMM_SELF)
         if boundary.size:
+            chosen = PETSc.IS().createGeneral(boundary, comm=PETSc.COMM_SELF)
             _call("MatFactorSetSchurIS", _object(self._factor), _object(chosen))
         self._pc.setUp()
         error = self._factor.getMumpsInfog(1)
@@ -74,11 +80,7 @@ class Substructure:
             )
         self.schur = self._schur_complement() if boundary.size else np.zeros((0, 0), order="F")
         if error < 0 or not np.all(np.isfinite(self.schur)):
-            raise RuntimeError(
-                "the bulk stiffness cannot be condensed onto the unknowns that contact touches "
-                f"(MUMPS error {error}): with these held it is still singular. A part of the body "
-                "may be held by nothing; or use condensation=False"
-            )
+            raise RuntimeError(f"{SINGULAR} (MUMPS error {error})")
         # Solutions with the boundary at rest, and not of the whole.
         self._factor.setMumpsIcntl(26, 0)
 
