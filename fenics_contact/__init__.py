@@ -18,7 +18,7 @@ from fenics_contact.laws.unilateral import Foundation, Frictionless
 from fenics_contact.meshes import model_to_mesh
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.results import output, plotting
-from fenics_contact.supports.base import Motion, Placement, Support
+from fenics_contact.supports.base import Motion, Placement, Rotation, Support
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.supports.rigid import Ball, Cylinder, HalfSpace, Obstacle
 from fenics_contact.surface.surface import ContactSurface
@@ -49,6 +49,7 @@ __all__ = [
     "Placement",
     "Response",
     "Resultants",
+    "Rotation",
     "Scaled",
     "Springs",
     "Status",

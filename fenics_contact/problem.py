@@ -462,10 +462,12 @@ class ContactProblem:
     def _solve(self, start: float, ahead: float, field: bool) -> Step:
         solver = self.solver
         self._check_before()
+        before = self.full.state()
         for bc in self._bcs:
             bc.set(self.u.x.array)
         self.u.x.scatter_forward()
         solver.equations.factorisations = 0
+        solver.follow(before)
         stiffness_changed = self.full.update_stiffness()
         solver.update_system(stiffness_changed)
         self._approach()

@@ -71,7 +71,9 @@ class EnergyState:
     Attributes:
         forces: At the unknowns, by the mark of the coordinates they are in.
         contacts: Of each contact the tractions on the body, its displacement relative to the
-            support, and that of the support as far as it is prescribed: (3, n_points, gdim).
+            support, and that of the support as far as it is prescribed: (3, n_points, gdim). Where
+            the support turns, the displacement relative to it in its frame, that of the body, and
+            the axes of the frame: (3 + gdim, n_points, gdim).
         springs: Energy in the contact's springs on this rank.
     """
 
@@ -82,19 +84,19 @@ class EnergyState:
     @classmethod
     def unloaded(cls, forces: dict[Any, Forces], contacts: Sequence[Contact]) -> EnergyState:
         """No forces on Γc."""
-        ways = [np.stack([0 * c.points, c.values.jump, c.values.shift]) for c in contacts]
-        return cls(forces, ways, 0.0)
+        return cls(forces, [_ways(c, 0 * c.points) for c in contacts], 0.0)
 
     @classmethod
     def at(cls, forces: dict[Any, Forces], contacts: Sequence[Contact]) -> EnergyState:
         """The state that ``contacts`` have evaluated."""
-        ways = [np.stack([c.traction, c.values.jump, c.values.shift]) for c in contacts]
         springs = sum(float(c.measure @ c.values.stored) for c in contacts)
-        return cls(forces, ways, springs)
+        return cls(forces, [_ways(c, c.traction) for c in contacts], springs)
 
     def between(self, jumps: Sequence[Array]) -> EnergyState:
         """The same state with the displacements relative to supports taken between new pairs."""
-        ways = [np.stack([w[0], jump, w[2]]) for w, jump in zip(self.contacts, jumps, strict=True)]
+        ways = [
+            np.stack([w[0], jump, *w[2:]]) for w, jump in zip(self.contacts, jumps, strict=True)
+        ]
         return dataclasses.replace(self, contacts=ways)
 
     def since(self, before: EnergyState, contacts: Sequence[Contact], comm: MPI.Comm) -> Energy:
@@ -110,14 +112,21 @@ class EnergyState:
         sums[2] = self.springs - before.springs
         for contact, there, here in zip(contacts, before.contacts, self.contacts, strict=True):
             mean = contact.measure[:, None] * 0.5 * (there[0] + here[0])
-            sums[0] += np.sum(mean * (here[2] - there[2]))
-            sums[4] -= np.sum(mean * (here[1] - there[1]))
+            relative, carried = here[1] - there[1], here[2] - there[2]
+            if contact.turns:
+                # Half-way between both ends, else a normal pressure works on what turns beneath it.
+                axes = 0.5 * (there[3:] + here[3:])
+                relative = np.einsum("jqi,qj->qi", axes, relative)
+                carried = carried - relative
+            sums[0] += np.sum(mean * carried)
+            sums[4] -= np.sum(mean * relative)
             if contact.law.has_friction:
                 sums[3] += contact.measure @ contact.values.dissipated
                 # Tractions before are those of the commit, not multipliers in their place.
                 slip, normal = contact.slip_vector(), contact.values.normal
                 weight, length = 0.5 * contact.measure, np.sqrt(_dot(slip, slip))
-                for traction in (there[0], here[0]):
+                first = contact.values.carried_traction if contact.finite else there[0]
+                for traction in (first, here[0]):
                     side = traction - _dot(traction, normal)[:, None] * normal
                     sums[5] += weight @ _dot(side, slip)
                     sums[6] += weight @ (np.sqrt(_dot(side, side)) * length)
@@ -128,6 +137,15 @@ class EnergyState:
         remainder = work - elastic - springs - dissipation
         imbalance = work - elastic - tractions
         return Energy(work, elastic, springs, dissipation, remainder, friction, sliding, imbalance)
+
+
+def _ways(contact: Contact, traction: Array) -> Array:
+    """A contact's part of `EnergyState.contacts`."""
+    jump = contact.values.jump
+    if not contact.turns:
+        return np.stack([traction, jump, contact.values.shift])
+    axes = [contact.turned(np.broadcast_to(unit, jump.shape)) for unit in np.eye(jump.shape[1])]
+    return np.stack([traction, jump, contact.own_displacement(), *axes])
 
 
 def _dot(one: Array, other: Array) -> Array:

@@ -114,6 +114,7 @@ class Judge:
             kinematics=self._linearisation(respond) if respond else {},
             kinematics_allowed=self.kinematics,
             displacement=global_max(self._comm, np.abs(self._full.u.x.array)) / self._imposed,
+            inverted=self._full.bulk.is_inverted(),
             routes=self._compare_routes() if self._second_route and laws else {},
         )
         return verdict, reaction

@@ -122,7 +122,8 @@ class Deviation:
         """At the evaluated state of a contact; nothing where it could not be told. Collective."""
         values, closed = contact.values, contact.status != Status.OPEN
         none = cls(np.zeros(len(closed)), np.zeros_like(values.normal))
-        if contact.support.is_flat or not (contact.rigid or _moves(contact)):
+        flat = contact.finite or contact.support.is_flat
+        if flat or not (contact.rigid or _moves(contact)):
             return none
         change, normal = contact.gap_deviation()
         told = closed & np.isfinite(normal).all(axis=1)

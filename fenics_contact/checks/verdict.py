@@ -74,6 +74,7 @@ class Verdict:
             ten times as large as the mesh, and as the motions and gaps that are imposed.
         displacement: The largest one, relative to these.
         created: Share of the energy exchanged that friction has given; see `Energy.created`.
+        inverted: Whether cells of a nonlinear bulk are turned inside out.
         routes: By contact the largest difference of its nodal forces from those that DOLFINx
             assembles from the boundary form; empty where it was not asked for, see ``second_route``
             of `ContactProblem`.
@@ -89,6 +90,7 @@ class Verdict:
     kinematics_allowed: float = np.inf
     displacement: float = 0.0
     created: float = 0.0
+    inverted: bool = False
     routes: dict[str, Balance] = field(default_factory=dict)
 
     @property
@@ -178,6 +180,11 @@ class Verdict:
                 f"a displacement is {self.displacement:.2g} times as large as the mesh: nothing "
                 "holds a body there, or stiffness and loads are in other units than lengths; or "
                 "accept it: ContactProblem(kinematics=inf)"
+            )
+        if self.inverted:
+            found.append(
+                "cells are turned inside out, det(I + grad u) ≤ 0: no deformation of a body; load "
+                "in smaller steps (increments() cuts them by itself), or refine the mesh there"
             )
         for contact, (depth, place) in self.unseen.items():
             found.append(

@@ -17,6 +17,13 @@ from fenics_contact import compat
 from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.deformed import DeformedPlaces
+from fenics_contact.contact.finite import (
+    ExactView,
+    FiniteKinematics,
+    Frame,
+    SampledView,
+    check_places,
+)
 from fenics_contact.contact.inputs import Inputs, displacement_degree
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
 from fenics_contact.contact.multipliers import Multipliers, TraceProjection
@@ -27,12 +34,12 @@ from fenics_contact.contact.results import PointResults
 from fenics_contact.contact.values import PointValues, Status
 from fenics_contact.laws.base import Law
 from fenics_contact.laws.stiffness import Springs
-from fenics_contact.parallel import global_max, global_min
-from fenics_contact.supports.base import Placement, Support
+from fenics_contact.parallel import global_max, global_min, global_sum
+from fenics_contact.supports.base import Placement, Support, as_vector
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.mass import assembled
-from fenics_contact.surface.surface import ContactSurface
+from fenics_contact.surface.surface import ContactSurface, PointEvaluator
 from fenics_contact.types import Array, Mask
 
 __all__ = ["Committed", "Contact", "Found", "passing"]
@@ -41,6 +48,7 @@ __all__ = ["Committed", "Contact", "Found", "passing"]
 logger = logging.getLogger("fenics_contact")
 
 _ENFORCEMENTS = ("penalty", "augmented")
+_KINEMATICS = ("small", "finite")
 # Of augmented enforcement, where nothing is said.
 _TOLERANCE = 1e-5
 # Normal times outward normal of the body above minus which Γc faces its support.
@@ -99,6 +107,7 @@ class Contact(PointResults):
         inputs: All that was given, as UFL.
         pairs: What lies opposite the points.
         gap_prescribed: Whether the gap was given apart from the geometry.
+        finite: Whether gap, normal and slip are those of displacements of any size.
         committed_jump: Displacement relative to the support at the last commit, (n_points, gdim),
             between the places that are opposite each other from then on; zero before the first.
     """
@@ -116,6 +125,7 @@ class Contact(PointResults):
         accuracy: str | float | None = None,
         enforcement: str | None = None,
         tolerance: float | None = None,
+        kinematics: str = "small",
         name: str = "contact",
     ) -> None:
         """Bind the parts. Collective; compiles what evaluates the points.
@@ -145,6 +155,10 @@ class Contact(PointResults):
             tolerance: Of augmented enforcement, by default 1e-5: how much of the largest traction
                 the springs may still bear, between 0 and 1, see `enforcement_error`. To the
                 functions of the multipliers the penetration is that share of the penalty's.
+            kinematics: "small": gap and normals are those of the undeformed body, and the verdict
+                looks at what that leaves out. "finite": displacements and rotations may be of any
+                size, on a rigid support whose place is known everywhere; the bulk form should bear
+                them, too. Tractions and stiffness are per undeformed area.
             name: In messages and files.
 
         Raises:
@@ -172,6 +186,7 @@ class Contact(PointResults):
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
         self.accuracy = None if accuracy is None else Accuracy.of(accuracy)
+        self.finite = self._choose_kinematics(kinematics, gap)
         augments, self.tolerance = self._choose_enforcement(enforcement, tolerance)
         # Linear elements hold a curved gap at their nodes alone (docs/enforcement.md). But between
         # two meshes, and on quadrilaterals of any shape, nodes carry no uniform pressure over.
@@ -180,19 +195,21 @@ class Contact(PointResults):
         self.quadrature = surface.quadrature(degree, nodal=nodal)
         self.multipliers: Multipliers | None = None
         if augments:
-            self.multipliers = Multipliers(self.quadrature, degree, law)
+            self.multipliers = Multipliers(self.quadrature, degree, law, turning=self.finite)
         self.inputs = Inputs(
             name, self.quadrature, law, support, weight=weight, accuracy=self.accuracy
         )
         if modulus is not None:
             self.set_modulus(modulus)
         self.pairs = Pairs(name, u, self.quadrature, support)
+        self._frame = Frame(self.inputs.shift, self.inputs.rotation)
         placement = self._place()
         self.gap_prescribed = gap is not None
 
         fields = {"opening": 0, "penetration": 0, "normal_traction": 0}
         if law.has_friction:
             fields |= {"traction": gdim, "jump": gdim, "slip": law.n_modes(gdim)}
+            fields |= {"normal": gdim} if self.finite else {}
         if self.multipliers is not None:
             fields |= {"multiplier": 0}
         self.history = PointFields(self.quadrature, fields)
@@ -203,32 +220,90 @@ class Contact(PointResults):
         # As expressions for the form on Γc, and sampled at the points for all else.
         given = self._given(placement, gap)
         self._data, sampled = self._sample(given, placement)
-        multipliers = None if self.multipliers is None else self.multipliers.fields
-        kinematics = SmallKinematics(self.history, multipliers)
-
-        def at_points(seen: Seen) -> PointLaw:
-            return PointLaw(
-                law,
-                seen,
-                kinematics,
-                self.quadrature,
-                self._jump,
-                acts=self.pairs.acts,
-                free=list(self.free_motion),
-            )
-
-        self._in_form, self._point_law = at_points(given), at_points(sampled)
+        self._view: SampledView | None = None
+        self._in_form, self._point_law = self._point_laws(given, sampled)
         self._point_law.prepare()
         self._acting = self._point_law
         self._frozen: tuple[PointLaw, fem.Function] | None = None  # and the pressure in it
         self._deformed = DeformedPlaces(self.quadrature, self._jump, placement)
         self._projection: TraceProjection | None = None
+        self._stretch: PointEvaluator | None = None
         self._own_form: Any = None
         self._values: PointValues | None = None
         if not self.rigid:
             self.pair()
+        if self.finite and law.has_friction:
+            self._start_history()
+            self.restore()
 
     # ---- construction ----------------------------------------------------------------------------
+
+    def _choose_kinematics(self, kinematics: str, gap: Any) -> bool:
+        """Whether they are finite.
+
+        Raises:
+            ValueError: It is no word for any, or something was given that has no sense with it.
+        """
+        name, support, law = self.name, self.support, self.law
+        if kinematics not in _KINEMATICS:
+            raise ValueError(
+                f"{name}: kinematics is {kinematics!r}; use one of {_KINEMATICS} (the share that "
+                "passes in a verdict is the kinematics of the ContactProblem)"
+            )
+        if kinematics == "small":
+            if support.rotation is not None:
+                raise ValueError(
+                    f'{name}: a support that turns needs Contact(kinematics="finite"); for small '
+                    "turns give its displacement as a UFL vector"
+                )
+            return False
+        if isinstance(support, DeformableBody):
+            raise ValueError(
+                f"{name}: finite kinematics take a rigid support, and this is a DeformableBody; "
+                'leave kinematics out, and give it update="increment" for slip over many facets'
+            )
+        if gap is not None:
+            raise ValueError(
+                f"{name}: a gap is prescribed, and finite kinematics take it from the places of "
+                "body and support; leave the gap out, and move the support by its displacement"
+            )
+        if law.has_tangential and not law.has_friction:
+            raise ValueError(
+                f"{name}: {type(law).__name__} bonds points to places of the support, and finite "
+                "kinematics know no such law; use one with friction, or leave k_t out"
+            )
+        return True
+
+    def _point_laws(self, given: Seen, sampled: Seen) -> tuple[PointLaw, PointLaw]:
+        """The law in the form on Γc, and at numbers at the points. Collective."""
+        law, history, x = self.law, self.history, ufl.SpatialCoordinate(self.surface.mesh)
+        multipliers = None if self.multipliers is None else self.multipliers.fields
+        in_form: SmallKinematics | FiniteKinematics
+        at_points: SmallKinematics | FiniteKinematics
+        in_form = at_points = SmallKinematics(history, multipliers)
+        if self.finite:
+            exact = ExactView(x, self._frame, self._support_at, history, multipliers)
+            turns, friction = self._frame.rotation is not None, law.has_friction
+            self._view = SampledView(
+                exact, self.quadrature, self._jump, turns=turns, friction=friction
+            )
+            in_form = FiniteKinematics(exact, multipliers)
+            at_points = FiniteKinematics(self._view, multipliers)
+        # Where all follows from X + u less the motion of the support, so do its derivatives.
+        free = [] if self.finite else list(self.free_motion)
+        acts = self.pairs.acts
+        return (
+            PointLaw(law, given, in_form, self.quadrature, self._jump, acts=acts, free=free),
+            PointLaw(law, sampled, at_points, self.quadrature, self._jump, acts=acts, free=free),
+        )
+
+    def _start_history(self) -> None:
+        """Let slip be counted from where the undeformed Γc begins. Collective."""
+        place = self._support_at(ufl.SpatialCoordinate(self.surface.mesh))
+        normal = place.direction / ufl.sqrt(ufl.dot(place.direction, place.direction))
+        found = PointEvaluator(self.quadrature, {"jump": place.gap * normal, "normal": normal})()
+        zeros = {name: self.history.values(name) for name in self.history.names}
+        self.history.commit(zeros | found)
 
     def _choose_enforcement(
         self, enforcement: str | None, tolerance: float | None
@@ -264,12 +339,19 @@ class Contact(PointResults):
         return True, tolerance
 
     def _place(self) -> Placement:
-        """Where the support is, seen from Γc (UFL)."""
+        """Where the support is, seen from the undeformed Γc (UFL)."""
         mesh = self.surface.mesh
         if self.pairs.distance is not None:
             return Placement(self.pairs.distance, ufl.FacetNormal(mesh))
         x = ufl.SpatialCoordinate(mesh)
-        shift = self.inputs.shift
+        if self.finite:
+            check_places(self.name, self._support_at, mesh)
+            place = self._support_at(self._frame.into(x))
+            return Placement(place.gap, self._frame.turned(place.direction))
+        return self._support_at(x, self.inputs.shift)
+
+    def _support_at(self, x: Any, shift: Any = None) -> Placement:
+        """Where a rigid support is, seen from x (UFL)."""
         return self.support.place(x, shift, lambda v: self.inputs.to_ufl("support", v))
 
     def _given(self, placement: Placement, gap: Any) -> Seen:
@@ -354,10 +436,15 @@ class Contact(PointResults):
         """Energy whose derivative by ``u`` is `form` (eq. 19, 43).
 
         Raises:
-            ValueError: The law has none (Coulomb; a foundation with k_t and without tension), or as
-                for `form`.
+            ValueError: The law has none (Coulomb; a foundation with k_t and without tension; any
+                friction in a frame that turns), or as for `form`.
         """
         self._check_form()
+        if self.law.has_potential and not self.has_potential:
+            raise ValueError(
+                f"{self.name}: friction has no potential with finite kinematics, whose tangent "
+                "planes turn; use the form"
+            )
         return self.inputs.weight * self._in_form.potential(self.u) * self.quadrature.ds
 
     def tangent(self, v: ufl.Argument, du: ufl.Argument) -> ufl.Form:
@@ -383,7 +470,9 @@ class Contact(PointResults):
         """Derivatives of `acting_traction` at the present ``u``. Collective."""
         self._update_points()
         data = self._data.values
-        turns = {i: (data[f"gap by {i}"], data[f"normal by {i}"]) for i in self.free_motion}
+        turns = {}
+        if not self.finite:
+            turns = {i: (data[f"gap by {i}"], data[f"normal by {i}"]) for i in self.free_motion}
         return self._acting.evaluate_tangent(turns)
 
     def energy(self) -> float:
@@ -425,7 +514,7 @@ class Contact(PointResults):
         Args:
             pressure: ≥ 0, shape (n_points,) (stress).
         """
-        if self.law.has_potential:
+        if self.has_potential:
             return
         if self._frozen is None:
             given = fem.Function(self.quadrature.space(), name="pressure")
@@ -437,8 +526,15 @@ class Contact(PointResults):
         given.x.scatter_forward()
 
     @property
+    def has_potential(self) -> bool:
+        """Whether the tractions follow from a potential, and the tangent is symmetric."""
+        return self.law.has_potential and not (self.finite and self.law.has_tangential)
+
+    @property
     def freezes(self) -> bool:
-        """Whether the law has a potential, at least under a given pressure."""
+        """Whether there is a potential, at least under a given pressure."""
+        if self.finite and self.law.has_tangential:
+            return False
         return self.law.at_pressure(ufl.as_ufl(0.0)).has_potential
 
     def thaw(self) -> None:
@@ -469,6 +565,8 @@ class Contact(PointResults):
         self.jump_map.mult(self.u.x.petsc_vec, self._jump.x.petsc_vec)
         self._jump.x.scatter_forward()
         self._data.update()
+        if self._view is not None:
+            self._view.update()
 
     def _evaluate(self) -> PointValues:
         """Everything at the points, as they were updated last. Collective."""
@@ -575,6 +673,17 @@ class Contact(PointResults):
         return self.pairs.search is None
 
     @property
+    def turns(self) -> bool:
+        """Whether the support turns."""
+        return self._frame.rotation is not None
+
+    def turned(self, vectors: Array) -> Array:
+        """Directions in the frame of the support, as they are in space: (n_points, gdim)."""
+        if self._view is None:
+            return vectors
+        return self._view.turned(vectors)
+
+    @property
     def couples(self) -> bool:
         """Whether contact ties unknowns together that the bulk does not."""
         return not self.rigid or bool(self.free_motion)
@@ -634,12 +743,51 @@ class Contact(PointResults):
         """Of the body that has Γc, at the points, (n_points, gdim) (length). Collective."""
         return self.pairs.own_displacement()
 
+    def moment(self, about: Sequence[float]) -> Array:
+        """Moment of the contact forces on the body about a point. Collective.
+
+        They act on the undeformed Γc, or with finite kinematics at X + u. That on a rigid support
+        is the opposite.
+
+        Args:
+            about: The point, gdim numbers (length).
+
+        Returns:
+            Its component out of the plane, (1,), or in space (3,) (force times length).
+        """
+        values = self.values
+        arm = values.x - as_vector(f"{self.name}: about", about, self._gdim)
+        if self.finite:
+            arm = arm + self.own_displacement()
+        force = self.measure[:, None] * values.total_traction
+        if self._gdim == 3:
+            turn = np.cross(arm, force)
+        else:
+            turn = (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0])[:, None]
+        return global_sum(self.surface.mesh.comm, turn.sum(axis=0))
+
+    def area_stretch(self) -> Array:
+        """Deformed area by undeformed, |J F⁻ᵀ N| with F = I + grad u, (n_points,). Collective.
+
+        Tractions divided by it are true ones (Cauchy's), per deformed area; those of the contact
+        are nominal. Of axisymmetric bodies, whose hoops stretch too, by 1 + u_r/r more.
+        """
+        if self._stretch is None:
+            gradient = ufl.Identity(self._gdim) + ufl.grad(self.u)
+            turned = ufl.transpose(ufl.inv(gradient))
+            normal = ufl.det(gradient) * ufl.dot(turned, ufl.FacetNormal(self.surface.mesh))
+            area = ufl.sqrt(ufl.dot(normal, normal))
+            self._stretch = PointEvaluator(self.quadrature, {"area": area})
+        return self._stretch()["area"]
+
     def relative_slide(self) -> Array:
         """Tangential displacement since pairs were found, (n_points, gdim) (length)."""
         return self.values.slide
 
     def true_placement(self) -> tuple[Array, Array]:
         """Gap and normal where the body has moved to: at X + u instead of X. Collective.
+
+        With finite kinematics these are the gap and normal of the contact itself.
 
         Returns:
             Gap, (n_points,) (length): NaN where there is no opposite, and infinite where an
@@ -649,6 +797,8 @@ class Contact(PointResults):
         if not self.rigid:
             return self.true_gap()
         self._update_points()
+        if self._view is not None:
+            return self._view.values("gap"), self._view.values("normal")
         return self._deformed()
 
     def gap_deviation(self) -> tuple[Array, Array]:
@@ -812,8 +962,9 @@ class Contact(PointResults):
         values = {n: points.arrays[n] for n in ("opening", "penetration", "normal_traction")}
         if self.law.has_friction:
             values |= {
-                "traction": points.traction,
-                "jump": points.jump,
+                "traction": points.framed_traction,
+                "jump": points.foot,
+                "normal": points.framed_normal,
                 "slip": self.history.values("slip") + points.slip_increment,
             }
         if self.multipliers is not None:

@@ -10,13 +10,13 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from fenics_contact.arguments import is_number
+from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.contact.accuracy import DEFAULT_FACTOR, Accuracy
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law
 from fenics_contact.laws.stiffness import Scaled, Springs
 from fenics_contact.parallel import global_max, global_min
-from fenics_contact.supports.base import Motion, Support, nonzero_vector
+from fenics_contact.supports.base import Motion, Rotation, Support, as_vector, nonzero_vector
 from fenics_contact.surface.modulus import modulus_over_height
 from fenics_contact.surface.surface import SurfaceQuadrature, VertexAreas
 from fenics_contact.types import Array
@@ -25,7 +25,7 @@ __all__ = ["Inputs", "displacement_degree"]
 
 
 # What a contact itself is given by these names, among which a law's parameters stand.
-_OWN = ("displacement", "gap", "support", "weight")
+_OWN = ("angle", "displacement", "gap", "support", "weight")
 # A direction with no more than this share across the normal counts as parallel to it.
 _PARALLEL = 1e-6
 
@@ -39,6 +39,7 @@ class Inputs:
         weight: Factor of the surface measure.
         law: Parameters of the law, by name.
         shift: Displacement of the support; None: it has none.
+        rotation: Matrix of its turn, and a point of the axis; None: it does not turn.
         free_motion: Components of it that are unknown, as constants by number.
         free_shift: The same as variables, to differentiate by.
         applied_force: The forces on these.
@@ -89,6 +90,7 @@ class Inputs:
         self.free_shift: dict[int, ufl.core.expr.Expr] = {}
         self.applied_force: dict[int, Any] = {}
         self.shift = self._displacement(support.displacement)
+        self.rotation = self._rotation(support.rotation)
 
     # ---- as UFL ----------------------------------------------------------------------------------
 
@@ -154,6 +156,14 @@ class Inputs:
                 f"needs ({self._gdim},)"
             )
         return shift
+
+    def _rotation(self, rotation: Rotation | None) -> tuple[Any, Any] | None:
+        if rotation is None:
+            return None
+        check_instance(f"{self._name}: rotation", rotation, Rotation)
+        matrix = rotation.matrix(self._gdim, lambda angle: self.to_ufl("angle", angle))
+        about = as_vector(f"{self._name}: about of the Rotation", rotation.about, self._gdim)
+        return matrix, self.to_ufl("support", about)
 
     def _moving(self, motion: Motion) -> ufl.core.expr.Expr:
         """The displacement of a support some components of which are unknown."""

@@ -1,8 +1,8 @@
 """What points of Γc feel of displacements: kinematics of small displacements.
 
 Gap and normals are those of the undeformed body. The map from displacements to what a point feels
-relative to its support is constant (`ContactOperator`), and a linear bulk stays linear. Another
-kinematics has another class with the same methods.
+relative to its support is constant (`ContactOperator`), and a linear bulk stays linear.
+`FiniteKinematics` has the same methods.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 import ufl
 
-from fenics_contact.laws.base import Kinematics, Law
+from fenics_contact.laws.base import Kinematics, Law, Response
 from fenics_contact.surface.fields import PointFields
 
 __all__ = ["Seen", "SmallKinematics"]
@@ -73,3 +73,13 @@ class SmallKinematics:
             traction = tangential(old_traction.ufl("traction"))
         u_n = ufl.dot(jump, normal)
         return Kinematics(seen.gap, u_n, normal, total, increment, traction, multiplier)
+
+    def told(
+        self, jump: Any, law: Law, seen: Seen, felt: Kinematics, response: Response
+    ) -> dict[str, Any]:
+        """What of it is told beside what laws see (UFL), by its name in `PointValues`."""
+        return {"jump": seen.relative(jump)}
+
+    def framed(self, vector: Any) -> Any:
+        """A direction as the history has it (UFL): in space."""
+        return vector

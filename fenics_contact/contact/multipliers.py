@@ -85,21 +85,27 @@ class Multipliers:
     """λ_n and λ_t at the points of a contact.
 
     Attributes:
-        fields: "pressure" λ_n and, with friction, "traction" λ_t (stress).
+        fields: "pressure" λ_n and, with friction, "traction" λ_t (stress), in the frame of the
+            support; where normals turn, "normal" are those it is across.
     """
 
-    def __init__(self, quadrature: SurfaceQuadrature, degree: int, law: Law) -> None:
+    def __init__(
+        self, quadrature: SurfaceQuadrature, degree: int, law: Law, *, turning: bool
+    ) -> None:
         """Zeros. Collective.
 
         Args:
             quadrature: The points.
             degree: Of the displacement element.
             law: Of the contact.
+            turning: Whether normals turn.
         """
         self._comm = quadrature.surface.mesh.comm
         self._law = law
-        friction = {"traction": quadrature.surface.mesh.geometry.dim} if law.has_friction else {}
-        self.fields = PointFields(quadrature, {"pressure": 0} | friction)
+        vectors = ["traction", "normal"] if turning else ["traction"]
+        self._vectors = vectors if law.has_friction else []
+        gdim = quadrature.surface.mesh.geometry.dim
+        self.fields = PointFields(quadrature, {"pressure": 0} | dict.fromkeys(self._vectors, gdim))
         self._project = TraceProjection(quadrature, degree)
 
     def _next(self, values: PointValues) -> dict[str, Array]:
@@ -108,7 +114,7 @@ class Multipliers:
         if self._law.has_normal_stiffness:
             found["pressure"] = self._project(-values.normal_traction)
         if self._law.has_friction:
-            found["traction"] = self._project(values.traction)
+            found["traction"] = self._project(values.framed_traction)
         return found
 
     def error(self, values: PointValues, history: PointFields) -> float:
@@ -134,7 +140,7 @@ class Multipliers:
 
     def update(self, values: PointValues) -> None:
         """Make the tractions of an evaluated contact the multipliers. Collective."""
-        self.fields.commit(self._next(values))
+        self.fields.commit(self._next(values) | {"normal": values.framed_normal})
 
     def committed(self, values: PointValues) -> dict[str, Array]:
         """What of the state of an evaluated contact becomes history, by name.
@@ -145,13 +151,11 @@ class Multipliers:
         """
         found = {"multiplier": self.fields.values("pressure")}
         if self._law.has_friction:
-            found["traction"] = self.fields.values("traction")
-            found["jump"] = values.jump - values.elastic_slip
+            found |= {name: self.fields.values(name) for name in self._vectors}
+            found["jump"] = values.foot - values.elastic_slip
         return found
 
     def restore(self, history: PointFields) -> None:
         """Take those of the last commit. Collective."""
         values = {"pressure": history.values("multiplier")}
-        if self._law.has_friction:
-            values["traction"] = history.values("traction")
-        self.fields.commit(values)
+        self.fields.commit(values | {name: history.values(name) for name in self._vectors})

@@ -11,6 +11,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
+from fenics_contact.contact.finite import FiniteKinematics
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
 from fenics_contact.laws.base import Kinematics, Law, Response
 from fenics_contact.parallel import global_max, global_min
@@ -49,7 +50,7 @@ class PointLaw:
         self,
         law: Law,
         seen: Seen,
-        kinematics: SmallKinematics,
+        kinematics: SmallKinematics | FiniteKinematics,
         quadrature: SurfaceQuadrature,
         jump: fem.Function,
         *,
@@ -113,8 +114,9 @@ class PointLaw:
     def traction(self, jump: Any, seen: Seen | None = None) -> Any:
         """r_n n + τ on the body, at a displacement (UFL)."""
         seen = seen or self.seen
-        response = self._response(self._felt(jump, seen), seen)
-        total = response.normal_traction * seen.normal
+        felt = self._felt(jump, seen)
+        response = self._response(felt, seen)
+        total = response.normal_traction * felt.normal
         return total if response.traction is None else total + response.traction
 
     def potential(self, jump: Any = None, seen: Seen | None = None) -> Any:
@@ -215,9 +217,9 @@ class PointLaw:
             "opening": response.opening,
             "penetration": response.penetration,
             "normal_traction": response.normal_traction,
-            "jump": self.seen.relative(self._jump),
             "stored": self._there(law.stored(felt, response, parameters)),
         }
+        told |= self._kinematics.told(self._jump, law, self.seen, felt, response)
         if law.has_own_normal:
             told |= self._own_normal(felt, response)
         if law.has_tangential:
@@ -241,7 +243,8 @@ class PointLaw:
             if law.has_friction:
                 assert felt.traction is not None
                 borne = felt.traction - response.traction
-                told |= {"elastic_slip": law.elastic_displacement(felt, borne, parameters)}
+                slip = law.elastic_displacement(felt, borne, parameters)
+                told |= {"elastic_slip": self._kinematics.framed(slip)}
         return self._evaluator(told)
 
     def _own_normal(self, felt: Kinematics, response: Response) -> dict[str, Any]:

@@ -84,7 +84,11 @@ class PointValues:
         dissipated: Work of friction per area.
         slip_increment: Δβ of every mode, (n_points, n_modes) (length).
         multiplier: λ_n (stress).
-        elastic_slip: What multipliers leave of K_t⁻¹ τ (length).
+        elastic_slip: What multipliers leave of K_t⁻¹ τ (length), as the history has it.
+        foot: Displacement of what the history measures slip by, in the frame of the support
+            (length): the jump, or with finite kinematics that of the closest point of the support.
+        framed_traction, framed_normal: τ (stress) and n in the frame of the support.
+        carried_traction: The committed τ as support and normal have turned it since (stress).
         arrays: All that was evaluated, by name, for files.
     """
 
@@ -119,6 +123,10 @@ class PointValues:
     slip_increment: Array
     multiplier: Array
     elastic_slip: Array
+    foot: Array
+    framed_traction: Array
+    framed_normal: Array
+    carried_traction: Array
     arrays: Mapping[str, Array]
 
     @classmethod
@@ -148,7 +156,11 @@ class PointValues:
             *("x", "normal", "direction_length", "facing", "weight", "initial_gap", "shift"),
             *("jump", "normal_displacement", "opening", "penetration", "normal_traction", "stored"),
         )
+        # With small displacements the history is in space.
+        kept = {"foot": "jump", "framed_traction": "traction", "framed_normal": "normal"}
+        kept |= {"carried_traction": "old_traction"}
         return cls(
+            **{n: arrays[n] if n in arrays else get(other, d) for n, other in kept.items()},
             **{name: arrays[name] for name in always},
             **{name: get(name) for name in scalars},
             **{name: get(name, d) for name in vectors},

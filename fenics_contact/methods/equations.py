@@ -94,10 +94,15 @@ class Equations:
         self.system.set_state(state)
 
     def residual(self, x: PETSc.Vec, f: PETSc.Vec) -> Norms:
-        """Compute the residual at ``x`` into ``f``, and its norms, kept too. Collective."""
+        """Compute the residual at ``x`` into ``f``, and its norms, kept too. Collective.
+
+        It is not a number where cells are turned inside out.
+        """
         self.set_state(x)
         contacts = self.system.contact_forces()
         total = sum(contacts, self.system.bulk_force())
+        if self._bulk.is_inverted():
+            total[:] = np.nan  # a line search takes a shorter step
         self.norms = self.system.norms(total, contacts, self.start)
         total[self.system.constrained] = 0.0
         f.array[:] = total / (self._bulk.scale * self.length)
@@ -132,7 +137,7 @@ class Equations:
     @property
     def has_potential(self) -> bool:
         """Whether every contact law has one."""
-        return all(c.law.has_potential for c in self.contacts)
+        return all(c.has_potential for c in self.contacts)
 
     def symmetric(self, consistent: bool) -> bool:
         """Whether the matrix of H₀, or of the consistent tangent, is."""

@@ -84,6 +84,11 @@ METHODS: dict[str, dict[str, Any]] = {
     "alternating": {},
     "continuation": {},
 }
+# Of some of them with a nonlinear bulk: far from a solution the tangent need not point downwards
+# along which `cp` looks for a root, and cells may turn inside out, whereupon `bt` steps shorter.
+_NONLINEAR: dict[str, dict[str, Any]] = {
+    "newton": {"snes_linesearch_type": "bt", "snes_linesearch_max_it": 40},
+}
 # What takes over where a method fails.
 _LAST_RESORT = "continuation"
 
@@ -148,6 +153,7 @@ class Solver:
         self._automatic = settings.method is None
         self.method = settings.method or "lbfgs"
         self.methods: dict[str, Method] = {}
+        self._followed: Array | None = None
         self._quasi_newton = True
         self.snes: PETSc.SNES
         self.main: SnesMethod
@@ -178,8 +184,10 @@ class Solver:
         self.condensed = self._choose_condensation()
         self._full.linear_kind = self._choose_linear_solver()
         self._set_system()
-        self.method = settings.method or ("newton" if self.condensed else "lbfgs")
-        options.set(_COMMON | METHODS[self.method], prefix)
+        cheap = self.condensed or not self._full.bulk.linear
+        self.method = settings.method or ("newton" if cheap else "lbfgs")
+        globalised = {} if self._full.bulk.linear else _NONLINEAR.get(self.method, {})
+        options.set(_COMMON | METHODS[self.method] | globalised, prefix)
         quasi_newton = options.get(prefix + "snes_type") == PETSc.SNES.Type.QN
         newton = linear.newton_options(self.system.linear_kind)
         if not quasi_newton:
@@ -320,6 +328,39 @@ class Solver:
         self._set_system(kept)
         self.snes.reset()
 
+    def follow(self, before: Array) -> None:
+        """Find where the body goes with the values prescribed now, for a start. Collective.
+
+        By one step on the tangent at the state before: next to conditions that moved far a
+        nonlinear bulk may be turned inside out, and no iteration comes back from there. The present
+        state stays.
+
+        Args:
+            before: The state in which the last increment ended.
+        """
+        equations, full = self.equations, self._full
+        self._followed = None
+        now = full.state()
+        change, image, step = full.vector(), full.vector(), full.vector()
+        change.array[:] = now - before
+        if full.bulk.linear or not change.norm() > 0:
+            return
+        full.set_state(before)
+        full.update_stiffness()
+        for contact in full.contacts:
+            contact.evaluate()
+        matrix = equations.matrix(True)
+        held = equations.held()
+        parts = equations.tangents() if held else equations.stiffnesses(everywhere=True)
+        equations.assemble(matrix, parts)
+        assert full.stiffness is not None
+        full.stiffness.mult(change, image)
+        image.array[full.constrained] = 0.0
+        image.scale(-1.0 / full.bulk.scale)
+        equations.solvers[True].solve(image, step)
+        self._followed = now + step.array_r
+        full.set_state(now)
+
     def restart(self) -> None:
         """Drop what is kept from earlier increments. Collective."""
         self.system.forget()
@@ -445,10 +486,11 @@ class Solver:
         """Unknowns of the system to start from, nearest to equilibrium first. Collective.
 
         The present state; that state moved on by as much as the last increment moved it: in
-        proportional loading that is the solution; and that state with one step of Newton's method
-        on the tangent in which the last increment ended. At the present state itself no point has
-        slipped yet, and all closed ones stick: from there Newton's method takes ten steps to let
-        them slip again, one after another from the edge of the contact inwards. The start by a step
+        proportional loading that is the solution; that state with one step of Newton's method
+        on the tangent in which the last increment ended; and what `follow` has found. At the
+        present state itself no point has slipped yet, and all closed ones stick: from there
+        Newton's method takes ten steps to let them slip again, one after another from the edge of
+        the contact inwards. The start by a step
         has the right ones slipping, and comes first unless it is far off.
         """
         equations, system = self.equations, self.system
@@ -468,8 +510,12 @@ class Solver:
             starts.append(self._predicted(present))
         if rate is not None and ahead and not cold:
             starts.append(present + ahead * system.part(rate))
+        if self._followed is not None:
+            starts.append(self._followed)
+            self._followed = None
         residuals += [equations.residual_at(start) for start in starts[1:]]
-        if predicts and residuals[1] <= _FAR * min(residuals):
+        # A nonlinear bulk does not come back from far off: a support moved into open points.
+        if predicts and self._full.bulk.linear and residuals[1] <= _FAR * min(residuals):
             residuals[1] = 0.0
         return [starts[i] for i in np.argsort(residuals, kind="stable")]
 

@@ -1,4 +1,4 @@
-"""What Γc presses on. A support says, by UFL alone, the gap s and the normal n at a point of Γc.
+"""What Γc presses on. A support says, by UFL alone, the gap s and the normal n at a point.
 
 n points **from the body to the support**; s ≥ 0 is the distance along n that is still open. A
 support knows no mesh: numbers become constants of the mesh through the function that is passed in,
@@ -16,7 +16,16 @@ import ufl
 
 from fenics_contact.arguments import is_number
 
-__all__ = ["Motion", "Placement", "Support", "ToUFL", "as_positive", "as_vector", "nonzero_vector"]
+__all__ = [
+    "Motion",
+    "Placement",
+    "Rotation",
+    "Support",
+    "ToUFL",
+    "as_positive",
+    "as_vector",
+    "nonzero_vector",
+]
 
 ToUFL = Callable[[Any], ufl.core.expr.Expr]
 
@@ -76,20 +85,66 @@ class Motion:
         }
 
 
+@dataclass(frozen=True)
+class Rotation:
+    """A prescribed turn of a support about an axis that is fixed in it, of any size.
+
+    It needs ``Contact(kinematics="finite")``. The displacement of the support moves the axis, too.
+
+    Args to the constructor:
+        angle: In radians, right-handed about the axis, in the plane anticlockwise: a number, or a
+            scalar ``fem.Constant`` to be changed between increments.
+        about: A point of the axis where the support has not been displaced, gdim numbers (length).
+        axis: Its direction, three numbers of any length; in the plane none.
+    """
+
+    angle: Any
+    about: Sequence[float]
+    axis: Sequence[float] | None = None
+
+    def matrix(self, gdim: int, to_ufl: ToUFL) -> ufl.core.expr.Expr:
+        """R, which takes directions from where the support began to where it is (gdim, gdim).
+
+        Args:
+            gdim: Dimension of the mesh.
+            to_ufl: Of the angle, if it is a number.
+
+        Raises:
+            ValueError: There is an axis in the plane, or none in space.
+        """
+        if gdim == 2 and self.axis is not None:
+            raise ValueError(f"axis of the Rotation is {self.axis!r}; in 2D it takes none")
+        if gdim == 3 and self.axis is None:
+            raise ValueError("axis of the Rotation is missing; in 3D give its direction")
+        angle = to_ufl(self.angle)
+        if angle.ufl_shape != ():
+            raise ValueError(
+                f"angle of the Rotation has shape {angle.ufl_shape}; it must be a scalar (radians)"
+            )
+        c, s = ufl.cos(angle), ufl.sin(angle)
+        if gdim == 2:
+            return ufl.as_matrix([[c, -s], [s, c]])
+        x, y, z = (float(v) for v in nonzero_vector("axis of the Rotation", self.axis, gdim))
+        across = ufl.as_matrix([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        return ufl.Identity(3) + s * across + (1 - c) * ufl.dot(across, across)
+
+
 class Support:
     """A rigid support: subclasses say where it is.
 
     Args to all of them: ``displacement``, the prescribed rigid translation (gdim numbers, a
     ``fem.Constant`` to be changed between increments, or a UFL vector), or a `Motion` where the
-    force on the support is given; none means fixed.
+    force on the support is given; none means fixed. ``rotation``, a `Rotation`: with finite
+    kinematics alone.
 
-    A support that moves is moved by this alone. Where its place or gap is changed instead (a
+    A support that moves is moved by these alone. Where its place or gap is changed instead (a
     constant in ``point``, ``center`` or ``gap``), contact opens and closes as it should, but
     friction does not feel the part along Γc, nor do the energies count work: nothing tells such a
     change from one of shape.
     """
 
     displacement: Any = None
+    rotation: Rotation | None = None
 
     @property
     def is_flat(self) -> bool:
@@ -102,7 +157,8 @@ class Support:
         """Gap and direction at ``x`` with the support translated by ``shift`` (None: not at all).
 
         Args:
-            x: Coordinates of the point of Γc, shape (gdim,).
+            x: Coordinates of the point, shape (gdim,): of Γc, or with finite kinematics where it
+                has moved to, seen from where the support began.
             shift: The displacement of the support, shape (gdim,).
             to_ufl: Turns numbers, constants and expressions into UFL.
 

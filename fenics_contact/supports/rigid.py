@@ -8,7 +8,14 @@ from typing import Any
 
 import ufl
 
-from fenics_contact.supports.base import Placement, Support, as_positive, as_vector, nonzero_vector
+from fenics_contact.supports.base import (
+    Placement,
+    Rotation,
+    Support,
+    as_positive,
+    as_vector,
+    nonzero_vector,
+)
 
 __all__ = ["Ball", "Cylinder", "HalfSpace", "Obstacle", "ToUFL"]
 
@@ -25,6 +32,7 @@ class HalfSpace(Support):
     point: Sequence[float]
     normal: Sequence[float]
     displacement: Any = None
+    rotation: Rotation | None = None
 
     @property
     def is_flat(self) -> bool:
@@ -51,6 +59,7 @@ class Ball(Support):
     radius: float
     inside: bool = False
     displacement: Any = None
+    rotation: Rotation | None = None
 
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
         """Gap |x - center - shift| - radius (negated inside); see `Support.place`."""
@@ -73,6 +82,7 @@ class Cylinder(Support):
     axis: Sequence[float] | None = None
     inside: bool = False
     displacement: Any = None
+    rotation: Rotation | None = None
 
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
         """Gap: distance from the axis minus radius (negated inside); see `Support.place`."""
@@ -104,26 +114,61 @@ def _round(arm: Any, shift: Any, radius: Any, inside: bool) -> Placement:
 
 @dataclass(frozen=True)
 class Obstacle(Support):
-    """Any rigid obstacle, by its gap and normal as numbers, constants, functions or UFL.
+    """Any rigid obstacle, by its distance at every place, or by gap and normal on Γc.
+
+    ``Obstacle(distance=lambda x: ufl.sqrt(x[0] ** 2 + x[1] ** 2) - 1)`` is a disc.
 
     Args to the constructor:
         gap: Distance that is open along ``normal`` before any displacement, in length; negative
-            is a penetration. A motion of the obstacle is no part of it: see `Support`.
+            is a penetration: numbers, constants, functions or UFL over Γc. A motion of the obstacle
+            is no part of it: see `Support`. Finite kinematics need ``distance`` in its place.
         normal: From the body to the obstacle, of any length greater than zero, shape (gdim,).
-        displacement: See `Support`; its part along ``normal`` adds to the gap.
+        displacement, rotation: See `Support`; the displacement's part along ``normal`` adds to the
+            gap.
+        distance: Instead of gap and normal: a function of a place x, a UFL vector, that gives the
+            signed distance of x from the obstacle (UFL scalar, length), positive outside of it. Its
+            gradient must be of length 1 where contact is: the normal is minus that.
     """
 
-    gap: Any
-    normal: Any
+    gap: Any = None
+    normal: Any = None
     displacement: Any = None
+    rotation: Rotation | None = None
+    distance: Callable[[Any], Any] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse both ways of giving it at once, and half of one.
+
+        Raises:
+            ValueError: It says what was given.
+        """
+        given = [n for n in ("gap", "normal", "distance") if getattr(self, n) is not None]
+        if given not in (["gap", "normal"], ["distance"]):
+            raise ValueError(
+                f"Obstacle has {' and '.join(given) or 'nothing'}; give gap and normal, or distance"
+            )
+        if self.distance is not None and not callable(self.distance):
+            raise TypeError(
+                f"distance of the Obstacle is {self.distance!r}; it must be a function of x, such "
+                "as lambda x: x[1]"
+            )
 
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """The given gap, plus the support's own motion along the normal; see `Support.place`."""
+        """Distance and its gradient at x, or what was given; see `Support.place`."""
         gdim = x.ufl_shape[0]
+        if self.distance is not None:
+            here = ufl.variable(x if shift is None else x - shift)
+            gap = ufl.as_ufl(self.distance(here))
+            _check_scalar("distance", gap)
+            return Placement(gap, -ufl.diff(gap, here))
         direction = to_ufl(nonzero_vector("normal of the Obstacle", self.normal, gdim))
         gap = to_ufl(self.gap)
-        if gap.ufl_shape != ():
-            raise ValueError(f"gap of the Obstacle has shape {gap.ufl_shape}; it must be a scalar")
+        _check_scalar("gap", gap)
         if shift is not None:
             gap = gap + ufl.dot(shift, direction) / ufl.sqrt(ufl.dot(direction, direction))
         return Placement(gap, direction)
+
+
+def _check_scalar(name: str, value: Any) -> None:
+    if value.ufl_shape != ():
+        raise ValueError(f"{name} of the Obstacle has shape {value.ufl_shape}; it must be a scalar")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import basix.ufl
 import dolfinx.fem.petsc
 import numpy as np
 import ufl
@@ -12,8 +13,9 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact import compat
-from fenics_contact.parallel import collective_errors, global_max
+from fenics_contact.parallel import collective_errors, global_max, global_min
 from fenics_contact.surface.dependence import Dependence
+from fenics_contact.surface.mass import assembled
 from fenics_contact.types import Array
 
 __all__ = ["Bulk"]
@@ -30,7 +32,8 @@ class Bulk:
             product with it, and loads are assembled once an increment.
         symmetric: Whether the assembled tangent is symmetric.
         stiffness: The tangent without Dirichlet conditions, valid after `update`.
-        scale: Largest entry on the tangent's diagonal, the unit of stiffness (force/length).
+        scale: Largest entry on the tangent's diagonal, the unit of stiffness (force/length); of a
+            nonlinear bulk on that of the first tangent, so that it is one unit all the way.
     """
 
     def __init__(self, form: ufl.Form, u: fem.Function) -> None:
@@ -62,6 +65,7 @@ class Bulk:
         derivative = ufl.derivative(form, u, ufl.TrialFunction(u.function_space))
         self.tangent_form = ufl.algorithms.expand_derivatives(derivative)
         self.linear = u not in self.tangent_form.coefficients()
+        self._volumes = None if self.linear else _Volumes(u)
         kinds = dict.fromkeys(integral.integral_type() for integral in form.integrals())
         parts = (_Part(form, kind, u) for kind in kinds)
         self._parts = [part for part in parts if not part.empty]
@@ -110,7 +114,8 @@ class Bulk:
         fem.petsc.assemble_matrix(self.stiffness, self._compiled_tangent)
         self.stiffness.assemble()
         diagonal = self.stiffness.getDiagonal()
-        self.scale = diagonal.norm(PETSc.NormType.NORM_INFINITY)
+        if self.linear or not self.scale:
+            self.scale = diagonal.norm(PETSc.NormType.NORM_INFINITY)
         self.symmetric = self._is_symmetric(diagonal)
         diagonal.destroy()
         if self.linear:
@@ -178,6 +183,14 @@ class Bulk:
         self._image.x.scatter_reverse(dolfinx.la.InsertMode.add)
         return self._owned(self._image).copy()
 
+    def is_inverted(self) -> bool:
+        """Whether cells are turned inside out by ``u``. Collective.
+
+        That is det(I + grad u) ≤ 0 at a point of the bulk: many forms of hyperelastic bodies have
+        solutions there. With a linear bulk displacements are small, and nothing is looked at.
+        """
+        return self._volumes is not None and not self._volumes.least() > 0
+
     def _owned(self, function: fem.Function) -> Array:
         dofmap = function.function_space.dofmap
         return function.x.array[: dofmap.index_map.size_local * dofmap.index_map_bs]
@@ -195,6 +208,25 @@ class Bulk:
         image.destroy()
         mirrored.destroy()
         return bool(symmetric)
+
+
+class _Volumes:
+    """Change of volume det(I + grad u) at points of the bulk, twice as many as u needs."""
+
+    def __init__(self, u: fem.Function) -> None:
+        """Compile. Collective."""
+        mesh, degree = u.function_space.mesh, 2 * u.function_space.ufl_element().degree
+        element = basix.ufl.quadrature_element(mesh.topology.cell_name(), degree=degree)
+        space = fem.functionspace(mesh, element)
+        measure = ufl.Measure("dx", mesh, metadata={"quadrature_degree": degree})
+        q, gradient = ufl.TestFunction(space), ufl.Identity(len(u)) + ufl.grad(u)
+        self._comm = mesh.comm
+        self._form = compat.compile_form(ufl.det(gradient) * q * measure)
+        self._weights = assembled(compat.compile_form(q * measure)).copy()
+
+    def least(self) -> float:
+        """At the present u, over all ranks; NaN where it is none. Collective."""
+        return global_min(self._comm, assembled(self._form) / self._weights, empty=np.inf)
 
 
 class _Part:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
+from fenics_contact.parallel import global_max
 from fenics_contact.systems.balance import Norms, Parts, by_body
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.forces import Forces
@@ -143,8 +145,22 @@ class System(ABC):
         return self.unknowns.vector()
 
     def terms(self, state: Array) -> Array:
-        """Size of what K u sums up in each row, whose round-off is left in it (force)."""
-        return np.asarray(self.diagonal * np.clip(state, -self.farthest, self.farthest))
+        """Size of what K u sums up in each row, whose round-off is left in it (force).
+
+        With finite kinematics contact sums up places in the place of displacements. Collective.
+        """
+        moved = np.abs(np.clip(state, -self.farthest, self.farthest))
+        return np.asarray(self.diagonal * (moved + self._coordinates))
+
+    @cached_property
+    def _coordinates(self) -> Array:
+        """Largest coordinate of a finite contact at what it touches, 0 elsewhere. Collective."""
+        found = np.zeros(self.unknowns.n_local)
+        for operator in self.operators:
+            if operator.contact.finite:
+                points = np.abs(operator.contact.points)
+                found[operator.touched] = global_max(self.unknowns.comm, points)
+        return found
 
     def by_body(self, *vectors: Array) -> Array:
         """Norms of vectors over the unknowns, (n_vectors, n_bodies). Collective."""

@@ -1,0 +1,247 @@
+"""Finite kinematics at single states: derivatives, the boundary form, what is refused."""
+
+from __future__ import annotations
+
+import dolfinx.fem.petsc
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+
+import fenics_contact as fc
+from fenics_contact import compat
+from fenics_contact.parallel import global_max
+from scenes.blocks import CELLS, TOP, wave
+from scenes.comparing import raised_everywhere
+from scenes.rubber import disc, rubber
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+
+K = 1e3
+LAWS = {
+    "frictionless": fc.Frictionless(K),
+    "cone": fc.Coulomb(0.3, K, K),
+    "nearly all stick": fc.Coulomb(5.0, K, K),
+    "Tresca": fc.Tresca(0.3, 20.0, K, K),
+}
+IN_SPACE = {
+    "polygon": fc.Coulomb(0.3, K, K, modes=5),
+    "ellipse": fc.Coulomb(0.3, K, K, transverse_friction=0.6, direction=(1, 0, 0)),
+}
+
+
+def supports(scene, shift, angle):
+    """Shapes that cut into the top of the block, by name."""
+    d, top = scene.dim, scene.height
+    turn = fc.Rotation(angle, (0.2,) * d, None if d == 2 else (1.0, 2.0, 3.0))
+    move = {"displacement": shift, "rotation": turn}
+    side, middle = (0.0,) * (d - 1), (0.0,) * (d - 1) + (top + 0.7,)
+    return {
+        "plane": fc.HalfSpace((*side, top), (*((0.3,) * (d - 1)), -1.0), **move),
+        "ball": fc.Ball(middle, 0.8, **move),
+        "cavity": fc.Ball((*side, top - 1.5), 1.6, inside=True, **move),
+        "cylinder": fc.Cylinder(middle, 0.8, None if d == 2 else (0.2, 1, 0.1), **move),
+        "ellipsoid": fc.Obstacle(distance=lambda x: _ellipsoid(x, middle), **move),
+    }
+
+
+def _ellipsoid(x, middle):
+    """No distance, but its gradient has length 1 where it vanishes."""
+    axes = [1.0, 0.8, 0.9][: len(middle)]
+    level = sum((x[i] - middle[i]) ** 2 / axes[i] ** 2 for i in range(len(middle)))
+    slope = 2 * ufl.sqrt(sum((x[i] - middle[i]) ** 2 / axes[i] ** 4 for i in range(len(middle))))
+    return (level - 1) / slope
+
+
+def derivative_error(contact, scene, seed, step=1e-6):
+    """Tangent times a direction, against central differences of the forces, relative."""
+    u, operator = scene.u, fc.ContactOperator(contact)
+    direction = fem.Function(u.function_space)
+    direction.interpolate(wave(scene.dim, seed))
+    start = u.x.array.copy()
+
+    def force(share):
+        u.x.array[:] = start + share * step * direction.x.array
+        return forces(operator).array_r.copy()
+
+    difference = (force(1) - force(-1)) / (2 * step)
+    u.x.array[:] = start
+    tangent = operator.tangent()
+    found = tangent.createVecLeft()
+    tangent.mult(direction.x.petsc_vec, found)
+    comm = scene.mesh.comm
+    size = global_max(comm, np.abs(difference))
+    return global_max(comm, np.abs(found.array_r - difference)) / size, size
+
+
+def forces(operator):
+    """Minus the forces of contact at the unknowns."""
+    vector = operator.unknowns.vector()
+    operator.add_force(vector)
+    return vector
+
+
+def states(scene, contact, shift, angle, n=3):
+    """States of a history that moves block and tool by a third of the block."""
+    for seed in range(n):
+        scene.u.interpolate(lambda x, seed=seed: 0.06 * wave(scene.dim, seed)(x))
+        shift.value[:] = 0.05 * np.cos(seed + np.arange(scene.dim))
+        angle.value = 0.2 * np.sin(seed + 1.0)
+        yield seed
+        contact.commit()
+
+
+@pytest.mark.parametrize("shape", ["plane", "ball", "cavity", "cylinder", "ellipsoid"])
+@pytest.mark.parametrize("cell", CELLS)
+def test_derivatives(cell, shape):
+    """Tangents against differences, over a history in which open, stick and slip all occur.
+
+    1e-6 of the largest entry: differences of 1e-6 have an error of 1e-9 where no status changes.
+    """
+    seen = np.zeros(3)
+    laws = LAWS if cell in ("triangle", "quadrilateral") else LAWS | IN_SPACE
+    for law in laws.values():
+        scene = rubber(cell, 2 if cell == "triangle" else 1, n=(4, 2), shuffled=True)
+        shift, angle = (fem.Constant(scene.mesh, v) for v in (np.zeros(scene.dim), 0.0))
+        contact = scene.contact(supports(scene, shift, angle)[shape], law)
+        for seed in states(scene, contact, shift, angle):
+            error, size = derivative_error(contact, scene, seed)
+            assert size > 1.0 and error < 1e-6
+            contact.evaluate()
+            r = contact.resultants()
+            seen += [r.open, r.stick, r.slip]
+    assert np.all(seen > 0)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+def test_the_boundary_form_is_the_same(cell, enforcement):
+    """`Contact.form` and its tangent have the expressions of the support, and not samples of them.
+
+    Nodal forces and products with the tangent agree to round-off, 1e-11.
+    """
+    scene = rubber(cell, 1, n=(4, 2))
+    v, du = (f(scene.u.function_space) for f in (ufl.TestFunction, ufl.TrialFunction))
+    shift, angle = (fem.Constant(scene.mesh, x) for x in (np.zeros(scene.dim), 0.0))
+    support = supports(scene, shift, angle)["ball"]
+    contact = scene.contact(support, fc.Coulomb(0.3, K, K), enforcement=enforcement)
+    comm, operator = scene.mesh.comm, fc.ContactOperator(contact)
+    maps = contact.entity_maps
+    form, tangent = (
+        compat.compile_form(f, maps) for f in (contact.form(v), contact.tangent(v, du))
+    )
+    for _ in states(scene, contact, shift, angle):
+        if contact.multipliers is not None:
+            contact.augment()
+        vector = forces(operator)
+        n = vector.getLocalSize()
+        assembled = fem.assemble_vector(form)
+        assembled.scatter_reverse(dolfinx.la.InsertMode.add)
+        size = global_max(comm, np.abs(vector.array_r))
+        assert size > 0
+        assert global_max(comm, np.abs(assembled.array[:n] - vector.array_r)) < 1e-11 * size
+        mine, theirs = operator.tangent(), fem.petsc.assemble_matrix(tangent)
+        theirs.assemble()
+        probe = fem.Function(scene.u.function_space)
+        probe.interpolate(wave(scene.dim, 3))
+        ours, other = (m.createVecLeft() for m in (mine, theirs))
+        mine.mult(probe.x.petsc_vec, ours)
+        theirs.mult(probe.x.petsc_vec, other)
+        size = global_max(comm, np.abs(ours.array_r))
+        assert global_max(comm, np.abs(ours.array_r - other.array_r)) < 1e-11 * size
+
+
+def test_without_friction_the_tangent_is_symmetric():
+    """The tractions are minus the gradient of the potential, ½ k ⟨-d⟩²: by differences, to 1e-6."""
+    scene = rubber("tetrahedron", 1, n=(4, 2))
+    contact = scene.contact(disc(scene, 0.8, displacement=(0, 0, -0.2)), fc.Frictionless(K))
+    assert contact.has_potential
+    comm, operator = scene.mesh.comm, fc.ContactOperator(contact)
+    direction = fem.Function(scene.u.function_space)
+    direction.interpolate(wave(3, 1))
+    start = fem.Function(scene.u.function_space)
+    start.interpolate(lambda x: 0.1 * wave(3, 0)(x))
+
+    def energy(step):
+        scene.u.x.array[:] = start.x.array + step * direction.x.array
+        return comm.allreduce(contact.energy())
+
+    slope = (energy(1e-5) - energy(-1e-5)) / 2e-5
+    scene.u.x.array[:] = start.x.array
+    vector = forces(operator)
+    assert vector.dot(direction.x.petsc_vec) == pytest.approx(slope, rel=1e-6)
+    tangent = operator.tangent()
+    mirrored = tangent.copy().transpose()
+    mirrored.axpy(-1.0, tangent)
+    assert 0 < tangent.norm() and mirrored.norm() < 1e-13 * tangent.norm()
+    assert not scene.contact(disc(scene, 0.8), fc.Tresca(0.3, 1.0, K, K)).has_potential
+
+
+def _refused(arguments, law=None, **options):
+    scene = rubber("triangle", 1, n=(2, 1))
+
+    def make():
+        support = arguments(scene) if callable(arguments) else arguments
+        scene.contact(support, law or fc.Frictionless(K), **options)
+
+    return make
+
+
+FLOOR = fc.HalfSpace((0, 1), (0, -1))
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "text"),
+    [
+        (_refused(FLOOR, kinematics="large"), ValueError, "'small', 'finite'"),
+        (_refused(FLOOR, gap=0.1), ValueError, "gap is prescribed"),
+        (_refused(FLOOR, law=fc.Foundation(K, K)), ValueError, "Foundation bonds"),
+        (_refused(fc.Obstacle(0.1, (0, 1))), ValueError, "distance=lambda"),
+        (
+            _refused(lambda s: fc.Obstacle(distance=lambda x: ufl.SpatialCoordinate(s.mesh)[1])),
+            ValueError,
+            "distance=lambda",
+        ),
+        (_refused(lambda s: fc.DeformableBody(s.tags, TOP)), ValueError, "rigid support"),
+        (
+            _refused(fc.HalfSpace((0, 1), (0, -1), rotation=0.1)),
+            ValueError,
+            "must be a Rotation",
+        ),
+        (
+            _refused(fc.HalfSpace((0, 1), (0, -1), rotation=fc.Rotation(0.1, (0, 0), (0, 0, 1)))),
+            ValueError,
+            "takes none",
+        ),
+        (
+            _refused(fc.HalfSpace((0, 1), (0, -1), rotation=fc.Rotation(0.1, (0, 0, 0)))),
+            ValueError,
+            "about",
+        ),
+        (
+            _refused(
+                fc.HalfSpace((0, 1), (0, -1), rotation=fc.Rotation(0.1, (0, 0))),
+                kinematics="small",
+            ),
+            ValueError,
+            'kinematics="finite"',
+        ),
+    ],
+)
+def test_refused(make, error, text):
+    """Before any work, on all ranks, with what to give instead."""
+    raised_everywhere(make, error, text)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({}, "has nothing"),
+        ({"gap": 1.0}, "has gap; give gap and normal"),
+        ({"gap": 1.0, "normal": (0, 1), "distance": abs}, "give gap and normal, or distance"),
+    ],
+)
+def test_an_obstacle_is_given_in_one_way(arguments, text):
+    """By gap and normal, or by its distance."""
+    with pytest.raises(ValueError, match=text):
+        fc.Obstacle(**arguments)
