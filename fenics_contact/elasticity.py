@@ -1,4 +1,4 @@
-"""Linear elastic bodies for those who need no form of their own: plane, axisymmetric, spatial.
+"""Elastic bodies for those who need no form of their own: plane, axisymmetric, spatial.
 
     body = elasticity.LinearElastic(u, E, nu, kind="plane stress", thickness=6.4)
     F = body.residual(v) + body.weight * pressure * v[1] * ds(TOP)
@@ -17,7 +17,7 @@ from dolfinx import fem
 
 from fenics_contact.arguments import is_number
 
-__all__ = ["KINDS", "LinearElastic"]
+__all__ = ["KINDS", "LinearElastic", "NeoHookean"]
 
 # Space dimension of every kind.
 KINDS = {"plane strain": 2, "plane stress": 2, "axisymmetric": 2, "3D": 3}
@@ -53,14 +53,8 @@ class LinearElastic:
         Raises:
             ValueError: An unknown kind, one for another dimension, or numbers out of range.
         """
-        if kind not in KINDS:
-            raise ValueError(f"kind is {kind!r}; use one of {list(KINDS)}")
+        _check_kind(u, kind, list(KINDS))
         mesh = u.function_space.mesh
-        if u.ufl_shape != (KINDS[kind],) or mesh.geometry.dim != KINDS[kind]:
-            raise ValueError(
-                f"u has shape {u.ufl_shape} on a mesh in {mesh.geometry.dim}D; a body of kind "
-                f"{kind!r} has ({KINDS[kind]},) in {KINDS[kind]}D"
-            )
         if thickness is not None and not kind.startswith("plane"):
             raise ValueError(f"thickness is {thickness!r}; a body of kind {kind!r} has none")
         self.u, self.kind = u, kind
@@ -107,6 +101,96 @@ class LinearElastic:
             dx: Measure of the body; a part of the mesh, or a quadrature degree of one's own.
         """
         return self.weight * ufl.inner(self.stress, self.strain(v)) * dx
+
+
+class NeoHookean:
+    """A body of compressible neo-Hookean rubber at strains of any size, by its residual in UFL.
+
+    W = G/2 (I₁ - 3 - 2 ln J) + λ/4 (J² - 1 - 2 ln J) per undeformed volume, or with ``isochoric``
+    W = G/2 (I₁/J^(2/3) - 3) + K/4 (J² - 1 - 2 ln J), where I₁ = F:F and J = det F. Both begin as
+    the linear body with E and ν. Tensors are 3 x 3 for every kind, as in `LinearElastic`.
+
+    Attributes:
+        u: The displacement.
+        kind: "plane strain", "axisymmetric" or "3D".
+        E, nu: Young's modulus (stress) and Poisson's ratio of the undeformed body (UFL).
+        weight: What every integral over the body or its boundary carries: 1, or 2πr of the
+            undeformed body. Multiply loads by it, and pass it on as ``Contact(weight=...)``.
+        F: Deformation gradient.
+        J: Change of the volume.
+        energy: W(F) (stress).
+        nominal: First Piola-Kirchhoff stress, ∂W/∂F, force per undeformed area.
+        stress: Cauchy stress, force per deformed area.
+    """
+
+    def __init__(
+        self, u: fem.Function, E: Any, nu: Any, kind: str, *, isochoric: bool = False
+    ) -> None:
+        """Make the body's expressions; nothing is compiled.
+
+        Args:
+            u: Displacement, shape (gdim,); axisymmetric (u_r, u_z).
+            E: Young's modulus (stress): a number, constant, function or UFL expression.
+            nu: Poisson's ratio, likewise; near 1/2 displacements alone lock: take degree 2, and
+                no more than 0.49.
+            kind: "plane strain", "axisymmetric" or "3D".
+            isochoric: Which of the two energies.
+
+        Raises:
+            ValueError: An unknown kind, one for another dimension, or numbers out of range.
+        """
+        _check_kind(u, kind, [k for k in KINDS if k != "plane stress"])
+        mesh = u.function_space.mesh
+        self.u, self.kind = u, kind
+        self.E = _coefficient(mesh, "E", E, 0.0, np.inf)
+        self.nu = _coefficient(mesh, "nu", nu, -1.0, 0.5)
+        axisymmetric = kind == "axisymmetric"
+        self.weight = 2 * ufl.pi * ufl.SpatialCoordinate(mesh)[0] if axisymmetric else 1.0
+        gradient = ufl.variable(ufl.Identity(3) + self.gradient(u))
+        self.F, self.J = gradient, ufl.det(gradient)
+        shear = self.E / (2 * (1 + self.nu))
+        lame = 2 * shear * self.nu / (1 - 2 * self.nu)
+        square, volume = ufl.inner(self.F, self.F), self.J**2 - 1 - 2 * ufl.ln(self.J)
+        if isochoric:
+            bulk = lame + 2 * shear / 3
+            self.energy = shear / 2 * (self.J ** (-2 / 3) * square - 3) + bulk / 4 * volume
+        else:
+            self.energy = shear / 2 * (square - 3 - 2 * ufl.ln(self.J)) + lame / 4 * volume
+        self.nominal = ufl.diff(self.energy, self.F)
+        self.stress = ufl.dot(self.nominal, ufl.transpose(self.F)) / self.J
+
+    def gradient(self, w: Any) -> Any:
+        """Gradient of a displacement by the undeformed body, shape (3, 3) (UFL)."""
+        slope = ufl.grad(w)
+        if self.kind == "3D":
+            return slope
+        across: Any = ufl.as_ufl(0.0)
+        if self.kind == "axisymmetric":
+            across = w[0] / ufl.SpatialCoordinate(self.u.function_space.mesh)[0]
+        return ufl.as_tensor(
+            [[slope[0, 0], slope[0, 1], 0], [slope[1, 0], slope[1, 1], 0], [0, 0, across]]
+        )
+
+    def residual(self, v: Any, dx: ufl.Measure = ufl.dx) -> ufl.Form:
+        """Virtual work of the stresses, ∫ P:grad v weight dx; subtract that of the loads.
+
+        Args:
+            v: Test function of ``u``'s space.
+            dx: Measure of the undeformed body; a part of it, or a quadrature degree of one's own.
+        """
+        return self.weight * ufl.inner(self.nominal, self.gradient(v)) * dx
+
+
+def _check_kind(u: fem.Function, kind: str, kinds: list[str]) -> None:
+    """Refuse a kind that is none, or for another dimension."""
+    if kind not in kinds:
+        raise ValueError(f"kind is {kind!r}; use one of {kinds}")
+    gdim = u.function_space.mesh.geometry.dim
+    if u.ufl_shape != (KINDS[kind],) or gdim != KINDS[kind]:
+        raise ValueError(
+            f"u has shape {u.ufl_shape} on a mesh in {gdim}D; a body of kind {kind!r} has "
+            f"({KINDS[kind]},) in {KINDS[kind]}D"
+        )
 
 
 def _coefficient(mesh: Any, name: str, value: Any, low: float, high: float) -> Any:

@@ -11,7 +11,7 @@ from dolfinx.mesh import CellType
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact.elasticity import LinearElastic
+from fenics_contact.elasticity import LinearElastic, NeoHookean
 from fenics_contact.parallel import global_max
 
 E, NU, PRESSURE, K_N = 1000.0, 0.3, 10.0, 1e5
@@ -195,3 +195,76 @@ def test_what_has_no_sense_is_refused() -> None:
     with pytest.raises(ValueError, match="thickness is 0"):
         LinearElastic(u, E, NU, "plane stress", thickness=0)
     LinearElastic(u, E, 0.5, "plane stress")  # incompressible sheets are ordinary
+
+
+@pytest.mark.parametrize("isochoric", [False, True])
+@pytest.mark.parametrize("kind", ["plane strain", "axisymmetric", "3D"])
+def test_neo_hookean_column_at_large_strain(kind, isochoric):
+    """Pressed to two thirds of its height between smooth planes: uniform stretches.
+
+    Reference: the stretch across is where the stress across vanishes, by bisection in plain Python
+    with derivatives of W by hand; the force is the nominal stress along. The floor gives way by
+    p/k_n. 1e-6.
+    """
+    shear, lame = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
+    bulk, k_n = lame + 2 * shear / 3, 1e6
+
+    def stresses(across, along):
+        """Nominal stress across and along at stretches; out of the plane kind's plane it is 1."""
+        stretch = np.array([across, 1.0 if kind == "plane strain" else across, along])
+        volume, square = stretch.prod(), stretch @ stretch
+        if isochoric:
+            part = shear * volume ** (-2 / 3) * (stretch - square / (3 * stretch))
+            part = part + bulk / 2 * (volume**2 - 1) / stretch
+        else:
+            part = shear * (stretch - 1 / stretch) + lame / 2 * (volume**2 - 1) / stretch
+        return part[0], part[2]
+
+    nominal = 0.0
+    for _ in range(20):  # until the floor is as deep as it is pressed
+        along = (2.0 - nominal / k_n) / 3.0
+        low, high = 1.0, 1.5
+        for _ in range(60):
+            middle = (low + high) / 2
+            low, high = (middle, high) if stresses(middle, along)[0] < 0 else (low, middle)
+        across, nominal = stresses(low, along)
+    d = 3 if kind == "3D" else 2
+    size = [2.0] * (d - 1) + [3.0]
+    cell = CellType.tetrahedron if d == 3 else CellType.triangle
+    make = dolfinx.mesh.create_box if d == 3 else dolfinx.mesh.create_rectangle
+    mesh = make(MPI.COMM_WORLD, [np.zeros(d), np.array(size)], [2] * d, cell)
+    tags = ends(mesh, d - 1, 3.0)
+    V = fem.functionspace(mesh, ("Lagrange", 2, (d,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    body = NeoHookean(u, E, NU, kind, isochoric=isochoric)
+    push = fem.Constant(mesh, 0.0)
+    bcs = []
+    for i in range(d - 1):
+        side = dolfinx.mesh.locate_entities_boundary(
+            mesh, d - 1, lambda x, i=i: np.isclose(x[i], 0)
+        )
+        dofs = fem.locate_dofs_topological(V.sub(i), d - 1, side)
+        bcs.append(fem.dirichletbc(0.0, dofs, V.sub(i)))
+    dofs = fem.locate_dofs_topological(V.sub(d - 1), d - 1, tags.find(TOP))
+    bcs.append(fem.dirichletbc(push, dofs, V.sub(d - 1)))
+    floor = fc.HalfSpace((0.0,) * d, (0.0,) * (d - 1) + (1.0,))
+    surface = fc.ContactSurface(mesh, tags, BOTTOM)
+    contact = fc.Contact(
+        u, surface, floor, fc.Frictionless(k_n), weight=body.weight, kinematics="finite"
+    )
+    problem = fc.ContactProblem(body.residual(v), u, bcs=bcs, contacts=[contact])
+    for share in (0.25, 0.5, 0.75, 1.0):
+        push.value = -share
+        step = problem.solve()
+        problem.commit()
+    assert abs(across) < 1e-9 * E
+    area = {"plane strain": 2.0, "axisymmetric": np.pi * 4.0, "3D": 4.0}[kind]
+    assert step.contacts["contact"].normal_force == pytest.approx(-nominal * area, rel=1e-6)
+    hoop = {"plane strain": 1.0, "axisymmetric": low, "3D": low}[kind]
+    stretch = contact.area_stretch() * (hoop if kind == "axisymmetric" else 1.0)
+    expected = low * hoop
+    assert np.allclose(stretch, expected, rtol=1e-5)
+    true = fem.form(body.stress[2 if d == 3 else 1, 2 if d == 3 else 1] * ufl.dx)
+    volume = mesh.comm.allreduce(fem.assemble_scalar(fem.form(ufl.as_ufl(1.0) * ufl.dx(mesh))))
+    mean = mesh.comm.allreduce(fem.assemble_scalar(true)) / volume
+    assert mean == pytest.approx(nominal / expected, rel=1e-5)
