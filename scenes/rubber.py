@@ -14,9 +14,14 @@ from dolfinx import fem
 import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic, NeoHookean
 from scenes.blocks import BOTTOM, TOP, block_mesh, dimension
+from scenes.comparing import at_points
 from scenes.elasticity import displacement_space
+from scenes.histories import History
 
 Array = np.ndarray
+
+# So that results are compared, and not what the solver leaves.
+TIGHT = {"snes_rtol": 1e-13}
 
 
 @dataclass
@@ -99,3 +104,82 @@ def disc(
     if angle is not None:
         turn = fc.Rotation(angle, centre, None if d == 2 else options.pop("axis", (0, 1, 0)))
     return fc.Ball(centre, radius, displacement=displacement, rotation=turn)
+
+
+class Tool(History):
+    """A disc that presses, is dragged and turns, on a block of rubber.
+
+    Attributes:
+        shift, angle: Of the disc.
+    """
+
+    def __init__(
+        self,
+        cell: str = "triangle",
+        *,
+        law: Any = None,
+        radius: float = 0.8,
+        contact: dict | None = None,
+        force: bool = False,
+        solver: dict | None = None,
+        **options: Any,
+    ) -> None:
+        """Make the scene.
+
+        Args:
+            cell: Of the block.
+            law: Of the contact.
+            radius: Of the disc.
+            contact: Arguments of the `Contact`.
+            force: Whether the disc is pressed by a force, ``down``, instead of a displacement.
+            solver: Arguments of the problem.
+            options: Of `rubber`.
+        """
+        space = cell in ("tetrahedron", "hexahedron")
+        options = {"n": (4, 2) if space else (12, 6), "degree": 1 if space else 2} | options
+        self.scene = rubber(cell, options.pop("degree"), **options)
+        mesh, d = self.scene.mesh, self.scene.dim
+        self.shift, self.angle = fem.Constant(mesh, np.zeros(d)), fem.Constant(mesh, 0.0)
+        self.down, self.side = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
+        self.force_given = force
+        motion: Any = self.shift
+        if force:
+            still = (0.0,) * (d - 2)
+            motion = fc.Motion(
+                force=(*(None,) * (d - 1), self.down), displacement=(self.side, *still, None)
+            )
+        support = disc(self.scene, radius, displacement=motion, angle=self.angle)
+        self.problem, self.contact = self.scene.problem(
+            support,
+            law or fc.Coulomb(0.3, 1e4, 1e4),
+            contact=contact,
+            **{"petsc_options": TIGHT, **(solver or {})},
+        )
+
+    def load(self, t: float) -> None:
+        """Down until 1, along and turned until 2, back and turned on until 4."""
+        down, along = min(t, 1.0), np.interp(t, [1, 2, 4], [0, 0.1, -0.1])
+        self.shift.value[:] = self.vector(along, -0.12 * down)
+        self.down.value, self.side.value = -60.0 * down, along
+        self.angle.value = 0.2 * max(t - 1, 0.0)
+
+    def vector(self, side: float, up: float) -> Array:
+        """Components along x and along the height."""
+        value = np.zeros(self.scene.dim)
+        value[0], value[-1] = side, up
+        return value
+
+    def go(self, side: float, up: float, angle: float = 0.0) -> fc.Step:
+        """One increment of the disc to a place and angle."""
+        self.shift.value[:], self.angle.value = self.vector(side, up), angle
+        step = self.problem.solve()
+        self.problem.commit()
+        return step
+
+    def resultant(self) -> Array:
+        """The contact force on the body."""
+        return self.contact.resultants().force
+
+    def tractions(self) -> Array:
+        """On the body at all points, ordered by their places in the undeformed body."""
+        return at_points(self.contact, self.contact.traction)

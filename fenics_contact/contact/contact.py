@@ -377,6 +377,9 @@ class Contact(PointResults):
             "initial_gap": given.gap,
             "shift": inputs.prescribed_shift(),
         } | {f"parameter {n}": v for n, v in given.parameters.items()}
+        if inputs.rotation is not None:
+            d, matrix = self._gdim, inputs.rotation[0]
+            expressions["turn"] = ufl.as_vector([matrix[i, j] for i in range(d) for j in range(d)])
         seen = ["initial_gap", "normal", *(f"parameter {n}" for n in given.parameters)]
         if given.shift is not None:
             expressions["support"] = given.shift
@@ -660,7 +663,7 @@ class Contact(PointResults):
         self.inputs.update()
         self._data.update()
         data = self._data.values
-        names = ["weight", "normal", "shift"]
+        names = ["weight", "normal", "shift", "turn"]
         if self.gap_prescribed or not self.pairs_anew:  # else it is that of the latest pairs
             names.append("initial_gap")
         return {n: v for n, v in data.items() if n in names or n.startswith("parameter ")}

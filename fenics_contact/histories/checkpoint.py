@@ -430,6 +430,7 @@ def _fixed(problem: ContactProblem, fields: Sequence[fem.Function]) -> dict[str,
         n_points = int(global_sum(mesh.comm, c.quadrature.n_points))
         words[f"quadrature of {c.name}"] = f"{n_points} points"
         words[f"history of {c.name}"] = ", ".join(c.history.names)
+        words[f"kinematics of {c.name}"] = "finite" if c.finite else "small"
         words[f"free motion of {c.name}"] = ", ".join("xyz"[i] for i in c.free_motion)
     for number, field in enumerate(fields):
         element = field.function_space.ufl_element()

@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
+import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact.methods.callbacks import Callbacks
@@ -112,6 +113,7 @@ class SnesMethod(ABC):
     Attributes:
         snes: The solver.
         gives_up: Whether to stop where the residual does not fall any more.
+        enough: Iterations after which to stop, whether it falls or not.
     """
 
     def __init__(
@@ -128,6 +130,7 @@ class SnesMethod(ABC):
         self._equations = equations
         self._callbacks = Callbacks(equations.full.unknowns.comm)
         self.consistent = False
+        self.enough = np.inf
 
     @property
     def max_it(self) -> int:
@@ -169,7 +172,8 @@ class SnesMethod(ABC):
         """Why SNES ends here, or that it goes on, as SNES has it."""
         if self._equations.solved():
             return int(_REASONS.CONVERGED_FNORM_RELATIVE)
-        if self._equations.watch.idle > _PATIENCE and self.gives_up():
+        slow = self.snes.getIterationNumber() >= self.enough
+        if slow or (self._equations.watch.idle > _PATIENCE and self.gives_up()):
             return int(_REASONS.DIVERGED_LINE_SEARCH)
         return int(_REASONS.ITERATING)
 

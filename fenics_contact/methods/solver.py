@@ -43,6 +43,8 @@ _MAX_ROUNDS = 60
 _FIRST_ROUND, _INNER, _NEARLY = 1e-4, 1e-2, 10.0
 # A start with up to this many times the residual of the best is taken first if its points slip.
 _FAR = 100.0
+# Iterations that Newton's method gets where it is slow, see `Solver._hurries`.
+_ENOUGH = 15
 # Increments expected where nothing is said.
 _EXPECTED = 4
 
@@ -450,7 +452,10 @@ class Solver:
             tries = [(starts[0], _LAST_RESORT)]
         elif goes_on:
             tries.append((starts[0], _LAST_RESORT))
-        for start, method in tries:
+            if self._hurries:
+                tries = [tries[0], tries[-1], *tries[:-1]]
+        for number, (start, method) in enumerate(tries):
+            self.main.enough = _ENOUGH if self._hurries and number == 0 else np.inf
             equations.solution.array[:] = start
             equations.watch.start()
             if stiffness_changed:
@@ -466,6 +471,16 @@ class Solver:
         made = sum(attempt.iterations for attempt in attempts[-1:])
         self.predicts = reason > 0 and newton and (factored or made > 0)
         return int(reason), attempts
+
+    @property
+    def _hurries(self) -> bool:
+        """Whether Newton's method gets few iterations before stiffness is led up from soft.
+
+        With friction on a nonlinear bulk points go from stick to slip one after another, each by a
+        factorisation, while the residual falls slowly.
+        """
+        slow = not (self._full.bulk.linear or self.equations.has_potential)
+        return slow and not self._quasi_newton and self.may_go_on()
 
     def _outcome(self, reason: int) -> str:
         """What became of an attempt, in words. Collective."""
