@@ -107,6 +107,9 @@ def _all() -> list[Target]:
     scene = "ball on a block, μ = 0.3"
     for other, limit in ((solve, 2.5), (lu, 1 / 6), (gamg, 1 / 2)):
         found.append(Target(scene, f"time / {other}", ball, ratio("by default", other), limit))
+    tagged = ratio("10 increments", solve)
+    scene = "ball on a block, all of its top tagged, 10 increments"
+    found.append(Target(scene, "time / linear solve", "tagged/tagged.csv", tagged, 2.5))
     large, million = "large/large.csv", 1_000_000
     scene = "ball on a block, a million dofs"
     one = ratio("contact", "linear, multigrid", million)

@@ -337,6 +337,40 @@ def ball_on_block(cells: int, friction: float = 0.3) -> Body:
     )
 
 
+TAGGED_RADIUS, TAGGED_DEPTH = 2.0, 0.01  # of the ball on a cube; a = √(R d) = 0.14
+
+
+@cache
+def ball_on_tagged_block(cells: int, friction: float = 0.3) -> Body:
+    """A rigid ball pressed on a unit cube of tetrahedra, ``cells`` along each edge.
+
+    All of the top is Γc, of which a sixteenth touches; the base is held. The displacement is that
+    below the ball's centre. Collective.
+    """
+    mesh = dolfinx.mesh.create_box(
+        MPI.COMM_WORLD, [[-0.5, -0.5, -1.0], [0.5, 0.5, 0.0]], (cells,) * 3
+    )
+    force = 4 / 3 / (1 - 0.3**2) * np.sqrt(TAGGED_RADIUS) * TAGGED_DEPTH**1.5
+    return Body(
+        mesh=mesh,
+        tags=sides(mesh, {AT_Z: plane(2, -1.0), TOUCHING: plane(2, 0.0)}),
+        E=1.0,
+        nu=0.3,
+        kind="3D",
+        friction=friction,
+        surface=TOUCHING,
+        held=tuple((i, AT_Z) for i in range(3)),
+        end=-TAGGED_DEPTH,
+        work=lambda v, load, ds: 0 * v[2] * ds(TOUCHING),
+        pressed=lambda v, ds: -v[2] * ds(TOUCHING),
+        contact=lambda load: _ball(TAGGED_RADIUS, load),
+        displacement=lambda u: float(output.at_node(u, (0.0, 0.0, 0.0))[2]),
+        force=force,
+        h=1 / cells,
+        by_hand=lambda x, load: _by_hand_ball(x, load, TAGGED_RADIUS),
+    )
+
+
 def hertz_force() -> float:
     """Of the ball on a half-space like the block, without friction: F = 4/3 E* √R d^(3/2)."""
     return 4 / 3 / (1 - 0.3**2) * np.sqrt(RADIUS) * DEPTH**1.5
@@ -356,8 +390,8 @@ def _ball(radius: float, load: Any) -> dict[str, Any]:
     return {"support": fc.Ball((0, 0, radius), radius, displacement=moved)}
 
 
-def _by_hand_ball(x: Any, load: Any) -> tuple[Any, Any, Any]:
+def _by_hand_ball(x: Any, load: Any, radius: float = RADIUS) -> tuple[Any, Any, Any]:
     """The same for forms by hand."""
-    arm = ufl.as_vector([0, 0, RADIUS + load]) - x
+    arm = ufl.as_vector([0, 0, radius + load]) - x
     distance = ufl.sqrt(ufl.dot(arm, arm))
-    return arm / distance, distance - RADIUS, ufl.as_vector([0, 0, load])
+    return arm / distance, distance - radius, ufl.as_vector([0, 0, load])

@@ -82,7 +82,12 @@ def made_up(folder: Path, slower: float) -> None:
         for run in ("μ = 0, 1 increments", "μ = 0.2, 1 increments", "μ = 0.2, 40 increments")
         for p, time in ((1, 10.0), (2, 5.0 * slower))
     ]
+    tagged = [
+        {"run": "one linear solve", "iterations": 1, "seconds": 10.0},
+        {"run": "10 increments", "iterations": 66, "seconds": 18.0 * slower},
+    ]
     tables = {"half_cylinder": cylinder, "ball": ball, "large": big, "ranks": plane}
+    tables["tagged"] = tagged
     for name, rows in tables.items():
         (folder / name).mkdir(exist_ok=True)
         timing.save(folder / name / f"{name}.csv", rows)
@@ -95,7 +100,7 @@ def test_targets(tmp_path: Path) -> None:
     assert {row["met"] for row in targets.table(tmp_path)} == {targets.NOT_MEASURED}
     made_up(tmp_path, 1.0)
     rows = targets.table(tmp_path)
-    expected = [0.9, 0.1, 1.2, 0.1, 1.9, 2.4, 0.16, 0.5, 5.0, 5.4, 2, 2, 2]
+    expected = [0.9, 0.1, 1.2, 0.1, 1.9, 2.4, 0.16, 0.5, 1.8, 5.0, 5.4, 2, 2, 2]
     expected += [10 / 6, 10 / 6]
     assert [row["measured"] for row in rows] == pytest.approx(expected)
     assert {row["met"] for row in rows} == {"yes"}
@@ -152,7 +157,7 @@ def test_model_of_ranks() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["half_cylinder", "ball"])
+@pytest.mark.parametrize("name", ["half_cylinder", "ball", "tagged"])
 def test_short_benchmark(name: str, tmp_path: Path) -> None:
     """The short benchmark ends well, every method finds the solution, and plots are drawn."""
     command = [sys.executable, str(ROOT / "benchmarks" / "run.py"), name, "--short"]

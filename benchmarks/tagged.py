@@ -1,0 +1,67 @@
+"""A rigid ball on a block all of whose top is tagged, in space, with friction: what tags cost.
+
+A cube of linear tetrahedra, the ball moved down in one increment and in ten, of which the last
+touches a sixteenth of the top: by this package as it chooses by itself; by a penalty form by hand
+in DOLFINx, every step of Newton's method by GMRES with GAMG; and one linear solve of the body, by
+factorisation and by multigrid. Residuals end below 1e-9 of the forces in all of them. Meshing is
+not counted, and the compiling of forms stands apart.
+
+    OMP_NUM_THREADS=1 python benchmarks/tagged.py            # five minutes
+    OMP_NUM_THREADS=1 python benchmarks/tagged.py --short
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from mpi4py import MPI
+
+from benchmarks import costs, timing
+from scenes import problems
+
+
+def runs(case: costs.Case, friction: float) -> dict[str, Callable[[], costs.Row]]:
+    """What to time, by name."""
+    package = partial(case.package, friction)
+    return {
+        costs.YARDSTICK: case.linear,
+        f"{costs.YARDSTICK}, multigrid": partial(case.linear, "multigrid"),
+        "1 increment": package,
+        "10 increments": partial(package, 10),
+        "10 increments, every field": partial(package, 10, "every"),
+        costs.PLAIN["multigrid"]: partial(case.plain, friction, "multigrid"),
+    }
+
+
+def main() -> None:
+    """Run."""
+    parser = timing.parser(__doc__, "tagged")
+    parser.add_argument(
+        "--cells", type=int, nargs="+", default=[12, 20, 30], help="a side; table: the last"
+    )
+    parser.add_argument("--friction", type=float, default=0.3)
+    parser.add_argument("--stiffness", type=float, default=10.0, help="k_n and k_t h/E")
+    parser.add_argument("--only", default="", help="runs whose name contains this")
+    arguments = parser.parse_args()
+    if MPI.COMM_WORLD.size > 1:
+        parser.error("times here are of one rank")
+    sizes = [6, 10, 14] if arguments.short else arguments.cells
+
+    def make(cells: int) -> costs.Case:
+        return costs.Case(problems.ball_on_tagged_block(cells), 1, arguments.stiffness)
+
+    def choose(case: costs.Case) -> dict[str, Callable[[], costs.Row]]:
+        found = runs(case, arguments.friction)
+        return {n: r for n, r in found.items() if arguments.only in n or n == costs.YARDSTICK}
+
+    title = f"Ball on a block, all of its top tagged, linear tetrahedra, μ = {arguments.friction:g}"
+    title += f", k h/E = {arguments.stiffness:g}"
+    cases = {f"{n} cells a side": partial(make, n) for n in sizes}
+    costs.study("tagged", title, cases, choose, arguments)
+
+
+if __name__ == "__main__":
+    np.seterr(all="ignore")
+    main()
