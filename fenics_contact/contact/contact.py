@@ -221,6 +221,9 @@ class Contact(PointResults):
         given = self._given(placement, gap)
         self._data, sampled = self._sample(given, placement)
         self._view: SampledView | None = None
+        # 1 at the points that the law is confined to, 0 at others.
+        self._within = fem.Function(self.quadrature.space(), name="within")
+        self._within.x.array[:] = 1.0
         self._in_form, self._point_law = self._point_laws(given, sampled)
         self._point_law.prepare()
         self._acting = self._point_law
@@ -291,9 +294,10 @@ class Contact(PointResults):
             at_points = FiniteKinematics(self._view, multipliers)
         # Where all follows from X + u less the motion of the support, so do its derivatives.
         free = [] if self.finite else list(self.free_motion)
-        acts = self.pairs.acts
+        paired = self.pairs.acts
+        acts = self._within if paired is None else paired * self._within
         return (
-            PointLaw(law, given, in_form, self.quadrature, self._jump, acts=acts, free=free),
+            PointLaw(law, given, in_form, self.quadrature, self._jump, acts=paired, free=free),
             PointLaw(law, sampled, at_points, self.quadrature, self._jump, acts=acts, free=free),
         )
 
@@ -543,6 +547,18 @@ class Contact(PointResults):
     def thaw(self) -> None:
         """Let the law itself act again."""
         self._acting = self._point_law
+
+    def confine(self, points: Mask | None = None) -> None:
+        """Let the law act at some of the points alone. Collective.
+
+        At the others nothing acts, whatever they do: they are open.
+
+        Args:
+            points: Mask of them, (n_points,); None: all, as at first.
+        """
+        self._within.x.array[: self.quadrature.n_points] = 1.0 if points is None else points
+        self._within.x.scatter_forward()
+        self.forget()
 
     def springs(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> Array:
         """Symmetric stiffness a K_n + b K_t of section 5 at the points as evaluated.

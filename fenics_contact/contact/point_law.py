@@ -54,7 +54,7 @@ class PointLaw:
         quadrature: SurfaceQuadrature,
         jump: fem.Function,
         *,
-        acts: fem.Function | None,
+        acts: Any,
         free: Sequence[int],
     ) -> None:
         """Bind; nothing is compiled yet.
@@ -65,7 +65,7 @@ class PointLaw:
             kinematics: What it sees of these.
             quadrature: The points.
             jump: Displacement of the body at the points, of that opposite taken away.
-            acts: 1 at points with an opposite, 0 at others; None: all have one.
+            acts: 1 at points at which it acts, 0 at others (UFL); None: it acts at all.
             free: Components of the support's displacement that are unknown.
         """
         self.law, self.seen = law, seen
@@ -88,7 +88,7 @@ class PointLaw:
     # ---- as UFL ----------------------------------------------------------------------------------
 
     def _there(self, value: Any) -> Any:
-        """A value at points with an opposite, 0 at the others."""
+        """A value at points at which the law acts, 0 at the others."""
         return value if self._acts is None else self._acts * value
 
     def _felt(self, jump: Any = None, seen: Seen | None = None) -> Kinematics:
@@ -96,7 +96,7 @@ class PointLaw:
         return self._kinematics.felt(jump, self.law, seen or self.seen)
 
     def _response(self, felt: Kinematics, seen: Seen | None = None) -> Response:
-        """What the law answers, nothing at points without an opposite."""
+        """What the law answers, nothing at points at which it does not act."""
         response = self.law.response(felt, (seen or self.seen).parameters)
         if self._acts is None:
             return response

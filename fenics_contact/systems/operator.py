@@ -11,14 +11,13 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.point_law import PointTangent
 from fenics_contact.systems.products import PointProduct
 from fenics_contact.systems.unknowns import Selection, Unknowns
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Indices, Mask
 
 __all__ = ["ContactOperator", "contact_operators"]
 
@@ -31,6 +30,9 @@ class ContactOperator:
     Attributes:
         contact: The contact; what acts at its points is that of its present state.
         unknowns: What the vectors and matrices are over.
+        within: Mask of this rank's points that feel none of the unknowns left out of a selection,
+            (n_points,). The others feel nothing here, and nothing acts at them. None: there are no
+            others, on any rank.
     """
 
     def __init__(
@@ -40,8 +42,8 @@ class ContactOperator:
 
         Args:
             contact: The contact.
-            unknowns: Those of a problem, or a selection that has all that contact touches; none:
-                the dofs of ``contact.u`` alone.
+            unknowns: Those of a problem, or a selection of them; none: the dofs of ``contact.u``
+                alone.
             first_motion: Number of this contact's first free motion among all of the unknowns.
         """
         self.contact = contact
@@ -49,14 +51,36 @@ class ContactOperator:
         self._gdim = contact.surface.mesh.geometry.dim
         self._first = self.unknowns.first_motion + first_motion
         self._of_bodies = self.unknowns.widened(contact.jump_map)
+        self.within = self._find_within()
         self._motions: PETSc.Mat | None = None
         self._map = self._of_bodies
+        self._confine(self._of_bodies)
         if contact.free_motion:
             self._motions = self._motion_map()
+            self._confine(self._motions)
             self._map = self._of_bodies.copy()
             different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
             self._map.axpy(-1.0, self._motions, different)
         self._at_points = self._map.createVecLeft()
+
+    def _find_within(self) -> Mask | None:
+        """See the attribute. Collective."""
+        if not isinstance(self.unknowns, Selection):
+            return None
+        pointers, columns, values = self.contact.jump_map.getValuesCSR()
+        row = np.repeat(np.arange(pointers.size - 1), np.diff(pointers))
+        lost = (values != 0.0) & ~self.unknowns.has(columns)
+        within = np.ones(self.contact.quadrature.n_points, dtype=np.bool_)
+        within[row[lost] // self._gdim] = False
+        return within if self.unknowns.comm.allreduce(int(not within.all())) else None
+
+    def _confine(self, matrix: PETSc.Mat) -> None:
+        """Let the other points feel nothing. Collective."""
+        if self.within is not None:
+            rows = matrix.createVecLeft()
+            rows.array[:] = np.repeat(self.within, self._gdim)
+            matrix.diagonalScale(rows, None)
+            rows.destroy()
 
     def _motion_map(self) -> PETSc.Mat:
         """The map from the unknowns to the free displacement of the support. Collective."""
@@ -75,13 +99,17 @@ class ContactOperator:
         )
 
     @cached_property
-    def touched(self) -> npt.NDArray[np.int32]:
+    def touched(self) -> Indices:
         """This rank's unknowns that the points feel or act on, ascending. Collective."""
+        return self.touched_by(np.ones(self.contact.quadrature.n_points, dtype=np.bool_))
+
+    def touched_by(self, chosen: Mask) -> Indices:
+        """Those that some of this rank's points feel or act on, ascending. Collective."""
         pointers, columns, values = self._map.getValuesCSR()
         csr = (pointers, columns, (values != 0.0).astype(np.float64))
         marks = PETSc.Mat().createAIJ(self._map.getSizes(), csr=csr, comm=self._map.comm)
         points, counts = marks.createVecLeft(), marks.createVecRight()
-        points.set(1.0)
+        points.array[:] = np.repeat(chosen, self._gdim)
         marks.multTranspose(points, counts)
         found = np.flatnonzero(counts.array_r > 0.0).astype(np.int32)
         for item in (marks, points, counts):

@@ -8,7 +8,8 @@ them needs no more than this.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
@@ -137,6 +138,26 @@ class System(ABC):
             self.outside,
             start,
         )
+
+    @property
+    def confined(self) -> bool:
+        """Whether there are points of Γc that feel unknowns outside of the system. Collective."""
+        return any(operator.within is not None for operator in self.operators)
+
+    @contextmanager
+    def acting(self) -> Iterator[None]:
+        """Confine the contacts to what the system has of Γc inside of the block. Collective.
+
+        What the others feel is not known before `complete`.
+        """
+        confined = [o for o in self.operators if o.within is not None]
+        try:
+            for operator in confined:
+                operator.contact.confine(operator.within)
+            yield
+        finally:
+            for operator in confined:
+                operator.contact.confine()
 
     # ---- states ----------------------------------------------------------------------------------
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Selection", "Unknowns"]
 
@@ -143,6 +143,16 @@ class Selection(Unknowns):
         self.comm.Scatterv((np.ascontiguousarray(values, dtype=np.float64), self._counts), result)
         return result
 
+    def has(self, numbers: Index) -> Mask:
+        """Which of all unknowns, by their global numbers, are among these."""
+        return self._found(numbers)[1]
+
+    def _found(self, numbers: Index) -> tuple[Index, Mask]:
+        """Their places among these, and whether they are there."""
+        position = np.searchsorted(self.numbers, numbers)
+        position[position == self.n_global] = 0
+        return position, self.numbers[position] == numbers
+
     def widened(self, matrix: PETSc.Mat, *, rows: bool = False) -> PETSc.Mat:
         """Of a matrix over the dofs the columns selected; zero at the motions; a new matrix.
 
@@ -154,9 +164,7 @@ class Selection(Unknowns):
         if rows:
             raise NotImplementedError("rows of a selection")
         pointers, columns, values = matrix.getValuesCSR()
-        position = np.searchsorted(self.numbers, columns)
-        position[position == self.n_global] = 0
-        found = self.numbers[position] == columns
+        position, found = self._found(columns)
         pointers = np.concatenate([[0], np.cumsum(found)])[pointers].astype(PETSc.IntType)
         n_rows = matrix.getLocalSize()[0]
         return PETSc.Mat().createAIJ(
