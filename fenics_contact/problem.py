@@ -44,6 +44,8 @@ logger = logging.getLogger("fenics_contact")
 _TOUCHING = 1e-12
 # Contact that bears less than this share of the load on a free motion bears nothing yet.
 _IDLE = 1e-3
+# What became of an attempt on too few unknowns.
+_SPREADS = "contact spreads beyond the unknowns kept"
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Step:
     Attributes:
         increment: Number of the increment, from 1.
         reason: SNES reason of the last solve (positive: converged).
-        iterations: SNES iterations in all.
+        iterations: SNES iterations in all, those on too few unknowns included.
         rounds: Solutions one after another, with multipliers between them.
         method: The method that found the solution; see `ContactProblem`.
         factorisations: Sparse matrices factored; dense ones of a condensed problem do not count.
@@ -173,7 +175,8 @@ class ContactProblem:
             fallback: Whether to go on by continuation where the method fails with no less than its
                 usual limit on iterations.
             condensation: Whether to iterate on the unknowns that contact touches alone, all others
-                eliminated: for a linear bulk. By default where it can be done and is
+                eliminated: for a linear bulk. Of a large Γc on those near the contact; where it
+                moves on or spreads they are chosen anew. By default where it can be done and is
                 worth it (`condensed.worthwhile`), unless an option names a linear solver.
             linear_solver: How systems over all unknowns are solved: "direct" (MUMPS) or "multigrid"
                 (GAMG: a V-cycle as H₀ of L-BFGS, or inside CG and GMRES for Newton's method). By
@@ -423,7 +426,8 @@ class ContactProblem:
             field: Whether to find all of u. If not, and if the problem is condensed, u may stay
                 behind: then only what contact touches, all results of the contacts included, is
                 that of the increment, and the verdict is on the condensed equations. `complete`
-                brings up the rest, for a fifteenth to a thirtieth of a factorisation.
+                brings up the rest, for a fifteenth to a thirtieth of a factorisation. Where not all
+                of Γc is kept u is found all the same, to see that the rest of Γc stays open.
 
         Returns:
             What was done, the verdict included.
@@ -438,19 +442,26 @@ class ContactProblem:
         self._fresh = False
         if self._pending_field is not None and not self.solver.is_current():
             self.complete()  # what it takes is about to go
-        saved = self.full.state(), self._load, self._pending_field, self._energy
+        self.solver.equations.factorisations = 0
+        saved = self._saved()
         try:
             # A trial of a line search may overflow, and the convergence test and the verdict see
             # it: a warning, on the rank that has the point, must not become an error there alone.
-            with self.solver.options.present(), np.errstate(all="ignore"):
-                step = self._solve(start, ahead, field)
+            with np.errstate(all="ignore"):
+                tried: list[Attempt] = []
+                step = None
+                while step is None:
+                    with self.solver.options.present():
+                        step = self._solve(start, ahead, field, tried)
+                    # Outside, lest a SNES that is made anew takes its options for the caller's.
+                    if step is None:
+                        self._go_back(saved)
+                        spread = sum(attempt.outcome == _SPREADS for attempt in tried)
+                        self.solver.change(anew=spread <= 1)
                 release_interrupt()
         except BaseException as error:
             fail_together(self._comm, error)
-            state, self._load, self._pending_field, self._energy = saved
-            self.full.set_state(state)
-            for contact in self.contacts:
-                contact.restore()
+            self._go_back(saved)
             if not isinstance(error, NotConverged | ValueError):
                 self.solver.recover()
             raise
@@ -459,47 +470,81 @@ class ContactProblem:
                 self.solver.options.warn_of_unread(self.prefix)
         return step
 
-    def _solve(self, start: float, ahead: float, field: bool) -> Step:
+    def _saved(self) -> tuple[Array, Array, Array | None, EnergyState]:
+        """What `solve` changes, apart from the contacts."""
+        return self.full.state(), self._load, self._pending_field, self._energy
+
+    def _go_back(self, saved: tuple[Array, Array, Array | None, EnergyState]) -> None:
+        """To where the increment starts. Collective."""
+        state, self._load, self._pending_field, self._energy = saved
+        self.full.set_state(state)
+        for contact in self.contacts:
+            contact.restore()
+
+    def _solve(self, start: float, ahead: float, field: bool, tried: list[Attempt]) -> Step | None:
+        """`solve`; None if it takes other unknowns than are kept. Collective.
+
+        Args:
+            start: When it began.
+            ahead: See `solve`.
+            field: Likewise.
+            tried: What was tried before; what is tried here is added.
+        """
         solver = self.solver
         self._check_before()
         before = self.full.state()
         for bc in self._bcs:
             bc.set(self.u.x.array)
         self.u.x.scatter_forward()
-        solver.equations.factorisations = 0
         solver.follow(before)
         stiffness_changed = self.full.update_stiffness()
-        solver.update_system(stiffness_changed)
         self._approach()
+        if solver.chooses():
+            return None
+        solver.update_system(stiffness_changed)
         self.full.farthest = solver.system.farthest = self._judge.begin()
         solver.system.begin(self._load)
-        reason, attempts, rounds = solver.solve(
-            ahead=ahead, rate=self._rate, cold=self._cold, stiffness_changed=stiffness_changed
-        )
-        lags = not field and self._may_lag()
+        with solver.system.acting():
+            reason, attempts, rounds = solver.solve(
+                ahead=ahead, rate=self._rate, cold=self._cold, stiffness_changed=stiffness_changed
+            )
+        # Points outside of what is kept have to be looked at, and it takes all of u to do so.
+        lags = not field and not solver.system.confined and self._may_lag()
+        self._pending_field = solver.system.pending_field if lags else None
+        if not lags:
+            solver.system.complete(solver.system.pending_field)
+        for contact in self.contacts:
+            contact.evaluate()
+        if solver.misses(found=reason > 0):
+            tried += [*attempts[:-1], replace(attempts[-1], outcome=_SPREADS)]
+            return None
+        tried += attempts
+        kinematics = reason > 0  # a solver that failed may have no factors for it
         if lags:
             self._begin_energy_kept()
-        judge = self._judge_kept if lags else self._judge_all
-        verdict = judge(kinematics=reason > 0)  # a solver that failed may have no factors for it
+            verdict = self._judge_kept(kinematics=kinematics)
+        else:
+            assemble = field or not solver.system.confined
+            verdict = self._judge_all(kinematics=kinematics, assemble=assemble)
         if reason <= 0 or verdict.failures:
-            raise self._not_converged(reason, verdict, attempts)
+            raise self._not_converged(reason, verdict, tried)
         energy = self._energy.since(self._committed_energy, self.contacts, self._comm)
         verdict = replace(verdict, created=energy.created)
         if verdict.failures:
-            raise self._not_converged(reason, verdict, attempts)
+            raise self._not_converged(reason, verdict, tried)
         self._judge.warn_of_large_motion(verdict)
         self._solved = _Solved(self.full.state(), [c.found() for c in self.contacts])
         return Step(
             increment=self.increment + 1,
             reason=reason,
-            iterations=sum(attempt.iterations for attempt in attempts),
+            iterations=sum(attempt.iterations for attempt in tried),
             rounds=rounds,
-            method=attempts[-1].method,
+            method=tried[-1].method,
             factorisations=solver.equations.factorisations,
             verdict=verdict,
             contacts={c.name: c.resultants() for c in self.contacts},
             energy=energy,
-            attempts=tuple(attempts),
+            attempts=tuple(tried),
             wall_seconds=time.perf_counter() - start,
             complete=not lags,
         )
@@ -541,15 +586,9 @@ class ContactProblem:
         committed = self._committed_lag[0] is self._pending_field
         before = self.full.state()
         self.solver.system.complete(self._pending_field)
-        state, image = self.unknowns.vector(), self.unknowns.vector()
-        state.array[:] = self.full.state()
-        assert self.full.stiffness is not None
-        self.full.stiffness.mult(state, image)
         self.full.begin(self._load)
-        bulk = image.array_r - self._load
+        bulk = self._product() - self._load
         verdict, reaction = self._judged(self.full, bulk, laws=False)
-        for vector in (state, image):
-            vector.destroy()
         if verdict.failures:
             self.full.set_state(before)
             number = self.increment + (not committed)
@@ -564,6 +603,17 @@ class ContactProblem:
         elif self._solved is not None:
             self._solved = replace(self._solved, state=self.full.state())
         return verdict
+
+    def _product(self) -> Array:
+        """The bulk's stiffness times the present state, (n_local,) (force). Collective."""
+        state, image = self.unknowns.vector(), self.unknowns.vector()
+        state.array[:] = self.full.state()
+        assert self.full.stiffness is not None
+        self.full.stiffness.mult(state, image)
+        product = image.array_r.copy()
+        for vector in (state, image):
+            vector.destroy()
+        return product
 
     def _check_before(self) -> None:
         self.bulk.check_finite()
@@ -608,13 +658,12 @@ class ContactProblem:
         if way is not None:
             self.full.set_state(self.full.state() + way)
 
-    def _judge_all(self, *, kinematics: bool) -> Verdict:
-        """Complete u and judge by assembly, past SNES and its residual. Collective."""
-        self.solver.system.complete(self.solver.system.pending_field)
-        self._pending_field = None
-        for contact in self.contacts:
-            contact.evaluate()
-        bulk = self.full.with_supports(self.bulk.assemble_residual())
+    def _judge_all(self, *, kinematics: bool, assemble: bool) -> Verdict:
+        """Judge a complete u by assembly, past SNES and its residual, or by K u. Collective."""
+        if assemble:
+            bulk = self.full.with_supports(self.bulk.assemble_residual())
+        else:
+            bulk = self._product() - self._load
         verdict, reaction = self._judged(self.full, bulk, kinematics=kinematics)
         forces: dict[object, Forces] = {self.full.mark: self.full.forces(bulk, reaction)}
         if self.solver.condensed and self.bulk.symmetric:
@@ -624,9 +673,6 @@ class ContactProblem:
 
     def _judge_kept(self, *, kinematics: bool) -> Verdict:
         """Judge the condensed equations; u stays behind. Collective."""
-        self._pending_field = self.solver.system.pending_field
-        for contact in self.contacts:
-            contact.evaluate()
         bulk = self.solver.system.bulk_force()
         verdict, _ = self._judged(self.solver.system, bulk, kinematics=kinematics)
         forces: dict[object, Forces] = {self.solver.system.mark: self._forces_kept()}
@@ -765,8 +811,7 @@ class ContactProblem:
         increment, expected = (int(value) for value in numbers)
         self.expect(expected)
         self._fresh, self._solved = False, None
-        if self.solver.condensed and self._comm.allreduce(int(kept.any())):
-            self.solver.keep(np.flatnonzero(kept).astype(np.int32))
+        self.solver.keep(np.flatnonzero(kept).astype(np.int32))
         self.increment = increment
         self._committed, self._rate = state.copy(), rate.copy() if increment else None
         self.full.set_state(state)

@@ -10,8 +10,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
+from fenics_contact.systems.candidates import touched
 from fenics_contact.systems.condensation import Condensation
-from fenics_contact.systems.condensed import touched, worthwhile
+from fenics_contact.systems.condensed import worthwhile
 from fenics_contact.systems.unknowns import Selection
 from scenes.blocks import CELLS, GRID, LEFT, RIGHT, TOP, block, kirchhoff
 from scenes.comparing import close, gathered, owned, raised_everywhere

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fenics_contact.systems import linear
-from fenics_contact.systems.condensed import touched, worthwhile
+from fenics_contact.systems.condensed import worthwhile
 from fenics_contact.systems.full import FullSystem
 
 __all__ = ["linear_kind", "obstacle_to_condensation"]
@@ -18,6 +18,7 @@ def obstacle_to_condensation(
     linear_solver: str | None,
     named: Sequence[str],
     increments: int,
+    n_kept: int,
 ) -> str | None:
     """Why not to iterate on the unknowns that contact touches alone; None: do. Collective.
 
@@ -27,6 +28,7 @@ def obstacle_to_condensation(
         linear_solver: What the caller wants for systems over all unknowns.
         named: Options given that name a linear solver, which the dense one cannot be.
         increments: How many of them are expected.
+        n_kept: How many unknowns there would be.
 
     Raises:
         ValueError: It is wanted and cannot be had.
@@ -50,9 +52,8 @@ def obstacle_to_condensation(
     if wanted or obstacle:
         return obstacle
     n = unknowns.n_global
-    n_touched = unknowns.comm.allreduce(touched(full.operators, unknowns).size)
-    if n_touched == n or not worthwhile(n, n_touched, gdim):
-        return f"contact touches {n_touched} of {n} unknowns, too many to gain by it"
+    if n_kept == n or not worthwhile(n, n_kept, gdim):
+        return f"contact touches {n_kept} of {n} unknowns, too many to gain by it"
     if unknowns.n_motions or linear_solver is not None:
         return None
     n_bytes = linear.factor_bytes(n, gdim, symmetric=full.bulk.symmetric)

@@ -1,9 +1,9 @@
 """The system on the unknowns that contact touches, where the bulk is linear.
 
-Contact acts on few unknowns, Γc's and those opposite. With the others eliminated, which takes one
-factorisation, the bulk is a dense matrix S on these (its Schur complement), whatever the loads and
-conditions of the increments to come: S x = g + contact forces. An iteration costs milliseconds, and
-one back-substitution at its end gives the field.
+Contact acts on few unknowns, Γc's and those opposite, or those that candidates touch. With the
+others eliminated, which takes one factorisation, the bulk is a dense matrix S on these (its Schur
+complement), whatever the loads and conditions of the increments to come: S x = g + contact forces.
+An iteration costs milliseconds, and one back-substitution at its end gives the field.
 """
 
 from __future__ import annotations
@@ -19,12 +19,11 @@ from fenics_contact.systems.condensation import Condensation
 from fenics_contact.systems.dense import PartlyFactored, Sum
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
-from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.system import System
-from fenics_contact.systems.unknowns import Selection, Unknowns
+from fenics_contact.systems.unknowns import Selection
 from fenics_contact.types import Array, Indices
 
-__all__ = ["CondensedSystem", "touched", "worthwhile"]
+__all__ = ["CondensedSystem", "all_kept", "inexpensive", "worthwhile"]
 
 logger = logging.getLogger("fenics_contact")
 
@@ -37,6 +36,11 @@ _SMALL = 500
 # 4 n² in three. Up to this share of n^((d-1)/d), the size of a surface of all of the mesh, the
 # dense one costs a quarter of the sparse one.
 _SURFACE_SHARE = {2: 3.0, 3: 1.2}
+# Share of these up to which what is kept is hardly felt in the cost.
+_CHEAP = 0.25
+# Share of these up to which all that contact touches is kept. Where some is left out every
+# increment takes a back-substitution, which in the plane costs more than fewer unknowns save.
+_ALL = {2: 1.0, 3: 0.5}
 
 
 def worthwhile(n: int, n_kept: int, dimension: int) -> bool:
@@ -47,17 +51,23 @@ def worthwhile(n: int, n_kept: int, dimension: int) -> bool:
     (106,000 unknowns, 768 kept). With contact the iteration on all unknowns nearly always takes
     more factorisations, or back-substitutions for the price of as many.
     """
+    return 0 < n_kept <= _most(n, dimension)
+
+
+def _most(n: int, dimension: int) -> float:
+    """How many of ``n`` unknowns are worth to be kept."""
     surface = _SURFACE_SHARE[dimension] * n ** ((dimension - 1) / dimension)
-    return 0 < n_kept <= min(_LARGEST, max(_SMALL, surface))
+    return min(_LARGEST, max(_SMALL, surface))
 
 
-def touched(operators: Sequence[ContactOperator], unknowns: Unknowns) -> Indices:
-    """This rank's unknowns that contact feels or acts on, ascending. Collective."""
-    found = np.zeros(unknowns.n_local, dtype=np.bool_)
-    found[unknowns.n_dofs :] = True
-    for operator in operators:
-        found[operator.touched] = True
-    return np.flatnonzero(found).astype(np.int32)
+def inexpensive(n: int, dimension: int) -> int:
+    """How many of ``n`` unknowns cost next to nothing more than fewer when they are kept."""
+    return int(max(_SMALL, _CHEAP * _most(n, dimension)))
+
+
+def all_kept(n: int, n_touched: int, dimension: int) -> bool:
+    """Whether to keep all that contact touches, whatever part of it may come into contact."""
+    return n_touched <= max(2 * _SMALL, _ALL[dimension] * _most(n, dimension))
 
 
 class CondensedSystem(System):
@@ -73,7 +83,7 @@ class CondensedSystem(System):
 
         Args:
             full: All unknowns of a problem.
-            unknowns: All of those that contact touches.
+            unknowns: Those that contact touches, or may touch in this increment.
             prefix: Of the options of the factorisation.
         """
         kept = unknowns.kept

@@ -1,0 +1,167 @@
+"""Blocks all of whose top is tagged, more than can touch what is pressed on it and dragged."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import dolfinx
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import CellType
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact import compat
+from scenes.blocks import dimension
+from scenes.elasticity import displacement_space, hold, residual
+from scenes.histories import History
+from scenes.meshes import mesh_of
+from scenes.tags import near, tagged
+
+Array = np.ndarray
+
+BASE, TOP, ROUND, LID, SIDE = 1, 2, 3, 4, 5
+E, NU, RADIUS, DEEP = 1000.0, 0.3, 4.0, 0.01
+# Cells of the block, of edges 2 (and 2) and 0.4: its top has more than a thousand unknowns.
+CELLS = {"quadrilateral": (520, 4), "triangle": (520, 4), "tetrahedron": (19, 19, 2)}
+HEIGHT = 0.4
+
+
+class Pressed(History):
+    """A ball, or disc, goes down into the middle until t = 1, then along by 0.25 a unit of t.
+
+    Attributes:
+        u: Displacement.
+        contact, problem: As made.
+    """
+
+    def __init__(
+        self,
+        law: Any = None,
+        *,
+        cell: str = "quadrilateral",
+        within: float = 1.0,
+        deep: float = DEEP,
+        force: float = 0.0,
+        pressure: float = 0.0,
+        length: float = 1.0,
+        contact: dict | None = None,
+        comm: MPI.Comm = MPI.COMM_WORLD,
+        **options: Any,
+    ) -> None:
+        """Make it, unloaded. Collective.
+
+        Args:
+            law: Of the contact, by default Coulomb's.
+            cell: Kind of the cells.
+            within: How far from its middle the top is tagged.
+            deep: How far the ball goes.
+            force: What drives it down; 0: it goes as far as that.
+            pressure: On the base, which is not held then: the ball alone holds the block up.
+            length: Unit of lengths.
+            contact: Arguments of `fc.Contact`.
+            comm: The ranks.
+            **options: Of the problem.
+        """
+        d, up = dimension(cell), dimension(cell) - 1
+        low, high = np.array([-1.0] * up + [-HEIGHT]), np.array([1.0] * up + [0.0])
+        make = dolfinx.mesh.create_rectangle if d == 2 else dolfinx.mesh.create_box
+        mesh = make(comm, [low * length, high * length], CELLS[cell], CellType[cell])
+
+        def top(x: Array, cells: Array) -> Array:
+            return near(up, 0.0)(x, cells) & (np.abs(x[:, 0]) < within * length)
+
+        where = {SIDE: near(0, -length), BASE: near(up, -HEIGHT * length), TOP: top}
+        tags = tagged(mesh, where)
+        self.u = fem.Function(displacement_space(mesh, 1))
+        v = ufl.TestFunction(self.u.function_space)
+        self._deep, self._most, self._length = deep * length, force * length**up, length
+        self._pressure = pressure
+        self.along, self.down, self.force, self.push = (fem.Constant(mesh, 0.0) for _ in range(4))
+        still = [0.0] * (d - 2)
+        moved: Any = ufl.as_vector([self.along, *still, self.down])
+        if force:
+            moved = fc.Motion(
+                force=(*(None,) * up, self.force), displacement=(self.along, *still, None)
+            )
+        centre = (*(0.0,) * up, RADIUS * length)
+        ball = fc.Ball(centre, RADIUS * length, displacement=moved)
+        k = 1e5 / length
+        law = law or fc.Coulomb(0.3, k_n=k, k_t=k)
+        surface = fc.ContactSurface(mesh, tags, TOP)
+        self.contact = fc.Contact(self.u, surface, ball, law, **(contact or {}))
+        bcs = [hold(self.u, tags, BASE, i) for i in range(d)]
+        F = residual(self.u, v, E, NU)
+        if pressure:
+            bcs = [hold(self.u, tags, SIDE, i) for i in range(up)]
+            F -= self.push * v[up] * ufl.Measure("ds", mesh, subdomain_data=tags)(BASE)
+        self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=[self.contact], **options)
+
+    def load(self, t: float) -> None:
+        """Set what moves the ball, or the block."""
+        self.push.value = self._pressure * min(t, 1.0)
+        if self._pressure:
+            return
+        self.down.value = -self._deep * min(t, 1.0)
+        self.force.value = -self._most * min(t, 1.0)
+        self.along.value = 0.25 * max(t - 1.0, 0.0) * self._length
+
+
+class Shod(History):
+    """The same in the plane with a round shoe, a body of its own, its lid moved: along by 0.04.
+
+    Attributes:
+        u: Displacement of both.
+        contact, problem: As made.
+    """
+
+    def __init__(
+        self,
+        law: Any = None,
+        *,
+        within: float = 1.0,
+        deep: float = DEEP,
+        update: str = "increment",
+        contact: dict | None = None,
+        **options: Any,
+    ) -> None:
+        """Make it, unloaded; ``within`` and ``deep`` as of `Pressed`. Collective."""
+        self._deep = deep
+        cell, x, cells, offset = "quadrilateral", [], [], 0
+        for low, high, n in (
+            ((-1.0, -HEIGHT), (1.0, 0.0), CELLS[cell]),
+            ((-1.2, 0.0), (1.2, 0.3), (72, 4)),
+        ):
+            part = dolfinx.mesh.create_rectangle(MPI.COMM_SELF, [low, high], n, CellType[cell])
+            x.append(part.geometry.x[:, :2].copy())
+            cells.append(compat.geometry_dofmap(part) + offset)
+            offset += len(x[-1])
+        # Its sole is a parabola, of the ball's radius at the middle.
+        x[1][:, 1] += (1 - x[1][:, 1] / 0.3) * x[1][:, 0] ** 2 / (2 * RADIUS)
+        mesh = mesh_of(cell, np.concatenate(x), np.concatenate(cells))
+
+        def top(x: Array, cells: Array) -> Array:
+            return near(1, 0.0)(x, cells) & (cells[:, 1] < 0) & (np.abs(x[:, 0]) < within)
+
+        def sole(x: Array, cells: Array) -> Array:
+            return (cells[:, 1] > 0) & (x[:, 1] < 0.2999) & (np.abs(x[:, 0]) < 1.1999)
+
+        where = {BASE: near(1, -HEIGHT), TOP: top, ROUND: sole, LID: near(1, 0.3)}
+        tags = tagged(mesh, where)
+        self.u = fem.Function(displacement_space(mesh, 1))
+        v = ufl.TestFunction(self.u.function_space)
+        self.along, self.down = (fem.Constant(mesh, 0.0) for _ in range(2))
+        bcs = [hold(self.u, tags, BASE, i) for i in range(2)]
+        bcs += [hold(self.u, tags, LID, i, c) for i, c in enumerate((self.along, self.down))]
+        shoe = fc.DeformableBody(tags, ROUND, update=update)
+        law = law or fc.Coulomb(0.3, k_n=1e5, k_t=1e5)
+        surface = fc.ContactSurface(mesh, tags, TOP)
+        self.contact = fc.Contact(self.u, surface, shoe, law, **(contact or {}))
+        F = residual(self.u, v, E, NU)
+        self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=[self.contact], **options)
+
+    def load(self, t: float) -> None:
+        """Set what moves the lid."""
+        self.down.value = -self._deep * min(t, 1.0)
+        self.along.value = 0.04 * max(t - 1.0, 0.0)

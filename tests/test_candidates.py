@@ -1,0 +1,265 @@
+"""Only what can touch: of a generous tag the unknowns that are kept when condensed.
+
+References are the same scene on all unknowns, or with a tight tag. All are solved to 1e-12 of the
+forces and agree to 1e-8 of the largest entry, increments one after another.
+"""
+
+import logging
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import fenics_contact as fc
+from scenes.comparing import close, nodal, shared_folder
+from scenes.generous import CELLS, Pressed, Shod
+from scenes.histories import goes_on
+
+pytestmark = [pytest.mark.timeout(240), pytest.mark.mpi]
+COMM = MPI.COMM_WORLD
+
+SAME = 1e-8
+TIGHT = {"petsc_options": {"snes_rtol": 1e-12}}
+# What costs next to nothing; the top has a thousand and more.
+FEW = 500
+
+
+def kept(made):
+    """Number of the unknowns kept."""
+    system = made.problem.solver.system
+    assert made.problem.solver.condensed
+    return system.unknowns.n_global
+
+
+def run(made, end=1.0, steps=2, **options):
+    """The steps to ``end``, and what they came to."""
+    found = list(made.increments(end, steps=steps, **options))
+    forces = np.array([step.contacts["contact"].force for step in found])
+    counts = [[s.contacts["contact"].stick, s.contacts["contact"].slip] for s in found]
+    return found, {"u": nodal(made.u), "forces": forces, "counts": np.array(counts)}
+
+
+def assert_same(one, other, rtol=SAME):
+    for name, value in other.items():
+        assert close(one[name], value, rtol), name
+
+
+def n_grown(steps):
+    """How often contact went beyond what was kept."""
+    return sum("spreads" in attempt.outcome for step in steps for attempt in step.attempts)
+
+
+# ---- the same results ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_a_generous_tag(cell):
+    """The same as on all unknowns and with a tight tag; few are kept, and condensed once."""
+    made = Pressed(cell=cell, **TIGHT)
+    steps, found = run(made)
+    assert kept(made) <= FEW
+    assert sum(step.factorisations for step in steps) == 1
+    assert n_grown(steps) == 0
+    full = Pressed(cell=cell, condensation=False, **TIGHT)
+    assert_same(found, run(full)[1])
+    # Where points are closed the ball has passed the top by a sixth of the tag at most.
+    assert_same(found, run(Pressed(cell=cell, within=0.5, **TIGHT))[1])
+
+
+LAWS = {
+    "frictionless": fc.Frictionless(k_n=1e5),
+    "polygon": fc.Coulomb(0.3, k_n=1e5, k_t=1e5, modes=6),
+    "layer": fc.Foundation(k_n=1e4, k_t=1e4, tension=False),
+}
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_laws(law):
+    """Of every kind, dragged a little."""
+    cell = "tetrahedron" if law == "polygon" else "quadrilateral"
+    made = [Pressed(LAWS[law], cell=cell, condensation=c, **TIGHT) for c in (None, False)]
+    (steps, found), (_, full) = (run(m, 1.2, 3) for m in made)
+    assert kept(made[0]) <= FEW
+    assert n_grown(steps) == 0
+    assert_same(found, full)
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton", "alternating", "continuation"])
+def test_methods(method):
+    """By every method; L-BFGS ends at less digits, and all unknowns are solved as exactly."""
+    made = [Pressed(condensation=c, method=method, **TIGHT) for c in (None, False)]
+    (_, found), (_, full) = (run(m) for m in made)
+    assert kept(made[0]) <= FEW
+    assert_same(found, full)
+
+
+def test_multipliers():
+    """Rounds of multipliers: none acts where nothing touches; to the tolerance of the rounds."""
+    tolerance = 1e-6
+    options = {"cell": "tetrahedron", "contact": {"enforcement": "augmented"}} | TIGHT
+    options["contact"]["tolerance"] = tolerance
+    made = [Pressed(condensation=c, **options) for c in (None, False)]
+    (steps, found), (_, full) = (run(m, 1.5, 3) for m in made)
+    assert kept(made[0]) <= FEW
+    assert max(step.rounds for step in steps) > 1
+    assert_same(found, full, tolerance)
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_a_ball_driven_by_a_force(cell):
+    """Its motion is an unknown: points away from the contact would be closed by it unseen."""
+    made = [Pressed(cell=cell, force=20.0, condensation=c, **TIGHT) for c in (None, False)]
+    (_, found), (_, full) = (run(m, 1.2, 3) for m in made)
+    assert kept(made[0]) <= FEW + 1
+    assert_same(found, full)
+
+
+@pytest.mark.parametrize("pressure", [5.0, 40.0])
+def test_a_body_that_contact_alone_holds(pressure):
+    """Pressed up against the ball; by the larger pressure contact grows beyond what is kept."""
+    made = [Pressed(pressure=pressure, condensation=c, **TIGHT) for c in (True, False)]
+    (steps, found), (_, full) = (run(m, 1.0, 4) for m in made)
+    assert n_grown(steps) >= 1 if pressure > 10 else kept(made[0]) <= FEW
+    assert_same(found, full)
+
+
+@pytest.mark.parametrize("update", ["never", "increment"])
+def test_two_bodies(update):
+    """A round shoe, a body of its own, pressed on and dragged; pairs as they were or found anew."""
+    end, steps = (1.0, 2) if update == "never" else (3.0, 12)
+    made = [Shod(update=update, condensation=c, **TIGHT) for c in (None, False)]
+    (_, found), (_, full) = (run(m, end, steps) for m in made)
+    assert kept(made[0]) <= FEW
+    assert_same(found, full)
+
+
+# ---- growth --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wanted", [None, True])
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_dragged_away(cell, wanted):
+    """Out of what was kept at first: kept anew, or more if it is wanted; then all is as it was."""
+    made = [Pressed(cell=cell, condensation=c, **TIGHT) for c in (wanted, False)]
+    (steps, found), (_, full) = (run(m, 3.5, 7) for m in made)
+    assert 1 <= n_grown(steps) <= 2
+    assert sum(step.factorisations for step in steps) == 1 + n_grown(steps)
+    if wanted is None:
+        assert kept(made[0]) <= FEW
+    assert_same(found, full)
+
+
+def test_two_bodies_pressed_deep():
+    """The shoe, until contact is wider than what was kept at first."""
+    made = [Shod(deep=0.05, condensation=c, kinematics=np.inf, **TIGHT) for c in (True, False)]
+    (steps, found), (_, full) = (run(m, 1.0, 10) for m in made)
+    assert n_grown(steps) >= 1
+    assert_same(found, full)
+
+
+@pytest.mark.parametrize("wanted", [None, True])
+def test_pressed_deep(wanted):
+    """Until most of the top touches: on all unknowns from then on, or on all that are touched."""
+    made = [Pressed(deep=0.12, condensation=c, kinematics=np.inf, **TIGHT) for c in (wanted, False)]
+    (steps, found), (_, full) = (run(m, 1.0, 10) for m in made)
+    assert steps[0].attempts[-1].outcome == "converged"
+    assert n_grown(steps) >= 1
+    if wanted:
+        assert kept(made[0]) > 1.5 * FEW
+    else:
+        assert not made[0].problem.solver.condensed
+    assert_same(found, full)
+
+
+def test_field_last():
+    """Without every field nothing closes unseen, and nothing changes: bit for bit serially."""
+    made = [Pressed(condensation=True) for _ in range(2)]
+    (steps, found), (others, every) = (
+        run(m, 3.0, 6, field=field) for m, field in zip(made, ("last", "every"), strict=True)
+    )
+    assert n_grown(steps) == n_grown(others) >= 1
+    assert all(step.complete for step in steps)
+    assert_same(found, every, 0.0 if COMM.size == 1 else SAME)
+    for one, other in zip(steps, others, strict=True):
+        size = abs(other.energy.work) + abs(other.energy.elastic)
+        for name in ("work", "elastic", "springs", "dissipation"):
+            ours, theirs = getattr(one.energy, name), getattr(other.energy, name)
+            assert close(ours, theirs, SAME, scale=size), name
+
+
+@pytest.mark.parametrize("wanted", [None, True])
+def test_restart(wanted, tmp_path):
+    """Broken off after what is kept has grown, and taken up: the same digits; see `goes_on`."""
+    make = lambda: Pressed(condensation=wanted)  # noqa: E731
+    goes_on(make, shared_folder(tmp_path), stop=5, end=3.5)
+
+
+def test_restart_on_all_unknowns(tmp_path):
+    """The same where contact has spread too far to be condensed."""
+    make = lambda: Pressed(deep=0.12, kinematics=np.inf)  # noqa: E731
+    goes_on(make, shared_folder(tmp_path), stop=4, end=1.0, steps=5)
+
+
+def test_an_increment_that_fails():
+    """It leaves u, history and what comes next as if it had not been."""
+    made, twin = (Pressed(condensation=True, fallback=False) for _ in range(2))
+    for m in (made, twin):
+        run(m, 1.0)
+    before = made.u.x.array.copy()
+    limits = made.problem.solver.main.max_it
+    made.load(3.0)
+    made.problem.solver.main.max_it = 1
+    with pytest.raises(fc.NotConverged):
+        made.problem.solve()
+    made.problem.solver.main.max_it = limits
+    assert np.array_equal(made.u.x.array, before)
+    results = []
+    for m in (made, twin):
+        m.load(1.5)
+        m.problem.solve()
+        m.problem.commit()
+        results.append({"u": nodal(m.u)})
+    assert_same(*results, rtol=1e-9)
+
+
+def test_units():
+    """The same unknowns, iterations and digits in other units, 1e-9 of the field."""
+    made = [Pressed(length=length) for length in (1.0, 1e-3)]
+    (one, a), (other, b) = (run(m, 2.0, 4) for m in made)
+    assert kept(made[0]) == kept(made[1])
+    assert [s.iterations for s in one] == [s.iterations for s in other]
+    assert close(b["u"] / 1e-3, a["u"], 1e-9)
+
+
+# ---- the choice ----------------------------------------------------------------------------------
+
+
+def test_contact_everywhere(caplog):
+    """Laws that act where the gap is open, and prescribed gaps, have all of Γc for candidates."""
+    everywhere = {
+        "tresca": (fc.Tresca(0.3, 8.0, k_n=1e5, k_t=1e5), {}),
+        "tension": (fc.Foundation(k_n=1e4, k_t=1e4), {}),
+        "gap": (None, {"gap": 0.1}),
+    }
+    for law, contact in everywhere.values():
+        caplog.clear()
+        with caplog.at_level(logging.INFO, logger="fenics_contact"):
+            made = Pressed(law, contact=contact)
+        assert not made.problem.solver.condensed
+        if COMM.rank == 0:
+            said = [record.getMessage() for record in caplog.records]
+            assert any("contact touches 1042 of" in text for text in said)
+        forced = Pressed(law, contact=contact, condensation=True)
+        assert kept(forced) == 2 * (CELLS["quadrilateral"][0] + 1)
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_any_number_of_ranks(cell):
+    """As many unknowns, iterations and growths as on one rank, and the same forces."""
+    made, alone = (Pressed(cell=cell, comm=comm, **TIGHT) for comm in (COMM, MPI.COMM_SELF))
+    (steps, found), (serial, expected) = (run(m, 3.0, 6) for m in (made, alone))
+    assert kept(made) == kept(alone)
+    assert [s.iterations for s in steps] == [s.iterations for s in serial]
+    assert n_grown(steps) == n_grown(serial)
+    for name in ("forces", "counts"):
+        assert close(found[name], expected[name], SAME), name
