@@ -152,7 +152,7 @@ def test_dragged_away(cell, wanted):
 def test_two_bodies_pressed_deep():
     """The shoe, until contact is wider than what was kept at first."""
     made = [Shod(deep=0.05, condensation=c, kinematics=np.inf, **TIGHT) for c in (True, False)]
-    (steps, found), (_, full) = (run(m, 1.0, 10) for m in made)
+    (steps, found), (_, full) = (run(m, 1.0, 5) for m in made)
     assert n_grown(steps) >= 1
     assert_same(found, full)
 
