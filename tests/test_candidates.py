@@ -16,6 +16,7 @@ from scenes.generous import CELLS, Pressed, Shod
 from scenes.histories import goes_on
 
 pytestmark = [pytest.mark.timeout(240), pytest.mark.mpi]
+ON_ONE_RANK = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="takes minutes there")
 COMM = MPI.COMM_WORLD
 
 SAME = 1e-8
@@ -123,7 +124,7 @@ def test_a_body_that_contact_alone_holds(pressure):
     assert_same(found, full)
 
 
-@pytest.mark.parametrize("update", ["never", "increment"])
+@pytest.mark.parametrize("update", ["never", pytest.param("increment", marks=ON_ONE_RANK)])
 def test_two_bodies(update):
     """A round shoe, a body of its own, pressed on and dragged; pairs as they were or found anew."""
     end, steps = (1.0, 2) if update == "never" else (3.0, 12)
@@ -149,6 +150,7 @@ def test_dragged_away(cell, wanted):
     assert_same(found, full)
 
 
+@ON_ONE_RANK
 def test_two_bodies_pressed_deep():
     """The shoe, until contact is wider than what was kept at first."""
     made = [Shod(deep=0.05, condensation=c, kinematics=np.inf, **TIGHT) for c in (True, False)]
