@@ -142,8 +142,10 @@ class Callbacks:
             finally:
                 del error  # it keeps this frame, which would keep it and all that solves
         dense.raise_kept(snes.getKSP())
-        reason = snes.getConvergedReason()
-        if reason <= 0 and self._comm.allreduce(linear.refused_memory(snes.getKSP().getPC())):
+        reason, pc = snes.getConvergedReason(), snes.getKSP().getPC()
+        refused = reason <= 0 and self._comm.allreduce(linear.refused_memory(pc))
+        linear.forget_failure(pc)
+        if refused:
             raise MemoryError(
                 "the factorisation was refused its memory: use more ranks, an iterative solver, or "
                 "a coarser mesh; if options limit MUMPS, raise the limit (mat_mumps_icntl_14, "

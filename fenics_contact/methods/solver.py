@@ -490,8 +490,11 @@ class Solver:
         full.stiffness.mult(change, image)
         image.array[full.constrained] = 0.0
         image.scale(-1.0 / full.bulk.scale)
-        equations.solvers[True].solve(image, step)
-        self._followed = now + step.array_r
+        ksp = equations.solvers[True]
+        ksp.solve(image, step)
+        if ksp.getConvergedReason() > 0:
+            self._followed = now + step.array_r
+        linear.forget_failure(ksp.getPC())
         full.set_state(now)
 
     def restart(self) -> None:

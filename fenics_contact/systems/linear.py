@@ -30,6 +30,7 @@ from fenics_contact.systems.modes import rigid_motions
 __all__ = [
     "KINDS",
     "factor_bytes",
+    "forget_failure",
     "memory",
     "near_nullspace",
     "newton_options",
@@ -145,6 +146,17 @@ def refused_memory(pc: PETSc.PC) -> bool:
     mumps = pc.getType() in ("lu", "cholesky") and pc.getFactorSolverType() == "mumps"
     # PETSc has no reason of its own for some of MUMPS' errors.
     return mumps and pc.getFactorMatrix().getMumpsInfog(1) in _NO_MEMORY
+
+
+def forget_failure(pc: PETSc.PC) -> None:
+    """Let the next matrix be factored anew where a factorisation has failed. Collective.
+
+    PETSc would take MUMPS' failure for that of all matrices to come, and solve with no factors.
+    """
+    if pc.getFailedReason() and pc.getType() in ("lu", "cholesky"):
+        operators = pc.getOperators()
+        pc.reset()
+        pc.setOperators(*operators)
 
 
 @functools.cache
