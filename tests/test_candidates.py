@@ -16,8 +16,8 @@ from scenes.generous import CELLS, Pressed, Shod
 from scenes.histories import goes_on
 
 pytestmark = [pytest.mark.timeout(240), pytest.mark.mpi]
-ON_ONE_RANK = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="takes minutes there")
 COMM = MPI.COMM_WORLD
+ON_ONE_RANK = pytest.mark.skipif(COMM.size > 1, reason="takes minutes there")
 
 SAME = 1e-8
 TIGHT = {"petsc_options": {"snes_rtol": 1e-12}}
