@@ -202,6 +202,15 @@ FLOOR = fc.HalfSpace((0, 1), (0, -1))
             ValueError,
             "distance=lambda",
         ),
+        (
+            _refused(
+                lambda s: fc.HalfSpace(
+                    (0, 1), (0, -1), displacement=0.1 * ufl.SpatialCoordinate(s.mesh)
+                )
+            ),
+            ValueError,
+            "differs from point to point",
+        ),
         (_refused(lambda s: fc.DeformableBody(s.tags, TOP)), ValueError, "rigid support"),
         (
             _refused(fc.HalfSpace((0, 1), (0, -1), rotation=0.1)),

@@ -349,7 +349,7 @@ class Contact(PointResults):
             return Placement(self.pairs.distance, ufl.FacetNormal(mesh))
         x = ufl.SpatialCoordinate(mesh)
         if self.finite:
-            check_places(self.name, self._support_at, mesh)
+            check_places(self.name, self._support_at, self.inputs.shift, mesh)
             place = self._support_at(self._frame.into(x))
             return Placement(place.gap, self._frame.turned(place.direction))
         return self._support_at(x, self.inputs.shift)

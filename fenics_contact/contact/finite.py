@@ -308,12 +308,17 @@ def _turned(vector: Any, before: Any, normal: Any) -> Any:
     return _tangential(cosine * vector + ufl.cross(axis, vector) + share * axis, normal)
 
 
-def check_places(name: str, place: Callable[[Any], Placement], mesh: Any) -> None:
-    """Refuse a support that says where it is on the undeformed Γc alone.
+def check_places(name: str, place: Callable[[Any], Placement], shift: Any, mesh: Any) -> None:
+    """Refuse a support that says where it is on the undeformed Γc alone, or is no rigid body.
 
     Raises:
         ValueError: It says what to give.
     """
+    if shift is not None and extract_type(shift, (ufl.SpatialCoordinate, ufl.Coefficient)):
+        raise ValueError(
+            f"{name}: the displacement of the support differs from point to point, and finite "
+            "kinematics take a rigid support: give numbers or constants, and turn it by a Rotation"
+        )
     anywhere = fem.Constant(mesh, np.zeros(mesh.geometry.dim))
     placement = place(anywhere)
     parts = placement.gap, ufl.as_vector(placement.direction)
