@@ -22,6 +22,7 @@ NUMBER = r"(-?[\d.]+(?:e[-+]\d+)?)"
 PRINTED = {
     "ball_on_block": (r"largest pressure {} MPa\s+Hertz: {} MPa", 0.03),
     "block_on_floor": (r"T = {} N/mm, μ N = {} N/mm; points that stick: 0", 1e-5),
+    "drum": (r"torque {} N mm/mm, μ R ∫p = {} N mm/mm", 5e-3),
     "hysteresis": (r"friction takes {} mJ/mm a cycle; area of the loop {} mJ/mm", 1e-5),
     "own_law": (r"closed up by {} mm; h ln\(p/p0\) = {} mm", 1e-5),
     "two_bodies": (r"the blocks shorten by {} mm, two springs by {} mm", 1e-5),
