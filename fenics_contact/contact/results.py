@@ -17,6 +17,10 @@ from fenics_contact.types import Array
 __all__ = ["PointResults"]
 
 
+# Of coordinates that are compared, by the largest.
+_DIGITS = 9
+
+
 class PointResults(ABC):
     """What is read off the points of Γc.
 
@@ -150,6 +154,8 @@ class PointResults(ABC):
     def gather(self) -> dict[str, Array]:
         """All of Γc on every rank, for pictures and tables, ordered by coordinates. Collective.
 
+        They are compared to 1e-9 of the largest: those of points in a row differ by round-off.
+
         Returns:
             Arrays over all points: x, normal, gap, pressure, tangential_traction, slip (sum of the
             modes), status, measure.
@@ -168,7 +174,8 @@ class PointResults(ABC):
             ]
         )
         rows = gather_rows(self.surface.mesh.comm, rows)
-        rows = rows[np.lexsort(rows[:, :d].T[::-1])]
+        size = np.abs(rows[:, :d]).max(initial=0.0) or 1.0
+        rows = rows[np.lexsort(np.round(rows[:, :d] / size, _DIGITS).T[::-1])]
         vectors = {"x": rows[:, :d], "normal": rows[:, d : 2 * d]}
         vectors["tangential_traction"] = rows[:, 2 * d : 3 * d]
         names = ("gap", "pressure", "slip", "status", "measure")
