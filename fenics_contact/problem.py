@@ -168,7 +168,8 @@ class ContactProblem:
                 it is stuck), or "alternating" (minimum problems in turn, each by Newton's method
                 with a line search on the energy). By default "lbfgs" on all unknowns, where a
                 factorisation costs as much as dozens of iterations, and condensed, where it costs
-                as much as ten, "newton", with "continuation" for the first increment.
+                as much as ten, "newton", with "continuation" for the first increment; "newton" for
+                a nonlinear bulk, too, whose tangent changes.
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
                 paper has 0; 1 needs a third of the iterations once a point sticks.

@@ -141,7 +141,6 @@ class Tool(History):
         mesh, d = self.scene.mesh, self.scene.dim
         self.shift, self.angle = fem.Constant(mesh, np.zeros(d)), fem.Constant(mesh, 0.0)
         self.down, self.side = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
-        self.force_given = force
         motion: Any = self.shift
         if force:
             still = (0.0,) * (d - 2)

@@ -304,8 +304,8 @@ class Contact(PointResults):
     def _start_history(self) -> None:
         """Let slip be counted from where the undeformed Γc begins. Collective."""
         place = self._support_at(ufl.SpatialCoordinate(self.surface.mesh))
-        normal = place.direction / ufl.sqrt(ufl.dot(place.direction, place.direction))
-        found = PointEvaluator(self.quadrature, {"jump": place.gap * normal, "normal": normal})()
+        start = {"jump": place.gap * place.normal, "normal": place.normal}
+        found = PointEvaluator(self.quadrature, start)()
         zeros = {name: self.history.values(name) for name in self.history.names}
         self.history.commit(zeros | found)
 
@@ -360,8 +360,7 @@ class Contact(PointResults):
 
     def _given(self, placement: Placement, gap: Any) -> Seen:
         """What laws see, as expressions on Γc."""
-        shift, direction = self.inputs.shift, placement.direction
-        normal = direction / ufl.sqrt(ufl.dot(direction, direction))
+        shift, normal = self.inputs.shift, placement.normal
         open_gap = placement.gap
         if gap is not None:
             open_gap = self.inputs.scalar("gap", gap)

@@ -21,7 +21,7 @@ import ufl
 from dolfinx import fem
 from ufl.algorithms.analysis import extract_constants, extract_type
 
-from fenics_contact.contact.kinematics import Seen
+from fenics_contact.contact.kinematics import Seen, tangential
 from fenics_contact.laws.base import Kinematics, Law, Response
 from fenics_contact.supports.base import Placement
 from fenics_contact.surface.fields import PointFields
@@ -126,8 +126,7 @@ class ExactView:
 
     def normal(self, jump: Any) -> Any:
         """See `View.normal`."""
-        direction = self._place(self._frame.into(self._x + jump)).direction
-        return self._frame.turned(direction / ufl.sqrt(ufl.dot(direction, direction)))
+        return self._frame.turned(self._place(self._frame.into(self._x + jump)).normal)
 
     def relative(self, jump: Any) -> Any:
         """See `View.relative`."""
@@ -266,8 +265,8 @@ class FiniteKinematics:
             multiplier = self._multipliers.ufl("pressure")
         if law.has_friction:
             foot = jump + gap * normal
-            total = _tangential(seen.relative(jump), normal)
-            increment = _tangential(foot - view.carried("foot"), normal)
+            total = tangential(seen.relative(jump), normal)
+            increment = tangential(foot - view.carried("foot"), normal)
             traction = _turned(view.carried("traction"), view.carried("normal"), normal)
         return Kinematics(seen.gap, seen.gap - gap, normal, total, increment, traction, multiplier)
 
@@ -293,19 +292,15 @@ class FiniteKinematics:
         return self._view.framed(vector)
 
 
-def _tangential(vector: Any, normal: Any) -> Any:
-    return vector - ufl.dot(vector, normal) * normal
-
-
 def _turned(vector: Any, before: Any, normal: Any) -> Any:
     """A vector turned with a unit normal by the smallest rotation; what is left along it goes."""
     cosine = ufl.dot(before, normal)
     if len(normal) == 2:
         sine = before[0] * normal[1] - before[1] * normal[0]
-        return _tangential(cosine * vector + sine * ufl.perp(vector), normal)
+        return tangential(cosine * vector + sine * ufl.perp(vector), normal)
     axis = ufl.cross(before, normal)
     share = ufl.dot(axis, vector) / ufl.max_value(1 + cosine, _OPPOSITE)
-    return _tangential(cosine * vector + ufl.cross(axis, vector) + share * axis, normal)
+    return tangential(cosine * vector + ufl.cross(axis, vector) + share * axis, normal)
 
 
 def check_places(name: str, place: Callable[[Any], Placement], shift: Any, mesh: Any) -> None:

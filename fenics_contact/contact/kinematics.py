@@ -16,7 +16,7 @@ import ufl
 from fenics_contact.laws.base import Kinematics, Law, Response
 from fenics_contact.surface.fields import PointFields
 
-__all__ = ["Seen", "SmallKinematics"]
+__all__ = ["Seen", "SmallKinematics", "tangential"]
 
 
 @dataclass(frozen=True)
@@ -61,16 +61,13 @@ class SmallKinematics:
             old_traction = self._multipliers
             multiplier = old_traction.ufl("pressure")
 
-        def tangential(vector: Any) -> Any:
-            return vector - ufl.dot(vector, normal) * normal
-
         if law.has_tangential:
-            total = tangential(seen.relative(jump))
+            total = tangential(seen.relative(jump), normal)
         if law.has_friction:
             # The old traction and displacement are taken along the present normal: the support
             # may have moved on since the last commit.
-            increment = tangential(seen.relative(jump) - self._history.ufl("jump"))
-            traction = tangential(old_traction.ufl("traction"))
+            increment = tangential(seen.relative(jump) - self._history.ufl("jump"), normal)
+            traction = tangential(old_traction.ufl("traction"), normal)
         u_n = ufl.dot(jump, normal)
         return Kinematics(seen.gap, u_n, normal, total, increment, traction, multiplier)
 
@@ -83,3 +80,8 @@ class SmallKinematics:
     def framed(self, vector: Any) -> Any:
         """A direction as the history has it (UFL): in space."""
         return vector
+
+
+def tangential(vector: Any, normal: Any) -> Any:
+    """The part of a vector across a unit normal (UFL)."""
+    return vector - ufl.dot(vector, normal) * normal

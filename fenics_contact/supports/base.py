@@ -42,6 +42,11 @@ class Placement:
     gap: ufl.core.expr.Expr
     direction: ufl.core.expr.Expr
 
+    @property
+    def normal(self) -> ufl.core.expr.Expr:
+        """The direction of length 1."""
+        return self.direction / ufl.sqrt(ufl.dot(self.direction, self.direction))
+
 
 @dataclass(frozen=True)
 class Motion:
