@@ -50,7 +50,9 @@ NU_MAX = 0.45
 # ---- drawing -------------------------------------------------------------------------------------
 
 
-def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
+def draw(
+    seed: int, *, without: tuple[str, ...] = (), ranks: int = 1, family: int | None = None
+) -> Scene:
     """A random scene.
 
     Args:
@@ -59,14 +61,18 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
             "restart", "bend", "both", "narrow", "changes", "multipliers", "motion", "gap",
             "ration", "space", "method", "accuracy".
         ranks: Kept in the scene.
+        family: Scenes of one family differ in their numbers, loads, methods and histories, and
+            share what they are built of, so that few forms are compiled; by default a scene is its
+            own family.
     """
     rng = np.random.default_rng([seed, 20])
+    built = rng if family is None else np.random.default_rng([family, 21])
 
-    def chance(p: float, feature: str = "") -> bool:
-        return bool(rng.random() < p) and feature not in without
+    def chance(p: float, feature: str = "", of: np.random.Generator = built) -> bool:
+        return bool(of.random() < p) and feature not in without
 
-    def pick(*values: Any) -> Any:
-        return values[int(rng.integers(len(values)))]
+    def pick(*values: Any, of: np.random.Generator = built) -> Any:
+        return values[int(of.integers(len(values)))]
 
     def log(low: float, high: float) -> float:
         return float(f"{10 ** rng.uniform(low, high):.3g}")
@@ -85,7 +91,7 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
     def box(origin: list[float], scale: float = 1.0) -> Scene:
         n = [int(rng.integers(1, most + 1)) for _ in range(d)]
         size = [float(f"{scale * rng.uniform(0.7, 1.6):.3g}") for _ in range(d)]
-        jitter = int(rng.integers(1, 1000)) if chance(0.4) and not (space and few) else 0
+        jitter = int(rng.integers(1, 1000)) if chance(0.4, of=rng) and not (space and few) else 0
         return {"origin": origin, "size": size, "n": n, "E": log(2, 4), "jitter": jitter}
 
     n_bodies = {"floor": 1, "corner": 1, "pair": 2, "tower": 3, "apart": 2}[layout]
@@ -96,9 +102,9 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
         below = bodies[-1]
         top = below["origin"][-1] + below["size"][-1]
         above = box([0.0] * d)
-        side = float(f"{rng.uniform(-0.3, 0.3):.3g}") if chance(0.5) else 0.0
+        side = float(f"{rng.uniform(-0.3, 0.3):.3g}") if chance(0.5, of=rng) else 0.0
         above["origin"] = [below["origin"][0] + side, *below["origin"][1:-1], top]
-        if chance(0.5):
+        if chance(0.5, of=rng):
             above["size"][:-1] = below["size"][:-1]
         bodies.append(above)
     scene: Scene = {
@@ -128,7 +134,7 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
         made: Scene = {"kind": kind}
         if kind not in ("frictionless", "foundation", "tension"):
             made["friction"] = (
-                pick(0.0, 0.1, 0.3, 0.3, 0.6, 1.2) if kind not in ("ellipse",) else 0.3
+                pick(0.0, 0.1, 0.3, 0.3, 0.6, 1.2, of=rng) if kind not in ("ellipse",) else 0.3
             )
         if kind in ("tresca", "prescribed"):
             made["pressure"] = float(f"{rng.uniform(0.1, 2) * strain:.3g}")
@@ -136,7 +142,7 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
             made["modes"] = pick(3, 4, 6, 8)
         if kind == "ellipse" or (kind == "polygon" and chance(0.4)):
             made["friction"] = made["friction"] or 0.2
-            made["transverse"] = pick(0.1, 0.3, 0.7)
+            made["transverse"] = pick(0.1, 0.3, 0.7, of=rng)
             made["direction"] = [1.0, 0.4, 0.1]
         made["k_n"] = pick(["scaled", log(0, 2)], ["number", log(-1, 3)], ["scaled", None])
         if kind == "prescribed":
@@ -171,10 +177,10 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
     def rigid() -> Scene:
         kind = pick("halfspace", "halfspace", "halfspace", *SUPPORTS[1:])
         made: Scene = {"kind": kind, "clearance": 0.0}
-        if chance(0.2):
+        if chance(0.2, of=rng):
             made["clearance"] = float(f"{rng.uniform(-0.5, 3) * strain:.3g}")
-        if kind == "halfspace" and chance(0.3):
-            made["slope"] = pick(0.1, -0.2, 3 * strain)
+        if kind == "halfspace" and chance(0.3, of=rng):
+            made["slope"] = pick(0.1, -0.2, 3 * strain, of=rng)
         if kind == "obstacle":
             made["curve"] = float(f"{rng.uniform(0, 3) * strain:.3g}")
         if kind not in ("halfspace", "obstacle"):
@@ -206,7 +212,7 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
 
     rigid_alone = layout in ("floor", "corner", "apart")
     if chance(0.15, "bend") and cell != "hexahedron" and (rigid_alone or degree == 2):
-        scale = pick(3 * strain, 3 * strain, 0.03)
+        scale = pick(3 * strain, 3 * strain, 0.03, of=rng)
         scene["bend"] = [float(f"{rng.uniform(-1, 1) * scale:.3g}") for _ in bodies]
         for c in contacts:
             c["law"]["k_n"] = c["law"]["k_n"] and ["number", 20.0]
@@ -220,7 +226,7 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
         other |= {"body": first["support"]["body"], "side": first["support"]["side"]}
         other["support"] |= {"body": first["body"], "side": first["side"]}
         contacts.insert(1, other)
-    if layout == "pair" and chance(0.08, "narrow"):
+    if layout == "pair" and chance(0.08, "narrow", of=rng):
         bodies[1]["size"][0] = float(f"{rng.uniform(0.03, 0.3) * bodies[0]['size'][0]:.3g}")
         room = bodies[0]["size"][0] - bodies[1]["size"][0]
         bodies[1]["origin"][0] = float(f"{rng.uniform(0.02, 0.98) * room:.3g}")
@@ -257,11 +263,11 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
 
     # Stages: of every driven body the pressure and shear at their end, in units of strain times E.
     levels = [1.0]
-    if chance(0.25, "levels"):
-        levels = [1.0, pick(1e-2, 1e-4, 1e-6)]
-        if chance(0.3):
+    if chance(0.25, "levels", of=rng):
+        levels = [1.0, pick(1e-2, 1e-4, 1e-6, of=rng)]
+        if chance(0.3, of=rng):
             levels.reverse()
-    share = pick(1.0, 1.0, 1e-3, 1e-6) if layout == "apart" else 1.0
+    share = pick(1.0, 1.0, 1e-3, 1e-6, of=rng) if layout == "apart" else 1.0
     stages = []
     frictions = [c["law"].get("friction", 0.3) for c in contacts]
     grip = max(min(frictions), 0.05)
@@ -275,6 +281,7 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
             ["press", "shear", "ease"],
             ["both"],
             ["both", "off", "both"],
+            of=rng,
         ):
             normal, side = {
                 "press": (1.0, 0.0),
@@ -296,7 +303,11 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
                     "side": side,
                     "across": side * across,
                 }
-                | ({"friction": pick(0.5, 1.5)} if stages and chance(0.1, "changes") else {})
+                | (
+                    {"friction": pick(0.5, 1.5, of=rng)}
+                    if stages and chance(0.1, "changes", of=rng)
+                    else {}
+                )
             )
     scene["strain"] = strain
     scene["share"] = share
@@ -304,17 +315,17 @@ def draw(seed: int, *, without: tuple[str, ...] = (), ranks: int = 1) -> Scene:
     if chance(0.15):
         scene["weight"] = log(-2, 1)  # body force
     total = sum(s["steps"] for s in stages)
-    if chance(0.25, "restart") and total > 1:
+    if chance(0.25, "restart", of=rng) and total > 1:
         scene["restart"] = int(rng.integers(1, total))
-    if chance(0.35, "units"):
+    if chance(0.35, "units", of=rng):
         scene["units"] = [log(-6, 6), log(-12, 12)]
-    if chance(0.4, "method"):
-        scene["method"] = pick("lbfgs", "newton", "continuation", "alternating")
-    if chance(0.2):
+    if chance(0.4, "method", of=rng):
+        scene["method"] = pick("lbfgs", "newton", "continuation", "alternating", of=rng)
+    if chance(0.2, of=rng):
         scene["condensation"] = False
-    if chance(0.1):
+    if chance(0.1, of=rng):
         scene["cuts"] = 4
-    if chance(0.08, "ration"):
+    if chance(0.08, "ration", of=rng):
         scene["ration"] = int(rng.integers(3, 9))
     return scene
 
