@@ -184,7 +184,7 @@ class Judge:
             values = contact.values
             across = np.abs(values.tangential_stiffness).max(axis=(1, 2))
             stiffness = values.normal_stiffness + across
-            terms = np.linalg.norm(values.jump, axis=1) + np.abs(values.initial_gap)
+            terms = contact.moved() + np.abs(values.initial_gap)
             blur = float(global_sum(self._comm, contact.measure @ (stiffness * terms)))
             sizes = (global_max(self._comm, np.abs(f)) for f in (mine - assembled, mine))
             residual, force = (float(size) for size in sizes)

@@ -16,6 +16,8 @@ __all__ = ["Attempt", "Balance", "NotConverged", "Verdict", "check_laws"]
 
 # The laws hold point by point up to rounding of their few operations.
 _LAW_TOLERANCE = 1e-10
+# Round-off of a traction, as a share of it, in units of that tolerance.
+_ROUND_OFF = 16 * np.finfo(float).eps / _LAW_TOLERANCE
 # Share of the energy exchanged that friction may seem to give: by the mean of the tractions at both
 # ends it does so where slip turns round within a long increment (6 % where a load aside is
 # reversed at once); in a state that smaller increments do not lead to it is half or more.
@@ -166,7 +168,16 @@ class Verdict:
                 "the equations; use smaller ones (increments() cuts them by itself)"
             )
         for contact, change in self.kinematics.items():
-            if not change.judged <= self.kinematics_allowed:
+            if self.kinematics_allowed == np.inf:
+                continue
+            if not np.isfinite(change.judged):
+                found.append(
+                    f"{contact}: how far displacements are too large to be taken as small cannot "
+                    "be told, because the springs of contact at its points hold a body against "
+                    "nothing; hold it by a condition or a weak spring, or accept it: "
+                    "ContactProblem(kinematics=inf)"
+                )
+            elif change.judged > self.kinematics_allowed:
                 found.append(
                     f"{contact}: displacements are too large to be taken as small: with gap and "
                     "normals where the body has moved to, the contact force would differ by "
@@ -278,8 +289,12 @@ def check_laws(contact: Contact) -> dict[str, float]:
     # An open point keeps no traction and counts no slip, whatever it moves.
     bears = limit > 0
     slipped = -np.einsum("qm,qmd->qd", beta, gradients)
-    # Round-off in the increments is that of the displacements they are differences of.
-    travel = (v.jump, v.increment, change)
+    # Round-off in the increments is that of the displacements they are differences of, and of the
+    # traction, which the springs turn into one: with multipliers that is larger than either.
+    size = np.abs(stiffness).max(axis=(1, 2), initial=0.0)
+    borne = np.linalg.norm(tau, axis=1)
+    yields = np.divide(borne, size, out=np.zeros_like(borne), where=size > 0)
+    travel = (v.jump, v.increment, change, _ROUND_OFF * yields)
     found["cone"] = relative(worst(np.maximum(functions, 0)), limit)
     found["limit"] = relative(worst(limit - v.limit_told), limit)
     found["slip"] = relative(worst(np.minimum(beta, 0), (missing - slipped)[bears]), *travel)

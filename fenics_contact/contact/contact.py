@@ -926,7 +926,7 @@ class Contact(PointResults):
         Raises:
             ValueError: There are no multipliers.
         """
-        return self._augmented().error(self.values, self.history)
+        return self._augmented().error(self.values, self.history, self.moved())
 
     def augment(self) -> float:
         """Let the multipliers bear what the springs did at the present ``u``. Collective.
@@ -942,10 +942,19 @@ class Contact(PointResults):
         """
         multipliers = self._augmented()
         self.evaluate()
-        error = multipliers.error(self.values, self.history)
+        error = multipliers.error(self.values, self.history, self.moved())
         multipliers.update(self.values)
         self.forget()
         return error
+
+    def moved(self) -> Array:
+        """Displacements that the jump is the difference of, whose round-off it has. Collective.
+
+        Returns:
+            Sum of their sizes at this rank's points, (n_points,) (length).
+        """
+        parts = self.own_displacement(), self.values.jump
+        return np.asarray(sum(np.linalg.norm(part, axis=1) for part in parts))
 
     def _augmented(self) -> Multipliers:
         if self.multipliers is None:

@@ -5,7 +5,8 @@ starts from λ_t in place of the committed traction. Where λ_n = -r_n and λ_t 
 and nothing creeps before it slips, however soft the springs are. After every solution the
 multipliers are taken from the tractions found, and the next one starts from there (Uzawa): each
 round leaves a share of about 1/(1 + k_n/k) of the penetration, k the stiffness of the body against
-it.
+it. Where springs are soft that is nearly all of it, so a round goes on to the combination of the
+last ones that leaves least (Anderson acceleration, doi:10.1137/10078356X).
 
 There are more points on Γc than displacements can answer: 3 to an edge of quadratic cells, which
 has 2 nodes of its own. Multipliers of every point would pile up what nothing answers, and those
@@ -25,7 +26,7 @@ from dolfinx import fem
 
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law
-from fenics_contact.parallel import global_max
+from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.mass import mass_solver
 from fenics_contact.surface.surface import SurfaceQuadrature
@@ -38,6 +39,9 @@ __all__ = ["Multipliers", "TraceProjection"]
 _ROUND_OFF = 1e-12
 # Round-off of a displacement, by its size.
 _BLUR = 100 * np.finfo(float).eps
+# How many rounds before the last are combined with it, and how well their rests are to be told
+# apart, relative and squared.
+_DEPTH, _DISTINCT = 6, 1e-12
 
 
 class TraceProjection:
@@ -81,6 +85,54 @@ class TraceProjection:
         return result.reshape(values.shape)
 
 
+class _Acceleration:
+    """Anderson's, of a sequence in which each array is made from the one before.
+
+    The next is the combination of those made, the coefficients adding up to 1, whose rests (what a
+    round changes) combined that way are least in the mean square over Γc. A rest that is larger
+    than the one before, as where points have changed their status, begins a new sequence.
+    """
+
+    def __init__(self, quadrature: SurfaceQuadrature) -> None:
+        self._comm = quadrature.surface.mesh.comm
+        self._weights = quadrature.weights
+        self.begin()
+
+    def begin(self) -> None:
+        """Drop all rounds."""
+        self._last: tuple[Array, Array] | None = None
+        self._size = np.inf
+        self._steps: list[tuple[Array, Array]] = []
+
+    def __call__(self, given: Array, made: Array) -> Array:
+        """The next of the sequence. Collective.
+
+        Args:
+            given: What the round began with, (n_points, n).
+            made: What came of it, the same shape.
+        """
+        rest = made - given
+        size = float(self._product(rest, rest))
+        if self._last is None or size > self._size:
+            self.begin()
+        else:
+            self._steps.append((rest - self._last[0], made - self._last[1]))
+            self._steps = self._steps[-_DEPTH:]
+        self._last, self._size = (rest, made), size
+        if not self._steps:
+            return made
+        changes = [change for change, _ in self._steps]
+        gram = np.array([[self._product(a, b) for b in changes] for a in changes])
+        right = np.array([self._product(a, rest) for a in changes])
+        long = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+        share = np.linalg.lstsq(gram / np.outer(long, long), right / long, rcond=_DISTINCT)[0]
+        steps = [way for _, way in self._steps]
+        return made - sum(c * way for c, way in zip(share / long, steps, strict=True))
+
+    def _product(self, a: Array, b: Array) -> Array:
+        return global_sum(self._comm, self._weights @ np.sum(a * b, axis=1))
+
+
 class Multipliers:
     """λ_n and λ_t at the points of a contact.
 
@@ -107,6 +159,7 @@ class Multipliers:
         gdim = quadrature.surface.mesh.geometry.dim
         self.fields = PointFields(quadrature, {"pressure": 0} | dict.fromkeys(self._vectors, gdim))
         self._project = TraceProjection(quadrature, degree)
+        self._accelerated = _Acceleration(quadrature)
 
     def _next(self, values: PointValues) -> dict[str, Array]:
         """The multipliers that the tractions of an evaluated contact make."""
@@ -117,8 +170,14 @@ class Multipliers:
             found["traction"] = self._project(values.framed_traction)
         return found
 
-    def error(self, values: PointValues, history: PointFields) -> float:
-        """Largest change that `update` would make, see `Contact.enforcement_error`. Collective."""
+    def error(self, values: PointValues, history: PointFields, moved: Array) -> float:
+        """Largest change that `update` would make, see `Contact.enforcement_error`. Collective.
+
+        Args:
+            values: Of the evaluated contact.
+            history: The committed state.
+            moved: See `Contact.moved`.
+        """
         found = self._next(values)
         names = [n for n in ("normal_traction", "traction") if n in history]
 
@@ -132,15 +191,19 @@ class Multipliers:
         if change <= _ROUND_OFF * max(scale, before):
             return 0.0
         # Displacements have round-off however little is borne, and springs make a traction of it.
-        moved = np.linalg.norm(values.jump, axis=1)
         for name in sorted({"k_n", "k_t"} & set(values.parameters)):
             if change <= _BLUR * global_max(self._comm, values.parameters[name] * moved):
                 return 0.0
         return change / scale if scale > 0 else np.inf
 
     def update(self, values: PointValues) -> None:
-        """Make the tractions of an evaluated contact the multipliers. Collective."""
-        self.fields.commit(self._next(values) | {"normal": values.framed_normal})
+        """Make the tractions of an evaluated contact the multipliers, and go on. Collective."""
+        found = self._next(values)
+        given = np.column_stack([self.fields.values(name) for name in found])
+        rows = self._accelerated(given, np.column_stack(list(found.values())))
+        self.fields.commit(
+            {"pressure": rows[:, 0], "traction": rows[:, 1:], "normal": values.framed_normal}
+        )
 
     def committed(self, values: PointValues) -> dict[str, Array]:
         """What of the state of an evaluated contact becomes history, by name.
@@ -157,5 +220,6 @@ class Multipliers:
 
     def restore(self, history: PointFields) -> None:
         """Take those of the last commit. Collective."""
+        self._accelerated.begin()
         values = {"pressure": history.values("multiplier")}
         self.fields.commit(values | {name: history.values(name) for name in self._vectors})

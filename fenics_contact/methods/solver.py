@@ -37,7 +37,7 @@ __all__ = ["METHODS", "Settings", "Solver"]
 logger = logging.getLogger("fenics_contact")
 
 # Rounds with multipliers before it is given up.
-_MAX_ROUNDS = 60
+_MAX_ROUNDS = 80
 # Residual, relative, to which the first round is solved; share of a round's error to which the next
 # is; and the error, in units of the tolerance, from which on the next may be the last one.
 _FIRST_ROUND, _INNER, _NEARLY = 1e-4, 1e-2, 10.0

@@ -28,6 +28,8 @@ _ROUND_OFF = 40 * np.finfo(float).eps
 # Round-off excuses a residual up to this share of the forces on a body that has a load, not more: a
 # displacement grown without bounds would excuse anything.
 _MOST = 1e-5
+# Forces below which numbers have lost digits: what is left of a load that has been taken away.
+_LEAST = np.finfo(float).tiny / np.finfo(float).eps
 
 
 @dataclass(frozen=True)
@@ -145,6 +147,7 @@ class Parts:
         force = np.max([loads, reaction, contact], axis=0)
         floor = _ROUND_OFF * np.maximum(terms, start)
         floor = np.where(loads > 0, np.minimum(floor, _MOST * force), floor)
+        floor = np.maximum(floor, _LEAST)
         # A body has the round-off of what it touches, too, where the other has gone far.
         floors = [floor[row].max(initial=0.0) for row in self._meets]
         for row, shared in zip(self._meets, floors, strict=True):
