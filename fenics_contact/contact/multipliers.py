@@ -96,13 +96,13 @@ class _Acceleration:
     def __init__(self, quadrature: SurfaceQuadrature) -> None:
         self._comm = quadrature.surface.mesh.comm
         self._weights = quadrature.weights
-        self.begin()
-
-    def begin(self) -> None:
-        """Drop all rounds."""
         self._last: tuple[Array, Array] | None = None
         self._size = np.inf
         self._steps: list[tuple[Array, Array]] = []
+
+    def begin(self) -> None:
+        """Drop all rounds."""
+        self._last, self._size, self._steps = None, np.inf, []
 
     def __call__(self, given: Array, made: Array) -> Array:
         """The next of the sequence. Collective.
