@@ -18,8 +18,17 @@ from fenics_contact.laws.unilateral import Foundation, Frictionless
 from fenics_contact.meshes import model_to_mesh
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.results import output, plotting
-from fenics_contact.supports.base import Motion, Placement, Rotation, Support
+from fenics_contact.supports.base import (
+    Motion,
+    Placement,
+    Rotation,
+    Sample,
+    SampledSupport,
+    Support,
+)
 from fenics_contact.supports.deformable import DeformableBody
+from fenics_contact.supports.meshed import RigidSurface
+from fenics_contact.supports.profile import RigidProfile
 from fenics_contact.supports.rigid import Ball, Cylinder, HalfSpace, Obstacle
 from fenics_contact.surface.surface import ContactSurface
 from fenics_contact.systems.operator import ContactOperator
@@ -49,7 +58,11 @@ __all__ = [
     "Placement",
     "Response",
     "Resultants",
+    "RigidProfile",
+    "RigidSurface",
     "Rotation",
+    "Sample",
+    "SampledSupport",
     "Scaled",
     "Springs",
     "Status",

@@ -23,6 +23,7 @@ from fenics_contact.contact.finite import (
     Frame,
     SampledView,
     check_places,
+    check_rigid,
 )
 from fenics_contact.contact.inputs import Inputs, displacement_degree
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
@@ -31,11 +32,12 @@ from fenics_contact.contact.pairs import Pairs, PairsState
 from fenics_contact.contact.point_data import PointData
 from fenics_contact.contact.point_law import PointLaw, PointTangent
 from fenics_contact.contact.results import PointResults
+from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues, Status
 from fenics_contact.laws.base import Law
 from fenics_contact.laws.stiffness import Springs
 from fenics_contact.parallel import global_max, global_min, global_sum
-from fenics_contact.supports.base import Placement, Support, as_vector
+from fenics_contact.supports.base import Placement, SampledSupport, Support, as_vector
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.mass import assembled
@@ -203,6 +205,11 @@ class Contact(PointResults):
             self.set_modulus(modulus)
         self.pairs = Pairs(name, u, self.quadrature, support)
         self._frame = Frame(self.inputs.shift, self.inputs.rotation)
+        self._jump = fem.Function(self.quadrature.space(gdim), name="jump")
+        # Of a support known in numbers: seen from the undeformed Γc, and from where it has moved.
+        self._sampled: tuple[SampledPlaces, SampledPlaces] | None = None
+        if isinstance(support, SampledSupport):
+            self._sampled = self._sample_support(support)
         placement = self._place()
         self.gap_prescribed = gap is not None
 
@@ -215,9 +222,8 @@ class Contact(PointResults):
         self.history = PointFields(self.quadrature, fields)
         self.committed_jump: Array = np.zeros((self.quadrature.n_points, gdim))
 
-        # All of contact is a sparse map from u to the jump at the points, and the law there.
-        self._jump = fem.Function(self.quadrature.space(gdim), name="jump")
-        # As expressions for the form on Γc, and sampled at the points for all else.
+        # All of contact is a sparse map from u to the jump at the points, and the law there: as
+        # expressions for the form on Γc, and sampled at the points for all else.
         given = self._given(placement, gap)
         self._data, sampled = self._sample(given, placement)
         self._view: SampledView | None = None
@@ -285,7 +291,8 @@ class Contact(PointResults):
         at_points: SmallKinematics | FiniteKinematics
         in_form = at_points = SmallKinematics(history, multipliers)
         if self.finite:
-            exact = ExactView(x, self._frame, self._support_at, history, multipliers)
+            place = self._support_at if self._sampled is None else self._sampled[1].at
+            exact = ExactView(x, self._frame, place, history, multipliers)
             turns, friction = self._frame.rotation is not None, law.has_friction
             self._view = SampledView(
                 exact, self.quadrature, self._jump, turns=turns, friction=friction
@@ -303,7 +310,13 @@ class Contact(PointResults):
 
     def _start_history(self) -> None:
         """Let slip be counted from where the undeformed Γc begins. Collective."""
-        place = self._support_at(ufl.SpatialCoordinate(self.surface.mesh))
+        x = ufl.SpatialCoordinate(self.surface.mesh)
+        if isinstance(self.support, SampledSupport):
+            places = SampledPlaces(self.quadrature, self.support, x)
+            places.update()
+            place = places.at(x)
+        else:
+            place = self._support_at(x)
         start = {"jump": place.gap * place.normal, "normal": place.normal}
         found = PointEvaluator(self.quadrature, start)()
         zeros = {name: self.history.values(name) for name in self.history.names}
@@ -349,10 +362,38 @@ class Contact(PointResults):
             return Placement(self.pairs.distance, ufl.FacetNormal(mesh))
         x = ufl.SpatialCoordinate(mesh)
         if self.finite:
-            check_places(self.name, self._support_at, self.inputs.shift, mesh)
+            check_rigid(self.name, self.inputs.shift)
+        if self._sampled is None and not self.finite:
+            return self._support_at(x, self.inputs.shift)
+        if self._sampled is None:
+            check_places(self.name, self._support_at, mesh)
             place = self._support_at(self._frame.into(x))
-            return Placement(place.gap, self._frame.turned(place.direction))
-        return self._support_at(x, self.inputs.shift)
+        else:
+            place = self._sampled[0].at(self._frame.into(x))
+        return Placement(place.gap, self._frame.turned(place.direction))
+
+    def _sample_support(self, support: SampledSupport) -> tuple[SampledPlaces, SampledPlaces]:
+        """From X, and from X + u, in the frame of the support. Collective.
+
+        Raises:
+            ValueError: Its data are of another dimension, or not the same on every rank.
+        """
+        mesh, d = self.surface.mesh, self._gdim
+        kind = type(support).__name__
+        if support.gdim != d:
+            raise ValueError(
+                f"{self.name}: the {kind} is given in {support.gdim} dimensions, and the mesh has "
+                f"{d}; give it {d} coordinates a point"
+            )
+        if len(set(mesh.comm.allgather(support.fingerprint))) > 1:
+            raise ValueError(
+                f"{self.name}: the data of the {kind} differ from rank to rank; give every rank "
+                "the same (read the file on all of them, or broadcast its arrays)"
+            )
+        x = ufl.SpatialCoordinate(mesh)
+        places = (self._frame.into(x), self._frame.into(x + self._jump))
+        rest, moved = (SampledPlaces(self.quadrature, support, place) for place in places)
+        return rest, moved
 
     def _support_at(self, x: Any, shift: Any = None) -> Placement:
         """Where a rigid support is, seen from x (UFL)."""
@@ -582,9 +623,17 @@ class Contact(PointResults):
         """Let the points be at the present ``u`` and data. Collective."""
         self.jump_map.mult(self.u.x.petsc_vec, self._jump.x.petsc_vec)
         self._jump.x.scatter_forward()
-        self._data.update()
+        self._update_data()
         if self._view is not None:
+            if self._sampled is not None:
+                self._sampled[1].update()
             self._view.update()
+
+    def _update_data(self) -> None:
+        """Let what does not follow from ``u`` be as it was given last. Collective."""
+        if self._sampled is not None:
+            self._sampled[0].update()
+        self._data.update()
 
     def _evaluate(self) -> PointValues:
         """Everything at the points, as they were updated last. Collective."""
@@ -676,7 +725,7 @@ class Contact(PointResults):
         What was evaluated before stays.
         """
         self.inputs.update()
-        self._data.update()
+        self._update_data()
         data = self._data.values
         names = ["weight", "normal", "shift", "turn"]
         if self.gap_prescribed or not self.pairs_anew:  # else it is that of the latest pairs
@@ -817,6 +866,10 @@ class Contact(PointResults):
         self._update_points()
         if self._view is not None:
             return self._view.values("gap"), self._view.values("normal")
+        if self._sampled is not None:
+            places = self._sampled[1]
+            places.update()
+            return places.values("distance"), places.values("normal")
         return self._deformed()
 
     def gap_deviation(self) -> tuple[Array, Array]:

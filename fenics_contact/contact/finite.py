@@ -28,7 +28,15 @@ from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
 from fenics_contact.types import Array
 
-__all__ = ["ExactView", "FiniteKinematics", "Frame", "SampledView", "View", "check_places"]
+__all__ = [
+    "ExactView",
+    "FiniteKinematics",
+    "Frame",
+    "SampledView",
+    "View",
+    "check_places",
+    "check_rigid",
+]
 
 
 # Of 1 + n·n₀ where a normal has turned round.
@@ -303,8 +311,8 @@ def _turned(vector: Any, before: Any, normal: Any) -> Any:
     return tangential(cosine * vector + ufl.cross(axis, vector) + share * axis, normal)
 
 
-def check_places(name: str, place: Callable[[Any], Placement], shift: Any, mesh: Any) -> None:
-    """Refuse a support that says where it is on the undeformed Γc alone, or is no rigid body.
+def check_rigid(name: str, shift: Any) -> None:
+    """Refuse a support that is displaced by other amounts at other points.
 
     Raises:
         ValueError: It says what to give.
@@ -314,6 +322,14 @@ def check_places(name: str, place: Callable[[Any], Placement], shift: Any, mesh:
             f"{name}: the displacement of the support differs from point to point, and finite "
             "kinematics take a rigid support: give numbers or constants, and turn it by a Rotation"
         )
+
+
+def check_places(name: str, place: Callable[[Any], Placement], mesh: Any) -> None:
+    """Refuse a support that says where it is on the undeformed Γc alone.
+
+    Raises:
+        ValueError: It says what to give.
+    """
     anywhere = fem.Constant(mesh, np.zeros(mesh.geometry.dim))
     placement = place(anywhere)
     parts = placement.gap, ufl.as_vector(placement.direction)

@@ -32,6 +32,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import collective_errors, fail_together, global_sum
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import files
+from fenics_contact.supports.base import SampledSupport
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.facets import facet_cells
 from fenics_contact.types import Array
@@ -452,6 +453,8 @@ def _data(problem: ContactProblem) -> dict[str, str]:
         switches = {n: v for n, v in vars(c.support).items() if isinstance(v, bool | str)}
         if isinstance(c.support, DeformableBody):
             switches["search_distance"] = c.support.search_distance
+        if isinstance(c.support, SampledSupport):
+            switches["data"] = c.support.fingerprint
         words[f"support of {c.name}"] = _name(c.support, switches)
         words[f"enforcement of {c.name}"] = (
             "penalty" if c.multipliers is None else f"augmented to {c.tolerance:g}"

@@ -1,4 +1,4 @@
-"""What Γc presses on. A support says, by UFL alone, the gap s and the normal n at a point.
+"""What Γc presses on. A support says the gap s and the normal n at a point: by UFL, or in numbers.
 
 n points **from the body to the support**; s ≥ 0 is the distance along n that is still open. A
 support knows no mesh: numbers become constants of the mesh through the function that is passed in,
@@ -15,11 +15,14 @@ import numpy as np
 import ufl
 
 from fenics_contact.arguments import is_number
+from fenics_contact.types import Array
 
 __all__ = [
     "Motion",
     "Placement",
     "Rotation",
+    "Sample",
+    "SampledSupport",
     "Support",
     "ToUFL",
     "as_positive",
@@ -169,6 +172,48 @@ class Support:
 
         Raises:
             ValueError: Data that are not of the mesh's dimension or out of range.
+        """
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What a support says in numbers at n places.
+
+    Attributes:
+        distance: Signed distance, positive outside of the support, (n,) (length).
+        normal: Minus its gradient: unit vectors from body to support, (n, gdim).
+        curvature: Its second derivatives, (n, gdim, gdim) (1/length).
+    """
+
+    distance: Array
+    normal: Array
+    curvature: Array
+
+
+class SampledSupport(Support):
+    """A rigid support that is known in numbers alone, from data: subclasses sample its distance.
+
+    They are asked at the present places of the points of Γc in every evaluation, so that tractions
+    and their derivatives are those of the distance itself. Subclasses have ``displacement`` and
+    ``rotation`` as attributes; see `Support`.
+    """
+
+    @property
+    def gdim(self) -> int:
+        """Dimension of space, 2 or 3."""
+        raise NotImplementedError
+
+    @property
+    def fingerprint(self) -> str:
+        """A word that tells the data from others, the same on every rank."""
+        raise NotImplementedError
+
+    def sample(self, x: Array) -> Sample:
+        """Distance, normal and curvature at places; not collective.
+
+        Args:
+            x: Finite coordinates where the support has neither moved nor turned, (n, gdim), n ≥ 0.
         """
         raise NotImplementedError
 

@@ -1,0 +1,193 @@
+"""Signed distance from a polyline or a mesh of triangles, with normals and curvature."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from fenics_contact.supports.base import Sample
+from fenics_contact.supports.search import FacetSearch
+from fenics_contact.types import Array, Mask
+
+__all__ = ["Facets"]
+
+Numbers = npt.NDArray[np.intp]
+
+# Of the size of the surface: distance from an edge within which the direction to it is round-off,
+# and difference of two distances that are the same.
+_AT_EDGE, _SAME = 1e-9, 1e-12
+# A facet of less than this share of its longest edge in height has no normal.
+_FLAT = 1e-10
+
+
+class Facets:
+    """Segments in the plane or triangles in space, outwards where their order says.
+
+    The sign at edges and corners is that of the pseudo-normal: the sum of the normals that meet
+    there, each weighted by its angle [Bærentzen & Aanæs, IEEE Trans. Vis. Comput. Graph. 11 (2005)
+    243-253]. Outside of an edge the distance is that from a line, with the curvature of a circle
+    about it; from a corner that of a ball. Places from which the border of an open surface is
+    closest are outside.
+
+    Attributes:
+        points: Distinct corners, (n_points, d) (length).
+        facets: Their numbers, anticlockwise seen from outside; in the plane the outside is on the
+            right of the way, (n_facets, d).
+        closed: Whether the surface has no border.
+        size: Its largest extent, or coordinate (length).
+    """
+
+    def __init__(self, points: Array, facets: Numbers) -> None:
+        """Make normals and search.
+
+        Args:
+            points: Corners, (n, d); equal ones are one.
+            facets: Numbers of the corners, (m, d).
+
+        Raises:
+            ValueError: No facet has a normal, or neighbours are turned against each other.
+        """
+        self.points, number = np.unique(points, axis=0, return_inverse=True)
+        facets = number.reshape(-1)[facets]
+        ordered = np.sort(facets, axis=1)
+        self.facets = facets[np.all(ordered[:, 1:] > ordered[:, :-1], axis=1)]
+        self.size = float(np.abs(self.points).max())
+        corners = self.points[self.facets]
+        normals, has = _facet_normals(corners)
+        if not has.any():
+            raise ValueError("no facet has an area: they lie on a point or on a line")
+        whole, borders = self._pseudo_normals(corners, normals)
+        self.closed = not borders.any()
+        # Facets without a normal have their part at edges and corners: neighbours cover them.
+        self._corners, self._normals, self._borders = corners[has], whole[has], borders[has]
+        self._spans = np.roll(self._corners, -1, axis=1) - self._corners
+        self._search = FacetSearch(self._corners)
+
+    def _pseudo_normals(self, corners: Array, normals: Array) -> tuple[Array, Mask]:
+        """Unit normals at a facet, its edges (in space) and its corners; which are a border.
+
+        Returns:
+            (n_facets, n_features, d) and (n_facets, n_features); feature 0 is the facet.
+        """
+        m, d = self.facets.shape
+        spans = np.roll(corners, -1, axis=1) - corners
+        at_corners = np.zeros_like(self.points)
+        borders = np.zeros((m, 1 if d == 2 else 4), dtype=np.bool_)
+        whole = normals[:, None, :]
+        if d == 2:
+            for k in range(2):
+                np.add.at(at_corners, self.facets[:, k], normals)
+            begins = np.bincount(self.facets[:, 0], minlength=len(self.points))
+            ends = np.bincount(self.facets[:, 1], minlength=len(self.points))
+            _check_order(begins, ends)
+            at_border = begins != ends
+        else:
+            for k in range(3):
+                one, other = spans[:, k], -spans[:, k - 1]
+                across = np.linalg.norm(np.cross(one, other), axis=1)
+                angle = np.arctan2(across, np.einsum("ij,ij->i", one, other))
+                np.add.at(at_corners, self.facets[:, k], angle[:, None] * normals)
+            neighbour = _neighbours(self.facets, len(self.points))
+            beside = np.where((neighbour >= 0)[:, :, None], normals[neighbour], 0.0)
+            whole = np.concatenate([whole, whole + beside], axis=1)
+            borders[:, 1:] = neighbour < 0
+            at_border = np.zeros(len(self.points), dtype=np.bool_)
+            for k in range(3):
+                at_border[self.facets[neighbour[:, k] < 0][:, [k, (k + 1) % 3]]] = True
+        whole = np.concatenate([whole, at_corners[self.facets]], axis=1)
+        length = np.linalg.norm(whole, axis=2, keepdims=True)
+        # Where two sheets lie back to back they cancel.
+        whole = np.where(length > _FLAT, whole, normals[:, None, :])
+        whole /= np.maximum(np.linalg.norm(whole, axis=2, keepdims=True), 1e-300)
+        return whole, np.concatenate([borders, at_border[self.facets]], axis=1)
+
+    def sample(self, x: Array) -> Sample:
+        """See `SampledSupport.sample`."""
+        d = x.shape[1]
+        facet = self._search.closest(x, self._distance, _SAME * self.size)
+        foot, feature = self._foot(x, facet)
+        outward = self._normals[facet, feature]
+        arm = x - foot
+        length = np.linalg.norm(arm, axis=1)
+        along = np.einsum("ij,ij->i", arm, outward)
+        side = np.where((along >= 0) | self._borders[facet, feature], 1.0, -1.0)
+        on_facet = feature == 0
+        distance = np.where(on_facet, along, side * length)
+        far = ~on_facet & (length > _AT_EDGE * self.size)
+        radius = np.where(far, distance, 1.0)
+        slope = np.where(far[:, None], arm / radius[:, None], outward)
+        across = np.eye(d) - np.einsum("ni,nj->nij", slope, slope)
+        if d == 3:
+            edge = (feature >= 1) & (feature <= 3)
+            line = self._spans[facet, np.where(edge, feature - 1, 0)]
+            line = np.where(edge[:, None], line / np.linalg.norm(line, axis=1)[:, None], 0.0)
+            across -= np.einsum("ni,nj->nij", line, line)
+        curvature = np.where(far[:, None, None], across / radius[:, None, None], 0.0)
+        return Sample(distance, -slope, curvature)
+
+    def _distance(self, x: Array, facet: Numbers) -> Array:
+        return np.linalg.norm(x - self._foot(x, facet)[0], axis=1)
+
+    def _foot(self, x: Array, facet: Numbers) -> tuple[Array, Numbers]:
+        """The closest point of one facet for each point, and the part of the facet it is on."""
+        corners, spans = self._corners[facet], self._spans[facet]
+        d = x.shape[1]
+        edges = 1 if d == 2 else 3
+        arms = x[:, None, :] - corners[:, :edges]
+        square = np.einsum("nki,nki->nk", spans[:, :edges], spans[:, :edges])
+        share = np.einsum("nki,nki->nk", arms, spans[:, :edges]) / square
+        share = np.clip(share, 0.0, 1.0)
+        feet = corners[:, :edges] + share[:, :, None] * spans[:, :edges]
+        if d == 2:
+            share, foot = share[:, 0], feet[:, 0]
+            feature = np.where(share <= 0.0, 1, np.where(share >= 1.0, 2, 0))
+            return foot, feature
+        normal = self._normals[facet, 0]
+        inward = np.cross(normal[:, None, :], spans)
+        inside = np.all(np.einsum("nki,nki->nk", arms, inward) >= 0.0, axis=1)
+        rows = np.arange(len(x))
+        best = np.argmin(np.sum((x[:, None, :] - feet) ** 2, axis=2), axis=1)
+        along = share[rows, best]
+        at_end = np.where(along <= 0.0, 4 + best, 4 + (best + 1) % 3)
+        feature = np.where((along <= 0.0) | (along >= 1.0), at_end, 1 + best)
+        height = np.einsum("ni,ni->n", arms[:, 0], normal)
+        flat = x - height[:, None] * normal
+        foot = np.where(inside[:, None], flat, feet[rows, best])
+        return foot, np.where(inside, 0, feature)
+
+
+def _facet_normals(corners: Array) -> tuple[Array, Mask]:
+    """Unit normals of facets, zero where there is none, and where there are: (n, d), (n,)."""
+    spans = np.roll(corners, -1, axis=1) - corners
+    if corners.shape[2] == 2:
+        normals: Array = np.stack([spans[:, 0, 1], -spans[:, 0, 0]], axis=1)
+        has = np.ones(len(corners), dtype=np.bool_)
+    else:
+        normals = np.asarray(np.cross(spans[:, 0], spans[:, 1]), dtype=np.float64)
+        longest = np.sum(spans**2, axis=2).max(axis=1)
+        has = np.linalg.norm(normals, axis=1) > _FLAT * longest
+    length = np.where(has, np.linalg.norm(normals, axis=1), np.inf)
+    return normals / length[:, None], has
+
+
+def _neighbours(facets: Numbers, n_points: int) -> Numbers:
+    """Of every edge of triangles the triangle beyond it, -1 where there is none: (n, 3)."""
+    start, end = facets, np.roll(facets, -1, axis=1)
+    forward = (start * n_points + end).ravel()
+    backward = (end * n_points + start).ravel()
+    keys, first, counts = np.unique(forward, return_index=True, return_counts=True)
+    _check_order(counts, np.ones_like(counts))
+    place = np.minimum(np.searchsorted(keys, backward), len(keys) - 1)
+    found = np.where(keys[place] == backward, first[place] // 3, -1)
+    return np.asarray(found.reshape(-1, 3), dtype=np.intp)
+
+
+def _check_order(ways: npt.NDArray[np.integer], back: npt.NDArray[np.integer]) -> None:
+    bad = int(np.sum((ways > 1) | (back > 1)))
+    if bad:
+        raise ValueError(
+            f"at {bad} edges or corners neighbours are ordered against each other, or more than "
+            "two facets meet: order all facets anticlockwise as seen from outside of the support "
+            "(in the plane: the support on the left of the way), each given once, and take bodies "
+            "that touch each other as supports of their own"
+        )

@@ -1,0 +1,192 @@
+"""Rigid supports whose surface is a smooth profile: in the plane, extruded or turned in space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fenics_contact.supports.base import (
+    Rotation,
+    Sample,
+    SampledSupport,
+    as_vector,
+    nonzero_vector,
+)
+from fenics_contact.supports.curve import Curve
+from fenics_contact.supports.meshed import as_points, fingerprint_of
+from fenics_contact.types import Array
+
+__all__ = ["RigidProfile"]
+
+# Of the size of the coordinates: distance from the axis that is none.
+_ON_AXIS = 1e-9
+
+
+class RigidProfile(SampledSupport):
+    """A rigid support whose surface is the cubic spline through points.
+
+    Normal and curvature are those of the spline, which has no corners: for these take a
+    `RigidSurface`. An open profile must reach beyond where contact may be: places from which its
+    end is closest are outside.
+    """
+
+    def __init__(
+        self,
+        points: npt.ArrayLike,
+        *,
+        closed: bool = False,
+        extruded: Sequence[float] | None = None,
+        turned: tuple[Sequence[float], Sequence[float]] | None = None,
+        displacement: Any = None,
+        rotation: Rotation | None = None,
+    ) -> None:
+        """Take the profile.
+
+        Args:
+            points: On the surface one after the other, (n, gdim) (length), the support on the left
+                of the way; the same on every rank. In space ``extruded`` or ``turned`` says what
+                is made of them.
+            closed: Whether the profile goes on from the last point to the first.
+            extruded: Direction along which the profile stays the same, three numbers of any
+                length; the left is that seen against it.
+            turned: A point of an axis and its direction, three numbers each: the surface is that of
+                revolution, and the left that in the half-plane with the axis upwards and the
+                points on its right. Where an open profile begins or ends on the axis, the surface
+                goes on smoothly across.
+            displacement: See `Support`.
+            rotation: Likewise.
+
+        Raises:
+            ValueError: Shapes or numbers are wrong, or neighbouring points are the same.
+        """
+        given = as_points("points of the RigidProfile", points)
+        self._gdim = given.shape[1]
+        ways = [v for v in (extruded, turned) if v is not None]
+        if len(ways) != self._gdim - 2:
+            raise ValueError(
+                "a RigidProfile takes neither extruded nor turned with points in the plane, and "
+                f"one of them with points in space; given are points in {self._gdim} dimensions, "
+                f"extruded={extruded!r} and turned={turned!r}"
+            )
+        self._section: _Prism | _Revolution | None = None
+        if extruded is not None:
+            self._section = _Prism(extruded)
+        elif turned is not None:
+            self._section = _Revolution(turned)
+        if self._section is not None:
+            given = self._section.plane(given)
+        if isinstance(self._section, _Revolution) and not closed:
+            given, closed = _mirrored(given)
+        if closed and np.array_equal(given[0], given[-1]):
+            given = given[:-1]
+        following = np.roll(given, -1, axis=0) if closed else given[1:]
+        same = np.flatnonzero(np.all(following == given[: len(following)], axis=1))
+        if len(same) or len(given) < 2 + closed:
+            raise ValueError(
+                f"points of the RigidProfile: {len(given)} in its plane, of which those with the "
+                f"numbers {same.tolist()} are where the next one is; give at least {2 + closed} "
+                "distinct points, in the order in which they lie on the surface"
+            )
+        self.curve = Curve(given, closed=closed)
+        ends = [a for way in ways for a in np.ravel(np.asarray(way, dtype=np.float64))]
+        self._fingerprint = fingerprint_of(given, np.array([float(closed), *ends]))
+        self.displacement, self.rotation = displacement, rotation
+
+    @property
+    def gdim(self) -> int:
+        """See `SampledSupport.gdim`."""
+        return self._gdim
+
+    @property
+    def fingerprint(self) -> str:
+        """See `SampledSupport.fingerprint`."""
+        return self._fingerprint
+
+    def sample(self, x: Array) -> Sample:
+        """See `SampledSupport.sample`."""
+        if self._section is None:
+            return self.curve.sample(x)
+        return self._section.lifted(x, self.curve.sample(self._section.plane(x)))
+
+
+class _Prism:
+    """A plane across a direction, along which nothing changes."""
+
+    def __init__(self, direction: Sequence[float]) -> None:
+        along = nonzero_vector("extruded of the RigidProfile", direction, 3)
+        # Right-handed with the direction, from the coordinate axis that is most across it.
+        first = np.eye(3)[np.argmin(np.abs(along))]
+        first = first - (first @ along) * along
+        first /= np.linalg.norm(first)
+        self._axes = np.stack([first, np.cross(along, first)])
+
+    def plane(self, x: Array) -> Array:
+        """Coordinates in the plane, (n, 2)."""
+        return np.asarray(x @ self._axes.T)
+
+    def lifted(self, x: Array, flat: Sample) -> Sample:
+        """What is known in the plane, in space."""
+        curvature = np.einsum("ai,nab,bj->nij", self._axes, flat.curvature, self._axes)
+        return Sample(flat.distance, flat.normal @ self._axes, curvature)
+
+
+class _Revolution:
+    """The half-plane of an axis: distance from it, and place along it."""
+
+    def __init__(self, axis: tuple[Sequence[float], Sequence[float]]) -> None:
+        if not isinstance(axis, Sequence) or len(axis) != 2:
+            raise ValueError(
+                f"turned of the RigidProfile is {axis!r}; it must be a point of the axis and its "
+                "direction, such as ((0, 0, 0), (0, 0, 1))"
+            )
+        self._origin = as_vector("point in turned of the RigidProfile", axis[0], 3)
+        self._along = nonzero_vector("direction in turned of the RigidProfile", axis[1], 3)
+
+    def _out(self, x: Array) -> tuple[Array, Array, Array]:
+        """Place along the axis, distance from it, and unit vectors out of it."""
+        arm = x - self._origin
+        height = arm @ self._along
+        out = arm - height[:, None] * self._along
+        radius = np.linalg.norm(out, axis=1)
+        off = radius > _ON_AXIS * np.linalg.norm(arm, axis=1)
+        # On the axis any direction across it does.
+        across = np.cross(self._along, np.eye(3)[np.argmin(np.abs(self._along))])
+        out[~off] = across / np.linalg.norm(across)
+        out[off] /= radius[off, None]
+        return height, np.where(off, radius, 0.0), out
+
+    def plane(self, x: Array) -> Array:
+        """Coordinates in the half-plane, (n, 2)."""
+        height, radius, _ = self._out(x)
+        return np.stack([radius, height], axis=1)
+
+    def lifted(self, x: Array, flat: Sample) -> Sample:
+        """What is known in the half-plane, in space."""
+        _, radius, out = self._out(x)
+        axes = np.stack([out, np.broadcast_to(self._along, out.shape)], axis=1)
+        normal = np.einsum("na,nai->ni", flat.normal, axes)
+        curvature = np.einsum("nai,nab,nbj->nij", axes, flat.curvature, axes)
+        # About the axis; on it that of the profile, which crosses it at a right angle.
+        far = radius > 0.0
+        slope = -flat.normal[:, 0] / np.where(far, radius, 1.0)
+        about = np.where(far, slope, flat.curvature[:, 0, 0])
+        round_ = np.cross(self._along, out)
+        curvature += about[:, None, None] * np.einsum("ni,nj->nij", round_, round_)
+        return Sample(flat.distance, normal, curvature)
+
+
+def _mirrored(points: Array) -> tuple[Array, bool]:
+    """An open profile in the half-plane, and across the axis where it ends there; if it closes."""
+    size = np.abs(points).max()
+    begins, ends = (points[i, 0] <= _ON_AXIS * size for i in (0, -1))
+    mirror = points[::-1] * np.array([-1.0, 1.0])
+    if begins and ends:
+        return np.concatenate([points, mirror[1:-1]]), True
+    if begins:
+        return np.concatenate([mirror[:-1], points]), False
+    if ends:
+        return np.concatenate([points, mirror[1:]]), False
+    return points, False
