@@ -20,11 +20,11 @@ from fenics_contact.checks.judge import Judge
 from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.verdict import Attempt, NotConverged, Verdict
 from fenics_contact.contact.contact import Contact, Found
-from fenics_contact.contact.inputs import displacement_degree
 from fenics_contact.contact.values import Resultants, Status
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
 from fenics_contact.methods.solver import METHODS, Settings, Solver
 from fenics_contact.parallel import fail_together, global_max, global_min
+from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_nodes
 from fenics_contact.surface.modulus import cell_modulus
 from fenics_contact.systems import linear
@@ -44,6 +44,11 @@ logger = logging.getLogger("fenics_contact")
 _TOUCHING = 1e-12
 # Contact that bears less than this share of the load on a free motion bears nothing yet.
 _IDLE = 1e-3
+# How parts of a mixed function are prescribed.
+_OF_A_PART = (
+    "; on a part of a mixed one it is dirichletbc(value, dofs, W.sub(0)), where dofs are those of "
+    "locate_dofs_topological((W.sub(0), V), ...) and V, _ = W.sub(0).collapse()"
+)
 # What became of an attempt on too few unknowns.
 _SPREADS = "contact spreads beyond the unknowns kept"
 
@@ -126,7 +131,8 @@ class ContactProblem:
     caller's ``petsc_options`` and the command line do not set comes from ``method``.
 
     Attributes:
-        u: The displacement.
+        u: What is solved for: the displacement, or a mixed function of which it is a part.
+        displacement: The displacement in it.
         contacts: The contacts.
         bulk: The bulk form.
         motions: The rigid motions of its bodies, and which of them are free.
@@ -160,8 +166,10 @@ class ContactProblem:
 
         Args:
             F: Residual of the bulk in ``u`` and one test function, loads included, contact not.
-            u: Displacement; its values are the starting state.
-            bcs: Dirichlet conditions on ``u`` or its components.
+            u: Displacement, or a mixed function w of which it is a part, beside a pressure for
+                instance; its values are the starting state. The contacts then have the displacement
+                of ``ufl.split(w)``.
+            bcs: Dirichlet conditions on ``u`` or its components, or on parts of w.
             contacts: Contacts of ``u``.
             method: "lbfgs" (quasi-Newton, H₀ = (K + αK_n + φK_t)⁻¹), "newton" (consistent
                 tangent), "continuation" (the same, from soft contact to stiff; alternating where
@@ -169,7 +177,8 @@ class ContactProblem:
                 with a line search on the energy). By default "lbfgs" on all unknowns, where a
                 factorisation costs as much as dozens of iterations, and condensed, where it costs
                 as much as ten, "newton", with "continuation" for the first increment; "newton" for
-                a nonlinear bulk, too, whose tangent changes.
+                a nonlinear bulk, too, whose tangent changes, and for a mixed function, whose
+                equations are those of a saddle point: "lbfgs" and "alternating" are refused there.
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
                 paper has 0; 1 needs a third of the iterations once a point sticks.
@@ -212,16 +221,15 @@ class ContactProblem:
                 f"kinematics is {kinematics!r}; it must be a positive share, such as 0.2, or "
                 "infinite, so that no increment fails by it"
             )
-        check_instance("u", u, fem.Function)
-        displacement_degree(u, u.function_space.mesh, "problem")
         check_instance("prefix", prefix, str)
         if petsc_options is not None:
             check_instance("petsc_options", petsc_options, Mapping)
         self.contacts = listed("contacts", contacts, Contact)
         self._bcs = listed("bcs", bcs, fem.DirichletBC)
         linear.warn_of_slow_blas()
+        self.displacement = self._find_displacement(u)
         self.u = u
-        self.bulk = Bulk(F, u)
+        self.bulk = Bulk(F, self.displacement)
         said = [c.accuracy for c in self.contacts if c.accuracy is not None]
         all_say = bool(said) and len(said) == len(self.contacts)
         self.accuracy = min(said, key=lambda a: a.error) if all_say else None
@@ -233,17 +241,19 @@ class ContactProblem:
         self._n_owned = self.unknowns.n_dofs
         self.constrained = self._constrained_unknowns()
         self._check_contacts()
-        self.full = FullSystem(u, self.unknowns, self.bulk, self.contacts, self.constrained)
+        self.full = FullSystem(
+            self.displacement, self.unknowns, self.bulk, self.contacts, self.constrained
+        )
 
         self.bulk.check_finite()
         self.full.update_stiffness()
         self.bulk.check_elastic()
         waiting = [c for c in self.contacts if c.needs_modulus]
         if waiting:
-            modulus = cell_modulus(self.bulk.tangent_form, u, waiting[0].weight)
+            modulus = cell_modulus(self.bulk.tangent_form, self.displacement, waiting[0].weight)
             for contact in waiting:
                 contact.set_modulus(modulus)
-        self.motions = RigidMotions(u.function_space, self.unknowns, self._motion_names())
+        self.motions = RigidMotions(self.displacement, self.unknowns, self._motion_names())
         self.initial_penetration = self._check_start()
         self.motions.find_free(self.full.stiffness, self.constrained)
         self.motions.check_held(self.operators)
@@ -300,6 +310,28 @@ class ContactProblem:
 
     # ---- construction ----------------------------------------------------------------------------
 
+    def _find_displacement(self, u: fem.Function) -> Displacement:
+        """That of the contacts, which must be of ``u`` and the same for all. Collective."""
+        if isinstance(u, ufl.core.expr.Expr) and not isinstance(u, fem.Function):
+            raise ValueError(
+                "problem: u is a part of a function, or another expression; give the function that "
+                "is solved for, the w of ufl.split(w)"
+            )
+        for contact in self.contacts:
+            found, first = contact.displacement, self.contacts[0].displacement
+            if found.whole is not u:
+                raise ValueError(f"{contact.name}: its u is not the u of the problem")
+            if not found.same_part(first):
+                raise ValueError(
+                    f"{contact.name}: its u is another part of the mixed function than that of "
+                    f"{self.contacts[0].name}; give all contacts the same"
+                )
+        if self.contacts:
+            return self.contacts[0].displacement
+        if not isinstance(u, fem.Function):
+            return Displacement(u, None, "problem")  # refuses it
+        return Displacement.only(u, "problem")
+
     def _motion_names(self) -> list[str]:
         return [
             f"translation along {'xyz'[i]} of the support of {contact.name}"
@@ -311,8 +343,16 @@ class ContactProblem:
         mask = np.zeros(self.unknowns.n_local, dtype=np.bool_)
         for bc in self._bcs:
             dofs, _ = bc.dof_indices()
-            if self._comm.allreduce(int(dofs.size and dofs.max() >= self.u.x.array.size)):
-                raise ValueError("a Dirichlet condition is on another function space than u")
+            # A collapsed part of a mixed space has numbers of its own.
+            own, all_of_u = (s.dofmap.index_map for s in (bc.function_space, self.u.function_space))
+            other = own.size_global != all_of_u.size_global
+            if self._comm.allreduce(
+                int(other or (dofs.size and dofs.max() >= self.u.x.array.size))
+            ):
+                advice = _OF_A_PART if self.displacement.mixed else ""
+                raise ValueError(
+                    f"a Dirichlet condition is on another function space than u{advice}"
+                )
             # Their number of owned dofs, which comes with them, is wrong for blocked conditions.
             mask[dofs[dofs < self._n_owned]] = True
         return mask
@@ -324,10 +364,10 @@ class ContactProblem:
         constrained = fem.Function(self.u.function_space)
         constrained.x.array[: self._n_owned] = self.constrained[: self._n_owned]
         constrained.x.scatter_forward()
+        dofs = self.displacement.dofs
+        mask = constrained.x.array if dofs is None else constrained.x.array[dofs]
         for contact in self.contacts:
-            if contact.u is not self.u:
-                raise ValueError(f"{contact.name}: its u is not the u of the problem")
-            held = _facets_held(contact, constrained.x.array)
+            held = _facets_held(contact, mask)
             n_held = self._comm.allreduce(held)
             if n_held:
                 raise ValueError(
@@ -793,7 +833,8 @@ class ContactProblem:
         values = self.u.x.array.copy()
         for bc in self._bcs:
             bc.set(values)
-        return self.unknowns.joined(values[: self._n_owned], np.zeros(self.unknowns.n_motions))
+        values = self.bulk.in_units(values[: self._n_owned])
+        return self.unknowns.joined(values, np.zeros(self.unknowns.n_motions))
 
     def set_committed(
         self,

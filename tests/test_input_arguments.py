@@ -82,17 +82,76 @@ def test_displacement_of_another_problem():
 
 
 def test_displacement_in_a_mixed_element():
-    """A pressure beside it, whole or in part, or scalars for its components: the reason is told."""
+    """The whole of it, parts that no derivative knows, no vector: told what to give instead."""
     scene = pressed()
     line = basix.ufl.element("P", "quadrilateral", 1)
     vector = basix.ufl.element("P", "quadrilateral", 2, shape=(2,))
     both = fem.Function(fem.functionspace(scene.mesh, basix.ufl.mixed_element([vector, line])))
     scalars = fem.Function(fem.functionspace(scene.mesh, basix.ufl.mixed_element([line, line])))
-    for u in (both, both.sub(0), scalars):
-        raised_everywhere(contact_with(u, scene), ValueError, "contact: u is in a mixed element")
-    v = ufl.TestFunction(both.function_space)
-    F = ufl.inner(ufl.grad(both), ufl.grad(v)) * ufl.dx
-    raised_everywhere(lambda: fc.ContactProblem(F, both), ValueError, "u is in a mixed element")
+    split = "u, p = ufl.split(w)"
+    u, p = ufl.split(both)
+    for whole in (both, scalars):
+        raised_everywhere(contact_with(whole, scene), ValueError, "a mixed element", split)
+    raised_everywhere(contact_with(both.sub(0), scene), ValueError, "w.sub(i)", split)
+    for none in (2 * u, u + scene.u, ufl.as_vector([both[1], both[0]])):
+        raised_everywhere(contact_with(none, scene), ValueError, "u is a", split)
+    raised_everywhere(contact_with(p, scene), ValueError, "shape ()")
+    v, q = ufl.TestFunctions(both.function_space)
+    F = ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx + p * q * ufl.dx
+    contact = contact_with(u, scene)()
+
+    def problem(F, u, **options):
+        return lambda: fc.ContactProblem(F, u, contacts=[contact], **options)
+
+    raised_everywhere(problem(F, u), ValueError, "the function that is solved for")
+    raised_everywhere(problem([F, F], [scene.u]), ValueError, "its u is not the u of the problem")
+    raised_everywhere(problem([F, F], both), ValueError, "F is a list", "one function w")
+    other = ufl.TestFunction(scene.u.function_space)
+    raised_everywhere(
+        problem(ufl.inner(ufl.grad(u), ufl.grad(other)) * ufl.dx, both),
+        ValueError,
+        "TestFunctions(W)",
+    )
+    outside = F + ufl.inner(both.sub(0), v) * ufl.dx
+    raised_everywhere(problem(outside, both), ValueError, "does not know", "ufl.split")
+    for method in ("lbfgs", "alternating"):
+        raised_everywhere(problem(F, both, method=method), ValueError, method, "saddle point")
+    raised_everywhere(
+        problem(F, both, linear_solver="multigrid"), ValueError, "multigrid", "saddle point"
+    )
+    raised_everywhere(
+        problem(F, both, condensation=True), ValueError, "condensation", "part of what is solved"
+    )
+    part, _ = both.function_space.sub(0).collapse()
+    stray = fem.dirichletbc(fem.Function(part), np.arange(2, dtype=np.int32))
+    raised_everywhere(problem(F, both, bcs=[stray]), ValueError, "Dirichlet", "W.sub(0)")
+
+
+def test_fields_as_a_list_of_functions():
+    """Blocked spaces are refused with the way there is; and a function with two displacements."""
+    scene = pressed()
+    p = fem.Function(fem.functionspace(scene.mesh, ("Lagrange", 1)))
+    F = scene.F
+    both = (scene.u, p)
+    raised_everywhere(contact_with(both, scene), ValueError, "u is a tuple", "mixed_element")
+    raised_everywhere(lambda: fc.ContactProblem(F, both), ValueError, "u is a tuple", "ufl.split")
+    space = ufl.MixedFunctionSpace(scene.u.function_space, p.function_space)
+    v, _ = ufl.TestFunctions(space)
+    parts = ufl.inner(ufl.grad(scene.u), ufl.grad(v)) * ufl.dx
+    raised_everywhere(lambda: fc.ContactProblem(parts, scene.u), ValueError, "in parts", "mixed")
+    vector = basix.ufl.element("P", "quadrilateral", 2, shape=(2,))
+    twice = fem.Function(fem.functionspace(scene.mesh, basix.ufl.mixed_element([vector, vector])))
+    v = ufl.TestFunction(twice.function_space)
+    F = ufl.inner(ufl.grad(twice), ufl.grad(v)) * ufl.dx
+    raised_everywhere(lambda: fc.ContactProblem(F, twice), ValueError, "of which 2 parts")
+    first, second = ufl.split(twice)
+    contacts = [
+        fc.Contact(u, scene.surface, scene.floor(), coulomb(), name=name)
+        for u, name in ((first, "one"), (second, "two"))
+    ]
+    raised_everywhere(
+        lambda: fc.ContactProblem(F, twice, contacts=contacts), ValueError, "two: its u is another"
+    )
 
 
 # ---- what is no argument at all ------------------------------------------------------------------

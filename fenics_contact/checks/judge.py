@@ -53,8 +53,9 @@ class Judge:
         self._contacts, self._comm = full.contacts, full.unknowns.comm
         self._imposed = motions.size
         self._told: set[str] = set()
-        gdim = len(full.u)
-        n_nodes = full.unknowns.first_motion / gdim
+        space = full.displacement.u.function_space
+        gdim = space.mesh.geometry.dim
+        n_nodes = space.dofmap.index_map.size_global
         self._cell_size = motions.size / n_nodes ** (1 / gdim)
 
     def begin(self) -> float:
@@ -113,7 +114,8 @@ class Judge:
             unseen=self._passing() if system is self._full else {},
             kinematics=self._linearisation(respond) if respond else {},
             kinematics_allowed=self.kinematics,
-            displacement=global_max(self._comm, np.abs(self._full.u.x.array)) / self._imposed,
+            displacement=global_max(self._comm, np.abs(self._full.displacement.u.x.array))
+            / self._imposed,
             inverted=self._full.bulk.is_inverted(),
             routes=self._compare_routes() if self._second_route and laws else {},
         )
@@ -133,14 +135,14 @@ class Judge:
 
     def _passing(self) -> dict[str, tuple[float, list[float]]]:
         """How deep bodies pass through between the points, by contact. Collective."""
-        by_area = self._cell_size ** (1 - len(self._full.u))
+        by_area = self._cell_size ** (1 - self._full.gdim)
         return passing(self._contacts, self._full.bulk.scale * by_area)
 
     def _linearisation(self, respond: Respond) -> dict[str, Linearisation]:
         """What taking displacements as small changes at this state, by contact. Collective."""
         if not self._contacts:
             return {}
-        modulus = self._full.bulk.scale * self._cell_size ** (2 - len(self._full.u))
+        modulus = self._full.bulk.scale * self._cell_size ** (2 - self._full.gdim)
         return linearisation(self._contacts, modulus, respond)
 
     def _force_sums(
@@ -169,7 +171,7 @@ class Judge:
         sizes = [np.bincount(system.label, np.abs(f), minlength=n)[:n] for f in forces]
         sums = global_sum(self._comm, np.stack([*total.T, count, np.sum(sizes, axis=0)]))
         # What cannot be told is left out; a force that is no number is seen by the translations.
-        rotations = sums[len(self._full.u) : -2]
+        rotations = sums[self._full.gdim : -2]
         rotations[np.isnan(rotations)] = 0.0
         return sums[:-2].T, sums[-2:]
 

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy.optimize
-from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -19,6 +18,7 @@ from fenics_contact import compat
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import agreed, gather_rows, global_min, global_sum
 from fenics_contact.surface.bodies import connected_bodies
+from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_cells
 from fenics_contact.systems.modes import rigid_motions
 from fenics_contact.systems.operator import ContactOperator
@@ -52,15 +52,16 @@ class RigidMotions:
     """
 
     def __init__(
-        self, space: fem.FunctionSpace, unknowns: Unknowns, supports: Sequence[str] = ()
+        self, displacement: Displacement, unknowns: Unknowns, supports: Sequence[str] = ()
     ) -> None:
         """Make the motions at this rank's unknowns. Collective.
 
         Args:
-            space: Of the displacement.
-            unknowns: Its dofs and the free motions of supports, each a rigid motion of its own.
+            displacement: What moves.
+            unknowns: The dofs and the free motions of supports, each a rigid motion of its own.
             supports: Names of the latter.
         """
+        space = displacement.u.function_space
         self._comm = space.mesh.comm
         gdim = space.mesh.geometry.dim
         n_owned = space.dofmap.index_map.size_local
@@ -83,7 +84,8 @@ class RigidMotions:
             kinds = rigid_motions(x - self._centres[b], self._sizes[b])
             for name, mode in kinds.items():
                 self.names.append(name + (of if n_bodies > 1 else ""))
-                modes.append(np.where(body[:, None] == b, mode, 0.0).ravel())
+                mine = np.where(body[:, None] == b, mode, 0.0).ravel()
+                modes.append(displacement.within(mine))
         self.names += supports
         none, still = np.zeros(len(supports)), np.zeros(unknowns.n_dofs)
         of_supports = [unknowns.joined(still, row) for row in np.eye(len(supports))]

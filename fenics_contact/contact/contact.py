@@ -25,7 +25,7 @@ from fenics_contact.contact.finite import (
     check_places,
     check_rigid,
 )
-from fenics_contact.contact.inputs import Inputs, displacement_degree
+from fenics_contact.contact.inputs import Inputs
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
 from fenics_contact.contact.multipliers import Multipliers, TraceProjection
 from fenics_contact.contact.pairs import Pairs, PairsState
@@ -39,6 +39,7 @@ from fenics_contact.laws.stiffness import Springs
 from fenics_contact.parallel import global_max, global_min, global_sum
 from fenics_contact.supports.base import Placement, SampledSupport, Support, as_vector
 from fenics_contact.supports.deformable import DeformableBody
+from fenics_contact.surface.displacement import Displacement, check_kind
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.mass import assembled
 from fenics_contact.surface.surface import ContactSurface, PointEvaluator
@@ -91,7 +92,9 @@ class Contact(PointResults):
     """Frictional contact of Γc with a support, as a boundary form and a committed history.
 
     Attributes:
-        u: The displacement, a vector-valued Lagrange function.
+        u: The displacement, a vector-valued Lagrange function; of a mixed function one of its own,
+            which has the values of the last evaluation.
+        displacement: What it is in the function that is solved for.
         surface, support, law: What was given.
         quadrature: The points of Γc.
         history: The committed state.
@@ -116,7 +119,7 @@ class Contact(PointResults):
 
     def __init__(
         self,
-        u: fem.Function,
+        u: fem.Function | ufl.core.expr.Expr,
         surface: ContactSurface,
         support: Support,
         law: Law,
@@ -133,7 +136,9 @@ class Contact(PointResults):
         """Bind the parts. Collective; compiles what evaluates the points.
 
         Args:
-            u: Displacement; vector-valued Lagrange of any degree on the surface's mesh.
+            u: Displacement; vector-valued Lagrange of any degree on the surface's mesh. Where it is
+                a part of a mixed function w, beside a pressure, that of ``u, p = ufl.split(w)``;
+                parts that are bubbles may be added to it, which Γc does not feel.
             surface: Γc.
             support: What it presses on.
             law: The reactions.
@@ -169,19 +174,20 @@ class Contact(PointResults):
         """
         check_instance("name", name, str)
         order = "the order is Contact(u, surface, support, law)"
+        check_kind(u, name, order)
         for what, value, kind in (
-            ("u", u, fem.Function),
             ("surface", surface, ContactSurface),
             ("support", support, Support),
             ("law", law, Law),
         ):
             check_instance(f"{name}: {what}", value, kind, order)
-        self.name, self.u = name, u
+        self.name = name
         self.surface, self.support, self.law = surface, support, law
         self.entity_maps = surface.entity_maps
         mesh = surface.mesh
         self._gdim = gdim = mesh.geometry.dim
-        degree = displacement_degree(u, mesh, name)
+        self.displacement = Displacement(u, mesh, name)
+        self.u, degree = self.displacement.u, self.displacement.degree
         try:
             law.check_complete()
             law.check_dimension(gdim)
@@ -203,7 +209,7 @@ class Contact(PointResults):
         )
         if modulus is not None:
             self.set_modulus(modulus)
-        self.pairs = Pairs(name, u, self.quadrature, support)
+        self.pairs = Pairs(name, self.u, self.quadrature, support)
         self._frame = Frame(self.inputs.shift, self.inputs.rotation)
         self._jump = fem.Function(self.quadrature.space(gdim), name="jump")
         # Of a support known in numbers: seen from the undeformed Γc, and from where it has moved.
@@ -446,14 +452,15 @@ class Contact(PointResults):
         """Virtual work of contact, to be **added** to a residual: -∫ (r_n v_n + τ·v_t) (46, 55).
 
         Args:
-            v: Test function of ``u``'s space. Compile with ``entity_maps=contact.entity_maps``.
+            v: Test function of ``u``'s space, of a mixed function the part of the test function
+                that ``ufl.split`` gives. Compile with ``entity_maps=contact.entity_maps``.
 
         Raises:
             ValueError: A stiffness is `Scaled` and the modulus is not known; or the support is
                 another body, or moves by an amount that is unknown.
         """
         self._check_form()
-        return self._form_at(self.u, v)
+        return self._form_at(self.displacement.expression, v)
 
     def _check_form(self) -> None:
         """Refuse what no form on Γc can hold."""
@@ -492,11 +499,15 @@ class Contact(PointResults):
                 f"{self.name}: friction has no potential with finite kinematics, whose tangent "
                 "planes turn; use the form"
             )
-        return self.inputs.weight * self._in_form.potential(self.u) * self.quadrature.ds
+        return (
+            self.inputs.weight
+            * self._in_form.potential(self.displacement.expression)
+            * self.quadrature.ds
+        )
 
     def tangent(self, v: ufl.Argument, du: ufl.Argument) -> ufl.Form:
         """Consistent tangent, the derivative of `form`; unsymmetric where Coulomb slips."""
-        return ufl.derivative(self.form(v), self.u, du)
+        return ufl.derivative(self.form(v), self.displacement.whole, du)
 
     # ---- the same, point by point: see `ContactOperator` -----------------------------------------
 
@@ -621,6 +632,7 @@ class Contact(PointResults):
 
     def _update_points(self) -> None:
         """Let the points be at the present ``u`` and data. Collective."""
+        self.displacement.follow()
         self.jump_map.mult(self.u.x.petsc_vec, self._jump.x.petsc_vec)
         self._jump.x.scatter_forward()
         self._update_data()
@@ -839,6 +851,7 @@ class Contact(PointResults):
         Tractions divided by it are true ones (Cauchy's), per deformed area; those of the contact
         are nominal. Of axisymmetric bodies, whose hoops stretch too, by 1 + u_r/r more.
         """
+        self.displacement.follow()
         if self._stretch is None:
             gradient = ufl.Identity(self._gdim) + ufl.grad(self.u)
             turned = ufl.transpose(ufl.inv(gradient))
@@ -938,8 +951,7 @@ class Contact(PointResults):
     def _traces(self) -> TraceProjection:
         """The projection on functions on Γc that displacements can answer to. Collective."""
         if self._projection is None:
-            degree = self.u.function_space.ufl_element().degree
-            self._projection = TraceProjection(self.quadrature, degree)
+            self._projection = TraceProjection(self.quadrature, self.displacement.degree)
         return self._projection
 
     # ---- state -----------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import basix
 import numpy as np
 import ufl
 from dolfinx import fem
@@ -21,7 +20,7 @@ from fenics_contact.surface.modulus import modulus_over_height
 from fenics_contact.surface.surface import SurfaceQuadrature, VertexAreas
 from fenics_contact.types import Array
 
-__all__ = ["Inputs", "displacement_degree"]
+__all__ = ["Inputs"]
 
 
 # What a contact itself is given by these names, among which a law's parameters stand.
@@ -273,34 +272,3 @@ def _range_error(contact: str, name: str, value: float, positive: bool) -> str:
     wanted = "greater than zero" if positive else "zero or greater"
     wanted += " (stress/length)" if name.startswith("k_") else ""
     return f"{contact}: {name} is {value:g} at a point of Γc; it must be finite and {wanted}"
-
-
-def displacement_degree(u: fem.Function, mesh: Any, name: str) -> int:
-    """Check that ``u`` is a displacement of ``mesh`` and return its element's degree."""
-    gdim, space = mesh.geometry.dim, u.function_space
-    if space.component() or (space.num_sub_spaces and space.dofmap.index_map_bs == 1):
-        raise ValueError(
-            f"{name}: u is in a mixed element, or a part of one; u must be in a space of its own, "
-            f'functionspace(mesh, ("Lagrange", degree, ({gdim},))): mixed formulations are not '
-            "supported; for bodies that are nearly incompressible take degree 2 or higher"
-        )
-    if u.ufl_shape != (gdim,):
-        raise ValueError(
-            f"{name}: u has shape {u.ufl_shape}; a displacement on this mesh has shape ({gdim},): "
-            f'make its space with functionspace(mesh, ("Lagrange", degree, ({gdim},)))'
-        )
-    if u.function_space.mesh is not mesh and u.function_space.mesh != mesh:
-        raise ValueError(f"{name}: u lives on another mesh than the contact surface")
-    element = u.function_space.ufl_element()
-    if u.function_space.dofmap.bs != gdim or element.pullback != ufl.identity_pullback:
-        raise ValueError(
-            f"{name}: u is in {element}; it must be in a vector-valued Lagrange space, "
-            f'functionspace(mesh, ("Lagrange", degree, ({gdim},)))'
-        )
-    basis = u.function_space.element.basix_element
-    if basis.family != basix.ElementFamily.P or basis.discontinuous or basis.degree < 1:
-        raise ValueError(
-            f"{name}: u is in {element}, of degree {basis.degree}; it must be continuous, a "
-            "Lagrange element of degree 1 or higher"
-        )
-    return int(basis.degree)

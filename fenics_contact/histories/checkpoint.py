@@ -19,8 +19,9 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import basix
 import dolfinx
 import numpy as np
 import scipy.spatial
@@ -35,7 +36,7 @@ from fenics_contact.results import files
 from fenics_contact.supports.base import SampledSupport
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.facets import facet_cells
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Indices
 
 __all__ = [
     "Stored",
@@ -128,15 +129,16 @@ def save(
     comm = problem.u.function_space.mesh.comm
     check_fields(problem, fields)
     unknowns, state = problem.committed_state()
-    n_dofs, gdim = problem.unknowns.n_dofs, len(problem.u)
-    nodes = (row[:n_dofs].reshape(-1, gdim) for row in unknowns)
     arrays = {
         "numbers": np.array(numbers, dtype=np.float64),
         "state": state,
         "motions": np.stack([problem.unknowns.motions(row) for row in unknowns]),
-        "nodes": _gather(comm, _node_places(problem.u.function_space), *nodes),
         **_probe(problem),
     }
+    physical = _physical(problem, unknowns)
+    for part in _parts(problem):
+        rows = physical[:, part.dofs].reshape(len(physical), -1, part.space.dofmap.bs)
+        arrays[part.name] = _gather(comm, _node_places(part.space), *rows)
     scene: dict[str, Any] = {"format": _FORMAT, "notes": notes, "contacts": {}}
     scene["fixed"], scene["data"] = _fixed(problem, fields), _data(problem)
     for contact in problem.contacts:
@@ -217,7 +219,9 @@ def check_fields(problem: ContactProblem, fields: Sequence[fem.Function]) -> Non
         dofmap = space.dofmap
         n_nodes = dofmap.index_map.size_local + dofmap.index_map.num_ghosts
         if field is problem.u:
-            raise ValueError(f"{what} is the displacement, which is saved by itself")
+            raise ValueError(
+                f"{what} is the function of the displacement, which is saved by itself"
+            )
         if field.x.array.dtype != np.float64:
             raise ValueError(f"{what} has values of type {field.x.array.dtype}; save float64")
         if MPI.Comm.Compare(space.mesh.comm, comm) not in (MPI.IDENT, MPI.CONGRUENT):
@@ -280,14 +284,15 @@ def take_up(
     _refuse(stored, _compare_words(stored.scene["fixed"], _fixed(problem, fields)))
     _refuse(stored, _compare_shapes(stored, problem, fields))
     size = problem.motions.size
-    nodes = _find(comm, stored, "nodes", _node_places(problem.u.function_space), size)
-    rows = nodes.reshape(len(nodes), len(stored.arrays["motions"]), -1).swapaxes(0, 1)
-    unknowns = np.stack(
-        [
-            problem.unknowns.joined(row.ravel(), stored.arrays["motions"][i])
-            for i, row in enumerate(rows)
-        ]
-    )
+    motions = stored.arrays["motions"]
+    rows = np.zeros((len(motions), problem.unknowns.n_dofs))
+    for part in _parts(problem):
+        nodes = _find(comm, stored, part.name, _node_places(part.space), size)
+        by_row = nodes.reshape(len(nodes), len(motions), -1).swapaxes(0, 1)
+        rows[:, part.dofs] = by_row.reshape(len(motions), -1)
+    joined = (problem.unknowns.joined(row, motions[i]) for i, row in enumerate(rows))
+    unknowns = np.stack(list(joined))
+    unknowns = _physical(problem, unknowns, back=True)
     points, given = [], []
     for contact in problem.contacts:
         places, (data, layout) = _point_places(contact), stored.scene["contacts"][contact.name]
@@ -417,7 +422,7 @@ def _list(differences: Sequence[str]) -> str:
 
 def _fixed(problem: ContactProblem, fields: Sequence[fem.Function]) -> dict[str, str]:
     """What no state can be taken over into another of, in words. Collective."""
-    space = problem.u.function_space
+    space = problem.displacement.u.function_space
     mesh, words = space.mesh, {}
     n_cells = mesh.topology.index_map(mesh.topology.dim).size_global
     degree = compat.geometry_element(mesh).degree
@@ -426,6 +431,9 @@ def _fixed(problem: ContactProblem, fields: Sequence[fem.Function]) -> dict[str,
     words["element"] = str(space.element.basix_element.family).split(".")[-1]
     words["element"] += f" of degree {space.element.basix_element.degree}"
     words["nodes"] = str(space.dofmap.index_map.size_global)
+    for part in _parts(problem)[1:]:
+        nodes = part.space.dofmap.index_map.size_global
+        words[part.name] = f"{part.space.ufl_element()} at {nodes} nodes"
     words["contacts"] = ", ".join(c.name for c in problem.contacts)
     for c in problem.contacts:
         n_points = int(global_sum(mesh.comm, c.quadrature.n_points))
@@ -479,17 +487,20 @@ def _probe(problem: ContactProblem) -> dict[str, Array]:
     """
     space = problem.u.function_space
     comm, d = space.mesh.comm, space.mesh.geometry.dim
-    x = space.tabulate_dof_coordinates()[:, :d]
-    low = x.min(axis=0, initial=np.inf)
+    parts = [(part.dofs, part.space.dofmap.bs, _positions(part.space)) for part in _parts(problem)]
+    low = parts[0][2].min(axis=0, initial=np.inf)
     comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
     n_owned = problem.unknowns.n_dofs
     smooth, images = [], []
     field, image = fem.Function(space), fem.Function(space)
     with problem.bulk.present_stiffness() as stiffness:
         for k in range(3):
-            phases = 1.0 + k + 2.0 * np.arange(d)
-            waves = np.cos(np.add.outer(np.arange(d), np.arange(d)) * (1 + k)) * (2 + k)
-            field.x.array[:] = np.sin((x - low) / problem.motions.size @ waves + phases).ravel()
+            for dofs, bs, x in parts:
+                phases = 1.0 + k + 2.0 * np.arange(bs)
+                waves = np.cos(np.add.outer(np.arange(d), np.arange(bs)) * (1 + k)) * (2 + k)
+                values = np.sin((x - low) / problem.motions.size @ waves + phases)
+                field.x.array[dofs] = values.ravel()
+            field.x.scatter_forward()
             stiffness.mult(field.x.petsc_vec, image.x.petsc_vec)
             smooth.append(field.x.array[:n_owned].copy())
             images.append(image.x.array[:n_owned].copy())
@@ -522,15 +533,16 @@ def _compare_shapes(
     stored: Stored, problem: ContactProblem, fields: Sequence[fem.Function]
 ) -> list[str]:
     """Whether the arrays are those of such a problem, but for the numbers of places."""
-    gdim, n_motions = len(problem.u), problem.unknowns.n_motions
+    gdim, n_motions = len(problem.displacement.u), problem.unknowns.n_motions
     wanted: dict[str, tuple[int | None, ...]] = {
         "numbers": (None,),
         "state": (2,),
         "motions": (6, n_motions),
-        "nodes": (None, 8 * gdim),
         "stiffness": (2, 9),
         "loads": (2, 3 + n_motions),
     }
+    for part in _parts(problem):
+        wanted[part.name] = (None, 2 * gdim + 6 * part.space.dofmap.bs)
     for c in problem.contacts:
         sizes = [sum(max(width, 1) for _, width in t) for t in stored.scene["contacts"][c.name]]
         n_history = c.history.rows().shape[1]
@@ -668,6 +680,61 @@ def _find(comm: MPI.Comm, stored: Stored, name: str, places: Array, size: float)
     return table[row, width:]
 
 
+class _Part(NamedTuple):
+    """Of what is solved for: a space of its own, and the numbers of this rank's dofs."""
+
+    name: str
+    space: fem.FunctionSpace
+    dofs: Indices
+
+
+def _parts(problem: ContactProblem) -> list[_Part]:
+    """The displacement first. Collective."""
+    displacement = problem.displacement
+    space, dofs = displacement.u.function_space, displacement.dofs
+    if dofs is None:
+        dofs = np.arange(displacement.n_owned, dtype=np.int32)
+    found = [_Part("nodes", space, dofs[: displacement.n_owned])]
+    for number, (other, numbers) in enumerate(displacement.others, start=1):
+        owned = other.dofmap.index_map.size_local * other.dofmap.index_map_bs
+        found.append(_Part(f"part {number}", other, numbers[:owned]))
+    return found
+
+
+def _physical(problem: ContactProblem, rows: Array, *, back: bool = False) -> Array:
+    """States and forces of `committed_state` in the user's units, or ``back``. Collective."""
+    n, bulk, found = problem.unknowns.n_dofs, problem.bulk, rows.copy()
+    convert = (bulk.in_units, bulk.from_units)
+    for i in range(4):  # two states and two forces
+        found[i, :n] = convert[(i < 2) != back](rows[i, :n])
+    return found
+
+
+def _positions(space: fem.FunctionSpace) -> Array:
+    """Coordinates of the owned nodes, (n, gdim).
+
+    Raises:
+        ValueError: Values are at no places.
+    """
+    gdim, dofmap = space.mesh.geometry.dim, space.dofmap
+    n_owned = dofmap.index_map.size_local
+    try:
+        bubbles = space.element.basix_element.family == basix.ElementFamily.bubble
+    except RuntimeError:  # a quadrature element has none
+        bubbles = False
+    if not bubbles:
+        return space.tabulate_dof_coordinates()[:n_owned, :gdim]
+    if dofmap.dof_layout.num_dofs != 1:
+        raise ValueError(
+            f"values in {space.ufl_element()} are at no points, and cannot be found again on other "
+            "ranks; take bubbles of one function a cell"
+        )
+    cells = dofmap.list[:, 0]
+    places = np.zeros((n_owned + dofmap.index_map.num_ghosts, gdim))
+    places[cells] = _middles(space.mesh)[: len(cells)]
+    return places[:n_owned]
+
+
 def _rows(field: fem.Function) -> Array:
     """Values at the owned nodes, (n_nodes, bs)."""
     dofmap = field.function_space.dofmap
@@ -700,7 +767,7 @@ def _node_places(space: fem.FunctionSpace) -> Array:
     np.add.at(sums, cells.ravel(), np.repeat(rows, cells.shape[1], axis=0))
     total.scatter_reverse(la.InsertMode.add)
     mean = sums[:n_owned, :gdim] / sums[:n_owned, gdim:]
-    return np.hstack([space.tabulate_dof_coordinates()[:n_owned, :gdim], mean])
+    return np.hstack([_positions(space), mean])
 
 
 def _point_places(contact: Contact) -> Array:

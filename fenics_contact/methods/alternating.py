@@ -143,7 +143,9 @@ class Alternation:
 
     def possible(self) -> bool:
         """Whether there are minimum problems, all of which the line search asks for energies."""
-        contacts = self._equations.contacts
+        contacts, full = self._equations.contacts, self._equations.full
+        if full.displacement.mixed:  # a saddle point, whatever the laws
+            return False
         return bool(contacts) and all(contact.freezes for contact in contacts)
 
     def _pressure(self) -> Array:

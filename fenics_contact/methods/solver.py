@@ -93,8 +93,11 @@ METHODS: dict[str, dict[str, Any]] = {
     "alternating": {},
     "continuation": {},
 }
-# Of some of them with a nonlinear bulk: far from a solution the tangent need not point downwards
-# along which `cp` looks for a root, and cells may turn inside out, whereupon `bt` steps shorter.
+# Those that go down towards a least energy, by which K is measured, too.
+_OF_MINIMA = ("lbfgs", "alternating")
+# Of some of them with a nonlinear bulk, or at a saddle point: far from a solution the tangent need
+# not point downwards along which `cp` looks for a root, and cells may turn inside out, whereupon
+# `bt` steps shorter.
 _NONLINEAR: dict[str, dict[str, Any]] = {
     "newton": {"snes_linesearch_type": "bt", "snes_linesearch_max_it": 40},
 }
@@ -200,9 +203,15 @@ class Solver:
         self.condensed = self._choose_condensation()
         self._full.linear_kind = self._choose_linear_solver()
         self._set_system()
-        cheap = self.condensed or not self._full.bulk.linear
+        plain = self._full.bulk.linear and not self._full.displacement.mixed
+        cheap = self.condensed or not plain
         self.method = settings.method or ("newton" if cheap else "lbfgs")
-        globalised = {} if self._full.bulk.linear else _NONLINEAR.get(self.method, {})
+        if self._full.displacement.mixed and self.method in _OF_MINIMA:
+            raise ValueError(
+                f"method is {self.method!r}, but u is a part of a mixed function, whose equations "
+                'are those of a saddle point and not of a minimum; use "newton" or "continuation"'
+            )
+        globalised = {} if plain else _NONLINEAR.get(self.method, {})
         options.set(_COMMON | METHODS[self.method] | globalised, prefix)
         quasi_newton = options.get(prefix + "snes_type") == PETSc.SNES.Type.QN
         newton = linear.newton_options(self.system.linear_kind)
@@ -351,7 +360,7 @@ class Solver:
 
     def _all_kept(self, everything: Indices) -> bool:
         """Whether contact touches so little that all of it is kept. Collective."""
-        return all_kept(self._full.unknowns.n_global, self._count(everything), len(self._full.u))
+        return all_kept(self._full.unknowns.n_global, self._count(everything), self._full.gdim)
 
     def _nearest(self, at_least: int = 0, away: Sequence[Array] | None = None) -> Indices:
         """Unknowns to keep: where bodies are nearest to each other. Collective.
@@ -367,7 +376,7 @@ class Solver:
             for contact in self._full.contacts:
                 contact.evaluate()
             away = [distances(contact) for contact in self._full.contacts]
-        for_nothing = inexpensive(self._full.unknowns.n_global, len(self._full.u))
+        for_nothing = inexpensive(self._full.unknowns.n_global, self._full.gdim)
         return nearest(
             self._full.operators,
             self._full.unknowns,
@@ -396,7 +405,7 @@ class Solver:
         return self._nearest(0, away) if anew else kept
 
     def _worthwhile(self, kept: Indices) -> bool:
-        n, gdim = self._full.unknowns.n_global, len(self._full.u)
+        n, gdim = self._full.unknowns.n_global, self._full.gdim
         return worthwhile(n, self._count(kept), gdim)
 
     def chooses(self) -> bool:

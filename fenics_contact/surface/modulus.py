@@ -13,6 +13,7 @@ from dolfinx import fem
 
 from fenics_contact import compat
 from fenics_contact.parallel import global_min
+from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_cells
 from fenics_contact.surface.mass import assembled, mass_solver
 from fenics_contact.surface.surface import ContactSurface
@@ -25,7 +26,7 @@ _SMOOTHING_FACETS = 4.0
 
 
 def cell_modulus(
-    bulk_tangent: ufl.Form, u: fem.Function, weight: ufl.core.expr.Expr
+    bulk_tangent: ufl.Form, displacement: Displacement, weight: ufl.core.expr.Expr
 ) -> fem.Function:
     """Young's modulus of every cell as the bulk form itself has it. Collective.
 
@@ -35,30 +36,37 @@ def cell_modulus(
     y for others.
     Both fields have no radial part, so that they serve axisymmetric forms too.
 
+    In a mixed form the stiffness of the volume is not that of displacements alone: E is 3 G, that
+    of an incompressible body.
+
     Args:
-        bulk_tangent: Bilinear form of the bulk, by (trial, test) of ``u``'s space.
-        u: The displacement, where a nonlinear bulk is linearised.
+        bulk_tangent: Bilinear form of the bulk, by (trial, test) of what is solved for.
+        displacement: In it, where a nonlinear bulk is linearised.
         weight: Factor of the volume measure that the bulk form carries (thickness, 2πr).
 
     Returns:
         A function, one value per cell (stress).
     """
-    space = u.function_space
+    space, u = displacement.whole.function_space, displacement.u
     cells = [i for i in bulk_tangent.integrals() if i.integral_type() == "cell"]
     test, trial = bulk_tangent.arguments()
     # Both energies and the volume as the components of one form: compiled and assembled at once.
     three = fem.functionspace(space.mesh, ("DG", 0, (3,)))
     q = ufl.TestFunction(three)
     form = weight * q[2] * ufl.dx(space.mesh)
-    x = space.tabulate_dof_coordinates()
+    x = u.function_space.tabulate_dof_coordinates()
+    dofs = np.arange(u.x.array.size) if displacement.dofs is None else displacement.dofs
     for direction in range(2):
         field = fem.Function(space)
-        field.x.array[1 :: len(u)] = x[:, direction]
+        field.x.array[dofs[1 :: len(u)]] = x[:, direction]
         form += ufl.replace(ufl.Form(cells), {test: q[direction] * field, trial: field})
     shear, stretch, volume = assembled(compat.compile_form(form)).reshape(-1, 3).T
     shear, stretch = shear / volume, stretch / volume
     isotropic = stretch > 1.2 * shear  # λ > -0.8 G: else no isotropic solid, and E is the stretch's
     modulus = fem.Function(fem.functionspace(space.mesh, ("DG", 0)), name="modulus")
+    if displacement.mixed:
+        modulus.x.array[:] = 3 * shear
+        return modulus
     modulus.x.array[:] = stretch
     G, M = shear[isotropic], stretch[isotropic]
     modulus.x.array[isotropic] = G * ((3 * M - 4 * G) / (M - G))

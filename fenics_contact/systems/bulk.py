@@ -1,4 +1,9 @@
-"""The user's bulk form as a map u -> F(u) with a tangent, treated once where it is linear."""
+"""The user's bulk form as a map u -> F(u) with a tangent, treated once where it is linear.
+
+Of a mixed function the parts beside the displacement, such as pressures, are counted in units of
+their own: with them they are lengths, and their equations forces, as large as those of
+displacements. So all that is judged by forces, or scaled by stiffness, can be.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +20,18 @@ from petsc4py import PETSc
 from fenics_contact import compat
 from fenics_contact.parallel import collective_errors, global_max, global_min
 from fenics_contact.surface.dependence import Dependence
+from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.mass import assembled
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Indices
 
 __all__ = ["Bulk"]
+
+# By the root of the stiffness of both, a coupling that is more than round-off.
+_COUPLED = 1e-8
+_OF_ONE = (
+    ": several fields are solved for as one function w of a mixed element, whose residual has the "
+    "test functions v, q = ufl.TestFunctions(W)"
+)
 
 
 class Bulk:
@@ -27,6 +40,9 @@ class Bulk:
     Attributes:
         form: The residual, UFL.
         space: Of ``u``.
+        displacement: What of ``u`` is one.
+        units: Of every dof of this rank, ghosts too: values over units are what all others see, and
+            residuals times units; None: all are 1. They stay as they are from the first `update`.
         tangent_form: Its derivative by ``u``, UFL.
         linear: Whether F is affine in ``u``: then its tangent is assembled once, a residual is a
             product with it, and loads are assembled once an increment.
@@ -36,18 +52,26 @@ class Bulk:
             nonlinear bulk on that of the first tangent, so that it is one unit all the way.
     """
 
-    def __init__(self, form: ufl.Form, u: fem.Function) -> None:
+    def __init__(self, form: ufl.Form, displacement: Displacement) -> None:
         """Differentiate and compile. Collective.
+
+        Args:
+            form: The residual.
+            displacement: In what is solved for.
 
         Raises:
             ValueError: ``form`` is no residual in the space of ``u``.
         """
+        u = displacement.whole
         if not isinstance(form, ufl.Form):
             raise ValueError(
                 f"F is a {type(form).__name__}; it must be the UFL residual of the bulk, such as "
                 "inner(sigma(u), epsilon(v))*dx - inner(load, v)*ds"
+                + (_OF_ONE if isinstance(form, list | tuple) else "")
             )
         arguments = form.arguments()
+        if any(argument.part() is not None for argument in arguments):
+            raise ValueError(f"F is in parts, by the test functions of several spaces{_OF_ONE}")
         if len(arguments) != 1:
             raise ValueError(
                 f"F has {len(arguments)} arguments; it must be a residual in one TestFunction and "
@@ -55,17 +79,28 @@ class Bulk:
             )
         space = arguments[0].ufl_function_space()
         if space != u.function_space:
-            raise ValueError("the TestFunction of F and u are of different function spaces")
+            raise ValueError(
+                "the TestFunction of F and u are of different function spaces"
+                + ("; take v, q = ufl.TestFunctions(W) of that of w" if displacement.mixed else "")
+            )
         if u not in form.coefficients():
             raise ValueError(
                 "F does not depend on u: write the residual with the Function u itself"
+                + (", by its parts of ufl.split(w)" if displacement.mixed else "")
             )
-        self._u = u
+        for other in form.coefficients():
+            if other is not u and np.shares_memory(other.x.array, u.x.array):
+                raise ValueError(
+                    f"F has {other.name!r}, a part of u as w.sub(i) gives it, which its derivative "
+                    "by u does not know; take the parts of ufl.split(w)"
+                )
+        self._u, self.displacement = u, displacement
+        self.units: Array | None = None
         self.form, self.space = form, u.function_space
         derivative = ufl.derivative(form, u, ufl.TrialFunction(u.function_space))
         self.tangent_form = ufl.algorithms.expand_derivatives(derivative)
         self.linear = u not in self.tangent_form.coefficients()
-        self._volumes = None if self.linear else _Volumes(u)
+        self._volumes = None if self.linear else _Volumes(displacement)
         kinds = dict.fromkeys(integral.integral_type() for integral in form.integrals())
         parts = (_Part(form, kind, u) for kind in kinds)
         self._parts = [part for part in parts if not part.empty]
@@ -75,6 +110,9 @@ class Bulk:
         self.scale = 0.0
         self._load = fem.Function(u.function_space)  # F(0)
         self._image = fem.Function(u.function_space)
+        self._state = fem.Function(u.function_space)  # u in units, if there are any
+        dofmap = u.function_space.dofmap
+        self._n_owned: int = dofmap.index_map.size_local * dofmap.index_map_bs
         tangent = self.tangent_form
         self._dependence = Dependence(tangent.constants(), tangent.coefficients())
 
@@ -115,7 +153,13 @@ class Bulk:
         self.stiffness.assemble()
         diagonal = self.stiffness.getDiagonal()
         if self.linear or not self.scale:
-            self.scale = diagonal.norm(PETSc.NormType.NORM_INFINITY)
+            of_displacement = self.displacement.within(np.ones(self.displacement.n_owned))
+            sizes = np.abs(diagonal.array_r * of_displacement)
+            self.scale = global_max(self._u.function_space.mesh.comm, sizes)
+        if self.displacement.mixed:
+            self._take_units()
+            diagonal.destroy()
+            diagonal = self.stiffness.getDiagonal()
         self.symmetric = self._is_symmetric(diagonal)
         diagonal.destroy()
         if self.linear:
@@ -130,6 +174,7 @@ class Bulk:
             return
         matrix = fem.petsc.assemble_matrix(self._compiled_tangent)
         matrix.assemble()
+        self._in_units(matrix)
         try:
             yield matrix
         finally:
@@ -171,8 +216,13 @@ class Bulk:
         """F(u) at this rank's owned dofs; a linear bulk needs `update_load` before. Collective."""
         if not self.linear:
             return self.assemble_residual()
-        self.stiffness.mult(self._u.x.petsc_vec, self._image.x.petsc_vec)
-        return self._owned(self._image) + self._owned(self._load)
+        state = self._u
+        if self.units is not None:
+            state = self._state
+            state.x.array[:] = self._u.x.array / self.units
+        self.stiffness.mult(state.x.petsc_vec, self._image.x.petsc_vec)
+        n = self._n_owned
+        return self._image.x.array[:n] + self._owned(self._load)
 
     def assemble_residual(self) -> Array:
         """F(u) by assembly, whatever the bulk. Collective."""
@@ -181,7 +231,7 @@ class Bulk:
             for part in self._parts:
                 part.assemble(self._image.x.array)
         self._image.x.scatter_reverse(dolfinx.la.InsertMode.add)
-        return self._owned(self._image).copy()
+        return self._owned(self._image)
 
     def is_inverted(self) -> bool:
         """Whether cells are turned inside out by ``u``. Collective.
@@ -192,8 +242,64 @@ class Bulk:
         return self._volumes is not None and not self._volumes.least() > 0
 
     def _owned(self, function: fem.Function) -> Array:
-        dofmap = function.function_space.dofmap
-        return function.x.array[: dofmap.index_map.size_local * dofmap.index_map_bs]
+        """A residual at this rank's owned dofs, by its unit; a copy."""
+        values = function.x.array[: self._n_owned]
+        return values.copy() if self.units is None else values * self.units[: self._n_owned]
+
+    def in_units(self, values: Array) -> Array:
+        """Values of ``u`` at dofs of this rank, from the first on, as all others see them; a copy.
+
+        The other way round: `from_units`.
+        """
+        return values.copy() if self.units is None else values / self.units[: values.size]
+
+    def from_units(self, values: Array) -> Array:
+        """The inverse of `in_units`."""
+        return values.copy() if self.units is None else values * self.units[: values.size]
+
+    def _take_units(self) -> None:
+        """Measure the units, the first time, and put `stiffness` in them. Collective."""
+        if self.units is None:
+            units = fem.Function(self.space)
+            units.x.array[:] = 1.0
+            for _, dofs in self.displacement.others:
+                units.x.array[dofs] = self._unit(dofs)
+            self.units = units.x.array
+        self._in_units(self.stiffness)
+
+    def _unit(self, dofs: Indices) -> float:
+        """Of a part: with it what couples it to displacements is as stiff as these. Collective.
+
+        A part that is coupled to others alone, or by round-off as bubbles are, is as stiff in
+        itself.
+        """
+        mask = np.zeros(self._n_owned)
+        mask[dofs[dofs < self._n_owned]] = 1.0
+        displacements = self.displacement.within(np.ones(self.displacement.n_owned))
+        coupling = self._block_size(mask, displacements)
+        own = self._block_size(mask, mask)
+        if coupling > _COUPLED * np.sqrt(self.scale * own):
+            return self.scale / coupling
+        return float(np.sqrt(self.scale / own)) if own > 0 else 1.0
+
+    def _block_size(self, rows: Array, columns: Array) -> float:
+        """Largest sum of absolute values in a row of a block of `stiffness`. Collective."""
+        block = self.stiffness.copy()
+        left, right = block.createVecLeft(), block.createVecRight()
+        left.array[:], right.array[:] = rows, columns
+        block.diagonalScale(left, right)
+        size = float(block.norm(PETSc.NormType.NORM_INFINITY))
+        for item in (block, left, right):
+            item.destroy()
+        return size
+
+    def _in_units(self, matrix: PETSc.Mat) -> None:
+        """Put a tangent in the units. Collective."""
+        if self.units is not None:
+            scaling = matrix.createVecLeft()
+            scaling.array[:] = self.units[: self._n_owned]
+            matrix.diagonalScale(scaling, scaling)
+            scaling.destroy()
 
     def _is_symmetric(self, probe: PETSc.Vec) -> bool:
         """Compare products with the matrix and its transpose for one rough vector."""
@@ -213,9 +319,10 @@ class Bulk:
 class _Volumes:
     """Change of volume det(I + grad u) at points of the bulk, twice as many as u needs."""
 
-    def __init__(self, u: fem.Function) -> None:
+    def __init__(self, displacement: Displacement) -> None:
         """Compile. Collective."""
-        mesh, degree = u.function_space.mesh, 2 * u.function_space.ufl_element().degree
+        u, mesh = displacement.expression, displacement.u.function_space.mesh
+        degree = 2 * displacement.degree
         element = basix.ufl.quadrature_element(mesh.topology.cell_name(), degree=degree)
         space = fem.functionspace(mesh, element)
         measure = ufl.Measure("dx", mesh, metadata={"quadrature_degree": degree})

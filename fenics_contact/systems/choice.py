@@ -33,12 +33,14 @@ def obstacle_to_condensation(
     Raises:
         ValueError: It is wanted and cannot be had.
     """
-    unknowns, gdim = full.unknowns, len(full.u)
+    unknowns, gdim = full.unknowns, full.gdim
     obstacle = None
     if not full.contacts:
         obstacle = "there is no contact"
     elif not full.bulk.linear:
         obstacle = "the bulk is not linear in u"
+    elif full.displacement.mixed:
+        obstacle = "displacements are a part of what is solved for"
     elif named:
         obstacle = f"the options name a linear solver ({', '.join(named)})"
     elif linear_solver == "multigrid":
@@ -81,10 +83,21 @@ def linear_kind(
         named: Options given that name a linear solver; they win.
         symmetric: Whether the matrix of H₀ is.
         tangent_symmetric: Whether the consistent tangent is.
+
+    Raises:
+        ValueError: The caller wants what cannot work.
     """
     kind, reason = wanted, "the caller's choice"
+    if full.displacement.mixed:
+        if kind == "multigrid":
+            raise ValueError(
+                "linear_solver is 'multigrid', but u is a part of a mixed function, whose "
+                "equations are those of a saddle point, which multigrid of displacements does not "
+                "solve; use 'direct', or leave it out"
+            )
+        return "direct", "displacements are a part of what is solved for"
     if kind is None:
-        n, gdim = full.unknowns.first_motion, len(full.u)
+        n, gdim = full.unknowns.first_motion, full.gdim
         n_bytes = linear.factor_bytes(n, gdim, symmetric=symmetric)
         if not tangent_symmetric:  # L-BFGS keeps the factors of both
             n_bytes += linear.factor_bytes(n, gdim, symmetric=False)

@@ -216,7 +216,7 @@ class CondensedSystem(System):
     def prepare(self, ksp: PETSc.KSP, matrix: PETSc.Mat) -> None:
         """Have a solver factor a matrix of `matrix` where contact acts, and the rest once."""
         if self._places is None:
-            gdim, space = len(self.u), self.u.function_space
+            gdim, space = self.gdim, self.u.function_space
             nodes = space.tabulate_dof_coordinates()[self._kept_dofs // gdim]
             nowhere = np.full(self.unknowns.n_motions, np.nan)
             whole, gathered = self.unknowns.whole, self.unknowns.gathered

@@ -10,7 +10,9 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
+from fenics_contact.parallel import global_max
 from fenics_contact.surface.bodies import connected_bodies
+from fenics_contact.surface.displacement import Displacement
 from fenics_contact.systems import linear
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.forces import Forces
@@ -22,9 +24,10 @@ __all__ = ["FullSystem"]
 
 
 class FullSystem(System):
-    """All unknowns: the displacement's dofs and the free motions of supports.
+    """All unknowns: the dofs of what is solved for and the free motions of supports.
 
     Attributes:
+        displacement: What of it is one.
         stiffness: The bulk's tangent over all unknowns, after `update_stiffness`.
     """
 
@@ -36,21 +39,29 @@ class FullSystem(System):
 
     def __init__(
         self,
-        u: fem.Function,
+        displacement: Displacement,
         unknowns: Unknowns,
         bulk: Bulk,
         contacts: Sequence[Contact],
         constrained: Mask,
     ) -> None:
         """Take over the parts of a problem. Collective."""
-        n, body = connected_bodies(u.function_space)
+        u, space = displacement.whole, displacement.u.function_space
+        n, body = connected_bodies(space)
         n_motions = sum(len(contact.free_motion) for contact in contacts)
-        dofs = np.repeat(body, len(u))[: unknowns.n_dofs]
+        dofs = np.repeat(body, space.dofmap.bs)[: unknowns.n_dofs]
+        if displacement.mixed:  # that of the cells around
+            label = np.zeros(u.x.array.size, dtype=body.dtype)
+            label[u.function_space.dofmap.list] = body[space.dofmap.list[:, :1]]
+            dofs = label[: unknowns.n_dofs]
+        self.displacement = displacement
         motions = n + np.arange(n_motions)
         label = unknowns.joined(dofs.astype(np.float64), motions.astype(np.float64))
         super().__init__(
             u, unknowns, bulk, contacts, constrained, label.astype(np.intp), n + n_motions
         )
+        moves = displacement.within(np.ones(displacement.n_owned))
+        self._moves: Mask = unknowns.joined(moves, np.ones(n_motions)) > 0
         self.stiffness: PETSc.Mat | None = None
         self._near_nullspace: PETSc.NullSpace | None = None
 
@@ -69,13 +80,24 @@ class FullSystem(System):
 
     def state(self) -> Array:
         """The present unknowns of this rank; a copy."""
-        return self.unknowns.joined(self.u.x.array[: self.unknowns.n_dofs], self.motions())
+        values = self.bulk.in_units(self.u.x.array[: self.unknowns.n_dofs])
+        return self.unknowns.joined(values, self.motions())
 
     def set_state(self, state: Array) -> None:
         """Make a state the present one. Collective."""
-        self.u.x.array[: self.unknowns.n_dofs] = state[: self.unknowns.n_dofs]
+        n = self.unknowns.n_dofs
+        self.u.x.array[:n] = self.bulk.from_units(state[:n])
         self.u.x.scatter_forward()
+        self.displacement.follow()
         self.set_motions(state)
+
+    def terms(self, state: Array) -> Array:
+        """See `System.terms`; a constraint on displacements sums up these. Collective."""
+        terms = super().terms(state)
+        if not self.displacement.mixed:
+            return terms
+        moved = min(global_max(self.unknowns.comm, np.abs(state[self._moves])), self.farthest)
+        return np.where(self._moves, terms, self.bulk.scale * moved)
 
     def part(self, state: Array) -> Array:
         """All of it."""
@@ -135,7 +157,8 @@ class FullSystem(System):
                 part.destroy()
         matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
-        if matrix.getBlockSize() == len(self.u):  # no supports move freely
+        # Not where supports move freely, or pressures are unknown, too.
+        if matrix.getBlockSize() == self.gdim and not self.displacement.mixed:
             if self._near_nullspace is None:
                 self._near_nullspace = linear.near_nullspace(self.u.function_space)
             matrix.setNearNullSpace(self._near_nullspace)

@@ -42,15 +42,16 @@ class ContactOperator:
 
         Args:
             contact: The contact.
-            unknowns: Those of a problem, or a selection of them; none: the dofs of ``contact.u``
-                alone.
+            unknowns: Those of a problem, or a selection of them; none: the dofs that are solved
+                for alone.
             first_motion: Number of this contact's first free motion among all of the unknowns.
         """
         self.contact = contact
-        self.unknowns = unknowns or Unknowns(contact.u.function_space)
+        displacement = contact.displacement
+        self.unknowns = unknowns or Unknowns(displacement.whole.function_space)
         self._gdim = contact.surface.mesh.geometry.dim
         self._first = self.unknowns.first_motion + first_motion
-        self._of_bodies = self.unknowns.widened(contact.jump_map)
+        self._of_bodies = self.unknowns.widened(displacement.lifted(contact.jump_map))
         self.within = self._find_within()
         self._motions: PETSc.Mat | None = None
         self._map = self._of_bodies

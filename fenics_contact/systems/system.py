@@ -34,7 +34,8 @@ class System(ABC):
     """States, forces and matrices over some unknowns of a problem.
 
     Attributes:
-        u: The displacement.
+        u: What is solved for.
+        gdim: Dimension of space.
         unknowns: The unknowns of the system.
         bulk: The bulk form.
         contacts: The contacts.
@@ -69,6 +70,7 @@ class System(ABC):
     ) -> None:
         """Take over the parts of a problem; see the attributes. Collective."""
         self.u, self.unknowns, self.bulk = u, unknowns, bulk
+        self.gdim: int = u.function_space.mesh.geometry.dim
         self.contacts, self.constrained = contacts, constrained
         self.label, self.n_bodies = label, n_bodies
         self.prescribed: Array = np.zeros(int(constrained.sum()))
