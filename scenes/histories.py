@@ -141,13 +141,13 @@ class Ramp(Slider, History):
 def picture(made: History) -> dict[str, Array]:
     """All that a state is, in an order that no distribution changes."""
     problem = made.problem
-    found = {"u": nodal(problem.u), "increment": np.array([problem.increment])}
+    found = {"u": _nodal(problem, problem.u), "increment": np.array([problem.increment])}
     field = fem.Function(problem.u.function_space)
     rows, _ = problem.committed_state()
     names = ("committed", "rate", "forces internal", "forces external")
     for name, values in zip(names, rows[:4], strict=True):
         owned(field)[:] = values[: problem.unknowns.n_dofs]
-        found[name] = nodal(field)
+        found[name] = _nodal(problem, field)
     for name, values in zip(names[:2], rows[:2], strict=True):
         found[f"{name} of supports"] = problem.unknowns.motions(values)
     energy = problem._committed_energy
@@ -167,6 +167,14 @@ def picture(made: History) -> dict[str, Array]:
         found[f"{c.name} counts"] = np.array([r.open, r.stick, r.slip, c.n_unpaired])
         found[f"{c.name} forces"] = np.r_[r.force, r.normal_force, r.tangential_force]
     return found
+
+
+def _nodal(problem: fc.ContactProblem, field: fem.Function) -> Array:
+    """Values of what is solved for, or a field like it, in an order of places."""
+    if not problem.displacement.mixed:
+        return nodal(field)
+    parts = range(field.function_space.num_sub_spaces)
+    return np.concatenate([nodal(field.sub(i).collapse()).ravel() for i in parts])
 
 
 def differences(a: History, b: History, tolerance: float) -> list[str]:

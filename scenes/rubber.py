@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import basix.ufl
 import dolfinx
 import numpy as np
 import ufl
@@ -15,13 +16,15 @@ import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic, NeoHookean
 from scenes.blocks import BOTTOM, TOP, block_mesh, dimension
 from scenes.comparing import at_points
-from scenes.elasticity import displacement_space
+from scenes.elasticity import displacement_space, strain
 from scenes.histories import History
 
 Array = np.ndarray
 
 # So that results are compared, and not what the solver leaves.
 TIGHT = {"snes_rtol": 1e-13}
+# Of displacement and pressure.
+MIXED = ("Taylor-Hood", "MINI")
 
 
 @dataclass
@@ -29,6 +32,8 @@ class Rubber:
     """A block; its top is Γc, in the middle of which is the origin of x (and y).
 
     Attributes:
+        u: What is solved for.
+        displacement: In it (UFL).
         F: Residual of the bulk.
         held: Displacement of the bottom.
     """
@@ -36,6 +41,7 @@ class Rubber:
     mesh: dolfinx.mesh.Mesh
     tags: dolfinx.mesh.MeshTags
     u: fem.Function
+    displacement: Any
     body: NeoHookean | LinearElastic
     F: ufl.Form
     held: fem.Function
@@ -56,7 +62,7 @@ class Rubber:
         """Of the top, by finite kinematics."""
         surface = fc.ContactSurface(self.mesh, self.tags, TOP)
         options = {"kinematics": "finite", "weight": self.body.weight} | options
-        return fc.Contact(self.u, surface, support, law, **options)
+        return fc.Contact(self.displacement, surface, support, law, **options)
 
     def problem(
         self, support: fc.Support, law: Any, *, contact: dict | None = None, **options: Any
@@ -76,22 +82,79 @@ def rubber(
     E: float = 1000.0,
     nu: float = 0.3,
     linear: bool = False,
+    mixed: str | None = None,
+    isochoric: bool = False,
+    kind: str | None = None,
     **mesh_arguments: Any,
 ) -> Rubber:
-    """A `Rubber` of the last of the sizes in height; ``linear``: at small strains instead."""
+    """A `Rubber` of the last of the sizes in height; ``linear``: at small strains instead.
+
+    ``mixed``: with a pressure, in one of `MIXED` elements, of which ``degree`` is not asked.
+    """
     d = dimension(cell)
     size = np.asarray(size or [2.0] * (d - 1) + [1.0])
     n = n if np.ndim(n) == 0 or len(n) == d else (n[0], n[0], n[1])
     mesh, tags = block_mesh(cell, n=n, size=size, **mesh_arguments)
     mesh.geometry.x[:, : d - 1] -= size[: d - 1] / 2
+    kind = kind or {2: "plane strain", 3: "3D"}[d]
+    if mixed:
+        return _mixed(mesh, tags, mixed, E, nu, kind, float(size[-1]), isochoric, linear)
     u = fem.Function(displacement_space(mesh, degree), name="u")
-    kind = {2: "plane strain", 3: "3D"}[d]
-    body = (LinearElastic if linear else NeoHookean)(u, E, nu, kind)
+    options = {} if linear else {"isochoric": isochoric}
+    body = (LinearElastic if linear else NeoHookean)(u, E, nu, kind, **options)
     held = fem.Function(u.function_space)
     dofs = fem.locate_dofs_topological(u.function_space, d - 1, tags.find(BOTTOM))
     bcs = [fem.dirichletbc(held, dofs)]
     F = body.residual(ufl.TestFunction(u.function_space), ufl.dx(mesh))
-    return Rubber(mesh, tags, u, body, F, held, bcs, float(size[-1]))
+    return Rubber(mesh, tags, u, u, body, F, held, bcs, float(size[-1]))
+
+
+def mixed_space(mesh: dolfinx.mesh.Mesh, name: str) -> fem.FunctionSpace:
+    """Displacement, bubbles if there are any, and pressure; the name is one of `MIXED`."""
+    cell, d = mesh.topology.cell_name(), mesh.geometry.dim
+    degree = 2 if name == "Taylor-Hood" else 1
+    parts = [basix.ufl.element("P", cell, degree, shape=(d,))]
+    if name == "MINI":
+        parts.append(basix.ufl.element("Bubble", cell, d + 1, shape=(d,)))
+    parts.append(basix.ufl.element("P", cell, 1))
+    return fem.functionspace(mesh, basix.ufl.mixed_element(parts))
+
+
+def split(fields: Sequence[Any]) -> tuple[Any, Any]:
+    """Displacement and pressure of the parts of a function, or test functions of both."""
+    first, *bubbles, last = fields
+    return sum(bubbles, first), last
+
+
+def _mixed(
+    mesh: dolfinx.mesh.Mesh,
+    tags: dolfinx.mesh.MeshTags,
+    name: str,
+    E: float,
+    nu: float,
+    kind: str,
+    height: float,
+    isochoric: bool,
+    linear: bool,
+) -> Rubber:
+    """A `Rubber` with a pressure."""
+    W = mixed_space(mesh, name)
+    w = fem.Function(W, name="w")
+    (u, p), (v, q) = split(ufl.split(w)), split(ufl.TestFunctions(W))
+    body = NeoHookean(u, E, nu, kind, isochoric=isochoric, pressure=p)
+    # UFL would take thousands of points a cell for bubbles in a nonlinear form.
+    dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 6} if name == "MINI" else {})
+    if linear:
+        G = E / (2 * (1 + nu))
+        work = 2 * G * ufl.inner(strain(u), strain(v)) - p * ufl.div(v)
+        F = (work - q * (ufl.div(u) + (1 - 2 * nu) / (2 * G * nu) * p)) * dx
+    else:
+        F = body.residual(v, dx, q=q)
+    space, _ = W.sub(0).collapse()
+    held = fem.Function(space)
+    dofs = fem.locate_dofs_topological((W.sub(0), space), tags.dim, tags.find(BOTTOM))
+    bcs = [fem.dirichletbc(held, dofs, W.sub(0))]
+    return Rubber(mesh, tags, w, u, body, F, held, bcs, height)
 
 
 def disc(

@@ -279,8 +279,11 @@ class Bulk:
         coupling = self._block_size(mask, displacements)
         own = self._block_size(mask, mask)
         if coupling > _COUPLED * np.sqrt(self.scale * own):
-            return self.scale / coupling
-        return float(np.sqrt(self.scale / own)) if own > 0 else 1.0
+            unit = self.scale / coupling
+        else:
+            unit = np.sqrt(self.scale / own) if own > 0 else 1.0
+        # A power of two, by which no digit is lost: a file has values, and a state is by units.
+        return float(2.0 ** np.round(np.log2(unit)))
 
     def _block_size(self, rows: Array, columns: Array) -> float:
         """Largest sum of absolute values in a row of a block of `stiffness`. Collective."""

@@ -1,0 +1,241 @@
+"""Contact on the displacement of a mixed function: nearly and fully incompressible bodies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+
+import fenics_contact as fc
+from fenics_contact import compat
+from fenics_contact.parallel import global_max
+from scenes.blocks import TOP, wave
+from scenes.comparing import (
+    assemble_matrix,
+    assemble_owned,
+    at_points,
+    close,
+    compiled,
+    owned,
+    shared_folder,
+)
+from scenes.histories import goes_on
+from scenes.rubber import MIXED, TIGHT, Tool, disc, rubber, split
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
+
+# Nearly as stiff against volume as against shape, then none, then linear at small strains.
+HOW = {
+    "Taylor-Hood": {"mixed": "Taylor-Hood", "nu": 0.4999},
+    "MINI": {"mixed": "MINI", "nu": 0.5},
+    "isochoric": {"mixed": "Taylor-Hood", "nu": 0.5, "isochoric": True},
+    "by force": {"mixed": "Taylor-Hood", "nu": 0.5, "force": True},
+    "augmented": {"mixed": "MINI", "nu": 0.4999, "contact": {"enforcement": "augmented"}},
+    "linear": {
+        "mixed": "Taylor-Hood",
+        "nu": 0.5,
+        "linear": True,
+        "solver": {"kinematics": np.inf},
+    },
+}
+
+
+def tool(how: str, cell: str = "triangle", **options) -> Tool:
+    """A block of few cells under a disc that presses, drags and turns."""
+    n = {"n": (8, 4)} if cell == "triangle" else {"n": (3, 2)}
+    return Tool(cell, **n, **HOW[how], **options)
+
+
+# ---- whole histories -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_history(how):
+    """Down, along, back and turned: all verdicts pass, which compare forces by a second route.
+
+    The reactions of the bottom, by assembly here, balance the contact force: 1e-10.
+    """
+    solver = {"second_route": True} | HOW[how].get("solver", {})
+    made = Tool("triangle", n=(8, 4), **{**HOW[how], "solver": {"petsc_options": TIGHT, **solver}})
+    scene, problem = made.scene, made.problem
+    form, part = compiled(scene.F), problem.displacement
+    held = fem.Function(part.u.function_space)
+    for step in made.increments():
+        assert not step.verdict.failures and step.verdict.routes
+        assert step.method in ("newton", "continuation")
+        forces = assemble_owned(form, scene.u.function_space)
+        forces[~problem.constrained[: forces.size]] = 0.0
+        reaction = np.zeros(scene.dim)
+        for i in range(scene.dim):
+            held.x.array[:] = 0.0
+            held.x.array[i :: scene.dim] = 1.0
+            reaction[i] = scene.mesh.comm.allreduce(part.within(owned(held)) @ forces)
+        assert close(-reaction, made.resultant(), 1e-10)
+    assert np.abs(made.resultant()).min() > 0.1
+
+
+@pytest.mark.parametrize("how", ["Taylor-Hood", "MINI", "by force", "augmented", "linear"])
+def test_going_on_from_a_file(how, tmp_path):
+    """Broken off while the tool turns, and taken up: the same digits on one rank, 1e-7 on more."""
+    goes_on(lambda: tool(how), shared_folder(tmp_path), stop=5)
+
+
+def test_in_space():
+    """Tetrahedra, pressed and dragged with friction by an isochoric body: verdicts pass."""
+    for how in ("Taylor-Hood", "MINI"):
+        made = tool(how, "tetrahedron")
+        for step in made.increments(1.5):
+            assert not step.verdict.failures
+        assert made.resultant()[-1] < -1.0
+
+
+def test_first_touch_in_increments_that_are_cut():
+    """A disc far away comes down in one increment: cut until it is followed, as 10 find it: 1e-7.
+
+    Without friction there is one answer.
+    """
+    ends = []
+    for steps in (1, 10):
+        made = Tool("triangle", n=(8, 4), law=fc.Frictionless(1e4), **HOW["MINI"])
+
+        def load(t, made=made):
+            made.shift.value[:] = made.vector(0.1, 0.5 - 0.8 * t)
+
+        *_, last = fc.increments(made.problem, load, 0.0, 1.0, steps=steps)
+        assert last.increment >= steps
+        ends.append(made.tractions())
+    assert np.abs(ends[1]).max() > 100.0
+    assert close(ends[0], ends[1], 1e-7)
+
+
+# ---- single states -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", MIXED)
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+def test_tangent_and_boundary_form(name, kinematics):
+    """Over the mixed unknowns: tangent by differences, 1e-6; form and tangent by DOLFINx, 1e-11.
+
+    In a state with points that stick, slip and are open.
+    """
+    scene = rubber("triangle", n=(8, 4), mixed=name, nu=0.5)
+    W, comm = scene.u.function_space, scene.mesh.comm
+    support = disc(scene, 0.8, displacement=(0.03, -0.1))
+    contact = scene.contact(support, fc.Coulomb(0.3, 1e3, 1e3), kinematics=kinematics)
+    operator = fc.ContactOperator(contact)
+    start, direction = (fem.Function(W) for _ in range(2))
+    for function, seed, size in ((start, 0, 0.03), (direction, 1, 1.0)):
+        function.sub(0).interpolate(lambda x, s=seed, a=size: a * wave(2, s)(x))
+
+    def force(step):
+        scene.u.x.array[:] = start.x.array + step * direction.x.array
+        vector = operator.unknowns.vector()
+        operator.add_force(vector)
+        return vector.array_r.copy()
+
+    difference = (force(1e-6) - force(-1e-6)) / 2e-6
+    forces = force(0.0)
+    tangent = operator.tangent()
+    product = tangent.createVecLeft()
+    tangent.mult(direction.x.petsc_vec, product)
+    size = global_max(comm, np.abs(difference))
+    assert size > 1.0
+    assert global_max(comm, np.abs(product.array_r - difference)) < 1e-6 * size
+    v, dw = split(ufl.TestFunctions(W))[0], ufl.TrialFunction(W)
+    assembled = assemble_owned(compiled(contact.form(v), contact), W)
+    assert global_max(comm, np.abs(assembled - forces)) < 1e-11 * global_max(comm, np.abs(forces))
+    theirs = assemble_matrix(compiled(contact.tangent(v, dw), contact))
+    other = theirs.createVecLeft()
+    theirs.mult(direction.x.petsc_vec, other)
+    assert global_max(comm, np.abs(other.array_r - product.array_r)) < 1e-11 * size
+    contact.evaluate()
+    r = contact.resultants()
+    assert min(r.open, r.stick, r.slip) > 0
+
+
+@pytest.mark.parametrize("how", ["Taylor-Hood", "linear"])
+def test_units(how):
+    """The same block in mm and MPa and in m and GPa: the same iterations, tractions to 1e-9."""
+    found = []
+    for length, stress in ((1.0, 1.0), (1e-3, 1e-3)):
+        scene = rubber(
+            "triangle",
+            n=(8, 4),
+            size=(2.0 * length, length),
+            E=1e3 * stress,
+            **{k: v for k, v in HOW[how].items() if k != "solver"},
+        )
+        shift = fem.Constant(scene.mesh, np.zeros(2))
+        law = fc.Coulomb(0.3, 1e4 * stress / length, 1e4 * stress / length)
+        problem, contact = scene.problem(
+            disc(scene, 0.8 * length, displacement=shift), law, kinematics=np.inf
+        )
+        iterations = []
+        for way in ((0.0, -0.05), (0.02, -0.1), (0.05, -0.1)):
+            shift.value[:] = np.array(way) * length
+            iterations.append(problem.solve().iterations)
+            problem.commit()
+        found.append((iterations, at_points(contact, contact.traction) / stress))
+    assert found[0][0] == found[1][0]
+    assert np.abs(found[0][1]).max() > 10.0
+    assert close(found[1][1], found[0][1], 1e-9)
+
+
+def test_cells_turned_inside_out_by_bubbles_are_seen():
+    """det(I + grad u) takes the bubbles in: they alone make it negative, or pass if smaller."""
+    scene = rubber("triangle", n=(4, 2), mixed="MINI", nu=0.5)
+    problem, _ = scene.problem(disc(scene, 0.8), fc.Frictionless(1e4))
+    _, bubbles = scene.u.function_space.sub(1).collapse()
+    for size, inverted in ((1e-3, False), (1.0, True)):
+        scene.u.x.array[:] = 0.0
+        scene.u.x.array[bubbles] = size
+        assert problem.bulk.is_inverted() is inverted
+
+
+def test_pressures_have_a_unit_by_which_their_equations_are_forces():
+    """Of a stress E/h: it is 1 for displacements and bubbles, to a factor of two and a half.
+
+    Residuals of the pressure's equations, times it, are what the residual of the problem has.
+    """
+    E = 1e3
+    for name in MIXED:
+        scene = rubber("triangle", n=(8, 4), mixed=name, nu=0.4999, E=E)
+        problem, _ = scene.problem(disc(scene, 0.8), fc.Frictionless(1e4))
+        units, parts = problem.bulk.units, [problem.displacement.dofs]
+        parts += [dofs for _, dofs in problem.displacement.others]
+        for dofs, expected in zip(parts, [1.0, *[1.0] * (len(parts) - 2), 4 * E], strict=True):
+            for unit in np.unique(units[dofs]):
+                assert expected / 2.5 <= unit <= 2.5 * expected, (name, expected)
+        owned(scene.u)[:] = 1e-3 * np.cos(np.arange(problem.unknowns.n_dofs) ** 2.0)
+        scene.u.x.scatter_forward()
+        raw = assemble_owned(compiled(scene.F), scene.u.function_space)
+        expected = raw * units[: raw.size]
+        assert np.abs(problem.bulk.assemble_residual() - expected).max(initial=0.0) < 1e-12 * E
+
+
+def test_the_stiffness_of_springs_follows_the_shear_modulus():
+    """E of a mixed form is 3 G, that of an incompressible body, whatever ν: 1e-9."""
+    for nu in (0.3, 0.5):
+        scene = rubber("triangle", n=(4, 2), mixed="Taylor-Hood", nu=nu, E=1e3)
+        problem, contact = scene.problem(disc(scene, 0.8), fc.Frictionless())
+        k_n, h = contact.values.parameters["k_n"], 0.5
+        assert problem.bulk.displacement.mixed
+        assert close(k_n, np.full_like(k_n, 10 * 3 * 1e3 / (2 * (1 + nu)) / h), 1e-9)
+
+
+def test_a_problem_without_contacts_finds_its_displacement():
+    """The one part that can be: the block squeezed keeps its volume where ν is 1/2, to 1e-6."""
+    scene = rubber("triangle", n=(6, 3), mixed="Taylor-Hood", nu=0.5)
+    W = scene.u.function_space
+    top = fem.Function(W.sub(0).collapse()[0])
+    top.interpolate(lambda x: np.vstack([0 * x[0], np.full_like(x[0], -0.1)]))
+    dofs = fem.locate_dofs_topological((W.sub(0), top.function_space), 1, scene.tags.find(TOP))
+    bcs = [*scene.bcs, fem.dirichletbc(top, dofs, W.sub(0))]
+    problem = fc.ContactProblem(scene.F, scene.u, bcs=bcs)
+    problem.solve()
+    volume = compat.compile_form(scene.body.J * ufl.dx(scene.mesh))
+    found = scene.mesh.comm.allreduce(fem.assemble_scalar(volume))
+    assert found == pytest.approx(2.0, rel=1e-6)
+    assert problem.displacement.u.x.array.size == top.x.array.size
+    assert global_max(scene.mesh.comm, np.abs(problem.displacement.u.x.array)) > 0.1
