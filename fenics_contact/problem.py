@@ -248,11 +248,8 @@ class ContactProblem:
         self.bulk.check_finite()
         self.full.update_stiffness()
         self.bulk.check_elastic()
-        waiting = [c for c in self.contacts if c.needs_modulus]
-        if waiting:
-            modulus = cell_modulus(self.bulk.tangent_form, self.displacement, waiting[0].weight)
-            for contact in waiting:
-                contact.set_modulus(modulus)
+        self._scaled = [c for c in self.contacts if c.needs_modulus]
+        self._measure_modulus()
         self.motions = RigidMotions(self.displacement, self.unknowns, self._motion_names())
         self.initial_penetration = self._check_start()
         self.motions.find_free(self.full.stiffness, self.constrained)
@@ -454,6 +451,14 @@ class ContactProblem:
         with self.solver.linearised(springs, self._load) as solve:
             yield solve
 
+    def _measure_modulus(self) -> None:
+        """Let stiffnesses that are multiples of E/h follow E of the bulk form. Collective."""
+        if self._scaled:
+            weight = self._scaled[0].weight
+            modulus = cell_modulus(self.bulk.tangent_form, self.displacement, weight)
+            for contact in self._scaled:
+                contact.set_modulus(modulus)
+
     # ---- solving ---------------------------------------------------------------------------------
 
     @interrupts_held()
@@ -480,7 +485,12 @@ class ContactProblem:
                 can balance.
         """
         start = time.perf_counter()
-        self._fresh = False
+        first, self._fresh = self._fresh, False
+        if first:
+            for contact in self.contacts:
+                contact.begin()
+            if not self.bulk.linear:  # whose tangent is that of u, and E may be another by now
+                self._measure_modulus()
         if self._pending_field is not None and not self.solver.is_current():
             self.complete()  # what it takes is about to go
         self.solver.equations.factorisations = 0
@@ -539,6 +549,8 @@ class ContactProblem:
         self.u.x.scatter_forward()
         solver.follow(before)
         stiffness_changed = self.full.update_stiffness()
+        if stiffness_changed and self.bulk.linear:
+            self._measure_modulus()
         self._approach()
         if solver.chooses():
             return None

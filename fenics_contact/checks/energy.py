@@ -72,8 +72,8 @@ class EnergyState:
         forces: At the unknowns, by the mark of the coordinates they are in.
         contacts: Of each contact the tractions on the body, its displacement relative to the
             support, and that of the support as far as it is prescribed: (3, n_points, gdim). Where
-            the support turns, the displacement relative to it in its frame, that of the body, and
-            the axes of the frame: (3 + gdim, n_points, gdim).
+            the support turns, the displacement relative to it in its frame, that of the body less
+            the free motion of the support, and the axes of the frame: (3 + gdim, n_points, gdim).
         springs: Energy in the contact's springs on this rank.
     """
 
@@ -145,7 +145,11 @@ def _ways(contact: Contact, traction: Array) -> Array:
     if not contact.turns:
         return np.stack([traction, jump, contact.values.shift])
     axes = [contact.turned(np.broadcast_to(unit, jump.shape)) for unit in np.eye(jump.shape[1])]
-    return np.stack([traction, jump, contact.own_displacement(), *axes])
+    # The work of forces that move the support is that of the loads.
+    own = contact.own_displacement()
+    for component, motion in contact.free_motion.items():
+        own[:, component] -= float(motion.value)
+    return np.stack([traction, jump, own, *axes])
 
 
 def _dot(one: Array, other: Array) -> Array:

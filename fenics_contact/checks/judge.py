@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fenics_contact.checks.kinematics import Linearisation, linearisation
+from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.verdict import Balance, Verdict, check_laws
 from fenics_contact.contact.contact import passing
@@ -112,6 +113,7 @@ class Judge:
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
             # Of the opposite only what Γc meets is known before u is complete.
             unseen=self._passing() if system is self._full else {},
+            obstacles={c.name: ObstacleCheck.of(c) for c in self._contacts if laws and c.rigid},
             kinematics=self._linearisation(respond) if respond else {},
             kinematics_allowed=self.kinematics,
             displacement=global_max(self._comm, np.abs(self._full.displacement.u.x.array))

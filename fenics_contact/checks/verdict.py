@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fenics_contact.checks.kinematics import Linearisation
+from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_max
 from fenics_contact.types import Array
@@ -71,6 +72,7 @@ class Verdict:
         enforcement_tolerance: What passes, by name.
         unseen: How deep the opposite body passes through Γc between its points (length), and where,
             by the names of the contacts where it does; see `Contact.unseen_penetration`.
+        obstacles: What is found of rigid supports, by contact.
         kinematics: What taking displacements as small changes, relative, by contact.
         kinematics_allowed: What passes; where it is finite no displacement passes that is more than
             ten times as large as the mesh, and as the motions and gaps that are imposed.
@@ -88,6 +90,7 @@ class Verdict:
     enforcement: dict[str, float] = field(default_factory=dict)
     enforcement_tolerance: dict[str, float] = field(default_factory=dict)
     unseen: dict[str, tuple[float, list[float]]] = field(default_factory=dict)
+    obstacles: dict[str, ObstacleCheck] = field(default_factory=dict)
     kinematics: dict[str, Linearisation] = field(default_factory=dict)
     kinematics_allowed: float = np.inf
     displacement: float = 0.0
@@ -197,6 +200,8 @@ class Verdict:
                 "cells are turned inside out, det(I + grad u) ≤ 0: no deformation of a body; load "
                 "in smaller steps (increments() cuts them by itself), or refine the mesh there"
             )
+        for contact, obstacle in self.obstacles.items():
+            found += obstacle.failures(contact)
         for contact, (depth, place) in self.unseen.items():
             found.append(
                 f"{contact}: the opposite body passes through Γc between its points, {depth:.3e} "

@@ -29,6 +29,7 @@ from fenics_contact.contact.inputs import Inputs
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
 from fenics_contact.contact.multipliers import Multipliers, TraceProjection
 from fenics_contact.contact.pairs import Pairs, PairsState
+from fenics_contact.contact.passage import Passage
 from fenics_contact.contact.point_data import PointData
 from fenics_contact.contact.point_law import PointLaw, PointTangent
 from fenics_contact.contact.results import PointResults
@@ -227,6 +228,7 @@ class Contact(PointResults):
             fields |= {"multiplier": 0}
         self.history = PointFields(self.quadrature, fields)
         self.committed_jump: Array = np.zeros((self.quadrature.n_points, gdim))
+        self._has_begun = False
 
         # All of contact is a sparse map from u to the jump at the points, and the law there: as
         # expressions for the form on Γc, and sampled at the points for all else.
@@ -241,15 +243,15 @@ class Contact(PointResults):
         self._acting = self._point_law
         self._frozen: tuple[PointLaw, fem.Function] | None = None  # and the pressure in it
         self._deformed = DeformedPlaces(self.quadrature, self._jump, placement)
+        numbers = support if isinstance(support, SampledSupport) else None
+        self._passage = Passage(self.quadrature, numbers or self._support_at)
         self._projection: TraceProjection | None = None
         self._stretch: PointEvaluator | None = None
         self._own_form: Any = None
         self._values: PointValues | None = None
         if not self.rigid:
             self.pair()
-        if self.finite and law.has_friction:
-            self._start_history()
-            self.restore()
+        self._count_from(self._own_jump())
 
     # ---- construction ----------------------------------------------------------------------------
 
@@ -314,20 +316,6 @@ class Contact(PointResults):
             PointLaw(law, sampled, at_points, self.quadrature, self._jump, acts=acts, free=free),
         )
 
-    def _start_history(self) -> None:
-        """Let slip be counted from where the undeformed Γc begins. Collective."""
-        x = ufl.SpatialCoordinate(self.surface.mesh)
-        if isinstance(self.support, SampledSupport):
-            places = SampledPlaces(self.quadrature, self.support, x)
-            places.update()
-            place = places.at(x)
-        else:
-            place = self._support_at(x)
-        start = {"jump": place.gap * place.normal, "normal": place.normal}
-        found = PointEvaluator(self.quadrature, start)()
-        zeros = {name: self.history.values(name) for name in self.history.names}
-        self.history.commit(zeros | found)
-
     def _choose_enforcement(
         self, enforcement: str | None, tolerance: float | None
     ) -> tuple[bool, float]:
@@ -368,7 +356,7 @@ class Contact(PointResults):
             return Placement(self.pairs.distance, ufl.FacetNormal(mesh))
         x = ufl.SpatialCoordinate(mesh)
         if self.finite:
-            check_rigid(self.name, self.inputs.shift)
+            check_rigid(self.name, self.inputs.shift, self.inputs.rotation)
         if self._sampled is None and not self.finite:
             return self._support_at(x, self.inputs.shift)
         if self._sampled is None:
@@ -632,14 +620,18 @@ class Contact(PointResults):
 
     def _update_points(self) -> None:
         """Let the points be at the present ``u`` and data. Collective."""
-        self.displacement.follow()
-        self.jump_map.mult(self.u.x.petsc_vec, self._jump.x.petsc_vec)
-        self._jump.x.scatter_forward()
+        self._update_jump()
         self._update_data()
         if self._view is not None:
             if self._sampled is not None:
                 self._sampled[1].update()
             self._view.update()
+
+    def _update_jump(self) -> None:
+        """Let the displacement at the points be the present one. Collective."""
+        self.displacement.follow()
+        self.jump_map.mult(self.u.x.petsc_vec, self._jump.x.petsc_vec)
+        self._jump.x.scatter_forward()
 
     def _update_data(self) -> None:
         """Let what does not follow from ``u`` be as it was given last. Collective."""
@@ -885,6 +877,45 @@ class Contact(PointResults):
             return places.values("distance"), places.values("normal")
         return self._deformed()
 
+    def distance_slope(self) -> Array:
+        """Length of the gradient of the gap where points are, (n_points,): 1 of a distance.
+
+        At X with small displacements, at X + u with finite ones. Collective.
+        """
+        n_points = len(self.values.x)
+        if self._view is not None:
+            return np.asarray(np.linalg.norm(self._view.values("slope"), axis=1))
+        if self.support.is_distance:
+            return self._data.values["direction_length"].copy()
+        return np.ones(n_points)
+
+    def support_curvature(self) -> Array:
+        """Second derivatives of the distance at X + u, (n_points, gdim, gdim) (1/length).
+
+        Collective.
+
+        Raises:
+            ValueError: Displacements are taken as small.
+        """
+        if self._view is None:
+            raise ValueError(f'{self.name}: there is none without kinematics="finite"')
+        turns = [self._view.values(f"turn {i}") for i in range(self._gdim)]
+        by_place = -np.stack(turns, axis=1)
+        return np.asarray(by_place + by_place.swapaxes(1, 2)) / 2
+
+    def passed_through(self) -> Mask:
+        """Points that have gone through a rigid support since the last commit, (n_points,).
+
+        On straight ways in its frame, with finite kinematics. Collective.
+
+        Raises:
+            ValueError: Displacements are taken as small.
+        """
+        if not self.finite:
+            raise ValueError(f'{self.name}: there is none without kinematics="finite"')
+        x, jump = self.points, self.values.jump
+        return self._passage.through(x + self.committed_jump, x + jump)
+
     def gap_deviation(self) -> tuple[Array, Array]:
         """True gap minus the linearised one, and the true normals: at X + u, not X. Collective.
 
@@ -1063,6 +1094,45 @@ class Contact(PointResults):
             values |= self.multipliers.committed(points)
         return Found(points, values)
 
+    def begin(self) -> None:
+        """Let slip be counted from the present ``u``, if nothing has been committed. Collective.
+
+        The support is where it was given, not displaced. `ContactProblem` calls it before its
+        first increment; the constructor has done so for the ``u`` of then.
+        """
+        if self._has_begun:
+            return
+        jump = self._own_jump()
+        if global_max(self.surface.mesh.comm, np.abs(jump - self.committed_jump)) > 0:
+            self._count_from(jump)
+
+    def _own_jump(self) -> Array:
+        """Displacement relative to what lies opposite, or of the body alone. Collective."""
+        self._update_jump()
+        rows = self._jump.x.array.reshape(-1, self._gdim)
+        return np.array(rows[: self.quadrature.n_points])
+
+    def _count_from(self, jump: Array) -> None:
+        """Let slip be counted from a displacement, the present one. Collective."""
+        self.committed_jump = jump
+        if self.law.has_friction:
+            start = {name: self.history.values(name) for name in self.history.names}
+            start["jump"] = jump
+            self.history.commit(start | (self._begin_on_support() if self.finite else {}))
+            self.restore()
+
+    def _begin_on_support(self) -> dict[str, Array]:
+        """The foot, minus X, and the normal there, with finite kinematics. Collective."""
+        x = ufl.SpatialCoordinate(self.surface.mesh) + self._jump
+        if isinstance(self.support, SampledSupport):
+            places = SampledPlaces(self.quadrature, self.support, x)
+            places.update()
+            place = places.at(x)
+        else:
+            place = self._support_at(x)
+        foot = self._jump + place.gap * place.normal
+        return PointEvaluator(self.quadrature, {"jump": foot, "normal": place.normal})()
+
     def commit(self, found: Found | None = None) -> None:
         """Make a state the history of the next increment. Collective.
 
@@ -1073,6 +1143,7 @@ class Contact(PointResults):
             self.evaluate()
             found = self.found()
         points, values = found.points, dict(found.history)
+        self._has_begun = True
         self.history.commit(values)
         self._values, self.committed_jump = points, points.jump
         if self.pairs_anew:
@@ -1093,7 +1164,7 @@ class Contact(PointResults):
     def set_committed(self, state: Committed) -> None:
         """Make a state the committed one again; `restore` drops what came after it. Collective."""
         self.history.set_rows(state.history)
-        self.committed_jump = state.jump
+        self.committed_jump, self._has_begun = state.jump, True
         self.pairs.set_state(state.pairs)
 
     def take_up(self, history: Array, values: Mapping[str, Array]) -> None:
@@ -1108,7 +1179,7 @@ class Contact(PointResults):
             # The pairs by which they were as deep as that are gone.
             self._find_pairs(self.u, values.get("depth"))
         self.restore()
-        self.committed_jump = self.values.jump
+        self.committed_jump, self._has_begun = self.values.jump, True
         mine = self.values.arrays
         if {n: v.shape for n, v in values.items()} == {n: v.shape for n, v in mine.items()}:
             self._values = PointValues.of(values)

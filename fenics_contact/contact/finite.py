@@ -311,13 +311,19 @@ def _turned(vector: Any, before: Any, normal: Any) -> Any:
     return tangential(cosine * vector + ufl.cross(axis, vector) + share * axis, normal)
 
 
-def check_rigid(name: str, shift: Any) -> None:
-    """Refuse a support that is displaced by other amounts at other points.
+def check_rigid(name: str, shift: Any, rotation: tuple[Any, Any] | None) -> None:
+    """Refuse a support that is displaced or turned by other amounts at other points.
 
     Raises:
         ValueError: It says what to give.
     """
-    if shift is not None and extract_type(shift, (ufl.SpatialCoordinate, ufl.Coefficient)):
+    varies = (ufl.SpatialCoordinate, ufl.Coefficient)
+    if rotation is not None and any(extract_type(ufl.as_ufl(e), varies) for e in rotation):
+        raise ValueError(
+            f"{name}: the Rotation differs from point to point, or depends on u; a support is "
+            "rigid: give numbers or constants"
+        )
+    if shift is not None and extract_type(shift, varies):
         raise ValueError(
             f"{name}: the displacement of the support differs from point to point, and finite "
             "kinematics take a rigid support: give numbers or constants, and turn it by a Rotation"

@@ -253,10 +253,14 @@ class Solver:
         inside = newton_solver(equations.symmetric(False))
         alternation = Alternation(equations, options, prefix, inside)
         if settings.method == "alternating" and self._full.contacts and not alternation.possible():
-            laws = [type(c.law).__name__ for c in self._full.contacts if not c.freezes]
+            none = [c for c in self._full.contacts if not c.freezes]
+            laws = ", ".join(type(c.law).__name__ for c in none)
+            why = "not even under a given pressure"
+            if all(c.finite for c in none):
+                why = "where displacements are finite, whose tangent planes turn"
             raise ValueError(
-                f"method is 'alternating', but {', '.join(laws)} has no potential, not even under "
-                "a given pressure: there is nothing to minimise; use another method"
+                f"method is 'alternating', but {laws} has no potential, {why}: there is nothing to "
+                "minimise; use another method"
             )
         inside = newton_solver(equations.symmetric(True))
         continuation = Continuation(equations, alternation, options, prefix, inside)
@@ -334,6 +338,12 @@ class Solver:
 
     def update_system(self, stiffness_changed: bool) -> None:
         """Follow changes of the pairs and of the bulk's tangent. Collective."""
+        self._update_pairs()
+        if stiffness_changed or not self.system.ready:
+            self.equations.factorisations += self.system.update()
+
+    def _update_pairs(self) -> None:
+        """Take the system and the matrices of the present pairs. Collective."""
         if self._pairings != self._present_pairings():
             if not self.condensed:
                 self._set_system()
@@ -346,8 +356,6 @@ class Solver:
             self._pairings = self._present_pairings()
             self.snes.reset()
             self._make_matrices()
-        if stiffness_changed or not self.system.ready:
-            self.equations.factorisations += self.system.update()
 
     # ---- the unknowns that are kept --------------------------------------------------------------
 
@@ -490,6 +498,7 @@ class Solver:
         change.array[:] = now - before
         if full.bulk.linear or not change.norm() > 0:
             return
+        self._update_pairs()
         full.set_state(before)
         full.update_stiffness()
         for contact in full.contacts:
@@ -677,12 +686,11 @@ class Solver:
             starts.append(self._followed)
             self._followed = None
         residuals += [equations.residual_at(start) for start in starts[1:]]
-        turned = predicts and len(starts) > 2 and residuals[0] < residuals[2]
-        turned &= _TURNED * residuals[0] < residuals[1]
         # A nonlinear bulk does not come back from far off: a support moved into open points.
-        near = predicts and residuals[1] <= _FAR * min(residuals)
-        if near and not turned and self._full.bulk.linear:
-            residuals[1] = 0.0
+        if predicts and self._full.bulk.linear and residuals[1] <= _FAR * min(residuals):
+            turned = len(starts) > 2 and residuals[0] < min(residuals[1] / _TURNED, residuals[2])
+            if not turned:
+                residuals[1] = 0.0
         return [starts[i] for i in np.argsort(residuals, kind="stable")]
 
     def _predicted(self, present: Array) -> Array:

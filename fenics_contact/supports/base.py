@@ -155,6 +155,11 @@ class Support:
     rotation: Rotation | None = None
 
     @property
+    def is_distance(self) -> bool:
+        """Whether the direction of `place` is the gradient of its gap, as it was given."""
+        return False
+
+    @property
     def is_flat(self) -> bool:
         """Whether s - u_n is the true gap wherever the body moves, and the normal constant."""
         return False

@@ -153,6 +153,11 @@ class Obstacle(Support):
                 "as lambda x: x[1]"
             )
 
+    @property
+    def is_distance(self) -> bool:
+        """See `Support.is_distance`."""
+        return self.distance is not None
+
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
         """Distance and its gradient at x, or what was given; see `Support.place`."""
         gdim = x.ufl_shape[0]

@@ -1,0 +1,75 @@
+"""Whether a rigid support is what contact takes it for, where the body has moved to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.values import Status
+from fenics_contact.parallel import global_max, global_min
+
+__all__ = ["ObstacleCheck"]
+
+
+# By how much the gradient of a distance may differ from 1 where contact is.
+_SLOPE = 0.05
+# Penetration by the radius of curvature that is left there: 1 is half of that of the support.
+_DEEP = 1.0
+
+
+@dataclass(frozen=True)
+class ObstacleCheck:
+    """Of one contact with a rigid support, the same on every rank.
+
+    Attributes:
+        slope: Length of the gradient of the distance at closed points, where it is farthest from 1.
+        depth: With finite kinematics the largest penetration, by the distance from there to the
+            centre of curvature of the support.
+        passed: Likewise a place of the undeformed Γc that has gone through the support to its other
+            side in this increment; None: there is none.
+    """
+
+    slope: float
+    depth: float
+    passed: list[float] | None
+
+    @classmethod
+    def of(cls, contact: Contact) -> ObstacleCheck:
+        """At the evaluated state of a contact. Collective."""
+        comm, closed = contact.surface.mesh.comm, contact.status != Status.OPEN
+        slopes = contact.distance_slope()[closed]
+        ends = global_min(comm, slopes, empty=1.0), global_max(comm, slopes, empty=1.0)
+        slope = max(ends, key=lambda value: abs(value - 1.0))
+        depth, passed = 0.0, None
+        if contact.finite and not contact.support.is_flat:
+            curvature = contact.support_curvature()[closed]
+            sunk = contact.values.penetration[closed]
+            bend = np.linalg.eigvalsh(curvature).max(axis=1, initial=0.0)
+            depth = global_max(comm, sunk * bend)
+            gone = comm.allgather(contact.points[contact.passed_through()].tolist())
+            passed = next((places[0] for places in gone if places), None)
+        return cls(slope, depth, passed)
+
+    def failures(self, contact: str) -> list[str]:
+        """What does not hold, in words."""
+        found = []
+        if not abs(self.slope - 1.0) <= _SLOPE:
+            found.append(
+                f"{contact}: the distance of the Obstacle changes by {self.slope:.3g} per length "
+                "where contact is, and not by 1: it is none; divide it by the length of its "
+                "gradient"
+            )
+        if not self.depth <= _DEEP:
+            found.append(
+                f"{contact}: a point is as deep in the support as half of its radius of curvature, "
+                "and about to come out on its other side; take a larger k_n, or "
+                'enforcement="augmented"'
+            )
+        if self.passed is not None:
+            found.append(
+                f"{contact}: the support has gone through Γc, at {np.round(self.passed, 6)}, in "
+                "one increment; load in smaller steps"
+            )
+        return found

@@ -1,0 +1,75 @@
+"""Whether points of Γc have gone through a rigid support, to its other side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+
+from fenics_contact.supports.base import Placement, SampledSupport
+from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
+from fenics_contact.types import Array, Mask
+
+__all__ = ["Passage"]
+
+
+# Places looked at between both ends of a way.
+_PLACES = 7
+# Of a way, by how much it is deeper in the support between its ends than at these.
+_DEEPER = 0.1
+
+
+class Passage:
+    """Of straight ways in the frame of a support; compiled when first needed.
+
+    A point that has slid round an edge, or along a curve, has its normal turned by less than a
+    right angle in an increment, or its way does not lead through the support.
+    """
+
+    def __init__(
+        self,
+        quadrature: SurfaceQuadrature,
+        support: Callable[[Any], Placement] | SampledSupport,
+    ) -> None:
+        """Bind.
+
+        Args:
+            quadrature: The points.
+            support: Gap and direction by a place in its frame (UFL), or the support itself.
+        """
+        self._quadrature, self._support = quadrature, support
+        self._place: fem.Function | None = None
+        self._evaluate: PointEvaluator | None = None
+
+    def through(self, before: Array, now: Array) -> Mask:
+        """Which points have passed through on the way from one place to another. Collective.
+
+        Args:
+            before: In the frame of the support, (n_points, gdim).
+            now: Likewise.
+        """
+        (first, turned), (last, normal) = self._sample(before), self._sample(now)
+        shares = np.arange(1, _PLACES + 1) / (_PLACES + 1)
+        between = np.min([self._sample(before + t * (now - before))[0] for t in shares], axis=0)
+        deeper = np.minimum(first, last) - between
+        far = _DEEPER * np.linalg.norm(now - before, axis=1)
+        opposite = np.sum(turned * normal, axis=1) < 0
+        return np.asarray(opposite & (between < 0) & (deeper > far))
+
+    def _sample(self, place: Array) -> tuple[Array, Array]:
+        """Distances and unit normals at places. Collective."""
+        if isinstance(self._support, SampledSupport):
+            found = self._support.sample(place)
+            return found.distance, found.normal
+        if self._place is None or self._evaluate is None:
+            self._place = fem.Function(self._quadrature.space(place.shape[1]), name="place")
+            seen = self._support(self._place)
+            self._evaluate = PointEvaluator(
+                self._quadrature, {"gap": seen.gap, "normal": seen.normal}
+            )
+        self._place.x.array[: place.size] = place.ravel()
+        self._place.x.scatter_forward()
+        values = self._evaluate()
+        return values["gap"], values["normal"]

@@ -1,0 +1,220 @@
+"""What the verdict says of rigid supports: no distance, too deep, on the other side.
+
+And how they meet what was given late: E, a start, a motion by force beside a turn.
+"""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.elasticity import NeoHookean
+from scenes.blocks import BOTTOM, TOP, block, kirchhoff
+from scenes.comparing import close, gathered
+from scenes.elasticity import hold
+from scenes.rubber import rubber
+from scenes.two_blocks import LOWER, UPPER, two_blocks
+
+COMM = MPI.COMM_WORLD
+pytestmark = pytest.mark.mpi
+
+
+def roller(scene, radius, shift, **options):
+    """A cylinder that just touches the middle of the top."""
+    return fc.Cylinder((0.0, scene.height + radius), radius, displacement=shift, **options)
+
+
+def level_set(scene, radius, *, true, shift):
+    """The same by a function that is zero on it, divided by the length of its gradient if true."""
+    top = scene.height + radius
+
+    def distance(x):
+        square = x[0] ** 2 + (x[1] - top) ** 2
+        value = square - radius**2
+        return value / (2 * ufl.sqrt(square)) if true else value
+
+    return fc.Obstacle(distance=distance, displacement=shift)
+
+
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+def test_what_is_no_distance_is_refused(kinematics):
+    """x² - R² in place of |x| - R has slope 2 R; over twice |x| it is one to p/2R, 1e-3 here."""
+    radius, forces = 2.0, []
+    for true in (True, False, None):
+        scene = rubber(n=(12, 4), linear=True)
+        shift = fem.Constant(scene.mesh, (0.0, -0.01))
+        support = roller(scene, radius, shift)
+        if true is not None:
+            support = level_set(scene, radius, true=true, shift=shift)
+        options = {"kinematics": kinematics}
+        problem, contact = scene.problem(support, fc.Coulomb(0.2), contact=options)
+        if true is False:
+            with pytest.raises(
+                fc.NotConverged, match=r"changes by (3\.9|4)\d* per length .*it is none"
+            ):
+                problem.solve()
+        else:
+            problem.solve()
+            forces.append(contact.resultants().force[1])
+    assert forces[0] == pytest.approx(forces[1], rel=1e-2)
+
+
+def test_a_support_that_sinks_in_is_refused():
+    """Soft springs, a small roller: refused before it comes out on its other side.
+
+    Every increment that passes has more force than the one before, and no point is deeper than
+    half of the radius.
+    """
+    radius, forces = 0.3, []
+    scene = rubber(n=(8, 4), E=10.0, nu=0.49)
+    shift = fem.Constant(scene.mesh, np.zeros(2))
+    problem, contact = scene.problem(roller(scene, radius, shift), fc.Coulomb(0.2, 50.0, 50.0))
+
+    def load(t):
+        shift.value[1] = -t
+
+    with pytest.raises(fc.NotConverged, match="half of its radius of curvature"):
+        for _ in fc.increments(problem, load, 0.0, 0.9, steps=9, max_cuts=2):
+            found = contact.resultants()
+            forces.append(found.normal_force)
+            assert found.max_penetration <= 0.51 * radius
+    assert len(forces) >= 3
+    assert np.all(np.diff(forces) > 0)
+
+
+def test_a_support_that_goes_through_in_one_increment_is_refused():
+    """A roller as thick as half of what it goes down by: nothing of Γc touches it there."""
+    radius = 0.15
+    scene = rubber(n=(16, 4), E=10.0)
+    shift = fem.Constant(scene.mesh, (0.0, -0.45))
+    problem, contact = scene.problem(roller(scene, radius, shift), fc.Frictionless(1e3))
+    contact.evaluate()
+    gone = gathered(COMM, contact.passed_through())
+    x = gathered(COMM, contact.points)[:, 0]
+    # Those that the roller has passed over: straight down, in its middle half and more.
+    assert gone[np.abs(x) < 0.5 * radius].all() and not gone[np.abs(x) > radius].any()
+    with pytest.raises(fc.NotConverged, match=r"gone through|half of its radius"):
+        problem.solve()
+
+
+def test_sliding_round_a_support_is_no_passage():
+    """Points that go a quarter of the way round a roller, outside of it or on it."""
+    scene = rubber(n=(16, 4), E=10.0)
+    shift = fem.Constant(scene.mesh, np.zeros(2))
+    _, contact = scene.problem(roller(scene, 1.0, shift), fc.Frictionless(1e3))
+    for angle in (0.2, 0.8, 1.4):
+        # Γc is flat: all of it turned about the middle of the roller.
+        c, s = np.cos(angle), np.sin(angle)
+        centre = np.array([[0.0], [scene.height + 1.0]])
+        turn = np.array([[c, -s], [s, c]])
+        scene.u.interpolate(lambda x, t=turn, m=centre: t @ (x[:2] - m) + m - x[:2])
+        contact.forget()
+        assert not contact.passed_through().any()
+
+
+def test_a_turn_that_differs_from_point_to_point_is_refused():
+    scene = rubber(n=(4, 2))
+    x = ufl.SpatialCoordinate(scene.mesh)
+    for angle in (0.1 * x[0], scene.u[0]):
+        turn = fc.Rotation(angle, about=(0.0, 2.0))
+        support = roller(scene, 1.0, (0.0, 0.0), rotation=turn)
+        with pytest.raises(ValueError, match="Rotation differs from point to point"):
+            scene.contact(support, fc.Coulomb(0.2))
+
+
+def test_work_of_a_force_beside_a_turn():
+    """A roller driven by a force that may turn, and does not: the work is force times way.
+
+    By hand ½ (f₀ + f₁) Δv; to the solver's tolerance.
+    """
+    scene = rubber(n=(8, 4), linear=True)
+    force, angle = fem.Constant(scene.mesh, 0.0), fem.Constant(scene.mesh, 0.0)
+    motion = fc.Motion(force=(None, force), displacement=(0.0, None))
+    turn = fc.Rotation(angle, about=(0.0, 2.0))
+    problem, contact = scene.problem(roller(scene, 1.0, motion, rotation=turn), fc.Coulomb(0.3))
+    before = 0.0
+    for number in (1, 2):
+        force.value = -20.0 * number
+        energy = problem.solve().energy
+        problem.commit()
+        now = float(contact.free_motion[1].value)
+        work = -10.0 * (2 * number - 1) * (now - before)
+        before = now
+        assert energy.work == pytest.approx(work, rel=1e-8)
+        assert abs(energy.imbalance) <= 1e-8 * work
+
+
+@pytest.mark.parametrize("linear", [True, False])
+def test_stiffness_follows_a_modulus_that_is_set_late(linear):
+    """E set after the problem was made: as if it had been there, 10 E/h; 1e-6."""
+    forces = []
+    for first in (1000.0, 1.0):
+        scene = block("quadrilateral", n=(6, 3), E=first)
+        shift = fem.Constant(scene.mesh, (0.0, 0.01))
+        held = [scene.hold(TOP, i) for i in range(2)]
+        law = {"displacement": shift}
+        if not linear:
+            scene.F = kirchhoff(scene)
+        problem, contact = scene.problem(fc.Coulomb(0.3), held, contact=law)
+        scene.E.value = 1000.0
+        problem.solve()
+        forces.append(contact.resultants().force)
+    assert close(np.array(forces[0]), np.array(forces[1]), 1e-6)
+    assert forces[0][1] > 1.0
+
+
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+@pytest.mark.parametrize("late", [False, True])
+def test_slip_is_counted_from_the_start(kinematics, late):
+    """A body that stands aside at first, without load, and is pressed straight down: no slip.
+
+    As from u = 0, to the round-off of so large a displacement. ``late``: it is moved after the
+    problem was made.
+    """
+    forces = []
+    for aside in (0.0, 0.3):
+        scene = rubber(n=(8, 4), linear=True)
+        plate = fc.HalfSpace((0.0, 1.0), (0.0, -1.0), displacement=(0.0, -0.001))
+        if late:
+            problem, contact = scene.problem(
+                plate, fc.Coulomb(0.2), contact={"kinematics": kinematics}
+            )
+        for field in (scene.u, scene.held):
+            field.interpolate(lambda x, a=aside: np.array([a + 0 * x[0], 0 * x[0]]))
+        if not late:
+            problem, contact = scene.problem(
+                plate, fc.Coulomb(0.2), contact={"kinematics": kinematics}
+            )
+        problem.solve()
+        problem.commit()
+        forces.append(contact.resultants().force)
+    assert close(np.array(forces[0]), np.array(forces[1]), 1e-6)
+    assert abs(forces[0][1]) > 1.0
+
+
+def test_rubber_on_rubber_with_pairs_found_anew():
+    """A nonlinear bulk whose top is moved, and pairs that change with every commit.
+
+    The force is that of one increment to what pairs found anew change, 1 %.
+    """
+    ends = []
+    for steps in (1, 4):
+        mesh, tags = two_blocks("triangle", (8, 3), (2.0, 1.0), 0.5)
+        space = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
+        u, v = fem.Function(space), ufl.TestFunction(space)
+        body = NeoHookean(u, 10.0, 0.3, "plane strain")
+        move = [fem.Constant(mesh, 0.0) for _ in range(2)]
+        bcs = [hold(u, tags, BOTTOM, i) for i in range(2)]
+        bcs += [hold(u, tags, TOP, i, value) for i, value in enumerate(move)]
+        base = fc.DeformableBody(tags, LOWER, update="increment")
+        contact = fc.Contact(u, fc.ContactSurface(mesh, tags, UPPER), base, fc.Frictionless())
+        problem = fc.ContactProblem(body.residual(v), u, bcs=bcs, contacts=[contact])
+        for number in range(1, steps + 1):
+            move[1].value = -0.05 * number / steps
+            problem.solve()
+            problem.commit()
+        ends.append(contact.resultants().normal_force)
+    assert ends[1] == pytest.approx(ends[0], rel=1e-2)
+    assert ends[0] > 0.1
