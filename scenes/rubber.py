@@ -18,6 +18,7 @@ from scenes.blocks import BOTTOM, TOP, block_mesh, dimension
 from scenes.comparing import at_points
 from scenes.elasticity import displacement_space, strain
 from scenes.histories import History
+from scenes.surfaces import ball, circle, ring
 
 Array = np.ndarray
 
@@ -157,16 +158,38 @@ def _mixed(
     return Rubber(mesh, tags, w, u, body, F, held, bcs, height)
 
 
+SHAPES = ("ball", "profile", "facets")
+
+
 def disc(
-    scene: Rubber, radius: float, *, displacement: Any = None, angle: Any = None, **options: Any
-) -> fc.Ball:
-    """A rigid disc or ball that touches the middle of the top; it turns about its centre."""
+    scene: Rubber,
+    radius: float,
+    *,
+    displacement: Any = None,
+    angle: Any = None,
+    axis: Sequence[float] = (0, 1, 0),
+    shape: str = "ball",
+) -> fc.Support:
+    """A rigid disc or ball that touches the middle of the top; it turns about its centre.
+
+    ``shape``: "ball" is exact; "profile" is a spline through 60 points, turned in space; "facets"
+    are 24 segments in the plane, 512 triangles in space.
+    """
     d = scene.dim
-    centre = (0.0,) * (d - 1) + (scene.height + radius,)
-    turn = None
-    if angle is not None:
-        turn = fc.Rotation(angle, centre, None if d == 2 else options.pop("axis", (0, 1, 0)))
-    return fc.Ball(centre, radius, displacement=displacement, rotation=turn)
+    centre = np.array((0.0,) * (d - 1) + (scene.height + radius,))
+    turn = None if angle is None else fc.Rotation(angle, centre, None if d == 2 else axis)
+    move = {"displacement": displacement, "rotation": turn}
+    if shape == "ball":
+        return fc.Ball(centre, radius, **move)
+    if shape == "facets":
+        if d == 2:
+            return fc.RigidSurface(circle(24, radius, centre), ring(24), **move)
+        return fc.RigidSurface(*ball(3, radius, centre), **move)
+    if d == 2:
+        return fc.RigidProfile(circle(60, radius, centre), closed=True, **move)
+    t = np.linspace(-np.pi / 2, np.pi / 2, 31)
+    half = centre + radius * np.column_stack([np.cos(t), np.zeros(31), np.sin(t)])
+    return fc.RigidProfile(half, turned=(centre, (0, 0, 1)), **move)
 
 
 class Tool(History):
@@ -184,6 +207,7 @@ class Tool(History):
         radius: float = 0.8,
         contact: dict | None = None,
         force: bool = False,
+        shape: str = "ball",
         solver: dict | None = None,
         **options: Any,
     ) -> None:
@@ -195,6 +219,7 @@ class Tool(History):
             radius: Of the disc.
             contact: Arguments of the `Contact`.
             force: Whether the disc is pressed by a force, ``down``, instead of a displacement.
+            shape: Of the disc, see `disc`.
             solver: Arguments of the problem.
             options: Of `rubber`.
         """
@@ -210,7 +235,7 @@ class Tool(History):
             motion = fc.Motion(
                 force=(*(None,) * (d - 1), self.down), displacement=(self.side, *still, None)
             )
-        support = disc(self.scene, radius, displacement=motion, angle=self.angle)
+        support = disc(self.scene, radius, displacement=motion, angle=self.angle, shape=shape)
         self.problem, self.contact = self.scene.problem(
             support,
             law or fc.Coulomb(0.3, 1e4, 1e4),

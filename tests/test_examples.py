@@ -22,6 +22,7 @@ NUMBER = r"(-?[\d.]+(?:e[-+]\d+)?)"
 PRINTED = {
     "ball_on_block": (r"largest pressure {} MPa\s+Hertz: {} MPa", 0.03),
     "block_on_floor": (r"T = {} N/mm, μ N = {} N/mm; points that stick: 0", 1e-5),
+    "cam": (r"work of the torque {} mJ/mm, stored {} mJ/mm", 5e-3),
     "drum": (r"torque {} N mm/mm, μ R ∫p = {} N mm/mm", 5e-3),
     "hysteresis": (r"friction takes {} mJ/mm a cycle; area of the loop {} mJ/mm", 1e-5),
     "own_law": (r"closed up by {} mm; h ln\(p/p0\) = {} mm", 1e-5),
@@ -41,7 +42,7 @@ def run(path: Path, folder: Path, ranks: int) -> str:
     return done.stdout
 
 
-def test_there_are_five() -> None:
+def test_each_is_run_and_named() -> None:
     """Each of them is run below, and named in the README."""
     assert sorted(PRINTED) == NAMES
     readme = (ROOT / "README.md").read_text()

@@ -14,6 +14,7 @@ from fenics_contact.parallel import global_max
 from scenes.blocks import CELLS, TOP, wave
 from scenes.comparing import raised_everywhere
 from scenes.rubber import disc, rubber
+from scenes.surfaces import ball, circle, ring
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
 
@@ -24,6 +25,7 @@ LAWS = {
     "nearly all stick": fc.Coulomb(5.0, K, K),
     "Tresca": fc.Tresca(0.3, 20.0, K, K),
 }
+SHAPES = ["plane", "ball", "cavity", "cylinder", "ellipsoid", "profile", "facets"]
 IN_SPACE = {
     "polygon": fc.Coulomb(0.3, K, K, modes=5),
     "ellipse": fc.Coulomb(0.3, K, K, transverse_friction=0.6, direction=(1, 0, 0)),
@@ -42,7 +44,28 @@ def supports(scene, shift, angle):
         "cavity": fc.Ball((*side, top - 1.5), 1.6, inside=True, **move),
         "cylinder": fc.Cylinder(middle, 0.8, None if d == 2 else (0.2, 1, 0.1), **move),
         "ellipsoid": fc.Obstacle(distance=lambda x: _ellipsoid(x, middle), **move),
+        "profile": _lens(middle, move),
+        "facets": _gem(middle, move),
     }
+
+
+def _lens(middle, move):
+    """A smooth bump that is not round; in space on one side turned about a slanting axis."""
+    t = np.linspace(-0.9, 0.9, 19)
+    if len(middle) == 2:
+        down = np.column_stack([t, 0.6 * t**2 + 0.1 * t**3 - 0.8])
+        return fc.RigidProfile((np.array(middle) + down)[::-1], **move)
+    axis = np.array([0.0, 0.6, 0.8])
+    out = t[t > -1e-9]
+    points = np.outer(out, [1, 0, 0]) + np.outer(0.6 * out**2 - 0.8, axis) + middle
+    return fc.RigidProfile(points[::-1], turned=(middle, axis), **move)
+
+
+def _gem(middle, move):
+    """Few large facets, with edges and corners in the middle of Γc."""
+    if len(middle) == 2:
+        return fc.RigidSurface(circle(7, 0.85, middle), ring(7), **move)
+    return fc.RigidSurface(*ball(1, 0.85, middle), **move)
 
 
 def _ellipsoid(x, middle):
@@ -91,7 +114,7 @@ def states(scene, contact, shift, angle, n=3):
         contact.commit()
 
 
-@pytest.mark.parametrize("shape", ["plane", "ball", "cavity", "cylinder", "ellipsoid"])
+@pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("cell", CELLS)
 def test_derivatives(cell, shape):
     """Tangents against differences, over a history in which open, stick and slip all occur.
@@ -114,16 +137,20 @@ def test_derivatives(cell, shape):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
-@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
-def test_the_boundary_form_is_the_same(cell, enforcement):
+@pytest.mark.parametrize(
+    ("shape", "enforcement"),
+    [("ball", "penalty"), ("ball", "augmented"), ("profile", "penalty"), ("facets", "augmented")],
+)
+def test_the_boundary_form_is_the_same(cell, shape, enforcement):
     """`Contact.form` and its tangent have the expressions of the support, and not samples of them.
 
-    Nodal forces and products with the tangent agree to round-off, 1e-11.
+    Of a support from data they have its expansion about where it was sampled last. Nodal forces
+    and products with the tangent agree to round-off, 1e-11.
     """
     scene = rubber(cell, 1, n=(4, 2))
     v, du = (f(scene.u.function_space) for f in (ufl.TestFunction, ufl.TrialFunction))
     shift, angle = (fem.Constant(scene.mesh, x) for x in (np.zeros(scene.dim), 0.0))
-    support = supports(scene, shift, angle)["ball"]
+    support = supports(scene, shift, angle)[shape]
     contact = scene.contact(support, fc.Coulomb(0.3, K, K), enforcement=enforcement)
     comm, operator = scene.mesh.comm, fc.ContactOperator(contact)
     maps = contact.entity_maps

@@ -23,6 +23,8 @@ HOW = {
     "by force": {"force": True},
     "linear": {"linear": True, "solver": {"kinematics": np.inf}},
     "frictionless": {"law": fc.Frictionless(1e4)},
+    "profile": {"shape": "profile"},
+    "facets": {"shape": "facets", "force": True},
 }
 
 

@@ -13,8 +13,8 @@ __all__ = ["Facets"]
 
 Numbers = npt.NDArray[np.intp]
 
-# Of the size of the surface: distance from an edge within which the direction to it is round-off,
-# and difference of two distances that are the same.
+# Of the size of the surface: distance from an edge within which the direction to it is round-off;
+# and difference of two distances that are the same, within which a place is at an edge or corner.
 _AT_EDGE, _SAME = 1e-9, 1e-12
 # A facet of less than this share of its longest edge in height has no normal.
 _FLAT = 1e-10
@@ -140,16 +140,22 @@ class Facets:
         feet = corners[:, :edges] + share[:, :, None] * spans[:, :edges]
         if d == 2:
             share, foot = share[:, 0], feet[:, 0]
-            feature = np.where(share <= 0.0, 1, np.where(share >= 1.0, 2, 0))
-            return foot, feature
+            away = np.linalg.norm(x[:, None, :] - corners, axis=2)
+            at = away <= _SAME * self.size
+            begins, ends = (share <= 0.0) | at[:, 0], (share >= 1.0) | at[:, 1]
+            return foot, np.where(begins, 1, np.where(ends, 2, 0))
         normal = self._normals[facet, 0]
         inward = np.cross(normal[:, None, :], spans)
         inside = np.all(np.einsum("nki,nki->nk", arms, inward) >= 0.0, axis=1)
         rows = np.arange(len(x))
-        best = np.argmin(np.sum((x[:, None, :] - feet) ** 2, axis=2), axis=1)
+        away = np.linalg.norm(x[:, None, :] - feet, axis=2)
+        best = np.argmin(away, axis=1)
+        inside &= away[rows, best] > _SAME * self.size
         along = share[rows, best]
-        at_end = np.where(along <= 0.0, 4 + best, 4 + (best + 1) % 3)
-        feature = np.where((along <= 0.0) | (along >= 1.0), at_end, 1 + best)
+        reach = _SAME * self.size / np.sqrt(square[rows, best])
+        begins, ends = along <= reach, along >= 1.0 - reach
+        at_end = np.where(begins, 4 + best, 4 + (best + 1) % 3)
+        feature = np.where(begins | ends, at_end, 1 + best)
         height = np.einsum("ni,ni->n", arms[:, 0], normal)
         flat = x - height[:, None] * normal
         foot = np.where(inside[:, None], flat, feet[rows, best])
