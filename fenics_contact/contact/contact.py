@@ -442,6 +442,8 @@ class Contact(PointResults):
         Args:
             v: Test function of ``u``'s space, of a mixed function the part of the test function
                 that ``ufl.split`` gives. Compile with ``entity_maps=contact.entity_maps``.
+                With a `SampledSupport` call `evaluate` before assembling, wherever ``u`` or the
+                support has moved: the form has the expansion about where it was sampled last.
 
         Raises:
             ValueError: A stiffness is `Scaled` and the modulus is not known; or the support is
