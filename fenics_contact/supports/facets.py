@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fenics_contact.supports.base import Sample
+from fenics_contact.supports.refinement import refined
 from fenics_contact.supports.search import FacetSearch
 from fenics_contact.types import Array, Mask
 
@@ -37,20 +38,29 @@ class Facets:
         size: Its largest extent, or coordinate (length).
     """
 
-    def __init__(self, points: Array, facets: Numbers) -> None:
+    def __init__(
+        self, points: Array, facets: Numbers, halvings: int = 0, sharp: float = 0.0
+    ) -> None:
         """Make normals and search.
 
         Args:
             points: Corners, (n, d); equal ones are one.
             facets: Numbers of the corners, (m, d).
+            halvings: How often triangles are `refined` towards a smooth surface.
+            sharp: Angle of edges that it keeps (radians).
 
         Raises:
             ValueError: No facet has a normal, or neighbours are turned against each other.
         """
-        self.points, number = np.unique(points, axis=0, return_inverse=True)
-        facets = number.reshape(-1)[facets]
-        ordered = np.sort(facets, axis=1)
-        self.facets = facets[np.all(ordered[:, 1:] > ordered[:, :-1], axis=1)]
+        self.points, self.facets = _welded(points, facets)
+        if halvings:
+            corners = self.points[self.facets]
+            beyond = _beyond(self.facets, len(self.points))
+            parts = refined(corners, _facet_normals(corners)[0], beyond, halvings, sharp)
+            d = points.shape[1]
+            self.points, self.facets = _welded(
+                parts.reshape(-1, d), np.arange(parts[:, :, 0].size).reshape(-1, d)
+            )
         self.size = float(np.abs(self.points).max())
         corners = self.points[self.facets]
         normals, has = _facet_normals(corners)
@@ -87,7 +97,8 @@ class Facets:
                 across = np.linalg.norm(np.cross(one, other), axis=1)
                 angle = np.arctan2(across, np.einsum("ij,ij->i", one, other))
                 np.add.at(at_corners, self.facets[:, k], angle[:, None] * normals)
-            neighbour = _neighbours(self.facets, len(self.points))
+            beyond = _beyond(self.facets, len(self.points))
+            neighbour = np.where(beyond < 0, -1, beyond // 3)
             beside = np.where((neighbour >= 0)[:, :, None], normals[neighbour], 0.0)
             whole = np.concatenate([whole, whole + beside], axis=1)
             borders[:, 1:] = neighbour < 0
@@ -162,6 +173,14 @@ class Facets:
         return foot, np.where(inside, 0, feature)
 
 
+def _welded(points: Array, facets: Numbers) -> tuple[Array, Numbers]:
+    """Distinct corners, and the facets that have as many of them."""
+    distinct, number = np.unique(points, axis=0, return_inverse=True)
+    facets = number.reshape(-1)[facets]
+    ordered = np.sort(facets, axis=1)
+    return distinct, facets[np.all(ordered[:, 1:] > ordered[:, :-1], axis=1)]
+
+
 def _facet_normals(corners: Array) -> tuple[Array, Mask]:
     """Unit normals of facets, zero where there is none, and where there are: (n, d), (n,)."""
     spans = np.roll(corners, -1, axis=1) - corners
@@ -176,15 +195,15 @@ def _facet_normals(corners: Array) -> tuple[Array, Mask]:
     return normals / length[:, None], has
 
 
-def _neighbours(facets: Numbers, n_points: int) -> Numbers:
-    """Of every edge of triangles the triangle beyond it, -1 where there is none: (n, 3)."""
+def _beyond(facets: Numbers, n_points: int) -> Numbers:
+    """Of every edge of triangles the number of its other side, -1 where there is none: (n, 3)."""
     start, end = facets, np.roll(facets, -1, axis=1)
     forward = (start * n_points + end).ravel()
     backward = (end * n_points + start).ravel()
     keys, first, counts = np.unique(forward, return_index=True, return_counts=True)
     _check_order(counts, np.ones_like(counts))
     place = np.minimum(np.searchsorted(keys, backward), len(keys) - 1)
-    found = np.where(keys[place] == backward, first[place] // 3, -1)
+    found = np.where(keys[place] == backward, first[place], -1)
     return np.asarray(found.reshape(-1, 3), dtype=np.intp)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,9 @@ __all__ = ["RigidSurface", "as_points", "fingerprint_of"]
 class RigidSurface(SampledSupport):
     """A rigid support given by its surface: triangles in space, in the plane a polyline.
 
-    Facets are flat: the normal jumps from one to the next. Points within the support are pushed
-    out through the closest facet. An open surface must reach beyond where contact may be: points
-    from which its border is closest are outside.
+    Facets are flat: the normal jumps from one to the next, by less with ``halvings``. Points within
+    the support are pushed out through the closest facet. An open surface must reach beyond where
+    contact may be: points from which its border is closest are outside.
 
     Attributes:
         facets: The surface, as it is searched.
@@ -34,6 +35,8 @@ class RigidSurface(SampledSupport):
         points: npt.ArrayLike,
         facets: npt.ArrayLike,
         *,
+        halvings: int = 0,
+        sharp: float = np.pi / 6,
         displacement: Any = None,
         rotation: Rotation | None = None,
     ) -> None:
@@ -44,6 +47,10 @@ class RigidSurface(SampledSupport):
             facets: Numbers of the corners of each facet, (n_facets, gdim): in space anticlockwise
                 as seen from outside, as in an STL file; in the plane with the support on the left
                 of the way.
+            halvings: How often the edges of triangles are halved, towards the smooth surface that
+                they stand for: each makes four triangles of one, and angles half as large.
+            sharp: Angle between neighbours (radians) from which on the edge is one of the surface
+                itself, and stays; borders stay, too.
             displacement: See `Support`.
             rotation: Likewise.
 
@@ -64,8 +71,16 @@ class RigidSurface(SampledSupport):
                 f"facets of the RigidSurface have numbers from {numbers.min()} to {numbers.max()}; "
                 f"there are {len(corners)} points: give numbers from 0 to {len(corners) - 1}"
             )
+        whole = is_number(halvings) and isinstance(halvings, Integral)
+        if not whole or halvings < 0 or (halvings and d == 2):
+            raise ValueError(
+                f"halvings of the RigidSurface is {halvings!r}; it must be a whole number, zero or "
+                "greater, and zero in the plane: a smooth curve through points is a RigidProfile"
+            )
+        if not (is_number(sharp) and 0 < sharp <= np.pi):
+            raise ValueError(f"sharp is {sharp!r}; it must be an angle in radians, from 0 to pi")
         try:
-            self.facets = Facets(corners, numbers.astype(np.intp))
+            self.facets = Facets(corners, numbers.astype(np.intp), int(halvings), float(sharp))
         except ValueError as error:
             raise ValueError(f"RigidSurface: {error}") from None
         self.displacement, self.rotation = displacement, rotation
@@ -76,6 +91,8 @@ class RigidSurface(SampledSupport):
         path: str | Path,
         *,
         scale: float = 1.0,
+        halvings: int = 0,
+        sharp: float = np.pi / 6,
         displacement: Any = None,
         rotation: Rotation | None = None,
     ) -> RigidSurface:
@@ -84,6 +101,8 @@ class RigidSurface(SampledSupport):
         Args:
             path: Of the file.
             scale: Factor of its coordinates, such as 1e-3 for a file in mm and a mesh in m.
+            halvings: See the constructor.
+            sharp: Likewise.
             displacement: See `Support`.
             rotation: Likewise.
 
@@ -94,7 +113,14 @@ class RigidSurface(SampledSupport):
         if not (is_number(scale) and np.isfinite(scale) and scale > 0):
             raise ValueError(f"scale is {scale!r}; it must be a number greater than zero")
         points, facets = read_stl(Path(path))
-        return cls(scale * points, facets, displacement=displacement, rotation=rotation)
+        return cls(
+            scale * points,
+            facets,
+            halvings=halvings,
+            sharp=sharp,
+            displacement=displacement,
+            rotation=rotation,
+        )
 
     @property
     def gdim(self) -> int:
