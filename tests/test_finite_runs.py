@@ -56,14 +56,15 @@ def test_a_file_of_another_kinematics_or_angle_is_refused(tmp_path):
     raised_everywhere(lambda: checkpoint.load(problem, path), ValueError, "kinematics")
 
 
-def test_first_touch_from_afar_in_increments_that_are_cut():
+@pytest.mark.parametrize("shape", ["ball", "profile"])
+def test_first_touch_from_afar_in_increments_that_are_cut(shape):
     """A disc half a block away comes down by 0.7 in one increment: cut until it is followed.
 
     The end is that of 20 equal increments: without friction there is one answer. 1e-7.
     """
     ends = []
     for steps in (1, 20):
-        tool = Tool(n=(16, 8), law=fc.Frictionless(1e4))
+        tool = Tool(n=(16, 8), law=fc.Frictionless(1e4), shape=shape)
 
         def load(t, tool=tool):
             tool.shift.value[:] = tool.vector(0.1, 0.5 - 0.7 * t)

@@ -50,7 +50,7 @@ class RigidSurface(SampledSupport):
             halvings: How often the edges of triangles are halved, towards the smooth surface that
                 they stand for: each makes four triangles of one, and angles half as large.
             sharp: Angle between neighbours (radians) from which on the edge is one of the surface
-                itself, and stays; borders stay, too.
+                itself, such as the rim of a cylinder.
             displacement: See `Support`.
             rotation: Likewise.
 

@@ -13,10 +13,12 @@ __all__ = ["refined"]
 
 Numbers = npt.NDArray[np.intp]
 
-# Corners and edges of the four triangles that one is halved to, among its corners (0, 1, 2) and the
-# middles of its edges (3, 4, 5); an edge within it is -1.
+# Corners of the four triangles that one is halved to, among its own (0, 1, 2) and the middles of
+# its edges (3, 4, 5); and their edges, two halves of each of its own, and 6 within it.
 _PARTS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
-_EDGES = ((0, -1, 2), (0, 1, -1), (-1, 1, 2), (-1, -1, -1))
+_EDGES = ((0, 6, 5), (1, 2, 6), (6, 3, 4), (6, 6, 6))
+# Square of the sine of the angle below which an edge is so sharp that it stays.
+_BLADE = 0.01
 
 
 def refined(corners: Array, normals: Array, beyond: Numbers, times: int, sharp: float) -> Array:
@@ -25,7 +27,8 @@ def refined(corners: Array, normals: Array, beyond: Numbers, times: int, sharp: 
     The middle of an edge lies on the cubic that its ends and the normals there give, that of the
     curved point-normal triangles of Vlachos, Peters, Boyd & Mitchell, Proc. I3D (2001) 159-166; so
     does its normal. Normals at a corner are the mean, weighted by angles, of the triangles that
-    follow each other around it across edges that are not sharp. Sharp edges and borders stay.
+    follow each other around it across edges that are not sharp. A sharp edge has two normals at
+    its ends, and bends as both say.
 
     Args:
         corners: Of the triangles, (m, 3, 3).
@@ -39,24 +42,49 @@ def refined(corners: Array, normals: Array, beyond: Numbers, times: int, sharp: 
         Corners of the new triangles, (4^times m, 3, 3), the same digits from both sides.
     """
     other = normals[beyond // 3]
-    fixed = (beyond < 0) | (np.einsum("ti,tki->tk", normals, other) < np.cos(sharp))
-    at_corners = _corner_normals(corners, normals, beyond, fixed)
+    sharp_edge = np.einsum("ti,tki->tk", normals, other) < np.cos(sharp)
+    at_corners = _corner_normals(corners, normals, beyond, (beyond < 0) | sharp_edge)
+    # Normals of the other side where it is another surface, at both ends of every edge.
+    ends = np.stack([3 * (beyond // 3) + (beyond % 3 + 1) % 3, beyond], axis=2)
+    across = np.where(sharp_edge & (beyond >= 0), 1.0, 0.0)[:, :, None, None]
+    across = across * at_corners.reshape(-1, 3)[ends]
     for _ in range(times):
-        ends, end_normals = np.roll(corners, -1, axis=1), np.roll(at_corners, -1, axis=1)
-        span, both = ends - corners, at_corners + end_normals
-        one = np.einsum("tki,tki->tk", span, at_corners)[:, :, None] * at_corners
-        two = np.einsum("tki,tki->tk", -span, end_normals)[:, :, None] * end_normals
-        middle = (corners + ends) / 2 - np.where(fixed[:, :, None], 0.0, (one + two) / 8)
-        share = 2 * np.einsum("tki,tki->tk", span, both) / np.sum(span**2, axis=2)
-        turned = both - share[:, :, None] * span
-        turned /= np.linalg.norm(turned, axis=2, keepdims=True)
+        span = np.roll(corners, -1, axis=1) - corners
+        end_normals = np.roll(at_corners, -1, axis=1)
+        bend = _bend(span, at_corners, across[:, :, 0]) + _bend(-span, end_normals, across[:, :, 1])
+        middle = (corners + np.roll(corners, -1, axis=1)) / 2 - bend / 8
+        between = _between(span, at_corners, end_normals)
+        beside = _between(span, across[:, :, 0], across[:, :, 1])
+        halves = np.zeros((len(corners), 7, 2, 3))
+        halves[:, 0:6:2, 0], halves[:, 0:6:2, 1] = across[:, :, 0], beside
+        halves[:, 1:6:2, 0], halves[:, 1:6:2, 1] = beside, across[:, :, 1]
         points = np.concatenate([corners, middle], axis=1)
-        directions = np.concatenate([at_corners, turned], axis=1)
-        within = np.concatenate([fixed, np.zeros((len(fixed), 1), dtype=np.bool_)], axis=1)
+        directions = np.concatenate([at_corners, between], axis=1)
         corners = np.concatenate([points[:, part] for part in _PARTS])
         at_corners = np.concatenate([directions[:, part] for part in _PARTS])
-        fixed = np.concatenate([within[:, edges] for edges in _EDGES])
+        across = np.concatenate([halves[:, edges] for edges in _EDGES])
     return corners
+
+
+def _bend(span: Array, normal: Array, other: Array) -> Array:
+    """The shortest vector with the span's parts along two normals, one of which may be 0."""
+    cosine = np.sum(normal * other, axis=2, keepdims=True)
+    one = np.sum(span * normal, axis=2, keepdims=True)
+    two = np.sum(span * other, axis=2, keepdims=True)
+    square = 1 - cosine**2
+    bends = square > _BLADE
+    along, aside = one - cosine * two, two - cosine * one
+    bend = (along * normal + aside * other) / np.where(bends, square, 1.0)
+    return np.asarray(np.where(bends, bend, 0.0))
+
+
+def _between(span: Array, one: Array, two: Array) -> Array:
+    """Normals in the middle of edges, of those at their ends; 0 between zeros."""
+    both = one + two
+    share = 2 * np.sum(span * both, axis=2) / np.sum(span**2, axis=2)
+    turned = both - share[:, :, None] * span
+    length = np.linalg.norm(turned, axis=2, keepdims=True)
+    return np.asarray(turned / np.where(length > 0, length, 1.0))
 
 
 def _corner_normals(corners: Array, normals: Array, beyond: Numbers, fixed: Mask) -> Array:
