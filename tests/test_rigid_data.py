@@ -259,6 +259,19 @@ def test_facets_halved_towards_a_smooth_surface():
     assert close(parts.distance, whole.distance, 1e-12)
 
 
+def test_from_afar_and_from_nowhere():
+    """A diverged iterate takes no time: 1e-6 of distances of 1e8 and 1e60; and no points at all."""
+    x = RNG.normal(size=(2000, 3))
+    x /= np.linalg.norm(x, axis=1)[:, None]
+    surface = fc.RigidSurface(*ball(5))
+    for away in (1e3, 1e8, 1e60):
+        assert close(surface.sample(away * x).distance, away - np.ones(2000), 1e-6)
+    nothing = surface.sample(np.empty((0, 3)))
+    assert nothing.distance.shape == (0,) and nothing.curvature.shape == (0, 3, 3)
+    flat = fc.RigidProfile(circle(40), closed=True).sample(np.empty((0, 2)))
+    assert flat.distance.shape == (0,) and flat.curvature.shape == (0, 2, 2)
+
+
 def test_many_points_and_facets():
     """10,000 points against 131,072 triangles: distances of a ball to the height of its facets."""
     support = fc.RigidSurface(*ball(7))

@@ -17,6 +17,8 @@ Numbers = npt.NDArray[np.intp]
 # Of the size of the surface: distance from an edge within which the direction to it is round-off;
 # and difference of two distances that are the same, within which a place is at an edge or corner.
 _AT_EDGE, _SAME = 1e-9, 1e-12
+# Of that size, too: how far one may be away to be told from where exactly.
+_AFAR = 1e6
 # A facet of less than this share of its longest edge in height has no normal.
 _FLAT = 1e-10
 
@@ -115,6 +117,10 @@ class Facets:
     def sample(self, x: Array) -> Sample:
         """See `SampledSupport.sample`."""
         d = x.shape[1]
+        # From afar all facets are as far away as round-off can tell: the rest of the way is added.
+        reach = np.linalg.norm(x, axis=1)
+        share = np.minimum(_AFAR * self.size / np.maximum(reach, 1e-300), 1.0)
+        x, rest = share[:, None] * x, (1.0 - share) * reach
         facet = self._search.closest(x, self._distance, _SAME * self.size)
         foot, feature = self._foot(x, facet)
         outward = self._normals[facet, feature]
@@ -134,7 +140,7 @@ class Facets:
             line = np.where(edge[:, None], line / np.linalg.norm(line, axis=1)[:, None], 0.0)
             across -= np.einsum("ni,nj->nij", line, line)
         curvature = np.where(far[:, None, None], across / radius[:, None, None], 0.0)
-        return Sample(distance, -slope, curvature)
+        return Sample(distance + rest, -slope, curvature)
 
     def _distance(self, x: Array, facet: Numbers) -> Array:
         return np.linalg.norm(x - self._foot(x, facet)[0], axis=1)

@@ -20,8 +20,8 @@ _SLENDER, _MOST = 4.0, 200_000
 _GRADES = 4.0
 # Corners that are looked at first; they suffice for most points.
 _FIRST = 4
-# Points of which all corners are looked for together, and pairs of point and facet: some 100 MB.
-_AT_ONCE, _TOGETHER = 1000, 200_000
+# Corners that are looked for together, and pairs of point and facet: some 100 MB.
+_AT_ONCE, _TOGETHER = 500_000, 200_000
 
 
 class FacetSearch:
@@ -91,7 +91,9 @@ class FacetSearch:
             point, column = np.nonzero(whole[:, None] & (away <= radius[:, None]))
             more = [self._near(x, bound + tolerance, point, corner[point, column])]
             rest = np.flatnonzero(~whole)
-            for some in np.array_split(rest, 1 + len(rest) // _AT_ONCE):
+            count = tree.query_ball_point(x[rest], radius[rest], return_length=True)
+            parts = np.flatnonzero(np.diff(np.cumsum(count) // _AT_ONCE)) + 1
+            for some in np.split(rest, parts):
                 lists = tree.query_ball_point(x[some], radius[some])
                 points = np.repeat(some, [len(found) for found in lists])
                 more.append(self._near(x, bound + tolerance, points, numbers[_joined(lists)]))
