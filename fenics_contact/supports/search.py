@@ -14,7 +14,8 @@ __all__ = ["FacetSearch"]
 
 Numbers = npt.NDArray[np.intp]
 
-# Longest edge by height of pieces that triangles are cut into, and their number at most.
+# Longest edge of pieces by the height of the triangle they are cut from; and how many more pieces
+# than twice the triangles there may be.
 _SLENDER, _MOST = 4.0, 200_000
 # Corners of one search differ in the size of their pieces by less than this factor.
 _GRADES = 4.0
@@ -137,15 +138,14 @@ def _joined(lists: npt.NDArray[np.object_]) -> Numbers:
 
 
 def _cut(triangles: Array) -> tuple[Array, Numbers]:
-    """Pieces of triangles, and the triangle of each: slender ones are halved across."""
-    facet = np.arange(len(triangles))
-    most = 2 * len(triangles) + _MOST
+    """Pieces of triangles, no longer than some heights of these, and the triangle of each."""
+    facet, most = np.arange(len(triangles)), 2 * len(triangles) + _MOST
+    edges = np.roll(triangles, -1, axis=1) - triangles
+    longest = np.sqrt(np.sum(edges**2, axis=2).max(axis=1))
+    height = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / longest
     while True:
-        edges = np.roll(triangles, -1, axis=1) - triangles
-        square = np.sum(edges**2, axis=2)
-        longest = square.max(axis=1)
-        area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-        slender = longest / np.maximum(area, 1e-300)
+        square = np.sum((np.roll(triangles, -1, axis=1) - triangles) ** 2, axis=2)
+        slender = np.sqrt(square.max(axis=1)) / height[facet]
         cut = np.flatnonzero(slender > _SLENDER)
         cut = cut[np.argsort(-slender[cut], kind="stable")][: most - len(triangles)]
         if not len(cut):
