@@ -177,8 +177,8 @@ class ContactProblem:
                 with a line search on the energy). By default "lbfgs" on all unknowns, where a
                 factorisation costs as much as dozens of iterations, and condensed, where it costs
                 as much as ten, "newton", with "continuation" for the first increment; "newton" for
-                a nonlinear bulk, too, whose tangent changes, and for a mixed function, whose
-                equations are those of a saddle point: "lbfgs" and "alternating" are refused there.
+                a nonlinear bulk, too, whose tangent changes. With a mixed function the equations
+                are those of a saddle point: "alternating" is refused there.
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
                 paper has 0; 1 needs a third of the iterations once a point sticks.

@@ -175,9 +175,9 @@ def estimate_errors(
         ValueError: Shapes that do not fit.
     """
     problem.complete()
-    u = problem.u
+    displacement = problem.displacement
     stress = ufl.as_ufl(stress)
-    strain = ufl.sym(ufl.grad(u)) if strain is None else ufl.as_ufl(strain)
+    strain = ufl.sym(ufl.grad(displacement.expression)) if strain is None else ufl.as_ufl(strain)
     if stress.ufl_shape != strain.ufl_shape or len(stress.ufl_shape) != 2:
         raise ValueError(
             f"stress has shape {stress.ufl_shape}, strain {strain.ufl_shape}; both must be (d, d), "
@@ -196,7 +196,7 @@ def estimate_errors(
         wanted=problem.accuracy.error if problem.accuracy else None,
         h=h,
         across=across,
-        degree=u.function_space.ufl_element().degree,
+        degree=displacement.degree,
         energy=float(np.sqrt(smooth.share)),
         cells=smooth.squares,
     )
@@ -313,10 +313,9 @@ class _Smoothed:
 
     def __init__(self, problem: ContactProblem, stress: Any, strain: Any) -> None:
         """Smooth. Collective."""
-        u = problem.u
-        mesh = u.function_space.mesh
+        mesh = problem.u.function_space.mesh
         weight = problem.contacts[0].weight if problem.contacts else 1.0
-        degree = u.function_space.ufl_element().degree
+        degree = problem.displacement.degree
         dx = ufl.dx(mesh, metadata={"quadrature_degree": 2 * degree})
         self.stress, smooth_strain = _smoothed(mesh, [stress, strain], degree, weight, dx)
         gap = ufl.inner(self.stress - stress, smooth_strain - strain)

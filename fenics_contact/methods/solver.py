@@ -93,11 +93,8 @@ METHODS: dict[str, dict[str, Any]] = {
     "alternating": {},
     "continuation": {},
 }
-# Those that go down towards a least energy, by which K is measured, too.
-_OF_MINIMA = ("lbfgs", "alternating")
-# Of some of them with a nonlinear bulk, or at a saddle point: far from a solution the tangent need
-# not point downwards along which `cp` looks for a root, and cells may turn inside out, whereupon
-# `bt` steps shorter.
+# Of some of them with a nonlinear bulk: far from a solution the tangent need not point downwards
+# along which `cp` looks for a root, and cells may turn inside out, whereupon `bt` steps shorter.
 _NONLINEAR: dict[str, dict[str, Any]] = {
     "newton": {"snes_linesearch_type": "bt", "snes_linesearch_max_it": 40},
 }
@@ -203,15 +200,14 @@ class Solver:
         self.condensed = self._choose_condensation()
         self._full.linear_kind = self._choose_linear_solver()
         self._set_system()
-        plain = self._full.bulk.linear and not self._full.displacement.mixed
-        cheap = self.condensed or not plain
+        cheap = self.condensed or not self._full.bulk.linear
         self.method = settings.method or ("newton" if cheap else "lbfgs")
-        if self._full.displacement.mixed and self.method in _OF_MINIMA:
+        if self._full.displacement.mixed and self.method == "alternating":
             raise ValueError(
-                f"method is {self.method!r}, but u is a part of a mixed function, whose equations "
-                'are those of a saddle point and not of a minimum; use "newton" or "continuation"'
+                "method is 'alternating', but u is a part of a mixed function, whose equations are "
+                "those of a saddle point and not of a minimum; use another method"
             )
-        globalised = {} if plain else _NONLINEAR.get(self.method, {})
+        globalised = {} if self._full.bulk.linear else _NONLINEAR.get(self.method, {})
         options.set(_COMMON | METHODS[self.method] | globalised, prefix)
         quasi_newton = options.get(prefix + "snes_type") == PETSc.SNES.Type.QN
         newton = linear.newton_options(self.system.linear_kind)
