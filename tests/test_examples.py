@@ -26,6 +26,7 @@ PRINTED = {
     "drum": (r"torque {} N mm/mm, μ R ∫p = {} N mm/mm", 5e-3),
     "hysteresis": (r"friction takes {} mJ/mm a cycle; area of the loop {} mJ/mm", 1e-5),
     "own_law": (r"closed up by {} mm; h ln\(p/p0\) = {} mm", 1e-5),
+    "plastic_block": (r"force {} N/mm, limit {} N/mm", 1e-5),
     "two_bodies": (r"the blocks shorten by {} mm, two springs by {} mm", 1e-5),
 }
 
