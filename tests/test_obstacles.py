@@ -51,9 +51,7 @@ def test_what_is_no_distance_is_refused(kinematics):
         options = {"kinematics": kinematics}
         problem, contact = scene.problem(support, fc.Coulomb(0.2), contact=options)
         if true is False:
-            with pytest.raises(
-                fc.NotConverged, match=r"by (3\.9|4)\d* per length .*it is none"
-            ):
+            with pytest.raises(fc.NotConverged, match=r"by (3\.9|4)\d* per length .*it is none"):
                 problem.solve()
         else:
             problem.solve()
