@@ -9,8 +9,9 @@ Every script of this folder takes ``--output``, ``--repeat`` and ``--short`` and
 (``.md``), numbers (``.csv``) and plots (``.png``) in its part of the output folder. The page there,
 `README.md`, joins the parts of this run and of earlier ones, below the table of targets. Forms are
 compiled anew, into a cache of this run, so that "first use" is what a new user waits. The exit code
-is 1 if a benchmark failed. ``methods.py`` (five minutes) and ``trade.py`` (ten minutes)
-have pages of their own in docs/ and are run when they are named, or by their own commands.
+is 1 if a benchmark failed. ``methods.py``, ``nonlinear.py`` (five minutes each) and ``trade.py``
+(ten minutes) have their tables on other pages of docs/ and are run when they are named, or by their
+own commands.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
 HELPERS = ("__init__", "run", "timing", "costs", "targets")
 # Long, and with pages of their own in docs/.
-BY_NAME_ONLY = ("methods", "trade")
+BY_NAME_ONLY = ("methods", "nonlinear", "trade")
 STAMP = "stamp.json"
 
 

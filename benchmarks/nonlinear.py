@@ -1,0 +1,134 @@
+"""L-BFGS against Newton's method with nonlinear bulks: rubber, with a pressure too, and J2 flow.
+
+    python benchmarks/nonlinear.py
+
+A block 2 x 1 of quadratic triangles, its bottom held, under a disc of radius 0.8 that is pressed in
+and then dragged with friction (μ = 0.3), ten increments: neo-Hookean (ν = 0.3, pressed by 0.15);
+the same with ν = 0.4999 and a pressure beside the displacement; and J2 plasticity at small strains
+with linear hardening, E/100, whose plastic strains the run keeps (pressed by 0.02, which is far
+beyond a yield stress of E/500). At a contact stiffness of 10 and of 1000 E/h, without the
+fallback and without cuts: a method that fails is seen to fail. Times are of all increments, medians
+of ``--repeat`` runs, without what is compiled once.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import basix
+import basix.ufl
+import numpy as np
+import ufl
+from dolfinx import fem
+
+import fenics_contact as fc
+from benchmarks import timing
+from scenes.rubber import Rubber, disc, rubber
+
+METHODS = ("newton", "lbfgs")
+STIFFNESSES = (10.0, 1000.0)
+STEPS, E = 10, 1000.0
+# Runs that take longer are not repeated (s).
+ONCE = 10.0
+Made = tuple[Rubber, float, Callable[[], None]]
+
+
+def hyperelastic(n: int) -> Made:
+    """Compressible rubber."""
+    return rubber("triangle", n=(2 * n, n), E=E), 0.15, lambda: None
+
+
+def with_pressure(n: int) -> Made:
+    """Rubber that hardly changes its volume."""
+    scene = rubber("triangle", n=(2 * n, n), E=E, nu=0.4999, mixed="Taylor-Hood")
+    return scene, 0.15, lambda: None
+
+
+def plastic(n: int) -> Made:
+    """J2 plasticity in plane strain, radial return at the points of the rule of degree 2."""
+    scene = rubber("triangle", n=(2 * n, n), E=E, linear=True)
+    u, space = scene.u, scene.u.function_space
+    shear, bulk, hardening, strength = E / 2.6, E / 1.2, E / 100, E / 500
+    at_points = basix.ufl.quadrature_element("triangle", value_shape=(3, 3), degree=2)
+    number = basix.ufl.quadrature_element("triangle", degree=2)
+    strains = fem.Function(fem.functionspace(scene.mesh, at_points), name="plastic strain")
+    way = fem.Function(fem.functionspace(scene.mesh, number), name="accumulated")
+    epsilon = ufl.sym(ufl.grad(u))
+    rows = [[epsilon[0, 0], epsilon[0, 1], 0], [epsilon[0, 1], epsilon[1, 1], 0], [0, 0, 0]]
+    strain = ufl.as_tensor(rows)
+    trial = 2 * shear * ufl.dev(strain - strains)
+    size = ufl.sqrt(1.5 * ufl.inner(trial, trial) + (1e-9 * strength) ** 2)
+    excess = ufl.max_value(size - strength - hardening * way, 0) / (3 * shear + hardening)
+    flow = 1.5 * excess * trial / size
+    stress = trial - 2 * shear * flow + bulk * ufl.tr(strain) * ufl.Identity(3)
+    virtual = ufl.derivative(strain, u, ufl.TestFunction(space))
+    scene.F = ufl.inner(stress, virtual) * ufl.dx(scene.mesh, degree=2)
+    points, _ = basix.make_quadrature(basix.CellType.triangle, 2)
+    grown = {strains: fem.Expression(strains + flow, points)}
+    grown[way] = fem.Expression(way + excess, points)
+
+    def keep() -> None:
+        values = []
+        for function, expression in grown.items():
+            found = fem.Function(function.function_space)
+            found.interpolate(expression)
+            values.append(found.x.array)
+        for function, array in zip(grown, values, strict=True):
+            function.x.array[:] = array
+
+    return scene, 0.02, keep
+
+
+SCENES = {"neo-Hookean": hyperelastic, "with pressure": with_pressure, "J2": plastic}
+
+
+def run(make: Callable[[int], Made], stiffness: float, method: str, n: int) -> timing.Row:
+    """One history."""
+    scene, depth, keep = make(n)
+    shift = fem.Constant(scene.mesh, np.zeros(2))
+    k = fc.Scaled(stiffness)
+    kinematics = "small" if depth < 0.1 else "finite"
+    problem, _ = scene.problem(
+        disc(scene, 0.8, displacement=shift),
+        fc.Coulomb(0.3, k, k),
+        contact={"kinematics": kinematics},
+        kinematics=np.inf,
+        method=method,
+        fallback=False,
+    )
+
+    def load(t: float) -> None:
+        shift.value[:] = depth * max(2 * t - 1, 0.0), -depth * min(2 * t, 1.0)
+
+    iterations, outcome = [], "converged"
+    try:
+        for step in fc.increments(problem, load, steps=STEPS, max_cuts=0):
+            iterations.append(step.iterations)
+            keep()
+    except fc.NotConverged as error:
+        iterations.append(error.iterations)
+        outcome = f"failed at increment {error.increment}"
+    return {"outcome": outcome, "iterations": sum(iterations), "most": max(iterations)}
+
+
+def main() -> None:
+    """Measure and write."""
+    arguments = timing.parser(__doc__, "nonlinear").parse_args()
+    n, stiffnesses = (6, STIFFNESSES[:1]) if arguments.short else (24, STIFFNESSES)
+    rows = []
+    for scene, make in SCENES.items():
+        for stiffness in stiffnesses:
+            runs = {m: functools.partial(run, make, stiffness, m, n) for m in METHODS}
+            first = {m: functools.partial(run, make, stiffness, m, 4) for m in METHODS}
+            repeat = 1 if arguments.short else arguments.repeat
+            for row in timing.measure(runs, repeat=repeat, first=first, once=ONCE):
+                told = {"scene": scene, "k_n h/E": stiffness, "method": row["run"]}
+                told |= {k: row[k] for k in ("outcome", "iterations", "most", "seconds")}
+                rows.append(told)
+                print(*told.values(), sep="  ", flush=True)
+    timing.write(arguments.output, "nonlinear", "L-BFGS and Newton with nonlinear bulks", rows)
+
+
+if __name__ == "__main__":
+    main()
