@@ -227,9 +227,11 @@ class RigidMotions:
         loose = self._loose(operators, closed_only=False)
         if loose.size:
             motions = "; ".join(self._describe(row) for row in loose)
+            finite = any(operator.contact.finite for operator in operators)
+            why = "nothing, to first order, holds" if finite else "nothing will ever hold"
             raise ValueError(
-                f"nothing will ever hold the body against this rigid motion: {motions}. Add a "
-                "Dirichlet condition on it, or friction"
+                f"{why} the body against this rigid motion: {motions}. Add a Dirichlet condition "
+                "on it, or friction"
             )
 
     def _loose(self, operators: Sequence[ContactOperator], closed_only: bool) -> Array:

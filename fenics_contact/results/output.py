@@ -93,7 +93,15 @@ def surface_fields(contact: Contact) -> dict[str, fem.Function]:
 
 
 def write_surface(folder: str | os.PathLike[str], contact: Contact, time: float = 0.0) -> None:
-    """Write `surface_fields` as one ParaView collection, ``NAME.pvd``. Collective."""
+    """Write `surface_fields` as one ParaView collection, ``NAME.pvd``. Collective.
+
+    It is one state, which replaces what was there: give every state of a series its own folder.
+
+    Args:
+        folder: Where to.
+        contact: Evaluated.
+        time: Time stamp, such as the load.
+    """
     _write(Path(folder) / f"{contact.name}.pvd", list(surface_fields(contact).values()), time)
 
 
@@ -101,6 +109,8 @@ def write_body(
     folder: str | os.PathLike[str], u: fem.Function, stress: Any = None, time: float = 0.0
 ) -> None:
     """Write ``displacement.pvd`` and, if a stress is given, ``stress.pvd``. Collective.
+
+    It is one state, as in `write_surface`.
 
     Args:
         folder: Where to.
