@@ -127,7 +127,7 @@ def test_a_body_that_contact_alone_holds(pressure):
 @pytest.mark.parametrize("update", ["never", pytest.param("increment", marks=ON_ONE_RANK)])
 def test_two_bodies(update):
     """A round shoe, a body of its own, pressed on and dragged; pairs as they were or found anew."""
-    end, steps = (1.0, 2) if update == "never" else (2.0, 5)
+    end, steps = (1.0, 2) if update == "never" else (1.5, 6)
     made = [Shod(update=update, condensation=c, **TIGHT) for c in (None, False)]
     (_, found), (_, full) = (run(m, end, steps) for m in made)
     assert kept(made[0]) <= FEW
