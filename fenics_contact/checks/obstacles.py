@@ -46,7 +46,10 @@ class ObstacleCheck:
         if contact.finite and not contact.support.is_flat:
             curvature = contact.support_curvature()[closed]
             sunk = contact.values.penetration[closed]
-            bend = np.linalg.eigvalsh(curvature).max(axis=1, initial=0.0)
+            # At a centre of curvature there is none, and no eigenvalues to look for.
+            known = np.isfinite(curvature).all(axis=(1, 2))
+            bend = np.full(len(sunk), np.inf)
+            bend[known] = np.linalg.eigvalsh(curvature[known]).max(axis=1, initial=0.0)
             depth = global_max(comm, sunk * bend)
             gone = comm.allgather(contact.points[contact.passed_through()].tolist())
             passed = next((places[0] for places in gone if places), None)

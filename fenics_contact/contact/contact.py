@@ -884,12 +884,12 @@ class Contact(PointResults):
 
         At X with small displacements, at X + u with finite ones. Collective.
         """
-        n_points = len(self.values.x)
+        values = self.values
         if self._view is not None:
             return np.asarray(np.linalg.norm(self._view.values("slope"), axis=1))
         if self.support.is_distance:
             return self._data.values["direction_length"].copy()
-        return np.ones(n_points)
+        return np.ones(len(values.x))
 
     def support_curvature(self) -> Array:
         """Second derivatives of the distance at X + u, (n_points, gdim, gdim) (1/length).

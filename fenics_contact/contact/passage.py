@@ -51,11 +51,13 @@ class Passage:
             now: Likewise.
         """
         (first, turned), (last, normal) = self._sample(before), self._sample(now)
+        opposite = np.sum(turned * normal, axis=1) < 0
+        if not self._quadrature.surface.mesh.comm.allreduce(int(opposite.any())):
+            return np.zeros(len(opposite), dtype=np.bool_)
         shares = np.arange(1, _PLACES + 1) / (_PLACES + 1)
         between = np.min([self._sample(before + t * (now - before))[0] for t in shares], axis=0)
         deeper = np.minimum(first, last) - between
         far = _DEEPER * np.linalg.norm(now - before, axis=1)
-        opposite = np.sum(turned * normal, axis=1) < 0
         return np.asarray(opposite & (between < 0) & (deeper > far))
 
     def _sample(self, place: Array) -> tuple[Array, Array]:
