@@ -1120,20 +1120,14 @@ class Contact(PointResults):
         if self.law.has_friction:
             start = {name: self.history.values(name) for name in self.history.names}
             start["jump"] = jump
-            self.history.commit(start | (self._begin_on_support() if self.finite else {}))
+            self.history.commit(start | (self._begin_on_support(jump) if self.finite else {}))
             self.restore()
 
-    def _begin_on_support(self) -> dict[str, Array]:
+    def _begin_on_support(self, jump: Array) -> dict[str, Array]:
         """The foot, minus X, and the normal there, with finite kinematics. Collective."""
-        x = ufl.SpatialCoordinate(self.surface.mesh) + self._jump
-        if isinstance(self.support, SampledSupport):
-            places = SampledPlaces(self.quadrature, self.support, x)
-            places.update()
-            place = places.at(x)
-        else:
-            place = self._support_at(x)
-        foot = self._jump + place.gap * place.normal
-        return PointEvaluator(self.quadrature, {"jump": foot, "normal": place.normal})()
+        self._update_data()
+        gap, normal = self._passage.sample(self._data.values["x"] + jump)
+        return {"jump": jump + gap[:, None] * normal, "normal": normal}
 
     def commit(self, found: Found | None = None) -> None:
         """Make a state the history of the next increment. Collective.

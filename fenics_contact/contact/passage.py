@@ -50,18 +50,25 @@ class Passage:
             before: In the frame of the support, (n_points, gdim).
             now: Likewise.
         """
-        (first, turned), (last, normal) = self._sample(before), self._sample(now)
+        (first, turned), (last, normal) = self.sample(before), self.sample(now)
         opposite = np.sum(turned * normal, axis=1) < 0
         if not self._quadrature.surface.mesh.comm.allreduce(int(opposite.any())):
             return np.zeros(len(opposite), dtype=np.bool_)
         shares = np.arange(1, _PLACES + 1) / (_PLACES + 1)
-        between = np.min([self._sample(before + t * (now - before))[0] for t in shares], axis=0)
+        between = np.min([self.sample(before + t * (now - before))[0] for t in shares], axis=0)
         deeper = np.minimum(first, last) - between
         far = _DEEPER * np.linalg.norm(now - before, axis=1)
         return np.asarray(opposite & (between < 0) & (deeper > far))
 
-    def _sample(self, place: Array) -> tuple[Array, Array]:
-        """Distances and unit normals at places. Collective."""
+    def sample(self, place: Array) -> tuple[Array, Array]:
+        """Distances and unit normals from body to support at places. Collective.
+
+        Args:
+            place: In the frame of the support, (n_points, gdim).
+
+        Returns:
+            (n_points,) (length) and (n_points, gdim).
+        """
         if isinstance(self._support, SampledSupport):
             found = self._support.sample(place)
             return found.distance, found.normal
