@@ -11,7 +11,7 @@ from dolfinx import fem
 import fenics_contact as fc
 from fenics_contact import compat
 from fenics_contact.parallel import global_max
-from scenes.blocks import CELLS, TOP, wave
+from scenes.blocks import CELLS, wave
 from scenes.comparing import raised_everywhere
 from scenes.rubber import disc, rubber
 from scenes.surfaces import ball, circle, ring
@@ -238,7 +238,6 @@ FLOOR = fc.HalfSpace((0, 1), (0, -1))
             ValueError,
             "differs from point to point",
         ),
-        (_refused(lambda s: fc.DeformableBody(s.tags, TOP)), ValueError, "rigid support"),
         (
             _refused(fc.HalfSpace((0, 1), (0, -1), rotation=0.1)),
             ValueError,

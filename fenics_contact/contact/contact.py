@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +32,7 @@ from fenics_contact.contact.pairs import Pairs, PairsState
 from fenics_contact.contact.passage import Passage
 from fenics_contact.contact.point_data import PointData
 from fenics_contact.contact.point_law import PointLaw, PointTangent
+from fenics_contact.contact.present import PresentKinematics, PresentPairs
 from fenics_contact.contact.results import PointResults
 from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues, Status
@@ -53,6 +54,7 @@ logger = logging.getLogger("fenics_contact")
 
 _ENFORCEMENTS = ("penalty", "augmented")
 _KINEMATICS = ("small", "finite")
+AnyKinematics: TypeAlias = SmallKinematics | FiniteKinematics | PresentKinematics
 # Of augmented enforcement, where nothing is said.
 _TOLERANCE = 1e-5
 # Normal times outward normal of the body above minus which Γc faces its support.
@@ -204,13 +206,17 @@ class Contact(PointResults):
         self.quadrature = surface.quadrature(degree, nodal=nodal)
         self.multipliers: Multipliers | None = None
         if augments:
-            self.multipliers = Multipliers(self.quadrature, degree, law, turning=self.finite)
+            turning = self.finite and not isinstance(support, DeformableBody)
+            self.multipliers = Multipliers(self.quadrature, degree, law, turning=turning)
         self.inputs = Inputs(
             name, self.quadrature, law, support, weight=weight, accuracy=self.accuracy
         )
         if modulus is not None:
             self.set_modulus(modulus)
         self.pairs = Pairs(name, self.u, self.quadrature, support)
+        self._present: PresentPairs | None = None
+        if self.finite and isinstance(support, DeformableBody):
+            self.pairs = self._present = PresentPairs(name, self.u, self.quadrature, support)
         self._frame = Frame(self.inputs.shift, self.inputs.rotation)
         self._jump = fem.Function(self.quadrature.space(gdim), name="jump")
         # Of a support known in numbers: seen from the undeformed Γc, and from where it has moved.
@@ -223,7 +229,7 @@ class Contact(PointResults):
         fields = {"opening": 0, "penetration": 0, "normal_traction": 0}
         if law.has_friction:
             fields |= {"traction": gdim, "jump": gdim, "slip": law.n_modes(gdim)}
-            fields |= {"normal": gdim} if self.finite else {}
+            fields |= {"normal": gdim} if self.finite and self.rigid else {}
         if self.multipliers is not None:
             fields |= {"multiplier": 0}
         self.history = PointFields(self.quadrature, fields)
@@ -249,9 +255,13 @@ class Contact(PointResults):
         self._stretch: PointEvaluator | None = None
         self._own_form: Any = None
         self._values: PointValues | None = None
-        if not self.rigid:
-            self.pair()
-        self._count_from(self._own_jump())
+        if self._present is not None:
+            self._present.commit()
+            self._update_points()
+        else:
+            if not self.rigid:
+                self.pair()
+            self._count_from(self._own_jump())
 
     # ---- construction ----------------------------------------------------------------------------
 
@@ -274,11 +284,6 @@ class Contact(PointResults):
                     "turns give its displacement as a UFL vector"
                 )
             return False
-        if isinstance(support, DeformableBody):
-            raise ValueError(
-                f"{name}: finite kinematics take a rigid support, and this is a DeformableBody; "
-                'leave kinematics out, and give it update="increment" for slip over many facets'
-            )
         if gap is not None:
             raise ValueError(
                 f"{name}: a gap is prescribed, and finite kinematics take it from the places of "
@@ -295,10 +300,12 @@ class Contact(PointResults):
         """The law in the form on Γc, and at numbers at the points. Collective."""
         law, history, x = self.law, self.history, ufl.SpatialCoordinate(self.surface.mesh)
         multipliers = None if self.multipliers is None else self.multipliers.fields
-        in_form: SmallKinematics | FiniteKinematics
-        at_points: SmallKinematics | FiniteKinematics
+        in_form: AnyKinematics
+        at_points: AnyKinematics
         in_form = at_points = SmallKinematics(history, multipliers)
-        if self.finite:
+        if self._present is not None:
+            in_form = at_points = PresentKinematics(self._present, multipliers)
+        elif self.finite:
             place = self._support_at if self._sampled is None else self._sampled[1].at
             exact = ExactView(x, self._frame, place, history, multipliers)
             turns, friction = self._frame.rotation is not None, law.has_friction
@@ -311,10 +318,16 @@ class Contact(PointResults):
         free = [] if self.finite else list(self.free_motion)
         paired = self.pairs.acts
         acts = self._within if paired is None else paired * self._within
+        felt = self._felt
         return (
-            PointLaw(law, given, in_form, self.quadrature, self._jump, acts=paired, free=free),
-            PointLaw(law, sampled, at_points, self.quadrature, self._jump, acts=acts, free=free),
+            PointLaw(law, given, in_form, self.quadrature, felt, acts=paired, free=free),
+            PointLaw(law, sampled, at_points, self.quadrature, felt, acts=acts, free=free),
         )
+
+    @property
+    def _felt(self) -> fem.Function:
+        """What laws are functions of, at the points."""
+        return self._jump if self._present is None else self._present.felt.function
 
     def _choose_enforcement(
         self, enforcement: str | None, tolerance: float | None
@@ -519,6 +532,10 @@ class Contact(PointResults):
         self._update_points()
         data = self._data.values
         turns = {}
+        if self._present is not None:
+            by_felt = self._acting.evaluate_tangent({}).by_jump
+            traction = self._acting.evaluate_traction()
+            return PointTangent(self._present.tangent(by_felt, traction, self.history))
         if not self.finite:
             turns = {i: (data[f"gap by {i}"], data[f"normal by {i}"]) for i in self.free_motion}
         return self._acting.evaluate_tangent(turns)
@@ -549,7 +566,7 @@ class Contact(PointResults):
         for item in (vector, forces):
             item.destroy()
         if self._own_form is None:
-            displacement = self.u if self.rigid and not self.free_motion else self._jump
+            displacement = self.u if self.rigid and not self.free_motion else self._felt
             form = self._form_at(displacement, ufl.TestFunction(space))
             self._own_form = compat.compile_form(-form, self.entity_maps)
         return by_points, assembled(self._own_form)[: by_points.size].copy()
@@ -576,12 +593,14 @@ class Contact(PointResults):
     @property
     def has_potential(self) -> bool:
         """Whether the tractions follow from a potential, and the tangent is symmetric."""
+        if self._present is not None:
+            return False
         return self.law.has_potential and not (self.finite and self.law.has_tangential)
 
     @property
     def freezes(self) -> bool:
         """Whether there is a potential, at least under a given pressure."""
-        if self.finite and self.law.has_tangential:
+        if self._present is not None or (self.finite and self.law.has_tangential):
             return False
         return self.law.at_pressure(ufl.as_ufl(0.0)).has_potential
 
@@ -622,6 +641,12 @@ class Contact(PointResults):
 
     def _update_points(self) -> None:
         """Let the points be at the present ``u`` and data. Collective."""
+        if self._present is not None:
+            self._update_data()
+            data, history = self._data.values, self.history
+            multipliers = None if self.multipliers is None else self.multipliers.fields
+            self.displacement.follow()
+            self._present.follow(data["x"], data["normal"], history, multipliers or history)
         self._update_jump()
         self._update_data()
         if self._view is not None:
@@ -644,7 +669,10 @@ class Contact(PointResults):
     def _evaluate(self) -> PointValues:
         """Everything at the points, as they were updated last. Collective."""
         arrays = {**self._data.values, **self._point_law.evaluate()}
-        if not self.rigid:
+        if self._present is not None:
+            arrays["paired"] = self.paired.astype(np.float64)
+            arrays["depth"] = self.pairs.depth(arrays["normal_displacement"])
+        elif not self.rigid:
             arrays["paired"] = self.paired.astype(np.float64)
             arrays["depth"] = self.pairs.depth(arrays["normal_displacement"])
             since = 0.0 if self.pairs.found_at is None else self.committed_jump
@@ -750,8 +778,20 @@ class Contact(PointResults):
         """Whether the support turns."""
         return self._frame.rotation is not None
 
+    def follow(self) -> None:
+        """Let pairs that follow the bodies be those of the present ``u``. Collective."""
+        if self._present is not None:
+            self._update_points()
+
+    @property
+    def follows(self) -> bool:
+        """Whether the pairs follow the bodies wherever they go."""
+        return self._present is not None
+
     def turned(self, vectors: Array) -> Array:
         """Directions in the frame of the support, as they are in space: (n_points, gdim)."""
+        if self._present is not None:
+            return self._present.turned(vectors)
         if self._view is None:
             return vectors
         return self._view.turned(vectors)
@@ -764,6 +804,8 @@ class Contact(PointResults):
     @property
     def pairs_anew(self) -> bool:
         """Whether opposites are found anew, on the deformed bodies, at every commit."""
+        if self._present is not None:
+            return False
         return isinstance(self.support, DeformableBody) and self.support.update == "increment"
 
     @property
@@ -773,6 +815,14 @@ class Contact(PointResults):
         Over the unknowns of a problem it is a `ContactOperator`.
         """
         return self.pairs.jump_map
+
+    @property
+    def local_map(self) -> PETSc.Mat | None:
+        """Sparse map from ``u`` to what derivatives at the points are by, where that is another.
+
+        With pairs that follow the bodies, see `PresentPairs`.
+        """
+        return None if self._present is None else self._present.local_map
 
     @property
     def pairings(self) -> int:
@@ -806,6 +856,8 @@ class Contact(PointResults):
     def _find_pairs(self, u: fem.Function | None, depth: Array | None) -> None:
         """`pair`, with the depth of the points in the opposite where it is known. Collective."""
         self._update_points()
+        if self._present is not None:
+            return
         points = self._evaluate()
         if depth is None:
             depth = np.zeros(self.quadrature.n_points) if u is None else points.depth
@@ -1094,6 +1146,8 @@ class Contact(PointResults):
             }
         if self.multipliers is not None:
             values |= self.multipliers.committed(points)
+        if self._present is not None and self.law.has_friction:
+            values |= {n: self._present.turned(values[n]) for n in ("traction", "jump")}
         return Found(points, values)
 
     def begin(self) -> None:
@@ -1103,6 +1157,11 @@ class Contact(PointResults):
         first increment; the constructor has done so for the ``u`` of then.
         """
         if self._has_begun:
+            return
+        if self._present is not None:
+            if not self._present.is_begun():
+                self._present.commit()
+                self.forget()
             return
         jump = self._own_jump()
         if global_max(self.surface.mesh.comm, np.abs(jump - self.committed_jump)) > 0:
@@ -1142,6 +1201,9 @@ class Contact(PointResults):
         self._has_begun = True
         self.history.commit(values)
         self._values, self.committed_jump = points, points.jump
+        if self._present is not None:
+            self._present.commit()
+            self.committed_jump = np.zeros_like(points.jump)
         if self.pairs_anew:
             # The traction stays with the points of Γc; what they slip over has moved on.
             self.pair(self.u)
@@ -1171,6 +1233,8 @@ class Contact(PointResults):
             values: The arrays of its `values`, for the results to be those of its solution.
         """
         self.history.set_rows(history)
+        if self._present is not None:
+            self._present.commit()
         if self.pairs_anew:
             # The pairs by which they were as deep as that are gone.
             self._find_pairs(self.u, values.get("depth"))

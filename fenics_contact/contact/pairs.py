@@ -13,9 +13,10 @@ from fenics_contact.contact.values import PointValues
 from fenics_contact.parallel import gather_rows, global_max, global_sum, warn
 from fenics_contact.supports.base import Support
 from fenics_contact.supports.deformable import DeformableBody
-from fenics_contact.surface.pairing import REASONS, LookBack, Pairing
+from fenics_contact.surface.pairing import LookBack, Pairing
+from fenics_contact.surface.rays import REASONS
 from fenics_contact.surface.surface import SurfaceQuadrature
-from fenics_contact.types import Array, Mask
+from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Pairs", "PairsState"]
 
@@ -85,17 +86,20 @@ class Pairs:
             u: Displacement in which to find them; None: the undeformed bodies.
         """
         assert self.search and self.distance and self.acts
-        comm, n = self._mesh.comm, self._quadrature.n_points
         opposite, distance, why = self.search.pair(x, normal, u, depth)
         self._forget_look_back()
         self.found_at = None if u is None else u.copy()
-        self.paired = ~np.isnan(distance)
-        for function, values in (
-            (self.distance, np.nan_to_num(distance)),
-            (self.acts, self.paired),
-        ):
-            function.x.array[:n] = values
-            function.x.scatter_forward()
+        self.distance.x.array[: len(distance)] = np.nan_to_num(distance)
+        self.distance.x.scatter_forward()
+        self._set_pairs(opposite, ~np.isnan(distance))
+        self._warn_of_unpaired(why)
+
+    def _set_pairs(self, opposite: PETSc.Mat, paired: Mask) -> None:
+        """Take the map to what is opposite (used up), and which points have it. Collective."""
+        assert self.acts
+        self.paired = paired
+        self.acts.x.array[: len(paired)] = paired
+        self.acts.x.scatter_forward()
         relative = self.own_map.copy()
         mask = relative.createVecLeft()
         mask.array[:] = np.repeat(self.paired, self._gdim)
@@ -105,9 +109,13 @@ class Pairs:
         mask.destroy()
         self.jump_map = relative
         self.number += 1
+        self.n_unpaired = int(global_sum(self._mesh.comm, np.count_nonzero(~paired)))
+
+    def _warn_of_unpaired(self, why: Index) -> None:
+        """Say so if more than half of the points have no opposite, and why. Collective."""
+        comm, n = self._mesh.comm, self._quadrature.n_points
         lost = [np.count_nonzero(~self.paired & (why == reason)) for reason in REASONS]
         *counts, total = (int(number) for number in global_sum(comm, [*lost, n]))
-        self.n_unpaired = sum(counts)
         if 2 * self.n_unpaired > total:
             told = [f"{k}: {text}" for k, text in zip(counts, REASONS.values(), strict=True) if k]
             warn(
@@ -167,8 +175,25 @@ class Pairs:
             self.own_displacement(),
         )
 
+    def _look_back(self, depth: float) -> tuple[LookBack, Array]:
+        """What the opposite sees of Γc, and by how much that has come closer. Collective.
+
+        Args:
+            depth: The largest of Γc in the opposite (length).
+        """
+        assert self.search is not None
+        if self._looking_back is None:
+            self._looking_back = self.search.look_back(self.found_at, depth)
+        back = self._looking_back
+        assert back.approach is not None
+        product = back.approach.createVecLeft()
+        back.approach.mult(self._u.x.petsc_vec, product)
+        approach = product.array_r.copy()
+        product.destroy()
+        return back, approach
+
     def _forget_look_back(self) -> None:
-        if self._looking_back is not None:
+        if self._looking_back is not None and self._looking_back.approach is not None:
             self._looking_back.approach.destroy()
         self._looking_back = None
 
@@ -196,14 +221,7 @@ class Pairs:
         nowhere = 0.0, np.zeros(self._gdim)
         if search is None:
             return nowhere
-        if self._looking_back is None:
-            depth = global_max(comm, self.depth(values.normal_displacement))
-            self._looking_back = search.look_back(self.found_at, depth)
-        back = self._looking_back
-        product = back.approach.createVecLeft()
-        back.approach.mult(self._u.x.petsc_vec, product)
-        approach = product.array_r.copy()
-        product.destroy()
+        back, approach = self._look_back(global_max(comm, self.depth(values.normal_displacement)))
         distance = back.distance
         if gap_prescribed:
             distance = search.largest(values.initial_gap)[back.facet]

@@ -13,6 +13,7 @@ from dolfinx import fem
 
 from fenics_contact.contact.finite import FiniteKinematics
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
+from fenics_contact.contact.present import PresentKinematics
 from fenics_contact.laws.base import Kinematics, Law, Response
 from fenics_contact.parallel import global_max, global_min
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
@@ -30,7 +31,8 @@ class PointTangent:
     """Derivatives of the traction at the points, (n_points, gdim, gdim) each (stress/length).
 
     Attributes:
-        by_jump: By the displacement of the body.
+        by_jump: By the displacement of the body; where `Contact.local_map` is one, of the forces
+            on the local unknowns by these.
         by_shift: By that of the support; None where no component of it is free.
     """
 
@@ -50,7 +52,7 @@ class PointLaw:
         self,
         law: Law,
         seen: Seen,
-        kinematics: SmallKinematics | FiniteKinematics,
+        kinematics: SmallKinematics | FiniteKinematics | PresentKinematics,
         quadrature: SurfaceQuadrature,
         jump: fem.Function,
         *,

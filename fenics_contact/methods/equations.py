@@ -170,6 +170,12 @@ class Equations:
             contacts: Contact's part, used up.
         """
         self.factorisations += self.system.fill(matrix, contacts)
+        if any(contact.follows for contact in self.contacts):
+            # A factorisation of another pattern is no start, whatever the matrix says.
+            for consistent, mine in self._matrices.items():
+                if mine.handle == matrix.handle:
+                    self.solvers[consistent].reset()
+                    self.solvers[consistent].setOperators(matrix)
         self._filled |= {c for c, m in self._matrices.items() if m.handle == matrix.handle}
 
     def assemble_tangent(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:

@@ -181,6 +181,11 @@ class FacetSet:
         nodes = self.space.dofmap.index_map.local_to_global(local)
         return nodes.reshape(weights.shape), weights
 
+    def slopes(self, facet: Index, place: Array) -> Array:
+        """Derivatives of the weights of `interpolation` by the places, (n, d - 1, n_basis)."""
+        table = tabulate(self._basis, 1, self._in_cell(facet, place))[1:, :, :, 0]
+        return np.einsum("jpk,pji->pik", table, self._edges[facet])
+
     def search(
         self, x: Array, ray: Array, u: fem.Function | None, counts: Rule
     ) -> tuple[Index, Array, Array]:
@@ -204,8 +209,11 @@ class FacetSet:
         radius = 1.5 * np.linalg.norm(tangents, axis=1).max(axis=1)
         near = min(_NEAREST, n_facets)
         away, candidates = scipy.spatial.cKDTree(middle).query(x, k=[*range(1, near + 1)])
-        pairs = np.repeat(np.arange(n), near), candidates.reshape(-1)
-        self._keep_nearest(x, ray, pairs, u, best, counts)
+        point, facet = np.repeat(np.arange(n), near), candidates.reshape(-1)
+        arm = middle[facet] - x[point]
+        along = np.einsum("pd,pd->p", arm, ray[point])
+        hopeful = np.linalg.norm(arm - along[:, None] * ray[point], axis=1) <= radius[facet]
+        self._keep_nearest(x, ray, (point[hopeful], facet[hopeful]), u, best, counts)
         if near == n_facets:
             return best
         # The nearest need not be the ones ahead: a long facet, or a far one. Where something was
@@ -256,20 +264,22 @@ class FacetSet:
         place: Array = self._middle.repeat(len(facet), axis=0)
         distance: Array = np.zeros(len(facet))
         singular = np.zeros(len(facet), dtype=bool)
+        rows = np.arange(len(facet))  # those still on their way
         for _ in range(_NEWTON_STEPS):
-            position, tangents = self.positions(facet, place, u)
-            rest = position - x - distance[:, None] * ray
-            system = np.concatenate([tangents, -ray[:, :, None]], axis=2)
+            position, tangents = self.positions(facet[rows], place[rows], u)
+            rest = position - x[rows] - distance[rows, None] * ray[rows]
+            system = np.concatenate([tangents, -ray[rows, :, None]], axis=2)
             # A facet along the ray is never met; its singular system must not stop the others.
             size = np.prod(np.linalg.norm(system, axis=1), axis=1)
-            singular = np.abs(np.linalg.det(system)) < 1e-12 * size
-            system[singular] = np.eye(d)
-            rest[singular] = 0.0
+            singular[rows] = np.abs(np.linalg.det(system)) < 1e-12 * size
+            system[singular[rows]] = np.eye(d)
+            rest[singular[rows]] = 0.0
             step = np.linalg.solve(system, -rest[..., None])[..., 0]
             # Far outside, a curved facet may bend any way: stay near it.
-            place = np.clip(place + step[:, :-1], -1.0, 2.0)
-            distance = distance + step[:, -1]
-            if np.all(np.abs(step[:, :-1]) < 1e-13):
+            place[rows] = np.clip(place[rows] + step[:, :-1], -1.0, 2.0)
+            distance[rows] += step[:, -1]
+            rows = rows[np.any(np.abs(step[:, :-1]) >= 1e-13, axis=1)]
+            if not len(rows):
                 break
         position, tangents = self.positions(facet, place, u)
         rest = np.linalg.norm(position - x - distance[:, None] * ray, axis=1)

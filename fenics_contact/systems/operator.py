@@ -165,6 +165,8 @@ class ContactOperator:
             A new matrix over the unknowns (force/length).
         """
         tangent = tangent or self.contact.acting_tangent()
+        if self.contact.local_map is not None:
+            return self._local_tangent(tangent.by_jump, self.contact.local_map)
         if tangent.by_shift is None:
             return self.springs(-tangent.by_jump)
         # Where the support moves its normals may turn: more than the opposite of ∂/∂jump.
@@ -178,17 +180,26 @@ class ContactOperator:
             item.destroy()
         return product
 
+    def _local_tangent(self, by_local: Array, local_map: PETSc.Mat) -> PETSc.Mat:
+        """Of pairs that follow the bodies; see `PresentPairs.tangent`. Collective."""
+        lifted = self.unknowns.widened(self.contact.displacement.lifted(local_map))
+        blocks = self._block_diagonal(-self.contact.area[:, None, None] * by_local)
+        product = blocks.ptap(lifted)
+        blocks.destroy()
+        return product
+
     @cached_property
     def _product(self) -> PointProduct:
         return PointProduct(self._map, self._gdim)
 
     def _block_diagonal(self, blocks: Array) -> PETSc.Mat:
-        """One block per point, (n_points, gdim, gdim)."""
-        n, d = self.contact.quadrature.n_points, self._gdim
-        first, _ = self._map.getOwnershipRange()
+        """One block per point, (n_points, d, d)."""
+        n, d = blocks.shape[:2]
+        comm = self.contact.surface.mesh.comm
+        first = d * (comm.exscan(n) or 0)
         columns = first + d * np.arange(n)[:, None, None] + np.arange(d)[None, None, :]
         columns = np.broadcast_to(columns, (n, d, d))
-        size = self._map.getSizes()[0]
+        size = (n * d, None)
         return PETSc.Mat().createAIJ(
             (size, size),
             csr=(
@@ -196,7 +207,7 @@ class ContactOperator:
                 columns.ravel().astype(PETSc.IntType),
                 blocks.ravel(),
             ),
-            comm=self.contact.surface.mesh.comm,
+            comm=comm,
         )
 
 

@@ -88,6 +88,8 @@ class System(ABC):
     @property
     def operators(self) -> list[ContactOperator]:
         """What the contacts are over these unknowns, with the pairs as they are. Collective."""
+        for contact in self.contacts:
+            contact.follow()
         pairings = [c.pairings for c in self.contacts]
         if self._operators is None or self._operators[0] != pairings:
             self._operators = pairings, contact_operators(self.contacts, self.unknowns)

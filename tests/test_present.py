@@ -1,0 +1,292 @@
+"""Two bodies that deform and slide far: pairs at the present places, their forces and tangent.
+
+`kinematics="finite"` with a `DeformableBody`. Displacements of the first tests are made up: random
+nodes, so that nothing is symmetric, on bodies that have turned by a large angle.
+"""
+
+from __future__ import annotations
+
+import dolfinx
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.elasticity import NeoHookean
+from fenics_contact.systems.operator import ContactOperator
+from scenes.elasticity import displacement_space, hold
+from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, two_blocks
+
+CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
+LAWS = {
+    "frictionless": fc.Frictionless(k_n=1e3),
+    "coulomb": fc.Coulomb(0.3, k_n=1e3, k_t=5e2),
+    "tresca": fc.Tresca(0.3, 20.0, k_n=1e3, k_t=5e2),
+}
+
+
+class Pair:
+    """A small block on a larger one, their meshes do not match; displacements are written at will.
+
+    Attributes:
+        mesh, u, contact: As made.
+    """
+
+    def __init__(
+        self, cell: str, law: fc.Law, *, degree: int = 1, n: tuple[int, int] = (4, 3), **options
+    ) -> None:
+        """Make them. Collective."""
+        widths, shift = ((1.0, 0.6), 0.17) if n == (4, 3) else ((1.0, 1.0), 0.0)
+        self.mesh, tags = two_blocks(cell, n, widths, shift)
+        self.d = self.mesh.geometry.dim
+        self.u = fem.Function(displacement_space(self.mesh, degree))
+        surface = fc.ContactSurface(self.mesh, tags, UPPER)
+        opposite = fc.DeformableBody(tags, LOWER)
+        self.contact = fc.Contact(self.u, surface, opposite, law, **options)
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """Their places, ghosts included, (n, d)."""
+        return self.u.function_space.tabulate_dof_coordinates()[:, : self.d]
+
+    def place(self, x: np.ndarray) -> None:
+        """Let nodes be at x, (n, d)."""
+        self.u.x.array[:] = (x - self.nodes).ravel()
+        self.u.x.scatter_forward()
+
+    def wobbled(self, size: float, seed: int) -> np.ndarray:
+        """Places off the nodes' by waves of a size, the same on any number of ranks, (n, d)."""
+        rng = np.random.default_rng(seed)
+        k, phase = rng.uniform(3, 9, (self.d, self.d)), rng.uniform(0, 6, self.d)
+        return self.nodes + size * np.sin(self.nodes @ k.T + phase)
+
+    def pressed(self, x: np.ndarray, down: float, along: float) -> np.ndarray:
+        """The upper body of places x, moved."""
+        upper = np.zeros(len(x), dtype=bool)
+        space = self.u.function_space
+        middles = dolfinx.mesh.compute_midpoints(
+            self.mesh, self.d, np.arange(len(space.dofmap.list), dtype=np.int32)
+        )
+        upper[space.dofmap.list[middles[:, self.d - 1] > 0.5].ravel()] = True
+        moved = x.copy()
+        moved[upper, self.d - 1] -= down
+        moved[upper, 0] += along
+        return moved
+
+    def force(self) -> np.ndarray:
+        """Contact's part of the residual at this rank's unknowns. Collective."""
+        self.contact.follow()
+        operator = ContactOperator(self.contact)
+        vector = operator.unknowns.vector()
+        vector.set(0.0)
+        operator.add_force(vector)
+        return vector.array_r.copy()
+
+
+def turn(d: int, angle: float) -> np.ndarray:
+    """Matrix of a turn, in space about an axis across all coordinates'."""
+    if d == 2:
+        c, s = np.cos(angle), np.sin(angle)
+        return np.array([[c, -s], [s, c]])
+    axis = np.array([1.0, 2.0, -1.0]) / np.sqrt(6)
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def loaded(pair: Pair, along: float) -> None:
+    """Commit a state on turned bodies, then press and shear further."""
+    d = pair.d
+    pair.place(pair.pressed(pair.wobbled(0.01, 1), 0.04, 0.0) @ turn(d, 0.7).T)
+    pair.contact.commit()
+    pair.place(pair.pressed(pair.wobbled(0.013, 2), 0.045, along) @ turn(d, 1.1).T)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("along", [0.004, 0.08])
+@pytest.mark.parametrize(("cell", "degree"), [*((c, 1) for c in CELLS), ("triangle", 2)])
+def test_the_tangent_is_the_derivative_of_the_forces(cell, degree, along, law):
+    """By central differences, to 1e-6 of the largest entry: steps are 1e-6 of the size."""
+    pair = Pair(cell, LAWS[law], degree=degree, kinematics="finite")
+    loaded(pair, along)
+    pair.contact.evaluate()
+    resultants = pair.contact.resultants()
+    assert resultants.max_penetration > 0.01
+    operator = ContactOperator(pair.contact)
+    tangent = operator.tangent()
+    way = pair.wobbled(1.0, 5) - pair.nodes
+    here = pair.nodes + pair.u.x.array.reshape(-1, pair.d)
+    vector, product = operator.unknowns.vector(), operator.unknowns.vector()
+    vector.array[:] = way.ravel()[: vector.array.size]
+    tangent.mult(vector, product)
+    forces = []
+    for step in (1e-6, -1e-6):
+        pair.place(here + step * way)
+        forces.append(pair.force())
+    slope = (forces[0] - forces[1]) / 2e-6
+    size = MPI.COMM_WORLD.allreduce(np.abs(slope).max(initial=0.0), op=MPI.MAX)
+    assert np.abs(slope - product.array_r).max(initial=0.0) <= 1e-6 * size
+
+
+def test_points_of_the_derivatives_stick_and_slip():
+    """What the differences above go through: both, in one state or the other."""
+    found = set()
+    for along in (0.004, 0.08):
+        pair = Pair("triangle", LAWS["coulomb"], kinematics="finite")
+        loaded(pair, along)
+        pair.contact.evaluate()
+        r = pair.contact.resultants()
+        found |= {name for name in ("stick", "slip") if getattr(r, name)}
+    assert found == {"stick", "slip"}
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron"])
+def test_turned_bodies_have_turned_forces(cell):
+    """A rotation of everything after the commit, about the normal too: 1e-10 of the forces."""
+    forces = []
+    for angle in (0.0, 0.9, -2.5):
+        pair = Pair(cell, LAWS["coulomb"], kinematics="finite")
+        loaded(pair, 0.004)
+        x = (pair.nodes + pair.u.x.array.reshape(-1, pair.d)) @ turn(pair.d, angle).T
+        pair.place(x + 0.3)
+        forces.append(pair.force().reshape(-1, pair.d) @ turn(pair.d, angle))
+    size = MPI.COMM_WORLD.allreduce(np.abs(forces[0]).max(initial=0.0), op=MPI.MAX)
+    assert size > 1.0
+    for other in forces[1:]:
+        assert np.abs(other - forces[0]).max(initial=0.0) <= 1e-10 * size
+
+
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
+def test_forces_on_both_bodies_cancel(cell):
+    """Their sum is round-off, and their moment the one that tractions have over a gap: small."""
+    pair = Pair(cell, LAWS["coulomb"], kinematics="finite")
+    loaded(pair, 0.08)
+    force = pair.force().reshape(-1, pair.d)
+    pair.contact.evaluate()
+    comm = MPI.COMM_WORLD
+    total = comm.allreduce(force.sum(axis=0))
+    size = comm.allreduce(np.abs(force).sum())
+    assert np.abs(total).max() <= 1e-14 * size
+    x = (pair.nodes + pair.u.x.array.reshape(-1, pair.d))[: len(force)]
+    moment = comm.allreduce(np.sum(x[:, 0] * force[:, 1] - x[:, 1] * force[:, 0]))
+    c = pair.contact
+    gap = np.abs(c.gap)
+    torque = comm.allreduce(np.sum(c.measure * gap * np.linalg.norm(c.tangential_traction, axis=1)))
+    assert abs(moment) <= torque + 1e-13 * size
+
+
+def test_small_displacements_are_the_limit():
+    """Matching meshes: the difference to small kinematics falls with the square of the size."""
+    errors = []
+    for size in (1e-3, 1e-4):
+        tractions = []
+        for kinematics in ("small", "finite"):
+            pair = Pair("triangle", LAWS["coulomb"], n=(5, 5), kinematics=kinematics)
+            pair.place(pair.pressed(pair.wobbled(size, 2), 3 * size, 0.7 * size))
+            tractions.append(pair.force() / size)
+        errors.append(np.abs(tractions[0] - tractions[1]).max(initial=0.0))
+    errors = np.array([MPI.COMM_WORLD.allreduce(e, op=MPI.MAX) for e in errors])
+    assert 0 < errors[1] < 0.15 * errors[0]
+
+
+class Blocks:
+    """Two neo-Hookean blocks, the upper one's top moved and turned.
+
+    Attributes:
+        contact, problem, u: As made.
+    """
+
+    def __init__(self, cell: str, law: fc.Law, n: tuple[int, int], **options) -> None:
+        """Make them, unloaded. Collective."""
+        widths, shift = ((2.0, 1.0), 0.3) if n[0] != n[1] else ((1.0, 1.0), 0.0)
+        self.mesh, tags = two_blocks(cell, n, widths, shift)
+        self.d = d = self.mesh.geometry.dim
+        self.u = fem.Function(displacement_space(self.mesh, 1))
+        v = ufl.TestFunction(self.u.function_space)
+        self.top = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
+        bcs = [hold(self.u, tags, BOTTOM, i) for i in range(d)]
+        bcs += [hold(self.u, tags, TOP, i, value) for i, value in enumerate(self.top)]
+        self.contact = fc.Contact(
+            self.u,
+            fc.ContactSurface(self.mesh, tags, UPPER),
+            fc.DeformableBody(tags, LOWER),
+            law,
+            kinematics="finite",
+            **options,
+        )
+        body = NeoHookean(self.u, 100.0, 0.3, "plane strain" if d == 2 else "3D")
+        self.problem = fc.ContactProblem(body.residual(v), self.u, bcs=bcs, contacts=[self.contact])
+
+    def load(self, t: float) -> None:
+        """Down while t < 1, then along."""
+        self.top[-1].value = -0.05 * min(t, 1.0)
+        self.top[0].value = 0.6 * max(t - 1.0, 0.0)
+
+    def history(self, until: float, steps, **options) -> list[fc.Step]:
+        """Solve and commit. Collective."""
+        return list(fc.increments(self.problem, self.load, 0.0, until, steps=steps, **options))
+
+
+WAY = [0.5, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0]
+
+
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+def test_a_block_slides_far(enforcement):
+    """Over three facets: T = mu N on the deformed slope, energy given to friction, all verified."""
+    blocks = Blocks("triangle", fc.Coulomb(0.2), (6, 4), enforcement=enforcement)
+    steps = blocks.history(2.0, WAY)
+    force = steps[-1].contacts["contact"]
+    assert force.slip > 0 and force.stick == 0
+    # On the block itself: tractions along and across the present normals are in the cone.
+    ratio = force.tangential_force / force.normal_force
+    assert ratio == pytest.approx(0.2, rel=1e-9 if enforcement == "penalty" else 1e-4)
+    taken = sum(step.energy.dissipation for step in steps[2:])
+    assert taken == pytest.approx(0.6 * 0.2 * force.normal_force, rel=0.1)  # N is nearly constant
+
+
+def test_a_history_goes_on_where_it_stopped(tmp_path):
+    """Resumed from a checkpoint it has the digits of one without a stop."""
+    path = MPI.COMM_WORLD.bcast(tmp_path) / "state"
+    whole = Blocks("triangle", fc.Coulomb(0.2), (6, 4))
+    steps = whole.history(2.0, WAY)
+    first = Blocks("triangle", fc.Coulomb(0.2), (6, 4))
+    for step in fc.increments(first.problem, first.load, 0.0, 2.0, steps=WAY, checkpoint=path):
+        if step.load >= 1.4:
+            break
+    again = Blocks("triangle", fc.Coulomb(0.2), (6, 4))
+    rest = list(fc.increments(again.problem, again.load, 0.0, 2.0, steps=WAY, checkpoint=path))
+    assert len(rest) == 3
+    for step, other in zip(rest, steps[-3:], strict=True):
+        mine, theirs = step.contacts["contact"], other.contacts["contact"]
+        np.testing.assert_allclose(mine.force, theirs.force, rtol=1e-9)
+
+
+def test_a_turned_patch_bears_a_uniform_pressure():
+    """Matching meshes, turned by half a radian and pressed: one pressure at all points, 1e-8."""
+    pair = Pair("triangle", fc.Frictionless(k_n=1e3), n=(5, 5), kinematics="finite")
+    x = pair.pressed(pair.nodes, 0.01, 0.0) @ turn(2, 0.5).T
+    pair.place(x)
+    pair.contact.evaluate()
+    np.testing.assert_allclose(pair.contact.pressure, 10.0, rtol=1e-10)
+    nodal = pair.force().reshape(-1, 2)
+    along = nodal @ turn(2, 0.5)[:, 0]
+    assert np.abs(along).max(initial=0.0) <= 1e-12
+
+
+def test_condensation_is_refused():
+    """Pairs follow the bodies: there is nothing constant to condense onto."""
+    mesh, tags = two_blocks("triangle", (4, 3), (1.0, 0.6), 0.17)
+    u = fem.Function(displacement_space(mesh, 1))
+    v = ufl.TestFunction(u.function_space)
+    contact = fc.Contact(
+        u,
+        fc.ContactSurface(mesh, tags, UPPER),
+        fc.DeformableBody(tags, LOWER),
+        fc.Frictionless(),
+        kinematics="finite",
+    )
+    bcs = [hold(u, tags, tag, i) for tag in (BOTTOM, TOP) for i in range(2)]
+    form = ufl.inner(ufl.sym(ufl.grad(u)), ufl.grad(v)) * ufl.dx
+    with pytest.raises(ValueError, match="pairs follow the bodies"):
+        fc.ContactProblem(form, u, bcs=bcs, contacts=[contact], condensation=True)
