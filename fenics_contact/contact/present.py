@@ -285,7 +285,7 @@ class PresentPairs(Pairs):
         # δn = -a^α (n·δa_α)
         normal = np.zeros((n, d, m))
         across = -np.einsum("qia,qk->qiak", now.along, now.normal)
-        normal[:, :, slopes] = across.reshape(n, d, -1)
+        normal[:, :, slopes] = across.reshape(n, d, d * (d - 1))
         # a_α δξ_α - n δg = δu(X) + g δn - δu(Y)
         right = now.gap[:, None, None] * normal
         right[:, :, own] += np.eye(d)
@@ -310,7 +310,9 @@ class PresentPairs(Pairs):
         blocks = np.zeros((n, m, m))
         blocks[:, own] += change
         blocks[:, other] -= change
-        blocks[:, other_slopes] -= np.einsum("qi,qam->qaim", traction, slide).reshape(n, -1, m)
+        blocks[:, other_slopes] -= np.einsum("qi,qam->qaim", traction, slide).reshape(
+            n, d * (d - 1), m
+        )
         blocks[now.hits.facet < 0] = 0.0
         return blocks
 
@@ -328,7 +330,7 @@ class PresentPairs(Pairs):
         n = len(normal)
         gradient = np.einsum("qim,qj->qijm", normal, before.normal)
         unit = np.eye(d)
-        own = np.einsum("ik,qja->qijak", unit, before.along).reshape(n, d, d, -1)
+        own = np.einsum("ik,qja->qijak", unit, before.along).reshape(n, d, d, 2 * d)
         gradient[..., slopes] += own
         w = np.einsum("qji,qjkm->qikm", now.rotation, gradient)
         skew = w - np.swapaxes(w, 1, 2)
