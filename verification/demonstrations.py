@@ -244,6 +244,14 @@ DEMOS = [
         },
     ),
     demo(
+        "Band on a drum that turns (capstan), finite",
+        "1.25 t/(2R): the formula is that of a band without thickness, and 1.0 of it is the tension's "
+        "arm; extrapolated to t = 0 the product of both t/R; 2 % and 0.5 % of pressure and torque: t/R",
+        "capstan",
+        source={"torque": "equilibrium", "p R": "equilibrium", "": "Eytelwein, μπ"},
+        budget="the formula is known to t/(2R), more than the error",
+    ),
+    demo(
         "Male–female fitting",
         "1e-7: equilibrium to the solver's tolerance; 1e-8 for homogeneity",
         "fitting",

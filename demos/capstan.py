@@ -1,0 +1,270 @@
+"""Capstan: a rubber band over a drum that turns, and pulls it by friction.
+
+Plane strain, neo-Hookean; lengths in mm, stresses in MPa, forces per mm of width. The band
+(E = 10, ν = 0.45) lies on the upper half of a rigid drum (R = 10), its tails hang down on both
+sides. A weight pulls one of them by T1, the end of the other one is held. The drum turns against
+the held end until all of the band slips, and goes on: the band stretches by a tenth, and the drum
+runs away under it.
+
+    python demos/capstan.py
+    python demos/capstan.py --thickness 0.5 --cells 40
+    mpirun -n 2 python demos/capstan.py
+
+Reference: Euler's and Eytelwein's formula T2/T1 = exp(μφ), φ = π, of a band without thickness.
+A band of thickness t carries its tension at R + t/2, but is rubbed at R: the moment on a piece of
+it that bends no further is in balance if (R + t/2) dT = μ R q dφ, q dφ the force that presses it.
+So the exponent is less than Eytelwein's by the share t/(2R), and what bends at both ends of the
+contact is of this order, too. Checked are that the exponent lacks no more than 1.25 t/(2R), that
+it tends to Eytelwein's with t (extrapolated from the two thinnest bands, to the product of both
+t/R), p R/T in the middle of the drum (2 %, as q and T differ for the thickest) and the torque,
+(T2 - T1)(R + t/2) (0.5 %). The exit code is 1 if one of them is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import dolfinx
+import gmsh
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from tqdm import tqdm
+
+import fenics_contact as fc
+from fenics_contact import output, plotting
+from fenics_contact.elasticity import NeoHookean
+
+E, NU, MU, R, TAIL = 10.0, 0.45, 0.3, 10.0, 10.0
+STRAIN = 0.05  # T1 over E t, so that bands of all thicknesses stretch alike
+HELD, PULLED, INNER = 1, 2, 3
+TIGHT = 0.995  # radius of the band over that of the drum: it touches all along from the start
+EYTELWEIN = float(np.exp(MU * np.pi))
+# The drum's turn (rad): slowly while slip spreads, then on under a band that stands still. Slip is
+# counted along the chord of an increment Δ, by which 1 - cos(Δ/2) of the friction points aside:
+# the last increment is short.
+TURN = (*(0.01 * np.arange(1, 21)), 0.6, 1.2, 1.8, 2.4, 3.0, 3.01)
+
+
+@dataclass
+class Run:
+    """One band.
+
+    Attributes:
+        path: Turn of the drum (rad) and T2/T1 after every increment.
+        points: What `Contact.gather` returns, at the end.
+        angle: Of the points, where they are at the end (rad), 0 where T2 comes in.
+        pressure: Their true pressure, per deformed area.
+        torque: On the band.
+    """
+
+    thickness: float
+    tension: float
+    contact: fc.Contact
+    rubber: NeoHookean
+    dofs: int
+    path: list[tuple[float, float]] = field(default_factory=list)
+    iterations: list[int] = field(default_factory=list)
+    angle: np.ndarray = field(default_factory=lambda: np.empty(0))
+    pressure: np.ndarray = field(default_factory=lambda: np.empty(0))
+    torque: float = 0.0
+
+    @property
+    def ratio(self) -> float:
+        """T2/T1 at the end."""
+        return self.path[-1][1]
+
+
+def make_mesh(thickness: float, cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
+    """The band, its cells curved like the drum; ``cells`` on each quarter of it. Collective."""
+    gmsh.initialize()
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.model.add("band")
+        if MPI.COMM_WORLD.rank == 0:
+            geo, outer = gmsh.model.geo, R + thickness
+            centre = geo.addPoint(0, 0, 0)
+            # Five cross-sections, from the held end to the weight, and four pieces between them.
+            sections = [
+                (geo.addPoint(x * R, y, 0), geo.addPoint(x * outer, y * far, 0))
+                for x, y, far in ((1, -TAIL, 1), (1, 0, 1), (0, R, outer / R), (-1, 0, 1))
+            ]
+            sections.append((geo.addPoint(-R, -TAIL, 0), geo.addPoint(-outer, -TAIL, 0)))
+            across = [geo.addLine(*section) for section in sections]
+            inner, pieces = [], []
+            for i in range(4):
+                (a, b), (c, d) = sections[i], sections[i + 1]
+                if i in (1, 2):
+                    low, high = geo.addCircleArc(a, centre, c), geo.addCircleArc(b, centre, d)
+                else:
+                    low, high = geo.addLine(a, c), geo.addLine(b, d)
+                inner.append(low)
+                loop = geo.addCurveLoop([across[i], high, -across[i + 1], -low])
+                pieces.append(geo.addPlaneSurface([loop]))
+                number = cells if i in (1, 2) else round(cells * TAIL / (R * np.pi / 2))
+                for line in (low, high):
+                    geo.mesh.setTransfiniteCurve(line, number + 1)
+            for line in across:
+                geo.mesh.setTransfiniteCurve(line, 3)
+            for piece in pieces:
+                geo.mesh.setTransfiniteSurface(piece)
+                geo.mesh.setRecombine(2, piece)
+            geo.synchronize()
+            gmsh.model.addPhysicalGroup(2, pieces, 1)
+            gmsh.model.addPhysicalGroup(1, [across[0]], HELD)
+            gmsh.model.addPhysicalGroup(1, [across[-1]], PULLED)
+            gmsh.model.addPhysicalGroup(1, inner, INNER)
+            gmsh.model.mesh.generate(2)
+            gmsh.model.mesh.setOrder(2)
+        mesh, _, tags = fc.model_to_mesh(gmsh.model, MPI.COMM_WORLD, gdim=2)
+        mesh.geometry.x[:] *= TIGHT
+        return mesh, tags
+    finally:
+        gmsh.finalize()
+
+
+def solve(thickness: float, cells: int) -> Run:
+    """Hang the weight on the band, then turn the drum. Collective."""
+    mesh, tags = make_mesh(thickness, cells)
+    V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
+    u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
+    rubber = NeoHookean(u, E, NU, "plane strain")
+    weight, angle = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
+    ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
+    F = rubber.residual(v) + weight / thickness * v[1] * ds(PULLED)
+    # Both ends are led straight down.
+    held = fem.locate_dofs_topological(V.sub(1), 1, tags.find(HELD))
+    led = fem.locate_dofs_topological(
+        V.sub(0), 1, np.concatenate([tags.find(HELD), tags.find(PULLED)])
+    )
+    bcs = [fem.dirichletbc(0.0, held, V.sub(1)), fem.dirichletbc(0.0, led, V.sub(0))]
+
+    drum = fc.Cylinder((0, 0), R, rotation=fc.Rotation(angle, about=(0, 0)))
+    surface = fc.ContactSurface(mesh, tags, INNER)
+    # Twenty times what the band as a hoop, E t/R², resists a pressure. Stiffer springs would gain
+    # nothing: a band that lies a little deeper turns by the same angle.
+    stiffness = 20 * E * thickness / R**2
+    friction = fem.Constant(mesh, 0.0)  # greased, until the weight hangs
+    law = fc.Coulomb(friction, stiffness, stiffness)
+    contact = fc.Contact(u, surface, drum, law, kinematics="finite")
+    problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
+
+    # T2 is what the stresses do in a displacement of the held end by 1, upwards on the band.
+    lift = fem.Function(V)
+    lift.x.array[held] = 1.0
+    reaction = fem.form(ufl.action(rubber.residual(v), lift))
+
+    tension = STRAIN * E * thickness
+    run = Run(thickness, tension, contact, rubber, V.dofmap.index_map.size_global * 2)
+    quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
+    for step in fc.increments(problem, weight, 0.0, tension):
+        run.iterations.append(step.iterations)
+    friction.value = MU
+    turning = fc.increments(problem, angle, 0.0, TURN[-1], steps=TURN)
+    for step in tqdm(turning, f"t = {thickness:g}", len(TURN), disable=quiet, unit="increment"):
+        run.iterations.append(step.iterations)
+        drawn = -mesh.comm.allreduce(fem.assemble_scalar(reaction))
+        run.path.append((step.load, drawn / tension))
+    run.torque = float(contact.moment((0, 0))[0])
+    run.angle, run.pressure = along_the_drum(contact)
+    return run
+
+
+def along_the_drum(contact: fc.Contact) -> tuple[np.ndarray, np.ndarray]:
+    """Angle and true pressure at the closed points, in their order, on all ranks. Collective."""
+    closed = contact.pressure > 0
+    _, normal = contact.true_placement()  # into the drum
+    angle = np.arctan2(-normal[closed, 1], -normal[closed, 0])
+    pressure = (contact.pressure / contact.area_stretch())[closed]
+    angle[angle < -np.pi / 2] += 2 * np.pi  # on the tail of the weight
+    rows = MPI.COMM_WORLD.allgather(np.stack([angle, pressure]))
+    angle, pressure = np.concatenate(rows, axis=1)
+    order = np.argsort(angle)
+    return angle[order], pressure[order]
+
+
+def compare(runs: list[Run]) -> dict[str, Any]:
+    """The bands beside their references."""
+    values, references = {}, {}
+    for run in runs:
+        t = f"t = {run.thickness:g}"
+        values[f"ln(T2/T1), {t}"] = float(np.log(run.ratio))
+        references[f"ln(T2/T1), {t}"] = (MU * np.pi, 1.25 * run.thickness / (2 * R))
+        # In the middle, far from where the band is straightened or bent.
+        middle = np.abs(run.angle - np.pi / 2) < np.pi / 6
+        tension = run.tension * run.ratio ** (1 - run.angle[middle] / np.pi)
+        values[f"p R/T, {t}"] = float(np.mean(run.pressure[middle] * R / tension))
+        references[f"p R/T, {t}"] = (1.0, 0.02)
+        values[f"torque [N], {t}"] = abs(run.torque)
+        arm = R + run.thickness / 2
+        references[f"torque [N], {t}"] = ((run.ratio - 1) * run.tension * arm, 0.005)
+    if len(runs) > 1:
+        (thick, much), (thin, less) = ((run.thickness, np.log(run.ratio)) for run in runs[-2:])
+        values["ln(T2/T1), t to 0"] = (thick * less - thin * much) / (thick - thin)
+        references["ln(T2/T1), t to 0"] = (MU * np.pi, thick * thin / R**2)
+    return output.compare(values, references)
+
+
+def draw(path: Path, runs: list[Run]) -> None:
+    """Pressure along the drum, and the ratio of the tensions while it turns. On this rank."""
+    with plotting.figure(path, 2) as (left, right):
+        at = np.linspace(0, np.pi, 200)
+        for run in runs:
+            label = f"t = {run.thickness:g} mm"
+            scaled = run.pressure * R / run.tension
+            left.plot(np.degrees(run.angle), scaled, ".", ms=3, label=label)
+            turn, ratio = np.degrees([a for a, _ in run.path]), [r for _, r in run.path]
+            right.plot(turn, ratio, ".-", label=label)
+        left.plot(np.degrees(at), np.exp(MU * (np.pi - at)), "k--", label="Eytelwein")
+        left.set(xlabel="angle from the held side [°]", ylabel="true pressure p R / T1 [–]")
+        left.set(title=f"Pressure on the drum, μ = {MU:g}", ylim=(0, 1.15 * EYTELWEIN))
+        right.axhline(EYTELWEIN, color="k", ls="--", label="exp(μπ)")
+        right.set(xlabel="turn of the drum [°]", ylabel="T2 / T1 [–]", ylim=(0.9, None))
+        right.set(title="Tension of the held end over the weight")
+        for ax in (left, right):
+            ax.grid(alpha=0.25)
+            ax.legend()
+
+
+def main() -> int:
+    """Turn the drum under every band, and write all results; 0 if every reference is met."""
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.add_argument(
+        "--thickness", type=float, nargs="+", default=[1.0, 0.5, 0.25], help="of the bands, mm"
+    )
+    parser.add_argument("--cells", type=int, default=16, help="cells on a quarter of the drum")
+    parser.add_argument("--output", type=Path, default=Path("output/capstan"), help="folder")
+    arguments, _ = parser.parse_known_args()
+    start = time.perf_counter()
+    runs = [solve(thickness, arguments.cells) for thickness in arguments.thickness]
+    comm, last = MPI.COMM_WORLD, runs[-1]
+    result: dict[str, Any] = {
+        "references": compare(runs),
+        "eytelwein": EYTELWEIN,
+        "dofs": last.dofs,
+        "iterations": [run.iterations for run in runs],
+        "paths": [run.path for run in runs],
+        "wall_seconds": time.perf_counter() - start,
+    }
+    output.write_body(arguments.output, last.contact.u, last.rubber.stress)
+    output.write_surface(arguments.output, last.contact)
+    plotting.plot_deformation(
+        arguments.output / "band.png", runs[0].contact.u, title=f"t = {runs[0].thickness:g} mm"
+    )
+    if comm.rank == 0:
+        print(output.table(result["references"]))
+        draw(arguments.output / "capstan.png", runs)
+    output.write_json(arguments.output / "result.json", result, comm)
+    return 0 if all(entry["passed"] for entry in result["references"].values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
