@@ -245,11 +245,19 @@ DEMOS = [
     ),
     demo(
         "Band on a drum that turns (capstan), finite",
-        "1.25 t/(2R): the formula is that of a band without thickness, and 1.0 of it is the tension's "
-        "arm; extrapolated to t = 0 the product of both t/R; 2 % and 0.5 % of pressure and torque: t/R",
+        "1.25 t/(2R): the formula is that of a band without thickness, and 1.0 of it is the arm of "
+        "the tension; extrapolated to t = 0 the product of both t/R; 2 % of the pressure and 0.5 % of "
+        "the torque: t/R",
         "capstan",
         source={"torque": "equilibrium", "p R": "equilibrium", "": "Eytelwein, μπ"},
         budget="the formula is known to t/(2R), more than the error",
+    ),
+    demo(
+        "O-ring between plates and in a groove, finite",
+        "5 %: the formula is a fit; 3 % for Hertz: a facet; meshes as they are; 1e-6: equilibrium",
+        "seal",
+        source={"c = 0.02": "Hertz", "c =": "Lindley", "bed": "equilibrium", "": "half the cells"},
+        budget="the formula is a fit, known to less than the error",
     ),
     demo(
         "Male–female fitting",
