@@ -1,31 +1,41 @@
 """A rubber block under a rigid disc, by GetFEM: numbers for `tests/test_finite_references.py`.
 
-    python3 verification/getfem_disc.py     # needs GetFEM 5.4, on Debian python3-getfem
+    python3 verification/getfem_disc.py               # without friction
+    python3 verification/getfem_disc.py --friction    # needs GetFEM 5.4, on Debian python3-getfem
 
-Plane strain, half of the block [0, 5] x [0, 10], held at its bottom and across x = 0; the disc of
-radius 4 stands on the middle of the top and is pressed down by 3 in twelve increments, without
-friction. W = G/2 (I₁ - 3 - 2 ln J) + λ/4 (J² - 1 - 2 ln J) with E = 1000, ν = 0.3; the disc is a
-penalty of ½ k ⟨R - |x - c|⟩² per undeformed length, k = 1e4. Biquadratic cells, three Gauss points
-along each side of them, all derivatives by GetFEM's own assembly language.
+Plane strain, a block 10 x 10 held at its bottom, under a disc of radius 4 that stands on the middle
+of its top. W = G/2 (I₁ - 3 - 2 ln J) + λ/4 (J² - 1 - 2 ln J) with E = 1000, ν = 0.3; the disc is a
+penalty of ½ k ⟨R - |x - c|⟩² per undeformed length, k = 1e4. Biquadratic cells of 0.5, three Gauss
+points along each side of them, all derivatives by GetFEM's own assembly language.
+
+Without friction half of the block is pressed by 3 in twelve increments. With μ = 0.3 all of it is
+pressed likewise, then the disc turns by 0.8 in eight increments, and is dragged by 2 in eight more.
+Friction is -k times what the foot of a point on the disc has moved along the disc since the last
+increment, R sin(θ - θ₀) of its angle there, added to what it was, and no more than μ p.
 """
 
 from __future__ import annotations
 
+import sys
 import time
 
 import getfem as gf  # no dependency: this script alone needs it
 import numpy as np
 
 E, NU, RADIUS, HEIGHT, DEPTH, STEPS, K = 1000.0, 0.3, 4.0, 10.0, 3.0, 12, 1e4
+KT = 1e3
+MU, TURN, WAY, MORE = 0.3, 0.8, 2.0, 8
+BOTTOM, TOP, MIDDLE = 1, 2, 3
+AWAY = "((X+u-c)/Norm(X+u-c))"  # from the disc's centre
+PRESSURE = "(k*neg_part(Norm(X+u-c)-R))"
 
 
-def main() -> None:
-    """Solve and print the force on half of the disc."""
-    gf.util_trace_level(0)
-    mesh = gf.Mesh("cartesian", np.linspace(0, 5, 11), np.linspace(0, HEIGHT, 21))
-    boxes = ([[-1, -1e-6], [6, 1e-6]], [[-1, HEIGHT - 1e-6], [6, 11]], [[-1e-6, -1], [1e-6, 11]])
-    bottom, top, middle = 1, 2, 3
-    for region, (low, high) in zip((bottom, top, middle), boxes, strict=True):
+def block(left: float, right: float) -> tuple[gf.Model, gf.MeshIm]:
+    """The rubber between two values of x, held at its bottom."""
+    along = np.linspace(left, right, round((right - left) / 0.5) + 1)
+    mesh = gf.Mesh("cartesian", along, np.linspace(0, HEIGHT, 21))
+    boxes = ([[-9, -1e-6], [9, 1e-6]], [[-9, HEIGHT - 1e-6], [9, 11]], [[-1e-6, -1], [1e-6, 11]])
+    for region, (low, high) in zip((BOTTOM, TOP, MIDDLE), boxes, strict=True):
         mesh.set_region(region, mesh.outer_faces_in_box(low, high))
     space = gf.MeshFem(mesh, 2)
     space.set_classical_fem(2)
@@ -33,7 +43,7 @@ def main() -> None:
     model = gf.Model("real")
     model.add_fem_variable("u", space)
     shear, lame = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
-    for name, value in {"G": [shear], "L": [lame], "k": [K], "R": [RADIUS]}.items():
+    for name, value in {"G": [shear], "L": [lame], "k": [K], "q": [KT], "R": [RADIUS]}.items():
         model.add_initialized_data(name, value)
     model.add_initialized_data("c", [0.0, HEIGHT + RADIUS])
     gradient = "(Id(2)+Grad_u)"
@@ -42,22 +52,80 @@ def main() -> None:
         f"G/2*(Norm_sqr{gradient}+1-3-2*log(Det{gradient}))"
         f"+L/4*(sqr(Det{gradient})-1-2*log(Det{gradient}))",
     )
-    model.add_nonlinear_term(rule, "k/2*sqr(neg_part(Norm(X+u-c)-R))", top)
-    model.add_Dirichlet_condition_with_simplification("u", bottom)
+    model.add_nonlinear_term(rule, "k/2*sqr(neg_part(Norm(X+u-c)-R))", TOP)
+    model.add_Dirichlet_condition_with_simplification("u", BOTTOM)
+    return model, rule
+
+
+def solve(model: gf.Model) -> int:
+    """One increment; Newton iterations."""
+    made, _ = model.solve("max_iter", 60, "max_res", 1e-9, "lsearch", "simplest")
+    return int(made)
+
+
+def without_friction() -> int:
+    """Print the force on half of the disc; Newton iterations."""
+    model, rule = block(0.0, 5.0)
     model.add_initialized_data("across", np.array([[1.0, 0.0], [0.0, 0.0]]))
     model.add_initialized_data("zero", [0.0, 0.0])
     # With multipliers the corner of the top is left free to move by 1e-3.
     model.add_generalized_Dirichlet_condition_with_penalization(
-        rule, "u", 1e12, middle, "zero", "across"
+        rule, "u", 1e12, MIDDLE, "zero", "across"
     )
-    start, iterations = time.perf_counter(), 0
+    iterations = 0
     for step in range(1, STEPS + 1):
         model.set_variable("c", [0.0, HEIGHT + RADIUS - DEPTH * step / STEPS])
-        made, _ = model.solve("max_iter", 60, "max_res", 1e-9, "lsearch", "simplest")
-        iterations += made
-        upward = "-k*neg_part(Norm(X+u-c)-R)*((X+u-c)/Norm(X+u-c)).[0;1]"
-        force = gf.asm("generic", rule, 0, upward, top, model)
+        iterations += solve(model)
+        force = gf.asm("generic", rule, 0, f"-{PRESSURE}*{AWAY}.[0;1]", TOP, model)
         print(f"{DEPTH * step / STEPS:.2f}  {force:.6f}")
+    return iterations
+
+
+def with_friction() -> int:
+    """Print force on the block and torque about the disc's centre; Newton iterations."""
+    model, rule = block(-8.0, 8.0)
+    points = gf.MeshImData(rule, TOP)
+    across = gf.MeshImData(rule, TOP, 2)
+    model.add_im_data("before", across)  # where the foot was, as a direction from the centre
+    model.add_im_data("borne", points)  # friction then, positive along [-y; x] of that direction
+    model.add_initialized_data("mu", [MU])
+    model.add_initialized_data("turn", [1.0, 0.0])  # cosine and sine of the last increment's angle
+    along = f"([0,-1;1,0]*{AWAY})"
+    was = "[turn(1)*before(1)-turn(2)*before(2);turn(2)*before(1)+turn(1)*before(2)]"
+    trial = f"(borne-q*R*({along}.(-{was})))"
+    bound = f"(mu*{PRESSURE})"
+    friction = f"({trial}-pos_part({trial}-{bound})+neg_part({trial}+{bound}))"
+    model.add_nonlinear_term(rule, f"-{friction}*({along}.Test_u)", TOP)
+
+    def keep() -> None:
+        found = model.interpolation(friction, points, TOP)
+        model.set_variable("before", model.interpolation(AWAY, across, TOP))
+        model.set_variable("borne", found)
+
+    model.set_variable("before", model.interpolation(AWAY, across, TOP))
+    iterations, done = 0, 0.0
+    path = [(0.0, DEPTH * i / STEPS, 0.0) for i in range(1, STEPS + 1)]
+    path += [(0.0, DEPTH, TURN * i / MORE) for i in range(1, MORE + 1)]
+    path += [(WAY * i / MORE, DEPTH, TURN) for i in range(1, MORE + 1)]
+    for side, depth, angle in path:
+        model.set_variable("c", [side, HEIGHT + RADIUS - depth])
+        model.set_variable("turn", [np.cos(angle - done), np.sin(angle - done)])
+        iterations += solve(model)
+        traction = f"({PRESSURE}*{AWAY}+{friction}*{along})"
+        # What the block feels is the opposite of what its stresses balance: p against AWAY.
+        x, y = (gf.asm("generic", rule, 0, f"{traction}({i})", TOP, model) for i in (1, 2))
+        torque = gf.asm("generic", rule, 0, f"Norm(X+u-c)*{friction}", TOP, model)
+        keep()
+        done = angle
+        print(f"({x:.6f}, {y:.6f}, {torque:.6f}),")
+    return iterations
+
+
+def main() -> None:
+    """Solve and print."""
+    gf.util_trace_level(0)
+    start = time.perf_counter()
+    iterations = with_friction() if "--friction" in sys.argv else without_friction()
     print(f"{iterations} Newton iterations, {time.perf_counter() - start:.2f} s")
 
 

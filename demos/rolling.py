@@ -1,0 +1,190 @@
+"""Rolling: a rigid disc is pressed into rubber, turns there until it slips, and is dragged along.
+
+Plane strain, neo-Hookean (E = 1000, ν = 0.3); lengths in mm, stresses in MPa, forces per mm of
+thickness. The disc (R = 4) is pressed by 3 into a block 16 x 10, held at its bottom: by 30 % of the
+height. Then it turns by 0.8: first the block follows, then points begin to slip from the edges of
+the contact, at last all of them do. Then the disc is dragged by 2 as it is. μ = 0.3.
+
+    python demos/rolling.py
+    mpirun -n 2 python demos/rolling.py
+
+References: forces and torque of GetFEM 5.4.2 on the same mesh, with the same penalty (1e4 along the
+normal, 1e3 across), where the disc has been pressed, turned and dragged (1e-7 of the force that
+presses; all increments are in verification/getfem_disc.py). A second route through this package:
+the block is moved to the other side instead of the disc, and the forces are the same (1e-10). And
+the torque of a disc that slips all over, R times μ times all pressure (2 %: it penetrates by p/k_n,
+up to 0.07). The exit code is 1 if one of them is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import dolfinx
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from tqdm import tqdm
+
+import fenics_contact as fc
+from fenics_contact import output, plotting
+from fenics_contact.elasticity import NeoHookean
+
+E, NU, MU, R = 1000.0, 0.3, 0.3, 4.0
+WIDTH, HEIGHT, CELL = 16.0, 10.0, 0.5
+DEPTH, TURN, WAY = 3.0, 0.8, 2.0
+K_N, K_T = 1e4, 1e3
+BOTTOM, TOP = 1, 2
+# Pressed until t = 1, turned until t = 2, dragged until t = 3.
+TIMES = (*(np.arange(1, 13) / 12), *(1 + np.arange(1, 17) / 8))
+# Drag, force of the disc downwards and torque on the block.
+GETFEM = {
+    1.0: (0.0, 3003.797966, 0.0),
+    2.0: (902.597361, 3106.755291, 4049.434181),
+    3.0: (800.943243, 2959.589109, 3796.018173),
+}
+
+
+def solve(moved: str) -> tuple[list[dict[str, float]], fc.Contact, NeoHookean, int]:
+    """Press, turn and drag; ``moved`` along x is "disc" or "block". Collective."""
+    corners, n = (
+        [(-WIDTH / 2, 0.0), (WIDTH / 2, HEIGHT)],
+        (round(WIDTH / CELL), round(HEIGHT / CELL)),
+    )
+    mesh = dolfinx.mesh.create_rectangle(
+        MPI.COMM_WORLD, corners, n, dolfinx.mesh.CellType.quadrilateral
+    )
+    sides = [
+        dolfinx.mesh.locate_entities_boundary(mesh, 1, lambda x, y=y: np.isclose(x[1], y))
+        for y in (0.0, HEIGHT)
+    ]
+    facets, values = np.concatenate(sides), np.repeat([BOTTOM, TOP], [len(s) for s in sides])
+    order = np.argsort(facets)
+    tags = dolfinx.mesh.meshtags(mesh, 1, facets[order], values[order].astype(np.int32))
+
+    V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
+    u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
+    rubber = NeoHookean(u, E, NU, "plane strain")
+    held = fem.Function(V)
+    bcs = [fem.dirichletbc(held, fem.locate_dofs_topological(V, 1, tags.find(BOTTOM)))]
+
+    shift, angle = fem.Constant(mesh, np.zeros(2)), fem.Constant(mesh, 0.0)
+    axis = (0.0, HEIGHT + R)
+    disc = fc.Cylinder(axis, R, displacement=shift, rotation=fc.Rotation(angle, about=axis))
+    surface = fc.ContactSurface(mesh, tags, TOP)
+    contact = fc.Contact(u, surface, disc, fc.Coulomb(MU, K_N, K_T), kinematics="finite")
+    # The rule of the second program, three points along each side of a cell.
+    dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4})
+    problem = fc.ContactProblem(
+        rubber.residual(v, dx),
+        u,
+        bcs=bcs,
+        contacts=[contact],
+        petsc_options={"snes_rtol": 1e-12},
+    )
+
+    def load(t: float) -> None:
+        """Down until 1, turned until 2, dragged until 3."""
+        along = WAY * max(t - 2.0, 0.0)
+        shift.value[:] = along if moved == "disc" else 0.0, -DEPTH * min(t, 1.0)
+        angle.value = TURN * float(np.clip(t - 1.0, 0.0, 1.0))
+        held.interpolate(
+            lambda x: np.stack([0 * x[0] - (along if moved == "block" else 0), 0 * x[0]])
+        )
+
+    path, history = [], fc.increments(problem, load, 0.0, 3.0, steps=TIMES)
+    quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
+    for step in tqdm(history, f"{moved} moved", len(TIMES), disable=quiet, unit="increment"):
+        r = step.contacts["contact"]
+        path.append(
+            {
+                "time": step.load,
+                "drag": float(r.force[0]),
+                "normal": -float(r.force[1]),
+                "torque": float(contact.moment(np.add(axis, shift.value))[0]),
+                "pressure": r.normal_force,
+                "stick": r.stick,
+                "slip": r.slip,
+                "iterations": step.iterations,
+            }
+        )
+    return path, contact, rubber, V.dofmap.index_map.size_global * 2
+
+
+def compare(path: list[dict[str, float]], other: list[dict[str, float]]) -> dict[str, Any]:
+    """The path beside GetFEM's, and beside that of the block that is moved instead."""
+    values, references = {}, {}
+    names = ("drag", "normal", "torque")
+    for row in path:
+        for name, reference in zip(names, GETFEM.get(round(row["time"], 9), ()), strict=False):
+            label = f"{name}, t = {row['time']:g}"
+            size = GETFEM[round(row["time"], 9)][1] * (R if name == "torque" else 1.0)
+            values[label] = row[name]
+            references[label] = (reference, 1e-7 * size / (reference or 1.0))
+    last = max(row["normal"] for row in path)
+    apart = [abs(a[n] - b[n]) for a, b in zip(path, other, strict=True) for n in names]
+    values["block moved instead, over force"] = max(apart) / last
+    references["block moved instead, over force"] = (0.0, 1e-10)
+    sliding = next(row for row in path if row["stick"] == 0 and row["time"] > 1)
+    values["torque over μ R ∫p, slipping"] = sliding["torque"] / (MU * R * sliding["pressure"])
+    references["torque over μ R ∫p, slipping"] = (1.0, 0.02)
+    return output.compare(values, references)
+
+
+def draw(file: Path, path: list[dict[str, float]]) -> None:
+    """Forces and torque, and how many points stick. On this rank."""
+    t = [row["time"] for row in path]
+    with plotting.figure(file, 2) as (left, right):
+        left.plot(t, [row["normal"] for row in path], ".-", label="force that presses")
+        left.plot(t, [row["drag"] for row in path], ".-", label="drag")
+        left.plot(t, [row["torque"] / R for row in path], ".-", label="torque / R")
+        at = list(GETFEM)
+        for k, scale in ((0, 1.0), (1, 1.0), (2, 1 / R)):
+            numbers = [GETFEM[time][k] * scale for time in at]
+            left.plot(at, numbers, "ko", fillstyle="none", label="GetFEM" if k == 0 else None)
+        left.set(ylabel="force [N/mm]", title=f"Disc on rubber, μ = {MU:g}, pressed by 30 %")
+        right.plot(t, [row["stick"] for row in path], ".-", label="sticking")
+        right.plot(t, [row["slip"] for row in path], ".-", label="slipping")
+        right.set(ylabel="points in contact [–]", title="State of the contact")
+        for ax in (left, right):
+            ax.set(xlabel="time: pressed to 1, turned to 2, dragged to 3 [–]")
+            ax.grid(alpha=0.25)
+            ax.legend()
+
+
+def main() -> int:
+    """Roll by both routes, and write all results; 0 if every reference is met."""
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.add_argument("--output", type=Path, default=Path("output/rolling"), help="folder")
+    arguments, _ = parser.parse_known_args()
+    start = time.perf_counter()
+    path, contact, rubber, dofs = solve("disc")
+    other, *_ = solve("block")
+    comm = MPI.COMM_WORLD
+    result: dict[str, Any] = {
+        "references": compare(path, other),
+        "dofs": dofs,
+        "path": path,
+        "wall_seconds": time.perf_counter() - start,
+    }
+    output.write_body(arguments.output, contact.u, rubber.stress)
+    output.write_surface(arguments.output, contact)
+    plotting.plot_deformation(
+        arguments.output / "block.png", contact.u, title="Pressed, turned and dragged"
+    )
+    if comm.rank == 0:
+        print(output.table(result["references"]))
+        draw(arguments.output / "rolling.png", path)
+    output.write_json(arguments.output / "result.json", result, comm)
+    return 0 if all(entry["passed"] for entry in result["references"].values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
