@@ -235,3 +235,22 @@ def test_parallel_runs(tmp_path: Path) -> None:
     assert forces[::2] == pytest.approx(forces[1::2], rel=1e-6)
     assert float(rows[1]["messages"]) > 0
     assert "Where the time goes" in (tmp_path / "README.md").read_text()
+
+
+def test_contact_at_large_strains_costs_few_newton_steps(tmp_path: Path) -> None:
+    """Steps are counts, the same on every machine: twice those of the bulk alone without friction.
+
+    With friction three times: while points begin to slip, Newton's method looks for those that do.
+    """
+    command = [sys.executable, str(ROOT / "benchmarks" / "finite.py"), "--short"]
+    subprocess.run(
+        [*command, "--output", str(tmp_path)], check=True, env=environment(), timeout=120
+    )
+    with open(tmp_path / "finite.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    ratios = {
+        (float(row["μ"]), row["run"]): float(row["steps / prescribed"])
+        for row in rows  # on the coarser mesh: 1.75 and 2.72
+    }
+    assert ratios[0.0, "contact"] < 2 and ratios[0.3, "contact"] < 3
+    assert ratios[0.0, "prescribed"] == ratios[0.3, "prescribed"] == 1

@@ -262,8 +262,8 @@ DEMOS = [
     ),
     demo(
         "Disc pressed into rubber, turned and dragged, finite",
-        "1e-7 of the force that presses, the digits that are written down; 1e-10 between two routes "
-        "of one program; 2 % for what penetration takes off the radius",
+        "1e-7 of the force that presses, the digits that are written down; 1e-10 between two "
+        "routes of one program; 2 % for what penetration takes off the radius",
         "rolling",
         source={"instead": "relative motion", "slipping": "Coulomb", "": "GetFEM 5.4.2, same mesh"},
         budget="the second program has the same mesh and penalty, and with them the same errors",
