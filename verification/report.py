@@ -10,11 +10,11 @@ from petsc4py import PETSc
 
 import fenics_contact as fc
 from scenes.processes import ROOT
-from verification import half_planes, solids, statics
+from verification import axisymmetric, half_planes, solids, statics
 from verification.cases import Case, Outcome, cases_of
 from verification.demonstrations import DEMOS
 
-CASES = cases_of(statics, half_planes, solids)
+CASES = cases_of(statics, half_planes, axisymmetric, solids)
 PAGE = ROOT / "docs" / "verification.md"
 
 
