@@ -4,6 +4,7 @@
     docker/run python verification/fuzz.py --scenes 1000 --resume results.csv
     docker/run python verification/fuzz.py --scenes 200 --ranks 2 --resume results2.csv
     docker/run python verification/fuzz.py --scenes 9000 --alike 12 --resume more.csv  # faster
+    docker/run python verification/fuzz.py --finite --scenes 300 --alike 12 --resume finite.csv
     docker/run python verification/fuzz.py --replay scene.json --minimise
     docker/run python verification/fuzz.py --table results.csv        # Markdown
 
@@ -49,6 +50,9 @@ OUTCOMES = ("right", "another", "refused", "wrong", "crashed", "slow", "unjudged
 FIELDS = ("seed", "ranks", "outcome", "kind", "increments", "seconds", "features", "detail")
 # What refusals say, by what they are about.
 CATEGORIES = {
+    "half of its radius": "too deep",
+    "gone through Γc": "gone through",
+    "cells are turned inside out": "inside out",
     "no contact force can balance": "load not balanced",
     "nothing will ever hold": "not held",
     "did not converge": "not converged",
@@ -162,6 +166,11 @@ def play(
 
     from verification import fuzz_judge, fuzz_scenes
 
+    make_scene, make_judge = fuzz_scenes.Made, fuzz_judge.Judge
+    if scene.get("kinematics") == "finite":
+        from verification import finite_reference, finite_scenes
+
+        make_scene, make_judge = finite_scenes.FiniteMade, finite_reference.FiniteJudge
     comm = comm or MPI.COMM_SELF
     records: list[dict[str, Any]] = []
     start, outcome, kind, detail = time.perf_counter(), "right", "", []
@@ -169,7 +178,7 @@ def play(
         with warnings.catch_warnings(), _limited(limit if comm.size == 1 else None):
             if comm.size == 1:  # on one rank of several it would leave the others waiting
                 warnings.simplefilter("error", RuntimeWarning)
-            fuzz_scenes.history(scene, comm, records.append, changed)
+            fuzz_scenes.history(scene, comm, records.append, changed, make_scene)
     except _Slow:
         outcome = "slow"
     except Exception as error:
@@ -187,7 +196,7 @@ def play(
     try:
         with warnings.catch_warnings(), _limited(3 * limit if limit and comm.size == 1 else None):
             warnings.simplefilter("ignore")
-            judge = fuzz_judge.Judge(scene) if records or outcome != "right" else None
+            judge = make_judge(scene) if records or outcome != "right" else None
             for record in records:
                 if spoiled is not None:
                     spoiled(record)
@@ -227,11 +236,13 @@ def _ahead(scene: Scene, records: list[dict[str, Any]]) -> tuple[int, float] | N
 def features(scene: Scene) -> list[str]:
     """What a scene has, for tables."""
     found = [scene["layout"], scene["cell"], f"degree {scene['degree']}", f"drive {scene['drive']}"]
+    found += [f"bulk {scene['bulk']}"] if "bulk" in scene else []
     for contact in scene["contacts"]:
         support = contact["support"]
         found += [f"law {contact['law']['kind']}", f"support {support['kind']}"]
         found += [f"pairs {support['update']}"] if "update" in support else []
         found += [f"moving by {support['moving']}"] if "moving" in support else []
+        found += [f"turning about {support['turn']}"] if "turn" in support else []
         found += [f"prescribed {n}" for n in ("gap",) if n in contact]
         found += [
             f"{n} {contact[n]}" for n in ("scheme", "enforcement", "accuracy") if n in contact
@@ -256,9 +267,10 @@ def features(scene: Scene) -> list[str]:
 
 def _drawn(seed: int, arguments: argparse.Namespace, ranks: int) -> Scene:
     """The scene of a seed, in a family with the other seeds next to it, if so asked."""
-    from verification.fuzz_scenes import draw
+    from verification import finite_scenes, fuzz_scenes
 
     family = seed // arguments.alike if arguments.alike > 1 else None
+    draw = finite_scenes.draw if arguments.finite else fuzz_scenes.draw
     return draw(seed, without=tuple(arguments.without), ranks=ranks, family=family)
 
 
@@ -288,7 +300,7 @@ def _work(seeds: list[int], arguments: argparse.Namespace) -> None:
 def _batch(seeds: list[int], arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Results of scenes solved in one process; ends early where it hangs or dies."""
     words = ["--work", ",".join(map(str, seeds)), "--limit", arguments.limit]
-    words += ["--alike", arguments.alike]
+    words += ["--alike", arguments.alike] + ["--finite"] * arguments.finite
     words += [v for name in arguments.without for v in ("--without", name)]
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
@@ -558,6 +570,9 @@ def main() -> int:
     parser.add_argument("--without", action="append", default=[], help="a feature to leave out")
     parser.add_argument(
         "--alike", type=int, default=1, help="so many scenes in a row share their forms"
+    )
+    parser.add_argument(
+        "--finite", action="store_true", help="scenes with finite kinematics; seeds of their own"
     )
     parser.add_argument("--table", nargs="+", help="print the table of files of results")
     parser.add_argument("--verbose", action="store_true", help="a line for every scene")

@@ -632,6 +632,10 @@ class Made:
             where["center"], where["radius"], axis, inside=inside, displacement=shift
         )
 
+    def options(self, contact: Scene) -> dict[str, Any]:
+        """More arguments of a contact."""
+        return {}
+
     def problem(self) -> fc.ContactProblem:
         """The package's problem. Collective."""
         contacts = []
@@ -648,6 +652,7 @@ class Made:
                     accuracy=c.get("accuracy"),
                     weight=self.thickness,
                     name=f"contact {i}",
+                    **self.options(c),
                 )
             )
         self.contacts = contacts
@@ -738,6 +743,8 @@ def _record(
             columns.append(contact.multipliers.fields.values("pressure"))
             if contact.law.has_friction:
                 columns.append(contact.multipliers.fields.values("traction"))
+                if contact.finite:
+                    columns.append(contact.multipliers.fields.values("normal"))
         rows = gathered(comm, np.column_stack(columns))
         r = step.contacts[contact.name]
         contacts.append(
@@ -747,7 +754,10 @@ def _record(
                 "pressure": rows[:, d + 1],
                 "tangential": rows[:, d + 2 : 2 * d + 2],
                 "lambda_n": rows[:, 2 * d + 2] if contact.multipliers is not None else None,
-                "lambda_t": rows[:, 2 * d + 3 :] if contact.multipliers is not None else None,
+                "lambda_t": rows[:, 2 * d + 3 : 3 * d + 3]
+                if contact.multipliers is not None
+                else None,
+                "lambda_at": rows[:, 3 * d + 3 :],
                 "tolerance": contact.tolerance,
                 "force": np.array(r.force),
                 "normal_force": r.normal_force,
@@ -773,7 +783,11 @@ def _record(
 
 
 def history(
-    scene: Scene, comm: MPI.Comm, done: Callable[[dict[str, Any]], None], changed: Any = None
+    scene: Scene,
+    comm: MPI.Comm,
+    done: Callable[[dict[str, Any]], None],
+    changed: Any = None,
+    make: type[Made] = Made,
 ) -> None:
     """Solve a scene by the package; ``done`` gets every committed increment. Collective.
 
@@ -782,8 +796,9 @@ def history(
         comm: Ranks.
         done: Called on all of them.
         changed: Function of the `Made` scene and its problem, to spoil them (tests).
+        make: What makes the scene.
     """
-    made = Made(scene, comm)
+    made = make(scene, comm)
     problem = made.problem()
     if changed is not None:
         changed(made, problem)
@@ -817,7 +832,7 @@ def history(
                 number += 1
                 if number == stop:
                     run.close()
-                    made = Made(scene, comm)
+                    made = make(scene, comm)
                     problem = made.problem()
                     run = steps(made, problem)
         comm.barrier()
@@ -834,14 +849,11 @@ def _scaled(value: float | None, contact: Scene) -> float:
     return fc.Accuracy.of(wanted).factor if wanted else 10.0
 
 
-def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float], reference.Load]]:
-    """The reference's problem, and its loads by stage and load parameter. On one rank."""
-    comm = MPI.COMM_SELF
-    made = Made(scene, comm)
-    d, V = made.d, made.V
+def body_of(made: Made) -> tuple[reference.Body, Callable[[int], reference.Surface]]:
+    """Arrays of a made scene, and its surfaces by their tags. On one rank."""
+    scene, d, V = made.scene, made.d, made.V
     tangent = ufl.derivative(made.F, made.u, ufl.TrialFunction(V))
     stiffness = fem.assemble_matrix(fem.form(tangent)).to_scipy().toarray()
-    minus = fem.form(-ufl.replace(made.F, {made.u: fem.Function(V)}))
     parts = np.zeros(len(V.tabulate_dof_coordinates()), dtype=int)
     parts[V.dofmap.list] = made.box[:, None]
     body = reference.Body(
@@ -867,6 +879,15 @@ def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float],
         ]
         return reference.Surface(body, list(zip(cells.tolist(), local, strict=False)))
 
+    return body, surface
+
+
+def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float], reference.Load]]:
+    """The reference's problem, and its loads by stage and load parameter. On one rank."""
+    made = Made(scene, MPI.COMM_SELF)
+    d, V = made.d, made.V
+    minus = fem.form(-ufl.replace(made.F, {made.u: fem.Function(V)}))
+    body, surface = body_of(made)
     contacts = [
         _contact(
             made,
@@ -880,7 +901,7 @@ def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float],
 
     def load(stage: int, t: float) -> reference.Load:
         made.apply(stage, t)
-        values = np.zeros(len(stiffness))
+        values = np.zeros(len(body.stiffness))
         for bc in made.bcs:
             bc.set(values)
         dofs = np.unique(np.concatenate([np.zeros(0, dtype=np.int32), *fixed]))
@@ -905,9 +926,11 @@ def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float],
     return reference.Problem(body, contacts), made, load
 
 
-def _contact(made: Made, contact: Scene, here: reference.Surface, opposite: Any) -> Any:
-    """A contact as the reference has it."""
-    scene, _body, law = made.scene, here.body, contact["law"]
+def contact_of(
+    made: Made, contact: Scene, here: reference.Surface, kind_of: Any = reference.ContactModel
+) -> tuple[Any, tuple[Array, Array]]:
+    """Points, stiffness and law of a contact, without its support; facet and place of the points."""
+    scene, law = made.scene, contact["law"]
     d, degree = made.d, scene["degree"]
     rigid = contact["support"]["kind"] != "body"
     wanted = contact.get("accuracy")
@@ -955,17 +978,15 @@ def _contact(made: Made, contact: Scene, here: reference.Surface, opposite: Any)
         tension=law["kind"] == "tension",
         unilateral=law["kind"] != "prescribed",
     )
-    interpolation = here.interpolation(facet, xi)
-    given = contact.get("gap")
     free = (
         tuple(contact["support"].get("free", ()))
         if contact["support"].get("moving") == "force"
         else ()
     )
-    made_model = reference.ContactModel(
+    made_model = kind_of(
         x=x,
         place=None,
-        interpolation=interpolation,
+        interpolation=here.interpolation(facet, xi),
         weights=weights,
         k_n=stiffness(law.get("k_n")),
         k_t=stiffness(law.get("k_t")),
@@ -974,7 +995,14 @@ def _contact(made: Made, contact: Scene, here: reference.Surface, opposite: Any)
         free=free,
         project=_projection(here, facet, xi, weights, max(1, degree - 1)) if augmented else None,
     )
-    if rigid:
+    return made_model, (facet, xi)
+
+
+def _contact(made: Made, contact: Scene, here: reference.Surface, opposite: Any) -> Any:
+    """A contact as the reference has it."""
+    made_model, (facet, xi) = contact_of(made, contact, here)
+    scene, given, x = made.scene, contact.get("gap"), made_model.x
+    if contact["support"]["kind"] != "body":
         place = _placement(contact["support"]["kind"], geometry(scene, contact), x)
         if given is not None:
             bare = place
@@ -986,6 +1014,7 @@ def _contact(made: Made, contact: Scene, here: reference.Surface, opposite: Any)
         made_model.place = place
         return made_model
     there, normal = opposite(), here.normal(facet, xi)
+    interpolation = made_model.interpolation
 
     def repair(u: Array | None) -> None:
         matrix, gap, paired = reference.pair(here, there, (facet, xi), u=u)
@@ -995,7 +1024,7 @@ def _contact(made: Made, contact: Scene, here: reference.Surface, opposite: Any)
         made_model.place = lambda shift: (gap + normal @ shift, normal + 0 * shift)
 
     repair(None)
-    if given is None and not the_law.tension:
+    if given is None and not made_model.law.tension:
         thickness = scene.get("thickness", 1.0)
         made_model.back = lambda u: reference.penetration(there, here, u, thickness)
     if contact["support"]["update"] == "increment":

@@ -775,6 +775,10 @@ class Problem:
             for c, f in zip(self.contacts, found, strict=True)
         ]
 
+    def stiffness(self, u: Array) -> Array:
+        """K, that at a displacement."""
+        return self.body.stiffness
+
     def residual(self, u: Array, load: Load, found: list[dict]) -> tuple[Array, Array]:
         """K u - f - contact on all unknowns, and force on supports not balanced."""
         total = self.body.stiffness @ u - load.force - sum(self.contact_force(found))

@@ -1,0 +1,490 @@
+"""Random scenes with finite kinematics: one body on rigid supports that move and turn.
+
+As in `fuzz_scenes`, whose mesh, loads and history they share, a scene is a dictionary of numbers
+that is played again as it is. It says ``"kinematics": "finite"``, its contacts lie below the body
+(and at its right), and its stages turn the support below as well.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import ufl
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.elasticity import NeoHookean
+from scenes.surfaces import ball, box, ring
+from verification.fuzz_scenes import TOP, Made, Scene, frictions
+
+__all__ = ["DEGREE", "KINDS", "FiniteMade", "draw", "pieces", "place_of"]
+
+Array = np.ndarray
+
+KINDS = (
+    *("halfspace", "ball", "cylinder", "ball inside", "cylinder inside"),
+    *("capsule", "torus", "profile", "turned profile", "facets", "box"),
+)
+# Of the quadrature of the nonlinear bulk, the same for both solutions.
+DEGREE = 4
+# Supports that turn about their middle without pressing more.
+_ROUND = ("ball", "cylinder", "ball inside", "cylinder inside")
+
+
+def draw(
+    seed: int, *, without: tuple[str, ...] = (), ranks: int = 1, family: int | None = None
+) -> Scene:
+    """A random scene.
+
+    Args:
+        seed: The same gives the same.
+        without: Features to leave out: "space", "rubber", "turn", "motion", "multipliers",
+            "units", "restart", "corner", "method", "accuracy", "changes", "ration".
+        ranks: Kept in the scene.
+        family: See `fuzz_scenes.draw`.
+    """
+    rng = np.random.default_rng([seed, 30])
+    built = rng if family is None else np.random.default_rng([family, 31])
+
+    def chance(p: float, feature: str = "", of: np.random.Generator = built) -> bool:
+        return bool(of.random() < p) and feature not in without
+
+    def pick(*values: Any, of: np.random.Generator = built) -> Any:
+        return values[int(of.integers(len(values)))]
+
+    def log(low: float, high: float) -> float:
+        return float(f"{10 ** rng.uniform(low, high):.3g}")
+
+    def within(low: float, high: float) -> float:
+        return float(f"{rng.uniform(low, high):.3g}")
+
+    space = chance(0.3, "space")
+    d = 3 if space else 2
+    cell = pick("tetrahedron", "hexahedron") if space else pick("triangle", "quadrilateral")
+    degree = 1 if chance(0.55) else 2
+    most = (2 if degree == 1 else 1) if space else (6 if degree == 1 else 4)
+    kinds = [k for k in KINDS if (space or k not in ("torus", "turned profile"))]
+    kind = pick("halfspace", *kinds)
+    # What is round touches more than one point only where it is pressed in.
+    rounded = kind not in ("halfspace", "box") and not kind.endswith("inside")
+    strain = log(-1.7, -0.6) if rounded else log(-2.7, -0.8)
+    n = [int(rng.integers(1, most + 1)) for _ in range(d)]
+    if rounded:
+        n[:-1] = [max(2, k) for k in n[:-1]]
+    jitter = int(rng.integers(1, 1000)) if chance(0.4, of=rng) else 0
+    body = {"origin": [0.0] * d, "size": [within(0.7, 1.6) for _ in range(d)], "n": n}
+    body |= {"E": log(2, 4), "jitter": jitter}
+    bulk = "rubber" if chance(0.5, "rubber") else "linear"
+    drive = pick("prescribed", "prescribed", "support", "support", "force")
+    law_kind = pick("frictionless", "frictionless", *["coulomb"] * 5, "tresca", "tension")
+    if space and chance(0.3):
+        law_kind = pick("polygon", "ellipse")
+
+    def law() -> Scene:
+        made: Scene = {"kind": law_kind}
+        made["k_n"] = pick(["scaled", log(0, 2)], ["number", log(0.5, 3)], ["scaled", None])
+        if law_kind not in ("frictionless", "tension"):
+            made["friction"] = pick(0.1, 0.3, 0.3, 0.6, 1.0, of=rng)
+            made["k_t"] = pick(["scaled", log(0, 2)], ["number", log(0, 2.5)])
+        if law_kind == "tresca":
+            made["pressure"] = float(f"{rng.uniform(0.1, 2) * strain:.3g}")
+        if law_kind == "polygon":
+            made["modes"] = pick(3, 4, 6, 8)
+        if law_kind == "ellipse":
+            made |= {"transverse": pick(0.1, 0.3, 0.7, of=rng), "direction": [1.0, 0.4, 0.1]}
+        return made
+
+    def contact(side: str, support: Scene) -> Scene:
+        made: Scene = {"body": 0, "side": side, "support": support, "law": law()}
+        if chance(0.15):
+            made["scheme"] = "vertex"
+        elif chance(0.15):
+            made["quadrature"] = pick(1, 3, 5)
+        if chance(0.2, "multipliers") and law_kind != "tension":
+            made["enforcement"] = "augmented"
+        elif chance(0.1, "accuracy") and law_kind != "tension":
+            made["accuracy"] = pick("draft", "standard", 1e-4)
+        return made
+
+    support: Scene = {"kind": kind, "clearance": 0.0, "radius": log(-0.3, 0.7)}
+    if chance(0.3, of=rng):
+        support["clearance"] = float(f"{rng.uniform(-0.3, 2) * strain:.3g}")
+    if kind == "halfspace" and chance(0.3, of=rng):
+        support["slope"] = pick(0.1, -0.2, of=rng)
+    if "cylinder" in kind and space and chance(0.5, of=rng):
+        support["axis"] = [0.2, 1.0, 0.1]
+    if kind in ("profile", "turned profile"):
+        support["points"] = pick(24, 40, 90, of=rng)
+        support["flat"] = within(0.6, 1.0)
+    if kind == "facets":
+        support["points"] = pick(12, 24, 60, of=rng)
+    turns = chance(0.6, "turn")
+    if turns:
+        support["turn"] = "middle" if kind in _ROUND and chance(0.6, of=rng) else "aside"
+        if space:
+            support["about"] = pick([0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.3, 1.0, 0.2], of=rng)
+            if drive != "force" and chance(0.2, of=rng):
+                support["about"] = [0.0, 0.0, 1.0]
+    if drive == "support":
+        support["moving"] = "displacement"
+        if chance(0.35, "motion"):
+            support["moving"], support["free"] = "force", [d - 1]
+    elif chance(0.3):
+        support["moving"] = "displacement"  # aside, while the body is pressed
+    contacts = [contact("bottom", support)]
+    if chance(0.1, "corner") and drive != "force":
+        contacts.append(contact("right", {"kind": "halfspace", "clearance": 0.3 * strain}))
+    for wall in contacts[1:]:
+        wall["support"]["moving"] = support.get("moving") and "displacement"
+        if not wall["support"]["moving"]:
+            wall["support"].pop("moving")
+
+    whole = list(range(d))
+    holds: list[list[Any]] = [[0, "top", whole, "moved" if drive == "prescribed" else "still"]]
+    if drive == "force":
+        holds = [[0, "left", [0], "still"]] + ([[0, "front", [1], "still"]] if space else [])
+
+    # Stages: strain at their end, ways aside in widths of the body, angle in radians.
+    far = pick(strain, strain, 0.1, 0.4, of=rng)
+    most_turned = 0.5 * strain
+    if turns and support["turn"] == "middle":
+        most_turned = pick(0.3, 1.5, 6.3, of=rng)
+    elif turns and support.get("about") == [0.0, 0.0, 1.0]:
+        most_turned = pick(0.3, 1.0, of=rng)
+    stages, angle = [], 0.0
+    for name in pick(
+        ["press"],
+        ["press", "shear"],
+        ["press", "turn"],
+        ["press", "shear", "reverse"],
+        ["press", "shear", "turn"],
+        ["press", "turn", "back"],
+        ["press", "lift", "press"],
+        ["press", "shear", "lift", "press"],
+        ["both"],
+        ["both", "off", "both"],
+        ["press", "both", "both", "ease"],
+        of=rng,
+    ):
+        normal, side = {
+            "press": (1.0, 0.0),
+            "shear": (1.0, rng.uniform(0.2, 1.0)),
+            "reverse": (1.0, -rng.uniform(0.2, 1.0)),
+            "turn": (1.0, rng.uniform(-0.2, 0.2)),
+            "back": (0.8, 0.0),
+            "lift": (-0.3 if drive != "force" else 0.0, 0.0),
+            "ease": (0.4, rng.uniform(0, 0.3)),
+            "both": (1.0, rng.uniform(-1, 1)),
+            "off": (0.1, 0.0),
+        }[name]
+        if turns and name in ("turn", "both"):
+            angle += most_turned * rng.uniform(-1, 1)
+        if name == "back":
+            angle *= 0.3
+        changes = chance(0.08, "changes", of=rng) and bool(stages)
+        steps = int(rng.integers(1, 5)) + 2 * (name == "turn")
+        stages.append(
+            {
+                "steps": steps,
+                "normal": normal,
+                "side": float(f"{side * far:.3g}"),
+                "across": float(f"{side * far * rng.uniform(-1, 1):.3g}") if space else 0.0,
+                "turn": float(f"{angle:.3g}") if turns else 0.0,
+            }
+            | ({"friction": pick(0.5, 1.5, of=rng)} if changes else {})
+        )
+    scene: Scene = {
+        "seed": seed,
+        "kinematics": "finite",
+        "bulk": bulk,
+        "layout": "corner" if len(contacts) > 1 else "floor",
+        "cell": cell,
+        "degree": degree,
+        "nu": within(0.0, 0.45),
+        "bodies": [body],
+        "ranks": ranks,
+        "units": [1.0, 1.0],
+        "drive": drive,
+        "contacts": contacts,
+        "holds": holds,
+        "strain": strain,
+        "share": 1.0,
+        "stages": stages,
+        "cuts": pick(1, 3, 5, of=rng),
+    }
+    total = sum(s["steps"] for s in stages)
+    if chance(0.3, "restart", of=rng) and total > 1:
+        scene["restart"] = int(rng.integers(1, total))
+    if chance(0.25, "units", of=rng):
+        scene["units"] = [log(-4, 4), log(-6, 6)]
+    if chance(0.3, "method", of=rng):
+        scene["method"] = pick("newton", "newton", "lbfgs", "continuation", of=rng)
+    if chance(0.2, of=rng):
+        scene["condensation"] = False
+    if chance(0.1):
+        scene["thickness"] = log(-2, 2)
+    if chance(0.05, "ration", of=rng):
+        scene["ration"] = int(rng.integers(4, 12))
+    return scene
+
+
+# ---- supports ------------------------------------------------------------------------------------
+
+
+def place_of(scene: Scene, contact: Scene) -> dict[str, Any]:
+    """Numbers of a support where it begins, in units of length."""
+    body, given = scene["bodies"][0], contact["support"]
+    length, d = scene["units"][0], len(body["size"])
+    size, kind = np.array(body["size"], dtype=float), given["kind"]
+    unit = np.eye(d)
+    if contact["side"] == "right":
+        point = (size[0] + given["clearance"]) * unit[0]
+        return {"point": point * length, "normal": -unit[0]}
+    up, middle = unit[-1], 0.5 * size * (1 - unit[-1])
+    clearance = given["clearance"]
+    if kind == "halfspace":
+        slope = given.get("slope", 0.0)
+        normal = (up - slope * unit[0]) / np.hypot(1.0, slope)
+        corner = size[0] * unit[0] if slope > 0 else 0.0
+        return {"point": (corner - clearance * normal) * length, "normal": normal}
+    radius = given["radius"] * max(size[:-1])
+    if kind.endswith("inside"):
+        # The corners of the bottom touch the wall of the cavity.
+        across = size[:-1] if kind.startswith("ball") else size[:1]
+        reach = 0.5 * float(np.linalg.norm(across))
+        radius = max(radius, 1.2 * reach)
+        height = np.sqrt(radius**2 - reach**2) - clearance
+        where = {"center": middle + height * up, "radius": radius}
+    elif kind == "capsule":  # lies along x, its middle below that of the body
+        half = 0.5 * radius * unit[0]
+        centre = middle - (radius + clearance) * up
+        where = {
+            "center": centre,
+            "radius": radius,
+            "ends": np.stack([centre - half, centre + half]),
+        }
+    elif kind == "torus":  # the tube's middle line as large as its radius and a half
+        where = {"ring": 1.5 * radius, "radius": 0.5 * radius + 0.3}
+        where["center"] = middle - (where["radius"] + clearance) * up
+    elif kind == "box":  # one end below the body, the other not
+        low, high = np.full(d, -2.0), np.full(d, 2.0)
+        low[0], low[-1], high[-1] = -3.0, -2.0, -clearance
+        high[0] = 0.3 * size[0] + min(given["radius"], 1.0) * size[0] / 2
+        centre = np.zeros(d)
+        where = {"low": low, "high": high, "center": centre}
+    else:
+        where = {"radius": radius}
+        drop = radius * given.get("flat", 1.0) if "profile" in kind else radius
+        where["center"] = middle - (drop + clearance) * up
+    where["center"] = where["center"].astype(float)
+    return {name: value * length for name, value in where.items()}
+
+
+def pieces(scene: Scene, contact: Scene) -> tuple[Array, Array]:
+    """Points of a support from data, and of facets their numbers, outwards."""
+    given, where = contact["support"], place_of(scene, contact)
+    kind, d = given["kind"], len(scene["bodies"][0]["size"])
+    if kind == "box":
+        low, high = where["low"], where["high"]
+        if d == 3:
+            return box(low, high)
+        return np.array([low, [high[0], low[1]], high, [low[0], high[1]]]), ring(4)
+    radius, centre = where["radius"], where["center"]
+    n = given["points"]
+    if kind == "facets":
+        if d == 3:
+            return ball(1 if n < 24 else 2, radius, centre)
+        t = 2 * np.pi * (np.arange(n) + 0.3) / n
+        return centre + radius * np.column_stack([np.cos(t), np.sin(t)]), ring(n)
+    flat = given["flat"]
+    if kind == "turned profile":
+        t = np.linspace(-np.pi / 2, np.pi / 2, n // 2 + 1)
+    else:
+        t = 2 * np.pi * np.arange(n) / n
+    points = np.zeros((len(t), d))
+    points[:, 0], points[:, -1] = radius * np.cos(t), flat * radius * np.sin(t)
+    if kind == "turned profile":  # ends on the axis, and not only nearly
+        points[[0, -1], 0] = 0.0
+    return centre + points, np.zeros((0, d), dtype=int)
+
+
+class FiniteMade(Made):
+    """A scene as mesh, forms and constants.
+
+    Attributes:
+        angle: Of the support below (radians).
+    """
+
+    def __init__(self, scene: Scene, comm: MPI.Comm, *, bulk: Any = None) -> None:
+        """Make it. Collective.
+
+        Args:
+            scene: The scene.
+            comm: Ranks.
+            bulk: Function of u, v, E and ν: density of the virtual work of rubber (UFL); by default
+                that of the package.
+        """
+        super().__init__(scene, comm)
+        d = self.d
+        self.angle = _constant(self.mesh, 0.0)
+        if scene["bulk"] == "rubber":
+            v = ufl.TestFunction(self.V)
+            ds = ufl.ds(self.mesh, subdomain_data=self.tags)
+            dx = ufl.Measure("dx", self.mesh, metadata={"quadrature_degree": DEGREE})
+            nu = _constant(self.mesh, scene["nu"])
+            if bulk is None:
+                kind = "plane strain" if d == 2 else "3D"
+                work = NeoHookean(self.u, self.E, nu, kind).residual(v, dx)
+            else:
+                work = bulk(self.u, v, self.E, nu) * dx
+            self.F = self.thickness * work - self.thickness * ufl.dot(self.traction, v) * ds(TOP)
+
+    def drives(self, stage: int, t: float) -> dict[str, float]:
+        """Normal, side, across and turn at a value of the load parameter within a stage."""
+        stages = self.scene["stages"]
+        zero = {"normal": 0.0, "side": 0.0, "across": 0.0, "turn": 0.0}
+        before = stages[stage - 1] if stage else zero
+        return {n: before[n] + t * (stages[stage][n] - before[n]) for n in zero}
+
+    def apply(self, stage: int, t: float) -> None:
+        """Set all loads."""
+        scene, d = self.scene, self.d
+        for contact, friction in zip(self.contacts, frictions(scene, stage), strict=False):
+            if friction is not None:
+                contact.parameters["friction"].value = friction
+        now, size = self.drives(stage, t), np.array(scene["bodies"][0]["size"])
+        way = np.zeros(d)
+        way[0] = now["side"] * size[0]
+        if d == 3:
+            way[1] = now["across"] * size[1]
+        down = now["normal"] * scene["strain"] * size[-1]
+        up = np.eye(d)[-1]
+        self.angle.value = now["turn"]
+        by_body, by_support = np.zeros(d), np.zeros(d)
+        if scene["drive"] == "prescribed":
+            by_body = -down * up
+            if not any("moving" in c["support"] for c in scene["contacts"]):
+                by_body = by_body + way
+            else:
+                by_support = -way
+        elif scene["drive"] == "support":
+            by_support = down * up - way
+        else:
+            pull = -now["normal"] * scene["strain"] * up
+            rows = self.traction.x.array.reshape(-1, d)
+            rows[self._cells] = pull * self.moduli[0]
+            by_support = -way
+        for _, i, value in self.moved:
+            value.value = by_body[i] * self.length
+        self.shift.value[:] = by_support * self.length
+        area = np.prod(size[:-1]) * self.length ** (d - 1) * self.thickness.value
+        force = now["normal"] * scene["strain"] * self.moduli[0] * area
+        for i in range(d):
+            self.push[i].value = max(force, 0.02 * scene["strain"] * self.moduli[0] * area)
+            self.pull[i].value = by_support[i] * self.length
+
+    def turn(self, contact: Scene) -> tuple[Array, Array | None] | None:
+        """A point of the axis, and its direction in space; None: it does not turn."""
+        given = contact["support"]
+        if "turn" not in given:
+            return None
+        where = place_of(self.scene, contact)
+        if given["turn"] == "middle":
+            about = where["center"]
+        else:  # a point near the middle of the bottom
+            size = np.array(self.scene["bodies"][0]["size"])
+            about = (size * (0.4 - 0.5 * np.eye(self.d)[-1])) * self.length
+        axis = None if self.d == 2 else np.array(given["about"])
+        if axis is not None and given["turn"] == "middle" and given["kind"].startswith("cylinder"):
+            axis = np.array(given.get("axis", (0.0, 1.0, 0.0)))
+        return about, axis
+
+    def support(self, contact: Scene) -> Any:
+        """The package's support."""
+        given, where, d = contact["support"], place_of(self.scene, contact), self.d
+        move: dict[str, Any] = {}
+        if given.get("moving") == "displacement":
+            move["displacement"] = self.shift
+        elif given.get("moving") == "force":
+            free = given["free"]
+            move["displacement"] = fc.Motion(
+                force=[self.push[i] if i in free else None for i in range(d)],
+                displacement=[None if i in free else self.pull[i] for i in range(d)],
+            )
+        turn = self.turn(contact)
+        if turn is not None:
+            about, axis = turn
+            move["rotation"] = fc.Rotation(
+                self.angle, about.tolist(), None if axis is None else axis.tolist()
+            )
+        kind = given["kind"]
+        if kind == "halfspace":
+            return fc.HalfSpace(where["point"], where["normal"], **move)
+        inside = kind.endswith("inside")
+        if kind.startswith("ball"):
+            return fc.Ball(where["center"], where["radius"], inside=inside, **move)
+        if kind.startswith("cylinder"):
+            axis = None if d == 2 else given.get("axis", (0.0, 1.0, 0.0))
+            return fc.Cylinder(where["center"], where["radius"], axis, inside=inside, **move)
+        if kind in ("capsule", "torus"):
+            shape = _capsule if kind == "capsule" else _torus
+            return fc.Obstacle(distance=lambda x: shape(self.mesh, where, x), **move)
+        points, numbers = pieces(self.scene, contact)
+        if kind in ("facets", "box"):
+            return fc.RigidSurface(points, numbers, **move)
+        if d == 2:
+            return fc.RigidProfile(points, closed=True, **move)
+        if kind == "profile":  # seen against y, x runs to the left
+            return fc.RigidProfile(points[::-1], closed=True, extruded=(0.0, 1.0, 0.0), **move)
+        return fc.RigidProfile(points, turned=(where["center"].tolist(), (0.0, 0.0, 1.0)), **move)
+
+    def options(self, contact: Scene) -> dict[str, Any]:
+        """Arguments of the contact that are not those of small displacements."""
+        return {"kinematics": "finite"}
+
+
+def _constant(mesh: Any, value: Any) -> Any:
+    from dolfinx import fem
+
+    return fem.Constant(mesh, value)
+
+
+def _capsule(mesh: Any, where: dict[str, Any], x: Any) -> Any:
+    """Distance from a segment along x, less the radius (UFL)."""
+    low, high = (_constant(mesh, end) for end in where["ends"])
+    radius = _constant(mesh, float(where["radius"]))
+    along = ufl.max_value(low[0], ufl.min_value(high[0], x[0]))
+    arm = x - ufl.as_vector([along, *(low[i] for i in range(1, len(low)))])
+    return ufl.sqrt(ufl.dot(arm, arm)) - radius
+
+
+def _torus(mesh: Any, where: dict[str, Any], x: Any) -> Any:
+    """Distance from a circle about z, less the radius of the tube (UFL)."""
+    # The circle touches below the middle of the body.
+    centre = where["center"].copy()
+    centre[0] -= where["ring"]
+    c = _constant(mesh, centre)
+    around, tube = (_constant(mesh, float(where[n])) for n in ("ring", "radius"))
+    out = ufl.sqrt((x[0] - c[0]) ** 2 + (x[1] - c[1]) ** 2) - around
+    return ufl.sqrt(out**2 + (x[2] - c[2]) ** 2) - tube
+
+
+def simpler(scene: Scene) -> list[Scene]:
+    """Scenes without what small displacements do not have."""
+    found = []
+
+    def add(change: Any) -> None:
+        other = copy.deepcopy(scene)
+        change(other)
+        if other != scene:
+            found.append(other)
+
+    add(lambda s: s.update(bulk="linear"))
+    for i in range(len(scene["stages"])):
+        add(lambda s, i=i: s["stages"][i].update(turn=0.0))
+    for i, contact in enumerate(scene["contacts"]):
+        if "turn" in contact["support"]:
+            add(lambda s, i=i: s["contacts"][i]["support"].pop("turn"))
+    return found
