@@ -419,7 +419,7 @@ class FiniteProblem(reference.Problem):
             size = max(np.linalg.norm(f) for f in [*forces, load.force[kept], total[fixed]])
             size = max([size, *(abs(load.pushes[c][i]) for c, i in free)])
             floor = np.linalg.norm(np.abs(stiff) @ np.abs(v))
-            for c, model in enumerate(self.contacts):
+            for model in self.contacts:
                 stiffest = model.weights * (model.k_n + model.k_t)
                 floor += stiffest.sum() * np.abs(model.x + model.jump(v)).max()
             return np.concatenate([total[kept], rest]), size, floor, whole
@@ -477,23 +477,34 @@ class FiniteProblem(reference.Problem):
             matrix = tangent(u, motion, closed=False)
             scale = np.sqrt(np.abs(np.diag(tangent(u, motion, closed=True))))
             system = matrix / scale[:, None] / scale
-            if not np.isfinite(system).all() or np.linalg.cond(system) > 1e12:
+            held = bool(np.isfinite(system).all() and np.linalg.cond(system) < 1e12)
+            if not held:
                 system = tangent(u, motion, closed=True) / scale[:, None] / scale
             step = -np.linalg.solve(system, rest / scale) / scale
             first = np.linalg.norm(rest / scale)
-            share, chosen = 1.0, None
-            for _ in range(12):
+            share, low, high, chosen = 1.0, 0.0, np.inf, None
+            for _ in range(40 if not held else 12):
                 v, m = u.copy(), motion.copy()
                 v[kept] += share * step[: len(kept)]
                 m += share * step[len(kept) :]
                 now = evaluate(v, m)
-                if now[3] and np.isfinite(now[0]).all():
+                valid = now[3] and np.isfinite(now[0]).all()
+                if valid:
                     chosen = (v, m, now)
-                    # Out of a cycle, now and then.
-                    if np.linalg.norm(now[0] / scale) < (1 - 0.1 * share) * first or (
-                        iteration % 9 == 8 and share < 0.5
-                    ):
+                if not held:
+                    # Nothing holds the body: on until something does, by the force along the way.
+                    along, slope = now[0] @ step, rest @ step
+                    if valid and abs(along) <= 0.3 * abs(slope):
                         break
+                    low, high = (share, high) if valid and along < 0 else (low, share)
+                    share = 2 * share if high == np.inf else 0.5 * (low + high)
+                    continue
+                # Out of a cycle, now and then.
+                free_pass = iteration % 9 == 8 and share < 0.5
+                if valid and (
+                    free_pass or np.linalg.norm(now[0] / scale) < (1 - 0.1 * share) * first
+                ):
+                    break
                 share *= 0.5
             if chosen is None:
                 break

@@ -929,7 +929,7 @@ def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float],
 def contact_of(
     made: Made, contact: Scene, here: reference.Surface, kind_of: Any = reference.ContactModel
 ) -> tuple[Any, tuple[Array, Array]]:
-    """Points, stiffness and law of a contact, without its support; facet and place of the points."""
+    """Points, stiffness and law of a contact without its support; facet and place of points."""
     scene, law = made.scene, contact["law"]
     d, degree = made.d, scene["degree"]
     rigid = contact["support"]["kind"] != "body"
