@@ -14,7 +14,7 @@ from fenics_contact.elasticity import NeoHookean
 from scenes.blocks import BOTTOM, TOP, block, kirchhoff
 from scenes.comparing import close, gathered
 from scenes.elasticity import hold
-from scenes.rubber import rubber
+from scenes.rubber import Tool, rubber
 from scenes.two_blocks import LOWER, UPPER, two_blocks
 
 COMM = MPI.COMM_WORLD
@@ -110,6 +110,35 @@ def test_sliding_round_a_support_is_no_passage():
         scene.u.interpolate(lambda x, t=turn, m=centre: t @ (x[:2] - m) + m - x[:2])
         contact.forget()
         assert not contact.passed_through().any()
+
+
+@pytest.mark.parametrize("shape", ["ball", "profile"])
+def test_a_turn_by_more_than_a_right_angle_is_refused(shape):
+    """A drum turned by 270° at once rubbed backwards, with all of μ N, and by 360° not at all.
+
+    Cut into halves until they pass, it rubs forwards: μ times the pressure, at the lever of the
+    points, 1e-9; as a drum that has slid for long. One that no point touches turns as it likes.
+    """
+    for angle in (1.5 * np.pi, 2 * np.pi):
+        tool = Tool(radius=0.8, law=fc.Coulomb(0.3, 1e4, 1e4), shape=shape)
+        tool.go(0.0, 0.01)
+        tool.go(0.0, 0.01, -angle)
+        tool.go(0.0, -0.05, -angle)
+        tool.go(0.0, -0.1, -angle)
+        with pytest.raises(fc.NotConverged, match=r"turns by .* rad in one increment"):
+            tool.go(0.0, -0.1, 0.0)
+
+        def turn(t, tool=tool, angle=angle):
+            tool.angle.value = (t - 1) * angle
+
+        for _ in fc.increments(tool.problem, turn, steps=1, max_cuts=2):
+            pass
+        contact, centre = tool.contact, (0.0, tool.scene.height + 0.7)
+        x = contact.points + contact.own_displacement()
+        lever = np.linalg.norm(x - np.array(centre), axis=1)
+        expected = COMM.allreduce(0.3 * float((contact.measure * lever) @ contact.pressure))
+        allowed = 1e-9 if shape == "ball" else 1e-5
+        assert contact.moment(centre)[0] == pytest.approx(expected, rel=allowed)
 
 
 def test_a_turn_that_differs_from_point_to_point_is_refused():

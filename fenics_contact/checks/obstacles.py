@@ -17,6 +17,9 @@ __all__ = ["ObstacleCheck"]
 _SLOPE = 0.05
 # Penetration by the radius of curvature that is left there: 1 is half of that of the support.
 _DEEP = 1.0
+# Of the angle that a support turns by in an increment (radians): a right one and round-off. Beyond
+# two of them the straight way of a point leads backwards.
+_TURN = np.pi / 2 + 1e-9
 
 
 @dataclass(frozen=True)
@@ -29,11 +32,13 @@ class ObstacleCheck:
             centre of curvature of the support.
         passed: Likewise a place of the undeformed Γc that has gone through the support to its other
             side in this increment; None: there is none.
+        turn: By which the support has turned in this increment where there is friction (radians).
     """
 
     slope: float
     depth: float
     passed: list[float] | None
+    turn: float = 0.0
 
     @classmethod
     def of(cls, contact: Contact) -> ObstacleCheck:
@@ -53,7 +58,9 @@ class ObstacleCheck:
             depth = global_max(comm, sunk * bend)
             gone = comm.allgather(contact.points[contact.passed_through()].tolist())
             passed = next((places[0] for places in gone if places), None)
-        return cls(slope, depth, passed)
+        rubs = contact.law.has_friction and comm.allreduce(int(closed.any())) > 0
+        turn = abs(contact.turned_by()) if rubs else 0.0
+        return cls(slope, depth, passed, turn)
 
     def failures(self, contact: str) -> list[str]:
         """What does not hold, in words."""
@@ -74,5 +81,11 @@ class ObstacleCheck:
             found.append(
                 f"{contact}: the support has gone through Γc, at {np.round(self.passed, 6)}, in "
                 "one increment; load in smaller steps"
+            )
+        if not self.turn <= _TURN:
+            found.append(
+                f"{contact}: the support turns by {self.turn:.3g} rad in one increment, in which "
+                "friction takes the straight way between both ends; turn it by no more than a "
+                "right angle in each"
             )
         return found

@@ -83,11 +83,13 @@ class Committed:
     Attributes:
         history: `PointFields.rows`.
         jump: `Contact.committed_jump`.
+        angle: `Contact.committed_angle`.
         pairs: Between what.
     """
 
     history: Array
     jump: Array
+    angle: float
     pairs: PairsState
 
 
@@ -118,6 +120,7 @@ class Contact(PointResults):
         finite: Whether gap, normal and slip are those of displacements of any size.
         committed_jump: Displacement relative to the support at the last commit, (n_points, gdim),
             between the places that are opposite each other from then on; zero before the first.
+        committed_angle: By which the support had turned then (radians).
     """
 
     def __init__(
@@ -234,6 +237,7 @@ class Contact(PointResults):
             fields |= {"multiplier": 0}
         self.history = PointFields(self.quadrature, fields)
         self.committed_jump: Array = np.zeros((self.quadrature.n_points, gdim))
+        self.committed_angle = 0.0
         self._has_begun = False
 
         # All of contact is a sparse map from u to the jump at the points, and the law there: as
@@ -430,6 +434,7 @@ class Contact(PointResults):
         } | {f"parameter {n}": v for n, v in given.parameters.items()}
         if inputs.rotation is not None:
             d, matrix = self._gdim, inputs.rotation[0]
+            expressions |= {"angle": inputs.angle, "about": inputs.rotation[1]}
             expressions["turn"] = ufl.as_vector([matrix[i, j] for i in range(d) for j in range(d)])
         seen = ["initial_gap", "normal", *(f"parameter {n}" for n in given.parameters)]
         if given.shift is not None:
@@ -957,18 +962,41 @@ class Contact(PointResults):
         by_place = -np.stack(turns, axis=1)
         return np.asarray(by_place + by_place.swapaxes(1, 2)) / 2
 
+    def angle(self) -> float:
+        """By which the support has turned since it began, 0 where it cannot (radians). Collective.
+
+        It is that of the last evaluation.
+        """
+        if self.inputs.angle is None:
+            return 0.0
+        # The same at all points.
+        return global_max(self.surface.mesh.comm, self.values.arrays["angle"])
+
+    def turned_by(self) -> float:
+        """By which the support has turned since the last commit (radians). Collective."""
+        return self.angle() - self.committed_angle
+
     def passed_through(self) -> Mask:
         """Points that have gone through a rigid support since the last commit, (n_points,).
 
-        On straight ways in its frame, with finite kinematics. Collective.
+        Of points that go straight on, and a support that turns evenly, with finite kinematics.
+        Collective.
 
         Raises:
             ValueError: Displacements are taken as small.
         """
         if not self.finite:
             raise ValueError(f'{self.name}: there is none without kinematics="finite"')
-        x, jump = self.points, self.values.jump
-        return self._passage.through(x + self.committed_jump, x + jump)
+        x, jump, rotation = self.points, self.values.jump, self.support.rotation
+        angle = self.turned_by()
+
+        def turned(places: Array, share: float) -> Array:
+            if rotation is None:
+                return places
+            about = self.values.arrays["about"]
+            return about + rotation.turned(places - about, share * angle)
+
+        return self._passage.through(x + self.committed_jump, x + jump, turned)
 
     def gap_deviation(self) -> tuple[Array, Array]:
         """True gap minus the linearised one, and the true normals: at X + u, not X. Collective.
@@ -1204,6 +1232,7 @@ class Contact(PointResults):
         if self._present is not None:
             self._present.commit()
             self.committed_jump = np.zeros_like(points.jump)
+        self.committed_angle = self.angle()
         if self.pairs_anew:
             # The traction stays with the points of Γc; what they slip over has moved on.
             self.pair(self.u)
@@ -1217,12 +1246,14 @@ class Contact(PointResults):
 
     def committed(self) -> Committed:
         """The committed state, for `set_committed`."""
-        return Committed(self.history.rows(), self.committed_jump, self.pairs.state())
+        rows = self.history.rows()
+        return Committed(rows, self.committed_jump, self.committed_angle, self.pairs.state())
 
     def set_committed(self, state: Committed) -> None:
         """Make a state the committed one again; `restore` drops what came after it. Collective."""
         self.history.set_rows(state.history)
         self.committed_jump, self._has_begun = state.jump, True
+        self.committed_angle = state.angle
         self.pairs.set_state(state.pairs)
 
     def take_up(self, history: Array, values: Mapping[str, Array]) -> None:
@@ -1240,6 +1271,7 @@ class Contact(PointResults):
             self._find_pairs(self.u, values.get("depth"))
         self.restore()
         self.committed_jump, self._has_begun = self.values.jump, True
+        self.committed_angle = self.angle()
         mine = self.values.arrays
         if {n: v.shape for n, v in values.items()} == {n: v.shape for n, v in mine.items()}:
             self._values = PointValues.of(values)

@@ -39,6 +39,7 @@ class Inputs:
         law: Parameters of the law, by name.
         shift: Displacement of the support; None: it has none.
         rotation: Matrix of its turn, and a point of the axis; None: it does not turn.
+        angle: Of that turn (radians); None likewise.
         free_motion: Components of it that are unknown, as constants by number.
         free_shift: The same as variables, to differentiate by.
         applied_force: The forces on these.
@@ -89,6 +90,7 @@ class Inputs:
         self.free_shift: dict[int, ufl.core.expr.Expr] = {}
         self.applied_force: dict[int, Any] = {}
         self.shift = self._displacement(support.displacement)
+        self.angle: Any = None
         self.rotation = self._rotation(support.rotation)
 
     # ---- as UFL ----------------------------------------------------------------------------------
@@ -160,9 +162,13 @@ class Inputs:
         if rotation is None:
             return None
         check_instance(f"{self._name}: rotation", rotation, Rotation)
-        matrix = rotation.matrix(self._gdim, lambda angle: self.to_ufl("angle", angle))
+        matrix = rotation.matrix(self._gdim, self._angle)
         about = as_vector(f"{self._name}: about of the Rotation", rotation.about, self._gdim)
         return matrix, self.to_ufl("support", about)
+
+    def _angle(self, angle: Any) -> Any:
+        self.angle = self.to_ufl("angle", angle)
+        return self.angle
 
     def _moving(self, motion: Motion) -> ufl.core.expr.Expr:
         """The displacement of a support some components of which are unknown."""

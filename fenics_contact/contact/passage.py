@@ -22,10 +22,11 @@ _DEEPER = 0.1
 
 
 class Passage:
-    """Of straight ways in the frame of a support; compiled when first needed.
+    """Of the ways of points, seen from a support; compiled when first needed.
 
-    A point that has slid round an edge, or along a curve, has its normal turned by less than a
-    right angle in an increment, or its way does not lead through the support.
+    In an increment a point goes straight on, as does the support, which turns evenly. A point that
+    has slid round an edge, or along a curve, has its normal turned by less than a right angle in
+    an increment, or its way does not lead through the support.
     """
 
     def __init__(
@@ -43,21 +44,25 @@ class Passage:
         self._place: fem.Function | None = None
         self._evaluate: PointEvaluator | None = None
 
-    def through(self, before: Array, now: Array) -> Mask:
+    def through(self, before: Array, now: Array, turned: Callable[[Array, float], Array]) -> Mask:
         """Which points have passed through on the way from one place to another. Collective.
 
         Args:
             before: In the frame of the support, (n_points, gdim).
             now: Likewise.
+            turned: Turns places by a share of the turn of the support on that way.
         """
-        (first, turned), (last, normal) = self.sample(before), self.sample(now)
-        opposite = np.sum(turned * normal, axis=1) < 0
+        (first, old), (last, new) = self.sample(before), self.sample(now)
+        # In the frame of the start, that does not turn.
+        end = turned(now, 1.0)
+        opposite = np.sum(old * (turned(now + new, 1.0) - end), axis=1) < 0
         if not self._quadrature.surface.mesh.comm.allreduce(int(opposite.any())):
             return np.zeros(len(opposite), dtype=np.bool_)
         shares = np.arange(1, _PLACES + 1) / (_PLACES + 1)
-        between = np.min([self.sample(before + t * (now - before))[0] for t in shares], axis=0)
+        places = [turned(before + t * (end - before), -t) for t in shares]
+        between = np.min([self.sample(place)[0] for place in places], axis=0)
         deeper = np.minimum(first, last) - between
-        far = _DEEPER * np.linalg.norm(now - before, axis=1)
+        far = _DEEPER * np.linalg.norm(end - before, axis=1)
         return np.asarray(opposite & (between < 0) & (deeper > far))
 
     def sample(self, place: Array) -> tuple[Array, Array]:

@@ -136,6 +136,15 @@ class Rotation:
         across = ufl.as_matrix([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         return ufl.Identity(3) + s * across + (1 - c) * ufl.dot(across, across)
 
+    def turned(self, vectors: Array, angle: float) -> Array:
+        """Vectors turned by an angle given by a number, (n, gdim)."""
+        c, s = np.cos(angle), np.sin(angle)
+        if self.axis is None:
+            return vectors @ np.array([[c, s], [-s, c]])
+        axis = nonzero_vector("axis of the Rotation", self.axis, 3)
+        along = np.outer(vectors @ axis, axis)
+        return np.asarray(along + c * (vectors - along) + s * np.cross(axis, vectors))
+
 
 class Support:
     """A rigid support: subclasses say where it is.
