@@ -14,8 +14,9 @@ import fenics_contact as fc
 from fenics_contact import checkpoint
 from fenics_contact.methods import solver as module
 from scenes import problems, two_blocks
-from scenes.blocks import GRID, TOP, Block, block, wave
+from scenes.blocks import GRID, RIGHT, TOP, Block, block, wave
 from scenes.comparing import at_points, close, gathered, raised_everywhere, shared_folder
+from scenes.rubber import rubber
 
 COMM = MPI.COMM_WORLD
 E = 1000.0
@@ -501,3 +502,31 @@ def test_a_contact_that_only_the_first_round_touches() -> None:
     assert step.contacts["floor"].normal_force == pytest.approx(1.0, rel=1e-8)
     assert step.contacts["ledge"].normal_force == 0.0
     assert step.verdict.enforcement["ledge"] == 0.0 and not step.verdict.failures
+
+
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+@pytest.mark.parametrize("method", ["newton", "lbfgs"])
+def test_a_node_held_inside_of_the_support_is_refused(kinematics, method):
+    """A side of a block whose lower node a condition moves into a wall: nothing undoes that.
+
+    Multipliers grew there from round to round, until what the springs bore was small beside them:
+    a pressure of 1e15 and more passed. Moved away from the wall, or by springs alone, it is solved.
+    """
+    found = []
+    for enforcement, way in (("augmented", 0.02), ("augmented", -0.02), ("penalty", 0.02)):
+        scene = rubber("quadrilateral", 1, n=(4, 4), linear=True)
+        surface = fc.ContactSurface(scene.mesh, scene.tags, RIGHT)
+        wall = fc.HalfSpace((1.0, 0.0), (-1.0, 0.0))
+        options = {"kinematics": kinematics, "enforcement": enforcement}
+        contact = fc.Contact(scene.u, surface, wall, fc.Coulomb(0.3), **options)
+        problem = fc.ContactProblem(
+            scene.F, scene.u, bcs=scene.bcs, contacts=[contact], method=method, kinematics=np.inf
+        )
+        scene.place(lambda x, way=way: x + np.array([[way], [0.0]]))
+        if enforcement == "augmented" and way > 0:
+            with pytest.raises(fc.NotConverged, match="multipliers grow from round to round"):
+                problem.solve()
+        else:
+            problem.solve()
+            found.append(contact.resultants().normal_force)
+    assert found[0] == 0.0 and 0.0 < found[1] < 1e3

@@ -42,6 +42,10 @@ _BLUR = 100 * np.finfo(float).eps
 # How many rounds before the last are combined with it, and how well their rests are to be told
 # apart, relative and squared.
 _DEPTH, _DISTINCT = 6, 1e-12
+# Where tractions have grown by more than the first factor since the rounds began, the springs must
+# bear less than this share of what they did then: else multipliers grow by the same in every round,
+# and what is left is small beside them alone.
+_GROWN, _FALLEN = 2.0, 0.1
 
 
 class TraceProjection:
@@ -160,6 +164,7 @@ class Multipliers:
         self.fields = PointFields(quadrature, {"pressure": 0} | dict.fromkeys(self._vectors, gdim))
         self._project = TraceProjection(quadrature, degree)
         self._accelerated = _Acceleration(quadrature)
+        self._first: tuple[float, float] | None = None  # change and tractions of the first round
 
     def _next(self, values: PointValues) -> dict[str, Array]:
         """The multipliers that the tractions of an evaluated contact make."""
@@ -188,6 +193,10 @@ class Multipliers:
         # By the tractions of this increment: those before it leave round-off and no more.
         scale = largest(lambda n: values.arrays[n], names)
         before = largest(history.values, names)
+        if change > 0:
+            self._first = self._first or (change, scale)
+            if scale > _GROWN * self._first[1] and change > _FALLEN * self._first[0]:
+                return np.inf
         if change <= _ROUND_OFF * max(scale, before):
             return 0.0
         # Displacements have round-off however little is borne, and springs make a traction of it.
@@ -221,5 +230,6 @@ class Multipliers:
     def restore(self, history: PointFields) -> None:
         """Take those of the last commit. Collective."""
         self._accelerated.begin()
+        self._first = None
         values = {"pressure": history.values("multiplier")}
         self.fields.commit(values | {name: history.values(name) for name in self._vectors})
