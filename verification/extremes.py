@@ -3,10 +3,10 @@
 python verification/extremes.py
 python verification/extremes.py --only stiffness --output /tmp/extremes.md
 
-The scenes are those of ``extreme_scenes.py``, by both direct methods with all that takes over
-where they fail. Writes docs/extremes.md and a CSV. The exit code is 1 if anything is wrong: an
-error above its tolerance, a number that is none, or an end that is neither a verified solution nor
-an error that says why.
+The scenes are those of ``extreme_scenes.py`` and ``extreme_finite.py``, by both direct methods with
+all that takes over where they fail. Writes docs/extremes.md and a CSV. The exit code is 1 if
+anything is wrong: an error above its tolerance, a number that is none, or an end that is neither a
+verified solution nor an error that says why.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy as np
 
 import fenics_contact as fc
 from scenes.processes import ROOT
+from verification import extreme_finite as finite
 from verification.extreme_scenes import (
     E,
     Solve,
@@ -84,7 +85,10 @@ class Row:
 
 @dataclass
 class Trial:
-    """A scene to be solved by each method: steps, and the error, None if nothing is compared."""
+    """A scene to be solved by each method: steps, and the error, None if nothing is compared.
+
+    ``slow``: it takes more than 20 s or so.
+    """
 
     group: str
     case: str
@@ -92,6 +96,7 @@ class Trial:
     reference: str = ""
     tolerance: float = 1e-6
     methods: tuple[str, ...] = METHODS
+    slow: bool = False
 
     def run(self) -> Iterator[Row]:
         """Solve by every method."""
@@ -198,6 +203,12 @@ def trials() -> Iterator[Trial]:
     yield from in_space()
     yield from two_bodies()
     yield from against_hertz()
+    yield from one_rank_alone()
+    yield from finite_kinematics()
+
+
+def one_rank_alone() -> Iterator[Trial]:
+    """Γc on one of several ranks, in processes of their own."""
     for ranks in (2, 3):
         for kind, k, mu in (("cushion", 10.0, 0.3), ("pair", 1e5, 0.0)):
             case = f"{ranks} ranks, {kind}, k_n h/E = {k:g}, μ = {mu:g}"
@@ -275,6 +286,74 @@ def against_hertz() -> Iterator[Trial]:
         yield Trial(name, f"{k:.0e}", solve, peak, 0.01 + share)
     solve, _ = hertz(10.0, enforcement="augmented")
     yield Trial(name, "1e+01, multipliers", solve, "Hertz, 1 %", 0.01)
+
+
+def finite_kinematics() -> Iterator[Trial]:
+    """Supports that move and turn by any amount, linear bodies and rubber."""
+    alone = ("newton",)  # of rubber
+    moment, again = "moment of friction at all points, exact", "the tractions before"
+    name = "finite kinematics, a disc turned, in increments"
+    full = 2 * np.pi
+    for angle, steps in ((full, 1), (full, 4), (full, 36), (100 * full, 1000)):
+        case = f"{angle / full * 360:.0f}° in {steps}"
+        long = steps == 1000
+        trial = Trial(name, case, finite.drum(angle, steps), moment, 1e-9, alone, slow=long)
+        yield trial
+    for mu in (1.0, 2.0):
+        case = f"360° in 12, μ = {mu:g}"
+        yield Trial(name, case, finite.drum(full, 12, mu), moment, 1e-9, alone)
+    linear = finite.drum(full, 12, linear=True)
+    yield Trial(name, "360° in 12, linear body", linear, moment, 1e-9)
+    for steps in (4, 12, 36):
+        case = f"body and disc, 360° in {steps}"
+        yield Trial(name, case, finite.turned_with_all(steps), again, 1e-7, alone)
+    name = "finite kinematics, facets slid over"
+    for n, steps in ((1000, 10), (4000, 40)):
+        solve, slow = finite.over_facets(2 * n, steps, 6.0), n > 1000
+        case = f"{n} of a plane, in {steps}"
+        yield Trial(name, case, solve, "a half-space", 1e-7, alone, slow)
+    for n, steps in ((1000, 12), (1000, 100)):
+        case = f"{n} of a drum, half round in {steps}"
+        solve = finite.over_drum(2 * n, steps, np.pi)
+        yield Trial(name, case, solve, "a round one", 1e-2, alone, steps == 100)
+    name = "finite kinematics, a block dragged off the end of a plate"
+    for mu, steps in ((0.0, 10), (0.0, 40), (0.3, 10), (0.3, 40), (1.0, 40)):
+        reference = "no force, and the first force, back" if mu == 0 else "no force"
+        case = f"μ = {mu:g}, in {steps}"
+        yield Trial(name, case, finite.off_the_edge(mu, steps), reference, 1e-7)
+    name = "finite kinematics, a column of rubber as high as 60 %"
+    exact = "uniform stretches by bisection"
+    for k in [10.0**i for i in range(-3, 7)]:
+        yield Trial(name, f"k_n h/E = {k:.0e}", finite.column(k), exact, 1e-6, alone)
+    for share in (0.3, 0.1):
+        case = f"{100 * share:.0f} %, in one increment"
+        yield Trial(name, case, finite.column(10, share), exact, 1e-6, alone)
+    yield Trial(name, "in 200", finite.column(10, steps=200), exact, 1e-6, alone, True)
+    yield Trial(name, "from 1000 heights away", finite.column(10, gap=1e3), exact, 1e-6, alone)
+    second = "the second solution of the random scenes"
+    for mu in (0.0, 0.3, 1.0):
+        name = f"finite kinematics, a disc pressed in, dragged and turned, k_n h/E, μ = {mu:g}"
+        for k in [10.0**i for i in (range(-3, 7) if mu == 0.3 else range(-3, 7, 3))]:
+            solve = finite.rubbed(k, mu)
+            yield Trial(name, f"{k:.0e}, rubber", solve, second, 1e-5, alone, k > 1e2)
+        for k in (1e-1, 1e1, 1e3):
+            solve, methods = finite.rubbed(k, mu, "linear"), METHODS if k < 1e3 else alone
+            yield Trial(name, f"{k:.0e}, linear body", solve, second, 1e-5, methods)
+    name = "finite kinematics, first touch from afar, in body heights"
+    for gap in (0.01, 1.0, 1000.0):
+        near = "from where it touches"
+        yield Trial(name, f"{gap:g}", finite.from_afar(gap), near, 1e-7, alone)
+        yield Trial(
+            name, f"{gap:g}, by force", finite.from_afar(gap, True), "the load", 1e-7, alone
+        )
+    name = "finite kinematics, increments"
+    for steps in (1, 2, 5, 200):
+        case = f"pressed in without friction in {steps}"
+        trial = Trial(name, case, finite.pressed_in(steps), "16", 1e-9, alone, steps == 200)
+        yield trial
+    for steps in (1, 10, 200):
+        case = f"a disc turned by 90° in {steps}"
+        yield Trial(name, case, finite.drum(full / 4, steps), moment, 1e-9, alone, steps == 200)
 
 
 # ---- the page ------------------------------------------------------------------------------------

@@ -1,0 +1,354 @@
+"""The extremes of finite kinematics: turns, ways, strains, stiffness, edges, and first touch.
+
+As in `extreme_scenes` a scene is a function of the method that returns the steps made and the error
+against its reference, relative. A block of rubber, its bottom held, is under a rigid tool where
+nothing else is said.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.elasticity import NeoHookean
+from scenes.blocks import BOTTOM, LEFT, TOP, block_mesh
+from scenes.elasticity import displacement_space, hold
+from scenes.rubber import TIGHT, Tool, rubber
+from scenes.surfaces import box, circle, ring
+from verification import finite_reference, finite_scenes
+from verification.extreme_scenes import Array, Solve
+
+E, NU = 1000.0, 0.3
+RADIUS, DEPTH = 0.8, 0.1
+
+
+def _relative(found: Any, wanted: Any) -> float:
+    found, wanted = np.asarray(found), np.asarray(wanted)
+    return float(np.abs(found - wanted).max() / np.abs(wanted).max())
+
+
+def _pressed(mu: float, method: str, **options: Any) -> tuple[Tool, list[fc.Step]]:
+    """The disc pressed in by `DEPTH`."""
+    law = fc.Coulomb(mu, 1e4, 1e4) if mu else fc.Frictionless(1e4)
+    solver = {"petsc_options": TIGHT, "method": method}
+    tool = Tool(law=law, radius=RADIUS, solver=solver, **options)
+    return tool, [tool.go(0.0, -0.5 * DEPTH), tool.go(0.0, -DEPTH)]
+
+
+def _led(tool: Tool, end: Any, steps: int) -> list[fc.Step]:
+    """In equal increments to a place aside, a height and an angle; the first cuts itself."""
+    start = np.array([tool.shift.value[0], tool.shift.value[-1], float(tool.angle.value)])
+
+    def load(t: float) -> None:
+        side, up, angle = start + t * (np.asarray(end) - start)
+        tool.shift.value[:], tool.angle.value = tool.vector(side, up), angle
+
+    return list(fc.increments(tool.problem, load, steps=steps))
+
+
+# ---- turns and ways ------------------------------------------------------------------------------
+
+
+def drum(angle: float, steps: int, mu: float = 0.3, **options: Any) -> Solve:
+    """A disc pressed and turned: the moment of friction is ∫ μ p times the distance from its axis.
+
+    All of it slips, once it has turned for a while.
+    """
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        tool, made = _pressed(mu, method, **options)
+        made += _led(tool, (0.0, -DEPTH, angle), steps)
+        contact, centre = tool.contact, np.array([0.0, tool.scene.height + RADIUS - DEPTH])
+        arm = np.linalg.norm(contact.points + contact.own_displacement() - centre, axis=1)
+        wanted = np.sign(angle) * mu * (contact.measure * arm) @ contact.pressure
+        return made, _relative(contact.moment(centre), wanted)
+
+    return solve
+
+
+def turned_with_all(steps: int, angle: float = 2 * np.pi) -> Solve:
+    """Pressed and dragged, then body and disc turned about the origin: the first tractions again.
+
+    The bottom of the body is led round as a rigid body.
+    """
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        tool, made = _pressed(0.3, method)
+        made += [tool.go(0.05, -DEPTH)]
+        before, place = tool.tractions(), tool.vector(0.05, -DEPTH)
+        centre = tool.vector(0.0, tool.scene.height + RADIUS)
+
+        def load(t: float) -> None:
+            c, s = np.cos(t * angle), np.sin(t * angle)
+            matrix = np.array([[c, -s], [s, c]])
+            tool.scene.place(lambda x: matrix @ x)
+            tool.shift.value[:] = matrix @ (centre + place) - centre
+            tool.angle.value = t * angle
+
+        made += list(fc.increments(tool.problem, load, steps=steps))
+        return made, _relative(tool.tractions(), before)
+
+    return solve
+
+
+def over_facets(n: int, steps: int, way: float) -> Solve:
+    """A block dragged under a plane of n facets, by a way: the plane in one piece."""
+
+    def force(method: str, support: Any) -> tuple[list[fc.Step], Array]:
+        scene = rubber(n=(8, 4))
+        shift = fem.Constant(scene.mesh, np.zeros(2))
+        options = {"method": method, "petsc_options": TIGHT}
+        problem, contact = scene.problem(support(shift), fc.Coulomb(0.3, 1e4, 1e4), **options)
+
+        def press(t: float) -> None:
+            shift.value[:] = 0.0, -0.05 * t
+
+        def drag(t: float) -> None:
+            shift.value[:] = way * t, -0.05
+
+        made = list(fc.increments(problem, press, steps=1))
+        made += list(fc.increments(problem, drag, steps=steps))
+        return made, contact.resultants().force
+
+    def facets(shift: Any) -> fc.RigidSurface:
+        x = np.linspace(-3.0 - way, 3.0 + way, n + 1)
+        points = np.column_stack([x, np.ones(n + 1)])
+        numbers = np.column_stack([np.arange(n), np.arange(1, n + 1)])
+        return fc.RigidSurface(points, numbers, displacement=shift)
+
+    def plane(shift: Any) -> fc.HalfSpace:
+        return fc.HalfSpace((0.0, 1.0), (0.0, -1.0), displacement=shift)
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        made, found = force(method, facets)
+        return made, _relative(found, force(method, plane)[1])
+
+    return solve
+
+
+def over_drum(n: int, steps: int, angle: float) -> Solve:
+    """A drum of n facets turned under pressure: the force of one that is round."""
+
+    def force(method: str, support: Any) -> tuple[list[fc.Step], Array]:
+        scene = rubber(n=(12, 6))
+        shift, turn = fem.Constant(scene.mesh, np.zeros(2)), fem.Constant(scene.mesh, 0.0)
+        centre = (0.0, scene.height + RADIUS)
+        move = {"displacement": shift, "rotation": fc.Rotation(turn, centre)}
+        options = {"method": method, "petsc_options": TIGHT}
+        law = fc.Coulomb(0.3, 1e4, 1e4)
+        problem, contact = scene.problem(support(centre, move), law, **options)
+
+        def press(t: float) -> None:
+            shift.value[1] = -DEPTH * t
+
+        def rotate(t: float) -> None:
+            turn.value = angle * t
+
+        made = list(fc.increments(problem, press, steps=2))
+        made += list(fc.increments(problem, rotate, steps=steps))
+        return made, contact.resultants().force
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        made, found = force(
+            method, lambda c, move: fc.RigidSurface(circle(n, RADIUS, c), ring(n), **move)
+        )
+        return made, _relative(found, force(method, lambda c, m: fc.Ball(c, RADIUS, **m))[1])
+
+    return solve
+
+
+def off_the_edge(mu: float, steps: int, linear: bool = True) -> Solve:
+    """A block dragged off the end of a plate: no force; without friction all of it again, back."""
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        scene = rubber(n=(8, 4), linear=linear)
+        shift = fem.Constant(scene.mesh, np.zeros(2))
+        corners, _ = box((-1.5, 1.0, -1.0), (1.5, 2.0, 1.0))
+        flat = corners[[0, 1, 3, 2], :2]
+        plate = fc.RigidSurface(flat, ring(4), displacement=shift)
+        law = fc.Coulomb(mu, 1e4, 1e4) if mu else fc.Frictionless(1e4)
+        options = {"method": method, "petsc_options": TIGHT}
+        problem, contact = scene.problem(plate, law, **options)
+
+        def lead(start: Any, end: Any, steps: int) -> list[fc.Step]:
+            def load(t: float) -> None:
+                shift.value[:] = np.asarray(start) + t * (np.asarray(end) - np.asarray(start))
+
+            return list(fc.increments(problem, load, steps=steps, max_cuts=6))
+
+        made = lead((0.0, 0.0), (0.0, -0.05), 1)
+        first = contact.resultants().force
+        made += lead((0.0, -0.05), (3.0, -0.05), steps)
+        off = contact.resultants().force
+        if mu:
+            return made, float(np.abs(off).max() / np.abs(first).max())
+        made += lead((3.0, -0.05), (0.0, -0.05), steps)
+        back = contact.resultants().force
+        return made, max(_relative(back, first), float(np.abs(off).max()))
+
+    return solve
+
+
+# ---- strain, stiffness, first touch --------------------------------------------------------------
+
+
+def column(
+    kappa: float, share: float = 0.6, steps: int = 1, *, gap: float = 0.0, mu: float = 0.0
+) -> Solve:
+    """A column 1 x 1 pressed by a plane until it is as high as a share of it, its sides free.
+
+    The stretches are uniform: across where the stress across vanishes, along where the nominal
+    stress is that of the springs, both by bisection. Where springs are soft, the plane goes as far.
+    """
+    n = (2, 4)
+    k_n = kappa * E * n[1]
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        mesh, tags = block_mesh("quadrilateral", n=n, size=(1.0, 1.0))
+        u = fem.Function(displacement_space(mesh, 2))
+        body = NeoHookean(u, E, NU, "plane strain")
+        bcs = [hold(u, tags, BOTTOM, 1), hold(u, tags, LEFT, 0)]
+        shift = fem.Constant(mesh, np.zeros(2))
+        plane = fc.HalfSpace((0.0, 1.0 + gap), (0.0, -1.0), displacement=shift)
+        law = fc.Coulomb(mu, k_n, k_n) if mu else fc.Frictionless(k_n)
+        surface = fc.ContactSurface(mesh, tags, TOP)
+        contact = fc.Contact(u, surface, plane, law, kinematics="finite")
+        F = body.residual(_test(u))
+        problem = fc.ContactProblem(
+            F, u, bcs=bcs, contacts=[contact], method=method, petsc_options=TIGHT
+        )
+        down = gap + 1.0 - share
+
+        def load(t: float) -> None:
+            shift.value[1] = -down * t
+
+        made = list(fc.increments(problem, load, steps=steps))
+        wanted = _bisect(lambda s: _stress(s) + k_n * (s - share), share * 0.5, 1.0)
+        found = 1.0 + u.x.array.reshape(-1, 2)[:, 1].min()
+        return made, abs(found - wanted) / (1.0 - wanted)
+
+    return solve
+
+
+def _test(u: fem.Function) -> Any:
+    import ufl
+
+    return ufl.TestFunction(u.function_space)
+
+
+def _nominal(along: float, across: float) -> tuple[float, float]:
+    """Nominal stress along and across a column in plane strain."""
+    shear, lame = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
+    volume = 0.5 * lame * ((along * across) ** 2 - 1)
+    return tuple(shear * (s - 1 / s) + volume / s for s in (along, across))
+
+
+def _stress(along: float) -> float:
+    across = _bisect(lambda s: _nominal(along, s)[1], 0.5, 5.0)
+    return _nominal(along, across)[0]
+
+
+def _bisect(rises: Any, low: float, high: float) -> float:
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if rises(middle) < 0 else (low, middle)
+    return 0.5 * (low + high)
+
+
+def rubbed(kappa: float, mu: float, bulk: str = "rubber", steps: int = 2, **change: Any) -> Solve:
+    """A block pressed on a disc and dragged, as high as 6 cells: forces of the second solution.
+
+    That of the random scenes, which shares the assembly of the bulk with the package.
+    """
+    law: dict[str, Any] = {"kind": "coulomb" if mu else "frictionless"}
+    law |= {"k_n": ["number", 4 * kappa]} | ({"k_t": ["number", 4 * kappa]} if mu else {})
+    law |= {"friction": mu} if mu else {}
+    support = {"kind": "ball", "clearance": 0.0, "radius": 1.0, "moving": "displacement"}
+    support |= {"turn": "middle"}
+    body = {"origin": [0.0, 0.0], "size": [1.0, 1.0], "n": [6, 4], "E": E, "jitter": 0}
+    stages = [
+        {"steps": steps, "normal": 1.0, "side": 0.0, "across": 0.0, "turn": 0.0},
+        {"steps": steps, "normal": 1.0, "side": 0.05, "across": 0.0, "turn": 0.3},
+    ]
+    scene = {"kinematics": "finite", "bulk": bulk, "layout": "floor", "cell": "quadrilateral"}
+    scene |= {"degree": 1, "nu": NU, "bodies": [body], "units": [1.0, 1.0], "drive": "support"}
+    scene |= {"contacts": [{"body": 0, "side": "bottom", "support": support, "law": law}]}
+    scene |= {"holds": [[0, "top", [0, 1], "still"]], "strain": 0.1, "share": 1.0}
+    scene |= {"stages": stages} | change
+
+    def solve(method: str) -> tuple[list[fc.Step], float | None]:
+        made = finite_scenes.FiniteMade(scene | {"method": method}, MPI.COMM_WORLD)
+        problem = made.problem()
+        other, _, loads = finite_reference.model(scene)
+        old = [c.start() for c in other.contacts]
+        u, motion = np.zeros(other.body.places.size), np.zeros(0)
+        known, steps, worst = True, [], 0.0
+        for stage in range(len(scene["stages"])):
+            for step in fc.increments(
+                problem, lambda t, s=stage: made.apply(s, t), steps=scene["stages"][stage]["steps"]
+            ):
+                steps.append(step)
+                if not known:
+                    continue
+                load = loads(stage, step.load)
+                try:
+                    u, motion, old = other.solve(u, motion, load, old)
+                except (finite_reference.Failed, np.linalg.LinAlgError):
+                    known = False
+                    continue
+                found = other.respond(u, motion, load, old)
+                pairs = zip(other.contacts, found, old, strict=True)
+                old = [c.next_state(f, o) for c, f, o in pairs]
+                force = other.contacts[0].weights @ found[0]["traction"]
+                worst = max(worst, _relative(step.contacts["contact 0"].force, force))
+        return steps, worst if known else None
+
+    return solve
+
+
+def from_afar(gap: float, by_force: bool = False) -> Solve:
+    """The disc comes from a gap away in one increment: the force it has from near, or its load."""
+
+    def force(method: str, gap: float) -> tuple[list[fc.Step], Array]:
+        scene = rubber(n=(12, 6))
+        shift: Any = fem.Constant(scene.mesh, np.zeros(2))
+        push = fem.Constant(scene.mesh, -60.0)
+        if by_force:
+            shift = fc.Motion(force=(None, push), displacement=(0.0, None))
+        disc = fc.Ball((0.0, scene.height + RADIUS + gap), RADIUS, displacement=shift)
+        options = {"method": method, "petsc_options": TIGHT}
+        problem, contact = scene.problem(disc, fc.Frictionless(1e4), **options)
+
+        def load(t: float) -> None:
+            if by_force:
+                push.value = -60.0 * t
+            else:
+                shift.value[1] = -(gap + 0.05) * t
+
+        made = list(fc.increments(problem, load, steps=1, max_cuts=10))
+        return made, contact.resultants().force
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        made, found = force(method, gap)
+        return made, _relative(found, (0.0, -60.0) if by_force else force(method, 0.0)[1])
+
+    return solve
+
+
+def pressed_in(steps: int, down: float = 0.3, **options: Any) -> Solve:
+    """The disc pressed in without friction, in any number of increments: the force of 16."""
+
+    def force(method: str, steps: int) -> tuple[list[fc.Step], Array]:
+        solver = {"petsc_options": TIGHT, "method": method}
+        tool = Tool(law=fc.Frictionless(1e4), radius=RADIUS, solver=solver, **options)
+        return _led(tool, (0.0, -down, 0.0), steps), tool.resultant()
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        made, found = force(method, steps)
+        return made, _relative(found, force(method, 16)[1])
+
+    return solve
