@@ -14,7 +14,7 @@ import pytest
 from mpi4py import MPI
 
 from scenes.processes import ROOT, environment
-from verification import fuzz, fuzz_scenes
+from verification import finite_reference, finite_scenes, fuzz, fuzz_scenes
 from verification import reference_solver as reference
 
 COMM = MPI.COMM_WORLD
@@ -49,6 +49,23 @@ def test_scenes_are_not_wrong(part):
     for scene in SCENES["scenes"][part::10][:: 1 if COMM.size == 1 else 5]:
         outcome = played(scene)
         assert outcome.outcome in FINE, f"{outcome}\n{json.dumps(scene)}"
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("number", range(len(SCENES["finite"])))
+def test_scenes_of_finite_kinematics_are_right(number):
+    """Supports that move and turn, linear bodies and rubber; on several ranks some of them.
+
+    On one rank they are solved, too, and most are the solution found apart.
+    """
+    if COMM.size > 1 and number % 4:
+        pytest.skip("takes longer on several ranks")
+    scene = SCENES["finite"][number]
+    outcome = played(scene)
+    assert outcome.outcome in FINE, f"{outcome}\n{json.dumps(scene)}"
+    if COMM.size == 1:
+        assert outcome.outcome == "right"
+        assert outcome.increments and {"equations", "apart", "nearest"} <= set(outcome.worst)
 
 
 @serial
@@ -165,6 +182,105 @@ def test_another_friction_is_found():
     assert outcome.outcome == "wrong"
 
 
+# A block pressed on a disc that is dragged and turned, so little that some points stick.
+TURNING = copy.deepcopy(ONE) | {
+    "kinematics": "finite",
+    "bulk": "linear",
+    "drive": "support",
+    "holds": [[0, "top", [0, 1], "still"]],
+    "strain": 0.05,
+    "stages": [
+        {"steps": 1, "normal": 1.0, "side": 0.0, "across": 0.0, "turn": 0.0},
+        {"steps": 2, "normal": 1.0, "side": 0.01, "across": 0.0, "turn": 0.02},
+    ],
+}
+TURNING["contacts"][0]["support"] = {
+    "kind": "ball",
+    "clearance": 0.0,
+    "radius": 1.0,
+    "moving": "displacement",
+    "turn": "middle",
+}
+
+
+@serial
+def test_a_good_scene_of_finite_kinematics_is_right():
+    assert played(TURNING).outcome == "right"
+
+
+def _forget_a_turn(history):
+    return {"traction": history.values("traction")[:, ::-1]}
+
+
+def _slip_from_elsewhere(history):
+    return {"jump": history.values("jump") + 1e-6}
+
+
+@serial
+@pytest.mark.parametrize("spoil", [_forget_a_turn, _slip_from_elsewhere])
+def test_a_spoiled_history_of_finite_kinematics_is_found(spoil):
+    """The traction with its components exchanged; slip counted from 1e-6 aside."""
+
+    def changed(made, problem):
+        commit, history = problem.commit, problem.contacts[0].history
+
+        def spoiled():
+            commit()
+            values = {n: history.values(n) for n in history.names}
+            history.commit(values | spoil(history))
+
+        problem.commit = spoiled
+
+    outcome = played(TURNING, changed=changed)
+    assert outcome.outcome == "wrong"
+    assert "equations" in outcome.kind
+
+
+@serial
+@pytest.mark.parametrize("what", ["angle", "shift"])
+def test_a_support_that_is_elsewhere_is_found(what):
+    """It turns or moves by a thousandth more than the scene says."""
+
+    def changed(made, problem):
+        apply, value = made.apply, getattr(made, what)
+
+        def more(stage, t):
+            apply(stage, t)
+            value.value = 1.001 * value.value
+
+        made.apply = more
+
+    assert played(TURNING, changed=changed).outcome == "wrong"
+
+
+@serial
+@pytest.mark.parametrize("kind", finite_scenes.KINDS)
+def test_shapes_of_the_second_solution(kind):
+    """Distances have slope 1, along their normals: by differences, 1e-6; in the plane and in space.
+
+    At places around the lowest corner of the body, near the support and not at its edges.
+    """
+    for d in (2, 3):
+        if d == 2 and kind in ("torus", "turned profile"):
+            continue
+        support = {"kind": kind, "clearance": 0.01, "radius": 1.3, "points": 24, "flat": 0.8}
+        body = {"origin": [0.0] * d, "size": [1.0, 1.1, 0.9][:d], "n": [1] * d}
+        scene = {"bodies": [body], "units": [1.0, 1.0]}
+        contact = {"side": "bottom", "support": support}
+        shape = finite_reference.shape_of(scene, contact)
+        x = np.random.default_rng(2).uniform(-0.05, 0.05, (40, d)) + 0.4 * (np.arange(d) < d - 1)
+        distance, normal = shape(x)
+        assert np.abs(distance).max() < 1.0
+        assert np.allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-12)
+        slope = np.zeros_like(x)
+        for i in range(d):
+            way = 1e-6 * np.eye(d)[i]
+            slope[:, i] = (shape(x + way)[0] - shape(x - way)[0]) / 2e-6
+        off = np.linalg.norm(slope + normal, axis=1)
+        # Where the closest facet changes the difference is of two of them.
+        assert np.sum(off > 1e-6) <= (2 if kind == "facets" else 0)
+
+
 @serial
 def test_a_raw_error_counts_as_a_crash_and_a_refusal_as_a_refusal():
     def raises(made, problem):
@@ -187,6 +303,9 @@ def test_seeds_reproduce_and_features_can_be_left_out():
     one = [fuzz_scenes.draw(s) for s in range(30)]
     assert one == [json.loads(json.dumps(fuzz_scenes.draw(s))) for s in range(30)]
     assert any(s["units"] != [1.0, 1.0] for s in one)
+    assert [finite_scenes.draw(s) for s in range(30)] == [
+        json.loads(json.dumps(finite_scenes.draw(s))) for s in range(30)
+    ]
     plain = [fuzz_scenes.draw(s, without=("units", "restart")) for s in range(30)]
     assert all(s["units"] == [1.0, 1.0] and "restart" not in s for s in plain)
 

@@ -10,6 +10,7 @@ the history kept from the start of the increment.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -32,10 +33,11 @@ Array = np.ndarray
 # Of a shape: signed distance, (n,), and minus its gradient, (n, d), at places (n, d).
 Shape = Callable[[Array], tuple[Array, Array]]
 
-# Steps of differences, by the size of the mesh: best for second-order differences.
-_DIFFERENCE = 1e-6
-# Parts into which an increment is cut, tried in turn.
+# Steps of differences, by the size of the mesh: shorter than stiff springs give way.
+_DIFFERENCE = 1e-8
+# Parts into which an increment is cut, tried in turn; and softer springs to start from.
 _PARTS = (4, 32)
+_SOFTER = 10.0 ** np.arange(-5, 0.1, 0.5)
 _ROUNDS = 400
 
 
@@ -347,14 +349,13 @@ class FiniteProblem(reference.Problem):
     ) -> tuple[Array, Array, list[Any]]:
         """One increment, in parts; see `reference.Problem.solve`."""
         for parts in _PARTS:
-            try:
+            with contextlib.suppress(Failed, np.linalg.LinAlgError):
                 v, m = u, motion
                 for share in np.arange(1, parts + 1) / parts:
                     v, m = self._increment(v, m, self._between(load, share), old, rtol)
                 break
-            except (Failed, np.linalg.LinAlgError):
-                if parts == _PARTS[-1]:
-                    raise
+        else:
+            v, m = self._stiffened(u, motion, load, old, rtol)
         for _ in range(_ROUNDS if any(c.project is not None for c in self.contacts) else 0):
             found = self.respond(v, m, load, old)
             new = [
@@ -374,6 +375,21 @@ class FiniteProblem(reference.Problem):
                 raise Failed("multipliers do not settle")
         self.before = load
         return v, m, old
+
+    def _stiffened(
+        self, u: Array, motion: Array, load: Any, old: list[Any], rtol: float
+    ) -> tuple[Array, Array]:
+        """With softer springs first."""
+        whole = [(c.k_n, c.k_t) for c in self.contacts]
+        try:
+            for factor in _SOFTER:
+                for contact, (k_n, k_t) in zip(self.contacts, whole, strict=True):
+                    contact.k_n, contact.k_t = factor * k_n, factor * k_t
+                u, motion = self._increment(u, motion, load, old, rtol)
+        finally:
+            for contact, (k_n, k_t) in zip(self.contacts, whole, strict=True):
+                contact.k_n, contact.k_t = k_n, k_t
+        return u, motion
 
     def _between(self, load: Any, share: float) -> Any:
         """Part of the way from the load before."""

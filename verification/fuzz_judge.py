@@ -33,6 +33,8 @@ _CURVED = 5.0
 # E/h is smoothed over Γc by rational integrands where quadrilaterals are no parallelograms, whose
 # quadrature is another here. Measured: 1.4e-8 of the pressure.
 _SMOOTHED, _K = 1e-7, ("k_n", "k_t")
+# Penetration that multipliers may leave, by the size of Γc.
+_INSIDE = 1e-2
 # Forces of the nearest exact solution, and of one found apart.
 _NEAREST, _APART = 1e-5, 1e-4
 
@@ -59,7 +61,9 @@ class Judge:
         paired = any(c["support"]["kind"] == "body" for c in scene["contacts"])
         slope = 4 * sum(map(abs, scene.get("bend", [0.0])))
         self._curved = _CURVED * slope**2 if paired else 0.0
-        scaled = any((c["law"].get(k) or [""])[0] == "scaled" for c in scene["contacts"] for k in _K)
+        scaled = any(
+            (c["law"].get(k) or [""])[0] == "scaled" for c in scene["contacts"] for k in _K
+        )
         if scaled and scene["cell"] == "hexahedron" and any(b["jitter"] for b in scene["bodies"]):
             self._curved += _SMOOTHED
         self.problem, made, self._load = self._model(scene)
@@ -305,6 +309,10 @@ class Judge:
             left = max(left, side)
         allowed = 2 * record["tolerance"] * scale + 4 * self._traction_rounding(contact, found)
         self._check(name, "multipliers", left, allowed)
+        # However large the tractions are: what is inside is not by as much as anyone can see.
+        if contact.law.has_normal:
+            deep = np.where(found["r_n"] < 0, contact.project @ found["closing"], 0.0).max()
+            self._check(name, "inside", deep, _INSIDE * np.ptp(contact.x, axis=0).max())
 
     def _check_through(self, name: str, u: Array, found: list[dict], now: dict[str, Any]) -> None:
         """Whether the other body sees far more contact than Γc does: it has passed through."""
