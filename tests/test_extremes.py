@@ -44,8 +44,29 @@ CHOSEN = {
     "two bodies, gap, in body lengths": ("1000",),
     "peak pressure of a roller, k_n h/E": ("1e-03", "1e+01", "1e+08", "1e+01, multipliers"),
 }
+# Of those with finite kinematics, by methods of their own.
+FINITE = {
+    "a disc turned, in increments": ("360° in 1", "360° in 4", "360° in 12, μ = 1"),
+    "facets slid over": ("1000 of a plane, in 10",),
+    "a block dragged off the end of a plate": ("μ = 0, in 10",),
+    "a column of rubber, to 60 % of its height": (
+        "k_n h/E = 1e-03",
+        "k_n h/E = 1e+06",
+        "10 %, in one increment",
+        "from 1000 heights away",
+    ),
+    "a disc pressed in, dragged and turned, k_n h/E, μ = 1": ("1e+00, rubber",),
+    "first touch from afar, in body heights": ("1000", "1000, by force"),
+    "increments": ("pressed in without friction in 1", "a disc turned by 90° in 1"),
+}
 REFUSED = ("pushed beyond friction", "no friction", "-1 times")
 FAST = [t for t in trials() if t.case in CHOSEN.get(t.group, ())]
+LARGE = [
+    dataclasses.replace(t, methods=(method,))
+    for t in trials()
+    for method in t.methods
+    if t.case in FINITE.get(t.group.removeprefix("finite kinematics, "), ()) and not t.slow
+]
 MORE = [Trial("loads", f"{load:g} times", pressed(10, load=load), "patch") for load in (1e3, -1.0)]
 
 
@@ -60,9 +81,19 @@ def test_extreme(trial, method):
     assert row.outcome.startswith("refused: " if refused else "verified"), row
 
 
+@pytest.mark.skipif(COMM.size > 1, reason="scenes of other tests run in parallel")
+@pytest.mark.parametrize("trial", LARGE, ids=lambda t: f"{t.group} {t.case} {t.methods[0]}")
+def test_extreme_of_finite_kinematics(trial):
+    """Verified within the tolerance of the reference."""
+    (row,) = trial.run()
+    assert not row.wrong, row
+    assert row.outcome == "verified" and row.reference, row
+
+
 def test_nothing_of_the_list_is_missing():
     """Every name above is that of a trial."""
     assert len(FAST) == sum(len(cases) for cases in CHOSEN.values())
+    assert len({(t.group, t.case) for t in LARGE}) == sum(map(len, FINITE.values()))
 
 
 @pytest.mark.mpi

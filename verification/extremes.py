@@ -321,7 +321,7 @@ def finite_kinematics() -> Iterator[Trial]:
         reference = "no force, and the first force, back" if mu == 0 else "no force"
         case = f"μ = {mu:g}, in {steps}"
         yield Trial(name, case, finite.off_the_edge(mu, steps), reference, 1e-7)
-    name = "finite kinematics, a column of rubber as high as 60 %"
+    name = "finite kinematics, a column of rubber, to 60 % of its height"
     exact = "uniform stretches by bisection"
     for k in [10.0**i for i in range(-3, 7)]:
         yield Trial(name, f"k_n h/E = {k:.0e}", finite.column(k), exact, 1e-6, alone)
@@ -349,7 +349,7 @@ def finite_kinematics() -> Iterator[Trial]:
     name = "finite kinematics, increments"
     for steps in (1, 2, 5, 200):
         case = f"pressed in without friction in {steps}"
-        trial = Trial(name, case, finite.pressed_in(steps), "16", 1e-9, alone, steps == 200)
+        trial = Trial(name, case, finite.pressed_in(steps), "16 of them", 1e-9, alone, steps == 200)
         yield trial
     for steps in (1, 10, 200):
         case = f"a disc turned by 90° in {steps}"
@@ -367,9 +367,10 @@ def page(rows: list[Row]) -> str:
         "# The extremes",
         "",
         "Written by `python verification/extremes.py`: a block on a floor or a round cushion, in "
-        "the plane or in space, one block on another, a roller on a half-plane; E = 1000, cold, in "
-        "one increment where nothing else is said. A solution is *verified* "
-        "when it passed the package's own checks; its error is that of the displacement (or force) "
+        "the plane or in space, one block on another, a roller on a half-plane; with finite "
+        "kinematics a block of rubber under a rigid tool; E = 1000, cold, in one increment where "
+        "nothing else is said. A solution is *verified* when it passed the package's own checks; "
+        "its error is that of the displacement (or force) "
         "against the reference, relative. Behind every attempt its iterations; “cut” is a halved "
         "increment.",
         "",
