@@ -53,7 +53,6 @@ CATEGORIES = {
     "half of its radius": "too deep",
     "gone through Γc": "gone through",
     "cells are turned inside out": "inside out",
-    "multipliers grow": "multipliers grow",
     "rad in one increment": "turned too far",
     "no contact force can balance": "load not balanced",
     "nothing will ever hold": "not held",

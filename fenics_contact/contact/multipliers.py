@@ -193,10 +193,10 @@ class Multipliers:
         # By the tractions of this increment: those before it leave round-off and no more.
         scale = largest(lambda n: values.arrays[n], names)
         before = largest(history.values, names)
-        if change > 0:
-            self._first = self._first or (change, scale)
-            if scale > _GROWN * self._first[1] and change > _FALLEN * self._first[0]:
-                return np.inf
+        if change > 0 and scale > 0:
+            first_change, first_scale = self._first = self._first or (change, scale)
+            if scale > _GROWN * first_scale and change > _FALLEN * first_change:
+                return change / first_scale
         if change <= _ROUND_OFF * max(scale, before):
             return 0.0
         # Displacements have round-off however little is borne, and springs make a traction of it.
