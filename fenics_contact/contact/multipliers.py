@@ -46,6 +46,8 @@ _DEPTH, _DISTINCT = 6, 1e-12
 # bear less than this share of what they did then: else multipliers grow by the same in every round,
 # and what is left is small beside them alone.
 _GROWN, _FALLEN = 2.0, 0.1
+# Round-off of a traction, by its size.
+_LOST = 16 * np.finfo(float).eps
 
 
 class TraceProjection:
@@ -193,16 +195,21 @@ class Multipliers:
         # By the tractions of this increment: those before it leave round-off and no more.
         scale = largest(lambda n: values.arrays[n], names)
         before = largest(history.values, names)
-        if change > 0 and scale > 0:
-            first_change, first_scale = self._first = self._first or (change, scale)
-            if scale > _GROWN * first_scale and change > _FALLEN * first_change:
-                return change / first_scale
-        if change <= _ROUND_OFF * max(scale, before):
-            return 0.0
         # Displacements have round-off however little is borne, and springs make a traction of it.
-        for name in sorted({"k_n", "k_t"} & set(values.parameters)):
-            if change <= _BLUR * global_max(self._comm, values.parameters[name] * moved):
-                return 0.0
+        springs = [values.parameters[n] for n in sorted({"k_n", "k_t"} & set(values.parameters))]
+        noise = max(
+            (float(_BLUR * global_max(self._comm, k * moved)) for k in springs), default=0.0
+        )
+        if scale > noise:
+            if change > 0:
+                self._first = self._first or (change, scale)
+            # What springs bear may be lost in the round-off of multipliers that have grown so far.
+            left = max(change, _LOST * scale)
+            first = self._first or (left, scale)
+            if scale > _GROWN * first[1] and left > _FALLEN * first[0]:
+                return left / first[1]
+        if change <= max(_ROUND_OFF * max(scale, before), noise):
+            return 0.0
         return change / scale if scale > 0 else np.inf
 
     def update(self, values: PointValues) -> None:
