@@ -236,7 +236,7 @@ class ContactProblem:
         self.increment = 0
         self.prefix = prefix
         self._comm = u.function_space.mesh.comm
-        n_motions = sum(len(contact.free_motion) for contact in self.contacts)
+        n_motions = sum(len(contact.motions) for contact in self.contacts)
         self.unknowns = Unknowns(u.function_space, n_motions)
         self._n_owned = self.unknowns.n_dofs
         self.constrained = self._constrained_unknowns()
@@ -250,7 +250,15 @@ class ContactProblem:
         self.bulk.check_elastic()
         self._scaled = [c for c in self.contacts if c.needs_modulus]
         self._measure_modulus()
-        self.motions = RigidMotions(self.displacement, self.unknowns, self._motion_names())
+        supports = [
+            (contact.name, motion) for contact in self.contacts for motion in contact.motions
+        ]
+        self.motions = RigidMotions(
+            self.displacement,
+            self.unknowns,
+            [f"{m.kind} {m.way} of the support of {name}" for name, m in supports],
+            turning=[motion.turns for _, motion in supports],
+        )
         self.initial_penetration = self._check_start()
         self.motions.find_free(self.full.stiffness, self.constrained)
         self.motions.check_held(self.operators)
@@ -328,13 +336,6 @@ class ContactProblem:
         if not isinstance(u, fem.Function):
             return Displacement(u, None, "problem")  # refuses it
         return Displacement.only(u, "problem")
-
-    def _motion_names(self) -> list[str]:
-        return [
-            f"translation along {'xyz'[i]} of the support of {contact.name}"
-            for contact in self.contacts
-            for i in contact.free_motion
-        ]
 
     def _constrained_unknowns(self) -> Mask:
         mask = np.zeros(self.unknowns.n_local, dtype=np.bool_)

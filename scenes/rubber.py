@@ -167,17 +167,22 @@ def disc(
     *,
     displacement: Any = None,
     angle: Any = None,
+    moment: Any = None,
     axis: Sequence[float] = (0, 1, 0),
     shape: str = "ball",
 ) -> fc.Support:
     """A rigid disc or ball that touches the middle of the top; it turns about its centre.
+
+    By ``angle``, or by ``moment``, or not at all.
 
     ``shape``: "ball" is exact; "profile" is a spline through 60 points, turned in space; "facets"
     are 24 segments in the plane, 512 triangles in space.
     """
     d = scene.dim
     centre = np.array((0.0,) * (d - 1) + (scene.height + radius,))
-    turn = None if angle is None else fc.Rotation(angle, centre, None if d == 2 else axis)
+    turn = None
+    if angle is not None or moment is not None:
+        turn = fc.Rotation(angle, centre, None if d == 2 else axis, moment)
     move = {"displacement": displacement, "rotation": turn}
     if shape == "ball":
         return fc.Ball(centre, radius, **move)
@@ -207,6 +212,7 @@ class Tool(History):
         radius: float = 0.8,
         contact: dict | None = None,
         force: bool = False,
+        driven: bool = False,
         shape: str = "ball",
         solver: dict | None = None,
         **options: Any,
@@ -219,6 +225,7 @@ class Tool(History):
             radius: Of the disc.
             contact: Arguments of the `Contact`.
             force: Whether the disc is pressed by a force, ``down``, instead of a displacement.
+            driven: Whether the disc is turned by a ``moment``, instead of an angle.
             shape: Of the disc, see `disc`.
             solver: Arguments of the problem.
             options: Of `rubber`.
@@ -229,13 +236,15 @@ class Tool(History):
         mesh, d = self.scene.mesh, self.scene.dim
         self.shift, self.angle = fem.Constant(mesh, np.zeros(d)), fem.Constant(mesh, 0.0)
         self.down, self.side = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
+        self.moment = fem.Constant(mesh, 0.0)
         motion: Any = self.shift
         if force:
             still = (0.0,) * (d - 2)
             motion = fc.Motion(
                 force=(*(None,) * (d - 1), self.down), displacement=(self.side, *still, None)
             )
-        support = disc(self.scene, radius, displacement=motion, angle=self.angle, shape=shape)
+        turn = {"moment": self.moment} if driven else {"angle": self.angle}
+        support = disc(self.scene, radius, displacement=motion, shape=shape, **turn)
         self.problem, self.contact = self.scene.problem(
             support,
             law or fc.Coulomb(0.3, 1e4, 1e4),
@@ -249,6 +258,7 @@ class Tool(History):
         self.shift.value[:] = self.vector(along, -0.12 * down)
         self.down.value, self.side.value = -60.0 * down, along
         self.angle.value = 0.2 * max(t - 1, 0.0)
+        self.moment.value = 3.0 * np.interp(t, [1, 2, 4], [0, 1, -1])
 
     def vector(self, side: float, up: float) -> Array:
         """Components along x and along the height."""

@@ -74,6 +74,7 @@ class EnergyState:
             support, and that of the support as far as it is prescribed: (3, n_points, gdim). Where
             the support turns, the displacement relative to it in its frame, that of the body less
             the free motion of the support, and the axes of the frame: (3 + gdim, n_points, gdim).
+            Where a moment turns it two more: `Contact.turning_rate`, and the angle.
         springs: Energy in the contact's springs on this rank.
     """
 
@@ -115,9 +116,15 @@ class EnergyState:
             relative, carried = here[1] - there[1], here[2] - there[2]
             if contact.turns:
                 # Half-way between both ends, else a normal pressure works on what turns beneath it.
-                axes = 0.5 * (there[3:] + here[3:])
+                d = here.shape[2]
+                axes = 0.5 * (there[3 : 3 + d] + here[3 : 3 + d])
                 relative = np.einsum("jqi,qj->qi", axes, relative)
                 carried = carried - relative
+                if contact.free_angle is not None:
+                    # The work of the moment is that of the loads, too.
+                    turned = here[-1] - there[-1]
+                    moments = 0.5 * (there[0] * there[-2] + here[0] * here[-2])
+                    sums[0] -= np.sum(contact.measure[:, None] * moments * turned)
             sums[0] += np.sum(mean * carried)
             sums[4] -= np.sum(mean * relative)
             if contact.law.has_friction:
@@ -149,7 +156,11 @@ def _ways(contact: Contact, traction: Array) -> Array:
     own = contact.own_displacement()
     for component, motion in contact.free_motion.items():
         own[:, component] -= float(motion.value)
-    return np.stack([traction, jump, own, *axes])
+    ways = [traction, jump, own, *axes]
+    if contact.free_angle is not None:
+        angle = float(contact.free_angle.value)
+        ways += [contact.turning_rate(), np.full_like(jump, angle)]
+    return np.stack(ways)
 
 
 def _dot(one: Array, other: Array) -> Array:

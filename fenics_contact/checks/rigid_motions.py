@@ -23,7 +23,7 @@ from fenics_contact.surface.facets import facet_cells
 from fenics_contact.systems.modes import rigid_motions
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.unknowns import Unknowns
-from fenics_contact.types import Array, Mask
+from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["RigidMotions"]
 
@@ -52,7 +52,12 @@ class RigidMotions:
     """
 
     def __init__(
-        self, displacement: Displacement, unknowns: Unknowns, supports: Sequence[str] = ()
+        self,
+        displacement: Displacement,
+        unknowns: Unknowns,
+        supports: Sequence[str] = (),
+        *,
+        turning: Sequence[bool] = (),
     ) -> None:
         """Make the motions at this rank's unknowns. Collective.
 
@@ -60,6 +65,7 @@ class RigidMotions:
             displacement: What moves.
             unknowns: The dofs and the free motions of supports, each a rigid motion of its own.
             supports: Names of the latter.
+            turning: Which of them are rotations, whose arms change with the state.
         """
         space = displacement.u.function_space
         self._comm = space.mesh.comm
@@ -87,6 +93,7 @@ class RigidMotions:
                 mine = np.where(body[:, None] == b, mode, 0.0).ravel()
                 modes.append(displacement.within(mine))
         self.names += supports
+        self._turning = np.array([False] * len(modes) + list(turning), dtype=np.bool_)
         none, still = np.zeros(len(supports)), np.zeros(unknowns.n_dofs)
         of_supports = [unknowns.joined(still, row) for row in np.eye(len(supports))]
         self._modes = np.array([unknowns.joined(mode, none) for mode in modes] + of_supports)
@@ -134,7 +141,7 @@ class RigidMotions:
 
     def _at_points(self, operator: ContactOperator) -> Array:
         """Jumps of the free motions at a contact's points: (n_free, n_points, gdim). Collective."""
-        if operator not in self._jumps:
+        if operator not in self._jumps or operator.contact.free_angle is not None:
             gdim, n_points = len(self._centres[0]), operator.contact.quadrature.n_points
             found = [operator.jump(c @ self._modes) for c in self.free]
             self._jumps[operator] = np.array(found).reshape(len(self.free), n_points, gdim)
@@ -209,6 +216,7 @@ class RigidMotions:
                 bearing.append(closed & (contact.values.grip > 0))
         # What holds a body still does with more of Γc closed: no need to look again.
         same = bool(self._holding) and all(operator in self._holders for operator in operators)
+        same = same and not self._turning.any()
         known = self._holding if same else []
         lacks = [np.any(was & ~now) for was, now in zip(known, bearing, strict=bool(known))]
         if self._comm.allreduce(not known or any(lacks)) == 0:
@@ -303,9 +311,11 @@ class RigidMotions:
         Raises:
             ValueError: It gives the resultant and the motion.
         """
-        if not len(self.free):
+        # By an angle arms turn with it: what cannot be borne here may be there.
+        rows = np.flatnonzero(~np.any(self.free[:, self._turning] != 0.0, axis=1))
+        if not len(rows):
             return
-        free = self._free_fields
+        named, free = self.free[rows], self._free_fields[rows]
         resultant = global_sum(self._comm, free @ load)
         # What the load could do at most, were all of it along the motion: the scale of "zero".
         size = float(global_sum(self._comm, np.abs(free) @ np.abs(load)).max())
@@ -313,7 +323,8 @@ class RigidMotions:
         for operator, contact in zip(operators, contacts, strict=True):
             if not contact.law.has_normal_stiffness:  # a prescribed normal traction is a load
                 force = -contact.values.parameters["pressure"][:, None] * contact.values.normal
-                work = np.einsum("mqd,qd,q->m", self._at_points(operator), force, contact.measure)
+                modes = self._at_points(operator)[rows]
+                work = np.einsum("mqd,qd,q->m", modes, force, contact.measure)
                 resultant += global_sum(self._comm, work)
         if np.abs(resultant).max() <= _BALANCED * size:
             return
@@ -325,7 +336,7 @@ class RigidMotions:
         known = len(data) == len(self._balanced) and all(map(_alike, data, self._balanced))
         if self._comm.allreduce(not known) == 0:
             return
-        rays = np.concatenate([self._rays(operator) for operator in operators], axis=0)
+        rays = np.concatenate([self._rays(operator, rows) for operator in operators], axis=0)
         # Unit columns: a ray's length has no meaning, and badly scaled ones spoil the solution. One
         # of rounding only, such as that of tangential forces on a motion across them, is none.
         length = np.linalg.norm(rays, axis=1)
@@ -340,12 +351,12 @@ class RigidMotions:
             size = max(size, scale)
             beyond = [i for i, r in enumerate(resultant) if abs(r) > limits[i] + _BALANCED * size]
             said = [
-                f"({self._describe(self.free[i])}) is {resultant[i]:.6g}, of which contact can "
+                f"({self._describe(named[i])}) is {resultant[i]:.6g}, of which contact can "
                 f"bear at most {limits[i]:.6g} with the rest as it is"
                 for i in beyond
             ]
             worst = int(np.argmax(np.abs(resultant)))
-            said = said or [f"({self._describe(self.free[worst])}) is {resultant[worst]:.6g}"]
+            said = said or [f"({self._describe(named[worst])}) is {resultant[worst]:.6g}"]
             raise ValueError(
                 "no contact force can balance the load: its resultant along the free motion "
                 f"{', and along '.join(said)}. Contact can only push along its normals and rub "
@@ -354,8 +365,11 @@ class RigidMotions:
             )
         self._balanced = data
 
-    def _rays(self, operator: ContactOperator) -> Array:
-        """Generalised forces of every admissible direction at every point: (n_rays, n_free)."""
+    def _rays(self, operator: ContactOperator, rows: Index) -> Array:
+        """Generalised forces of every admissible direction at every point: (n_rays, n_rows).
+
+        On some of the free motions, by their numbers.
+        """
         contact, values = operator.contact, operator.contact.values
         normal = values.normal
         d = normal.shape[1]
@@ -377,9 +391,9 @@ class RigidMotions:
             directions.append(-normal)
         if law.has_tension:
             directions.append(normal)
-        modes = self._at_points(operator)
+        modes = self._at_points(operator)[rows]
         rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
-        return gather_rows(self._comm, np.concatenate(rays).reshape(-1, len(self.free)))
+        return gather_rows(self._comm, np.concatenate(rays).reshape(-1, len(rows)))
 
 
 def _alike(one: Array, other: Array) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -25,7 +25,7 @@ from fenics_contact.contact.finite import (
     check_places,
     check_rigid,
 )
-from fenics_contact.contact.inputs import Inputs
+from fenics_contact.contact.inputs import FreeMotion, Inputs
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
 from fenics_contact.contact.multipliers import Multipliers, TraceProjection
 from fenics_contact.contact.pairs import Pairs, PairsState
@@ -114,6 +114,9 @@ class Contact(PointResults):
         free_motion: Components of the support's displacement that follow from the force on it, as
             scalar constants by number of the component: their values are results (length).
         applied_force: The forces on it, likewise (force).
+        free_angle: Angle of a support that is turned by a moment, a scalar constant whose value is
+            a result (radians); None: there is none.
+        applied_moment: The moment, likewise (force times length).
         inputs: All that was given, as UFL.
         pairs: What lies opposite the points.
         gap_prescribed: Whether the gap was given apart from the geometry.
@@ -434,8 +437,12 @@ class Contact(PointResults):
         } | {f"parameter {n}": v for n, v in given.parameters.items()}
         if inputs.rotation is not None:
             d, matrix = self._gdim, inputs.rotation[0]
-            expressions |= {"angle": inputs.angle, "about": inputs.rotation[1]}
-            expressions["turn"] = ufl.as_vector([matrix[i, j] for i in range(d) for j in range(d)])
+            expressions["about"] = inputs.rotation[1]
+            if d == 3:
+                expressions["axis"] = inputs.axis
+            if inputs.free_angle is None:
+                rows = [matrix[i, j] for i in range(d) for j in range(d)]
+                expressions |= {"angle": inputs.angle, "turn": ufl.as_vector(rows)}
         seen = ["initial_gap", "normal", *(f"parameter {n}" for n in given.parameters)]
         if given.shift is not None:
             expressions["support"] = given.shift
@@ -472,7 +479,7 @@ class Contact(PointResults):
 
     def _check_form(self) -> None:
         """Refuse what no form on Γc can hold."""
-        if self.free_motion:
+        if self.motions:
             raise ValueError(
                 f"{self.name}: the form on Γc cannot hold the unknown motion of the support; use "
                 "ContactProblem, or prescribe the displacement"
@@ -543,7 +550,29 @@ class Contact(PointResults):
             return PointTangent(self._present.tangent(by_felt, traction, self.history))
         if not self.finite:
             turns = {i: (data[f"gap by {i}"], data[f"normal by {i}"]) for i in self.free_motion}
-        return self._acting.evaluate_tangent(turns)
+        tangent = self._acting.evaluate_tangent(turns)
+        if self.free_angle is None:
+            return tangent
+        assert self.support.rotation is not None
+        spun = self.support.rotation.rate(self._acting.evaluate_traction())
+        return replace(tangent, spun=spun)
+
+    def turning_rate(self) -> Array:
+        """Way by a unit angle of the support's points where those of Γc are now. Collective.
+
+        Returns:
+            ω × r, with r from the axis as it is now, (n_points, gdim) (length).
+
+        Raises:
+            ValueError: The support does not turn.
+        """
+        if self.support.rotation is None:
+            raise ValueError(f"{self.name}: the support does not turn")
+        jump = self._own_jump()
+        self._update_data()
+        data = self._data.values
+        arm = data["x"] + jump - data["about"] - data.get("support", 0.0)
+        return self.support.rotation.rate(arm)
 
     def energy(self) -> float:
         """`potential` at the present ``u``, this rank's points only. Collective.
@@ -571,7 +600,7 @@ class Contact(PointResults):
         for item in (vector, forces):
             item.destroy()
         if self._own_form is None:
-            displacement = self.u if self.rigid and not self.free_motion else self._felt
+            displacement = self.u if self.rigid and not self.motions else self._felt
             form = self._form_at(displacement, ufl.TestFunction(space))
             self._own_form = compat.compile_form(-form, self.entity_maps)
         return by_points, assembled(self._own_form)[: by_points.size].copy()
@@ -713,6 +742,21 @@ class Contact(PointResults):
         return self.inputs.applied_force
 
     @property
+    def free_angle(self) -> fem.Constant | None:
+        """Unknown angle of the support; see the class."""
+        return self.inputs.free_angle
+
+    @property
+    def applied_moment(self) -> fem.Constant | None:
+        """The moment that turns it; see the class."""
+        return self.inputs.applied_moment
+
+    @property
+    def motions(self) -> list[FreeMotion]:
+        """All unknowns of the support, displacements before the angle."""
+        return self.inputs.motions
+
+    @property
     def needs_modulus(self) -> bool:
         """Whether a stiffness is `Scaled` and still waits for `set_modulus`."""
         return self.inputs.needs_modulus
@@ -766,7 +810,7 @@ class Contact(PointResults):
         self.inputs.update()
         self._update_data()
         data = self._data.values
-        names = ["weight", "normal", "shift", "turn"]
+        names = ["weight", "normal", "shift", "turn", "about", "axis"]
         if self.gap_prescribed or not self.pairs_anew:  # else it is that of the latest pairs
             names.append("initial_gap")
         return {n: v for n, v in data.items() if n in names or n.startswith("parameter ")}
@@ -804,7 +848,7 @@ class Contact(PointResults):
     @property
     def couples(self) -> bool:
         """Whether contact ties unknowns together that the bulk does not."""
-        return not self.rigid or bool(self.free_motion)
+        return not self.rigid or bool(self.motions)
 
     @property
     def pairs_anew(self) -> bool:
@@ -967,6 +1011,8 @@ class Contact(PointResults):
 
         It is that of the last evaluation.
         """
+        if self.free_angle is not None:
+            return float(self.free_angle.value)
         if self.inputs.angle is None:
             return 0.0
         # The same at all points.

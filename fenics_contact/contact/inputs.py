@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,13 +23,53 @@ from fenics_contact.surface.modulus import modulus_over_height
 from fenics_contact.surface.surface import SurfaceQuadrature, VertexAreas
 from fenics_contact.types import Array
 
-__all__ = ["Inputs"]
+__all__ = ["FreeMotion", "Inputs"]
 
 
 # What a contact itself is given by these names, among which a law's parameters stand.
-_OWN = ("angle", "displacement", "gap", "support", "weight")
+_OWN = ("angle", "displacement", "gap", "moment", "support", "weight")
 # A direction with no more than this share across the normal counts as parallel to it.
 _PARALLEL = 1e-6
+
+
+@dataclass(frozen=True)
+class FreeMotion:
+    """An unknown of a rigid support, which systems have as a length with a force on it.
+
+    Attributes:
+        way: "along x", or "about its axis".
+        constant: What is found: a displacement (length), or an angle.
+        load: What is given: the force or moment, as it is now.
+        length: The angle times this is the unknown, the moment by it the force; else 1. A power of
+            two, so that there is no round-off in it.
+        turns: Whether it is an angle.
+    """
+
+    way: str
+    constant: fem.Constant
+    load: Callable[[], Any]
+    length: float = 1.0
+    turns: bool = False
+
+    @property
+    def kind(self) -> str:
+        """In a word."""
+        return "rotation" if self.turns else "translation"
+
+    @property
+    def value(self) -> float:
+        """The unknown (length)."""
+        return float(self.constant.value) * self.length
+
+    def set_value(self, value: float) -> None:
+        """Make an unknown the present one."""
+        self.constant.value = value / self.length
+
+    @property
+    def force(self) -> float:
+        """What acts on it (force)."""
+        load = self.load()
+        return float(load.value if isinstance(load, fem.Constant) else load) / self.length
 
 
 class Inputs:
@@ -40,9 +83,13 @@ class Inputs:
         shift: Displacement of the support; None: it has none.
         rotation: Matrix of its turn, and a point of the axis; None: it does not turn.
         angle: Of that turn (radians); None likewise.
+        axis: Direction of the axis, in space; None: it does not turn, or in the plane.
         free_motion: Components of it that are unknown, as constants by number.
         free_shift: The same as variables, to differentiate by.
         applied_force: The forces on these.
+        free_angle: That of the turn, where it is unknown; else None.
+        applied_moment: What turns it then.
+        motions: All unknowns of the support, displacements first.
     """
 
     def __init__(
@@ -91,6 +138,13 @@ class Inputs:
         self.applied_force: dict[int, Any] = {}
         self.shift = self._displacement(support.displacement)
         self.angle: Any = None
+        self.motions = [
+            FreeMotion(f"along {'xyz'[i]}", constant, partial(self.applied_force.get, i))
+            for i, constant in self.free_motion.items()
+        ]
+        self.axis: Any = None
+        self.free_angle: fem.Constant | None = None
+        self.applied_moment: fem.Constant | None = None
         self.rotation = self._rotation(support.rotation)
 
     # ---- as UFL ----------------------------------------------------------------------------------
@@ -162,13 +216,46 @@ class Inputs:
         if rotation is None:
             return None
         check_instance(f"{self._name}: rotation", rotation, Rotation)
-        matrix = rotation.matrix(self._gdim, self._angle)
+        given = rotation.angle, rotation.moment
+        if (given[0] is None) == (given[1] is None):
+            raise ValueError(
+                f"{self._name}: the Rotation has angle {given[0]!r} and moment {given[1]!r}; give "
+                "one of them, and None for the other, which is found"
+            )
         about = as_vector(f"{self._name}: about of the Rotation", rotation.about, self._gdim)
+        axis = rotation.unit_axis(self._gdim)
+        angle = self._turning(rotation, about) if given[0] is None else given[0]
+        self.angle = self.to_ufl("angle", angle)
+        matrix = rotation.matrix(self._gdim, self.angle)
+        self.axis = self.to_ufl("support", axis) if self._gdim == 3 else None
         return matrix, self.to_ufl("support", about)
 
-    def _angle(self, angle: Any) -> Any:
-        self.angle = self.to_ufl("angle", angle)
-        return self.angle
+    def _turning(self, rotation: Rotation, about: Any) -> fem.Constant:
+        """The angle of a support that is turned by a moment. Collective."""
+        moment = rotation.moment
+        if not (is_number(moment) or (isinstance(moment, fem.Constant) and not moment.ufl_shape)):
+            raise TypeError(
+                f"{self._name}: moment of the Rotation is {moment!r}; give a number or a scalar "
+                "fem.Constant"
+            )
+        if isinstance(about, ufl.core.expr.Expr):
+            raise TypeError(
+                f"{self._name}: about of the Rotation is {about!r}; where the moment is given it "
+                f"must be {self._gdim} numbers: the displacement of the support moves the axis"
+            )
+        self.applied_moment = self.to_ufl("moment", moment)
+        self.free_angle = fem.Constant(self._surface.mesh, 0.0)
+        # Nodes, whose coordinates are the same on any number of ranks.
+        arms = self._surface.submesh.geometry.x[:, : self._gdim] - about
+        reach = np.linalg.norm(rotation.rate(arms), axis=1)
+        _, exponent = math.frexp(global_max(self._surface.mesh.comm, reach))
+        length = 2.0 ** (exponent - 1)
+        self.motions.append(
+            FreeMotion(
+                "about its axis", self.free_angle, lambda: self.applied_moment, length, turns=True
+            )
+        )
+        return self.free_angle
 
     def _moving(self, motion: Motion) -> ufl.core.expr.Expr:
         """The displacement of a support some components of which are unknown."""

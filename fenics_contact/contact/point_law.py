@@ -28,16 +28,20 @@ _BARELY = 1e-8
 
 @dataclass(frozen=True)
 class PointTangent:
-    """Derivatives of the traction at the points, (n_points, gdim, gdim) each (stress/length).
+    """Derivatives of the traction at the points.
 
     Attributes:
-        by_jump: By the displacement of the body; where `Contact.local_map` is one, of the forces
-            on the local unknowns by these.
-        by_shift: By that of the support; None where no component of it is free.
+        by_jump: By the displacement of the body, (n_points, gdim, gdim) (stress/length); where
+            `Contact.local_map` is one, of the forces on the local unknowns by these.
+        by_shift: By that of the support, likewise; None where no component of it is free.
+        spun: By a turn of body and support together, ω × the traction, (n_points, gdim) (stress);
+            None where the support is not turned by a moment. Anisotropic friction, whose direction
+            stays as it is, has some more.
     """
 
     by_jump: Array
     by_shift: Array | None = None
+    spun: Array | None = None
 
 
 class PointLaw:

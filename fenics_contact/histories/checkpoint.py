@@ -60,7 +60,7 @@ _SAME = 1e-9
 # Relative difference up to which data are the same, and, of lengths, relative to the mesh: the gap
 # to a support is a difference of coordinates.
 _EQUAL, _ROUND_OFF = 1e-9, 1e-11
-_LENGTHS = ("initial_gap", "shift")
+_LENGTHS = ("initial_gap", "shift", "about")
 _REMEDY = "remove it to start anew"
 
 
@@ -440,7 +440,8 @@ def _fixed(problem: ContactProblem, fields: Sequence[fem.Function]) -> dict[str,
         words[f"quadrature of {c.name}"] = f"{n_points} points"
         words[f"history of {c.name}"] = ", ".join(c.history.names)
         words[f"kinematics of {c.name}"] = "finite" if c.finite else "small"
-        words[f"free motion of {c.name}"] = ", ".join("xyz"[i] for i in c.free_motion)
+        free = ["xyz"[i] for i in c.free_motion] + ["angle"] * (c.free_angle is not None)
+        words[f"free motion of {c.name}"] = ", ".join(free)
     for number, field in enumerate(fields):
         element = field.function_space.ufl_element()
         size = field.function_space.dofmap.index_map.size_global

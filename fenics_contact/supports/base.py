@@ -95,27 +95,30 @@ class Motion:
 
 @dataclass(frozen=True)
 class Rotation:
-    """A prescribed turn of a support about an axis that is fixed in it, of any size.
+    """A turn of a support about an axis that is fixed in it, of any size.
 
-    It needs ``Contact(kinematics="finite")``. The displacement of the support moves the axis, too.
+    One of angle and moment is given, the other is None: ``Rotation(None, about, moment=0.0)`` turns
+    as contact turns it, as a roller does. It needs ``Contact(kinematics="finite")``. The
+    displacement of the support moves the axis, too, whether it is prescribed or a `Motion`.
 
     Args to the constructor:
         angle: In radians, right-handed about the axis, in the plane anticlockwise: a number, or a
-            scalar ``fem.Constant`` to be changed between increments.
+            scalar ``fem.Constant`` to be changed between increments. None where the moment is
+            given; then it is found.
         about: A point of the axis where the support has not been displaced, gdim numbers (length).
         axis: Its direction, three numbers of any length; in the plane none.
+        moment: External moment on the support about the axis, in the sense of the angle (force
+            times length; in 2D per thickness), a number or scalar ``fem.Constant``; of a symmetric
+            model the modelled part's share.
     """
 
     angle: Any
     about: Sequence[float]
     axis: Sequence[float] | None = None
+    moment: Any = None
 
-    def matrix(self, gdim: int, to_ufl: ToUFL) -> ufl.core.expr.Expr:
-        """R, which takes directions from where the support began to where it is (gdim, gdim).
-
-        Args:
-            gdim: Dimension of the mesh.
-            to_ufl: Of the angle, if it is a number.
+    def unit_axis(self, gdim: int) -> Array:
+        """Direction of the axis, (3,); in the plane out of it.
 
         Raises:
             ValueError: There is an axis in the plane, or none in space.
@@ -124,7 +127,22 @@ class Rotation:
             raise ValueError(f"axis of the Rotation is {self.axis!r}; in 2D it takes none")
         if gdim == 3 and self.axis is None:
             raise ValueError("axis of the Rotation is missing; in 3D give its direction")
-        angle = to_ufl(self.angle)
+        if self.axis is None:
+            return np.array([0.0, 0.0, 1.0])
+        found: Array = nonzero_vector("axis of the Rotation", self.axis, gdim)
+        return found
+
+    def matrix(self, gdim: int, angle: ufl.core.expr.Expr) -> ufl.core.expr.Expr:
+        """R, which takes directions from where the support began to where it is (gdim, gdim).
+
+        Args:
+            gdim: Dimension of the mesh.
+            angle: As UFL, given or found.
+
+        Raises:
+            ValueError: There is an axis in the plane, or none in space; or the angle is no scalar.
+        """
+        x, y, z = (float(v) for v in self.unit_axis(gdim))
         if angle.ufl_shape != ():
             raise ValueError(
                 f"angle of the Rotation has shape {angle.ufl_shape}; it must be a scalar (radians)"
@@ -132,7 +150,6 @@ class Rotation:
         c, s = ufl.cos(angle), ufl.sin(angle)
         if gdim == 2:
             return ufl.as_matrix([[c, -s], [s, c]])
-        x, y, z = (float(v) for v in nonzero_vector("axis of the Rotation", self.axis, gdim))
         across = ufl.as_matrix([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         return ufl.Identity(3) + s * across + (1 - c) * ufl.dot(across, across)
 
@@ -144,6 +161,12 @@ class Rotation:
         axis = nonzero_vector("axis of the Rotation", self.axis, 3)
         along = np.outer(vectors @ axis, axis)
         return np.asarray(along + c * (vectors - along) + s * np.cross(axis, vectors))
+
+    def rate(self, vectors: Array) -> Array:
+        """By how much vectors that turn with the support change by a unit angle, (n, gdim)."""
+        if vectors.shape[1] == 2:
+            return np.column_stack([-vectors[:, 1], vectors[:, 0]])
+        return np.asarray(np.cross(self.unit_axis(3), vectors), dtype=np.float64)
 
 
 class Support:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
@@ -48,7 +47,7 @@ class FullSystem(System):
         """Take over the parts of a problem. Collective."""
         u, space = displacement.whole, displacement.u.function_space
         n, body = connected_bodies(space)
-        n_motions = sum(len(contact.free_motion) for contact in contacts)
+        n_motions = sum(len(contact.motions) for contact in contacts)
         dofs = np.repeat(body, space.dofmap.bs)[: unknowns.n_dofs]
         if displacement.mixed:  # that of the cells around
             label = np.zeros(u.x.array.size, dtype=body.dtype)
@@ -139,7 +138,7 @@ class FullSystem(System):
 
     def with_supports(self, residual: Array) -> Array:
         """A residual over the dofs with that of the free supports, which their forces are."""
-        forces = [f for c in self.contacts for f in _numbers(c.applied_force)]
+        forces = [motion.force for c in self.contacts for motion in c.motions]
         return self.unknowns.joined(residual, -np.array(forces))
 
     def matrix(self, *, symmetric: bool) -> PETSc.Mat:
@@ -195,8 +194,3 @@ class FullSystem(System):
         diagonal.destroy()
         matrix.scale(1.0 / scale)
         return int(self.linear_kind == "direct")
-
-
-def _numbers(forces: Mapping[int, Any]) -> list[float]:
-    """Values of numbers and scalar constants."""
-    return [float(f.value if isinstance(f, fem.Constant) else f) for f in forces.values()]

@@ -3,6 +3,9 @@
 All of contact acts at points: the map D takes unknowns to the displacement that a point feels
 relative to its support, the law makes tractions of it there, and -Dᵀ takes these, times the area of
 their points, to forces. The law is evaluated on Γc alone, whatever the element of the bulk.
+
+D is constant, but for one column: by the angle of a support that is turned by a moment points feel
+-ω × r, where they are now. As the unknown is a length, L times the angle, so is this by L.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.point_law import PointTangent
+from fenics_contact.parallel import global_sum
 from fenics_contact.systems.products import PointProduct
 from fenics_contact.systems.unknowns import Selection, Unknowns
 from fenics_contact.types import Array, Indices, Mask
@@ -23,9 +27,10 @@ __all__ = ["ContactOperator", "contact_operators"]
 
 
 class ContactOperator:
-    """How the points of a contact feel unknowns, and act on them. It does not change.
+    """How the points of a contact feel unknowns, and act on them.
 
-    Pairs found anew, or other unknowns, take another one.
+    It does not change, but for what they feel of an angle. Pairs found anew, or other unknowns,
+    take another one.
 
     Attributes:
         contact: The contact; what acts at its points is that of its present state.
@@ -62,6 +67,12 @@ class ContactOperator:
             self._map = self._of_bodies.copy()
             different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
             self._map.axpy(-1.0, self._motions, different)
+        # Number of the angle among the unknowns, if there is one, and L.
+        self._turn: int | None = None
+        self._length = 1.0
+        for number, motion in enumerate(contact.motions):
+            if motion.turns:
+                self._turn, self._length = self._first + number, motion.length
         self._at_points = self._map.createVecLeft()
 
     def _find_within(self) -> Mask | None:
@@ -112,10 +123,12 @@ class ContactOperator:
         points, counts = marks.createVecLeft(), marks.createVecRight()
         points.array[:] = np.repeat(chosen, self._gdim)
         marks.multTranspose(points, counts)
-        found = np.flatnonzero(counts.array_r > 0.0).astype(np.int32)
+        felt = counts.array_r > 0.0
+        if self._turn is not None and self.unknowns.has_motions_here:
+            felt[self._turn - self.unknowns.first] = True
         for item in (marks, points, counts):
             item.destroy()
-        return found
+        return np.flatnonzero(felt).astype(np.int32)
 
     def jump(self, values: Array) -> Array:
         """Displacement relative to the support: of unknowns (n_local,), (n_points, gdim).
@@ -126,7 +139,11 @@ class ContactOperator:
         vector.array[:] = values
         self._map.mult(vector, self._at_points)
         vector.destroy()
-        return self._at_points.array_r.reshape(-1, self._gdim).copy()
+        found = self._at_points.array_r.reshape(-1, self._gdim).copy()
+        if self._turn is not None:
+            turned = self.unknowns.motions(values)[self._turn - self.unknowns.first_motion]
+            found -= turned * self._arms()
+        return found
 
     def add_force(self, residual: PETSc.Vec, traction: Array | None = None) -> None:
         """Add what tractions do to a residual, minus their forces. Collective.
@@ -138,8 +155,13 @@ class ContactOperator:
         """
         if traction is None:
             traction = self.contact.acting_traction()
-        self._at_points.array[:] = -(self.contact.area[:, None] * traction).ravel()
+        force = self.contact.area[:, None] * traction
+        self._at_points.array[:] = -force.ravel()
         self._map.multTransposeAdd(self._at_points, residual, residual)
+        if self._turn is not None:
+            moment = float(global_sum(self.unknowns.comm, np.sum(self._arms() * force)))
+            if self.unknowns.has_motions_here:
+                residual.array[self._turn - self.unknowns.first] += moment
 
     def springs(self, stiffness: Array) -> PETSc.Mat:
         """Stiffness of springs at the points, (n_points, gdim, gdim) (stress/length). Collective.
@@ -148,10 +170,15 @@ class ContactOperator:
             A new matrix over the unknowns (force/length).
         """
         blocks = self.contact.area[:, None, None] * stiffness
-        if isinstance(self.unknowns, Selection):
+        if isinstance(self.unknowns, Selection) and self._turn is None:
             return self._product(blocks)
         matrix = self._block_diagonal(blocks)
-        product = matrix.ptap(self._map)
+        if self._turn is None:
+            product = matrix.ptap(self._map)
+        else:
+            present = self._present_map(self._turn)
+            product = matrix.ptap(present)
+            present.destroy()
         matrix.destroy()
         return product
 
@@ -167,6 +194,10 @@ class ContactOperator:
         tangent = tangent or self.contact.acting_tangent()
         if self.contact.local_map is not None:
             return self._local_tangent(tangent.by_jump, self.contact.local_map)
+        if tangent.spun is not None and self._turn is not None:
+            product = self.springs(-tangent.by_jump)
+            self._add_spin(product, tangent.spun, self._turn)
+            return product
         if tangent.by_shift is None:
             return self.springs(-tangent.by_jump)
         # Where the support moves its normals may turn: more than the opposite of ∂/∂jump.
@@ -187,6 +218,69 @@ class ContactOperator:
         product = blocks.ptap(lifted)
         blocks.destroy()
         return product
+    # ---- a support that is turned by a moment ----------------------------------------------------
+
+    def _arms(self) -> Array:
+        """ω × r / L at the points, what they feel of the angle's unknown but for the sign.
+
+        Collective.
+
+        Returns:
+            (n_points, gdim); zero where a point is not within.
+        """
+        arms = np.asarray(self.contact.turning_rate() / self._length, dtype=np.float64)
+        return arms if self.within is None else np.where(self.within[:, None], arms, 0.0)
+
+    def _present_map(self, column: int) -> PETSc.Mat:
+        """D as it is now, a new matrix. Collective."""
+        arms = self._arms()
+        every = np.arange(arms.size, dtype=np.int32)
+        turn = self._one_column(arms.size, column, every, -arms.ravel())
+        present = self._map.copy()
+        present.axpy(1.0, turn, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        turn.destroy()
+        return present
+
+    def _one_column(self, n_rows: int, column: int, filled: Indices, values: Array) -> PETSc.Mat:
+        """A matrix with values in one column alone, in some of this rank's rows, ascending."""
+        counts = np.zeros(n_rows, dtype=PETSc.IntType)
+        counts[filled] = 1
+        return PETSc.Mat().createAIJ(
+            ((n_rows, None), (self.unknowns.n_local, None)),
+            csr=(
+                np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType),
+                np.full(len(values), column, dtype=PETSc.IntType),
+                values,
+            ),
+            comm=self.contact.surface.mesh.comm,
+        )
+
+    def _add_spin(self, product: PETSc.Mat, spun: Array, column: int) -> None:
+        """Add to DᵀBD that tractions turn with the support, and arms move. Collective.
+
+        With w = ω × T / L and e = ω × r / L the angle changes T by w, besides what follows from the
+        jump, and the moment is T·e, whose arm moves with u: T·(ω × du) = -w·du. So w makes the same
+        entries to either side of the diagonal, and e·w on it.
+
+        Args:
+            product: Added to.
+            spun: ω × T, (n_points, gdim) (stress).
+            column: Number of the angle.
+        """
+        share = self.contact.area[:, None] * spun / self._length
+        diagonal = float(global_sum(self.unknowns.comm, np.sum(self._arms() * share)))
+        self._at_points.array[:] = share.ravel()
+        forces = self._map.createVecRight()
+        self._map.multTranspose(self._at_points, forces)
+        if self.unknowns.has_motions_here:
+            forces.array[column - self.unknowns.first] = -diagonal / 2
+        n = self.unknowns.n_local
+        own = self._one_column(n, column, self.touched, forces.array_r[self.touched])
+        mirrored = own.copy().transpose()
+        for part in (own, mirrored):
+            product.axpy(-1.0, part, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+            part.destroy()
+        forces.destroy()
 
     @cached_property
     def _product(self) -> PointProduct:
@@ -213,7 +307,7 @@ class ContactOperator:
 
 def contact_operators(contacts: Sequence[Contact], unknowns: Unknowns) -> list[ContactOperator]:
     """One of every contact of a problem, over its unknowns. Collective."""
-    firsts = np.cumsum([0, *(len(contact.free_motion) for contact in contacts)])
+    firsts = np.cumsum([0, *(len(contact.motions) for contact in contacts)])
     return [
         ContactOperator(contact, unknowns, int(first))
         for contact, first in zip(contacts, firsts, strict=False)

@@ -78,7 +78,7 @@ class System(ABC):
         self.diagonal: Array = np.zeros(unknowns.n_local)
         self.outside: Array = np.zeros((2, n_bodies))
         self.farthest = np.inf
-        self._motions = [c for contact in contacts for c in contact.free_motion.values()]
+        self._motions = [motion for contact in contacts for motion in contact.motions]
         self._contact_vector = unknowns.vector()
         self._operators: tuple[list[int], list[ContactOperator]] | None = None
         self._parts: tuple[list[int], Parts] | None = None
@@ -100,10 +100,10 @@ class System(ABC):
         """What has to be in balance, for the present pairs. Collective."""
         pairings = [c.pairings for c in self.contacts]
         if self._parts is None or self._parts[0] != pairings:
-            moving = [(n, i) for n, c in enumerate(self.contacts) for i in c.free_motion]
+            moving = [(n, m.way) for n, c in enumerate(self.contacts) for m in c.motions]
             n = self.n_bodies - len(moving)
             bodies = [f"body {b + 1}" if n > 1 else "the body" for b in range(n)]
-            bodies += [f"support of {self.contacts[c].name} along {'xyz'[i]}" for c, i in moving]
+            bodies += [f"support of {self.contacts[c].name} {way}" for c, way in moving]
             touched = [operator.touched for operator in self.operators]
             names = [c.name for c in self.contacts]
             parts = Parts(
@@ -193,12 +193,12 @@ class System(ABC):
 
     def motions(self) -> Array:
         """The present free motions of supports, on every rank."""
-        return np.array([float(c.value) for c in self._motions])
+        return np.array([motion.value for motion in self._motions])
 
     def set_motions(self, state: Array) -> None:
         """Make those of a state the present ones. Collective."""
-        for constant, value in zip(self._motions, self.unknowns.motions(state), strict=True):
-            constant.value = value
+        for motion, value in zip(self._motions, self.unknowns.motions(state), strict=True):
+            motion.set_value(value)
 
     @abstractmethod
     def state(self) -> Array:
