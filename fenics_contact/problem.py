@@ -697,7 +697,7 @@ class ContactProblem:
         if not len(self.motions.free):
             return
         borne, load = (
-            np.abs(self.motions.resultants(forces)).max()
+            np.abs(self.motions.resultants(forces)).max(initial=0.0)
             for forces in (self.full.contact_force(), self._load)
         )
         if borne < _IDLE * load:

@@ -264,9 +264,16 @@ class RigidMotions:
         sizes, vectors = np.linalg.eigh(mean)
         return agreed(self._comm, vectors[:, sizes < _FELT].T @ self.free)
 
+    def _straight(self) -> Index:
+        """Numbers of the free motions but for those by which supports turn."""
+        return np.flatnonzero(~np.any(self.free[:, self._turning] != 0.0, axis=1))
+
     def resultants(self, forces: Array) -> Array:
-        """Work of forces at this rank's unknowns on the free motions, (n_free,). Collective."""
-        return global_sum(self._comm, self._free_fields @ forces)
+        """Work of forces at this rank's unknowns on the free motions. Collective.
+
+        But for those by which supports turn: what presses may have no moment.
+        """
+        return global_sum(self._comm, self._free_fields[self._straight()] @ forces)
 
     def approach(self, load: Array, operators: Sequence[ContactOperator]) -> Array | None:
         """Rigid motion to first touch, where the load sets free bodies moving. Collective.
@@ -311,8 +318,7 @@ class RigidMotions:
         Raises:
             ValueError: It gives the resultant and the motion.
         """
-        # By an angle arms turn with it: what cannot be borne here may be there.
-        rows = np.flatnonzero(~np.any(self.free[:, self._turning] != 0.0, axis=1))
+        rows = self._straight()  # arms turn with a support: what it cannot bear here it may there
         if not len(rows):
             return
         named, free = self.free[rows], self._free_fields[rows]

@@ -200,6 +200,22 @@ class System(ABC):
         for motion, value in zip(self._motions, self.unknowns.motions(state), strict=True):
             motion.set_value(value)
 
+    def rolled(self, state: Array) -> Array:
+        """A state with supports that turn freely turned to where they slip least. Collective.
+
+        Args:
+            state: The present one.
+        """
+        for contact in self.contacts:
+            contact.evaluate()
+        changes = [
+            operator.rolling() if motion.turns else 0.0
+            for operator in self.operators
+            for motion in operator.contact.motions
+        ]
+        here = self.unknowns.joined(np.zeros(self.unknowns.n_dofs), np.array(changes))
+        return state + here
+
     @abstractmethod
     def state(self) -> Array:
         """The present unknowns of this rank; a copy."""

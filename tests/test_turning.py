@@ -1,0 +1,385 @@
+"""Supports turned by a moment: the angle is unknown, the moment about the axis given."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact import checkpoint
+from fenics_contact.parallel import global_max, global_sum
+from scenes.blocks import wave
+from scenes.comparing import close, raised_everywhere, shared_folder
+from scenes.histories import goes_on
+from scenes.rubber import TIGHT, Tool, disc, rubber
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
+COMM = MPI.COMM_WORLD
+
+K = 1e3
+RADIUS = 0.8
+# Of the roller: side, up, moment; pressed, dragged, driven on, turned round.
+PATH = [(0.0, -0.1, 0.0), (0.06, -0.1, 0.0), (0.1, -0.1, -2.0), (0.02, -0.1, 1.0)]
+
+
+def turned_by(contact, axis):
+    """Moment of the contact forces on the body about the axis of the support, as it is now."""
+    d = len(axis)
+    motion = np.array(contact.values.shift[:1].sum(axis=0))
+    motion = np.array([COMM.allreduce(float(v), op=MPI.SUM) for v in motion])
+    motion /= max(1, COMM.allreduce(int(len(contact.points) > 0)))
+    for i, constant in contact.free_motion.items():
+        motion[i] += float(constant.value)
+    found = contact.moment(np.asarray(axis) + motion)
+    return float(found @ contact.support.rotation.unit_axis(d)[-len(found) :])
+
+
+def moment_of(tool):
+    """The same of a `Tool`."""
+    return turned_by(tool.contact, tool.vector(0.0, tool.scene.height + RADIUS))
+
+
+def roll(tool, side, up, moment):
+    """One increment of a driven `Tool`."""
+    tool.moment.value = moment
+    return tool.go(side, up)
+
+
+# ---- derivatives ---------------------------------------------------------------------------------
+
+
+def scene_of(cell, law, shape):
+    """A support that cuts into a block, pressed and turned by forces; all unknowns there are."""
+    scene = rubber(cell, 2 if cell == "triangle" else 1, n=(4, 2), shuffled=True)
+    d = scene.dim
+    side, middle = (0.0,) * (d - 1), (0.0,) * (d - 1) + (scene.height + 0.7,)
+    move = {
+        "displacement": fc.Motion(force=(1.0,) + (None,) * (d - 1)),
+        "rotation": fc.Rotation(None, (0.2,) * d, None if d == 2 else (1.0, 2.0, 3.0), moment=0.5),
+    }
+    supports = {
+        "plane": fc.HalfSpace((*side, scene.height), (*((0.3,) * (d - 1)), -1.0), **move),
+        "ball": fc.Ball(middle, 0.8, **move),
+        "cylinder": fc.Cylinder(middle, 0.8, None if d == 2 else (0.2, 1, 0.1), **move),
+    }
+    problem, contact = scene.problem(supports[shape], law, kinematics=np.inf)
+    return problem, contact
+
+
+def difference(problem, contact, state, way):
+    """Largest error of the tangent times a way, against central differences of forces; shares.
+
+    Returns:
+        Of all rows, and of those of the support's unknowns, relative to the largest of each.
+    """
+    operator, unknowns, step = problem.operators[0], problem.unknowns, 1e-6
+
+    def force(share):
+        problem.full.set_state(state + share * step * way)
+        vector = unknowns.vector()
+        operator.add_force(vector)
+        return vector.array_r.copy()
+
+    expected = (force(1) - force(-1)) / (2 * step)
+    problem.full.set_state(state)
+    tangent = operator.tangent()
+    vector, image = tangent.createVecs()
+    vector.array[:] = way
+    tangent.mult(vector, image)
+    rows = [(image.array_r, expected)]
+    rows.append(tuple(unknowns.motions(v) for v in rows[0]))
+    errors = [global_max(COMM, np.abs(a - b)) for a, b in rows]
+    return [e / global_max(COMM, np.abs(b)) for e, (_, b) in zip(errors, rows, strict=True)]
+
+
+@pytest.mark.parametrize("shape", ["plane", "ball", "cylinder"])
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
+def test_derivatives(cell, shape):
+    """The column of the angle, its row, and both with all others, over a history: 1e-6.
+
+    Central differences of 1e-6 in a state of size 1 have an error of 1e-9. Open, sticking and
+    slipping points occur. The matrix without friction is symmetric, to round-off.
+    """
+    seen = np.zeros(3)
+    for law in (fc.Frictionless(K), fc.Coulomb(0.3, K, K), fc.Coulomb(5.0, K, K)):
+        problem, contact = scene_of(cell, law, shape)
+        d, unknowns, u = contact.points.shape[1], problem.unknowns, problem.u
+        n_motions = unknowns.n_motions
+        assert n_motions == 2
+        for seed in range(3):
+            u.interpolate(lambda x, d=d, seed=seed: 0.06 * wave(d, seed)(x))
+            moved = 0.1 * np.sin(seed + 1.0 + np.arange(n_motions))
+            state = unknowns.joined(u.x.array[: unknowns.n_dofs], moved)
+            problem.full.set_state(state)
+            contact.evaluate()
+            r = contact.resultants()
+            seen += [r.open, r.stick, r.slip]
+            u.interpolate(wave(d, seed + 5))
+            direction = u.x.array[: unknowns.n_dofs].copy()
+            still = np.zeros_like(direction)
+            angle, shifts = np.eye(n_motions)[-1], 1.0 - np.eye(n_motions)[-1]
+            ways = [unknowns.joined(still, angle), unknowns.joined(still, shifts)]
+            ways += [unknowns.joined(direction, 0 * angle), unknowns.joined(direction, angle)]
+            for way in ways:
+                assert max(difference(problem, contact, state, way)) < 1e-6
+            if contact.has_potential:
+                tangent = problem.operators[0].tangent()
+                mirrored = tangent.copy().transpose()
+                mirrored.axpy(-1.0, tangent)
+                assert 0 < tangent.norm() and mirrored.norm() < 1e-13 * tangent.norm()
+            contact.commit()
+    assert seen[0] > 0 and seen[1] > 0 and seen[2] > 0
+
+
+# ---- balance -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_a_platen_pressed_eccentrically(cell):
+    """It tilts until the contact forces have the moment: 1e-9 of force times width.
+
+    The same force to the other side tilts it the other way, 1e-7; in the middle not at all.
+    """
+    scene = rubber(cell, 1, n=(8, 4) if cell == "triangle" else (4, 2), diagonal="crossed")
+    d, top = scene.dim, scene.height
+    moment, about = fem.Constant(scene.mesh, 0.0), (0.0,) * (d - 1) + (top,)
+    down = fc.Motion(force=(None,) * (d - 1) + (-40.0,))
+    turn = fc.Rotation(None, about, None if d == 2 else (0, -1, 0), moment=moment)
+    platen = fc.HalfSpace(about, (0.0,) * (d - 1) + (-1.0,), displacement=down, rotation=turn)
+    problem, contact = scene.problem(platen, fc.Frictionless(1e4), petsc_options=TIGHT)
+    angles = []
+    for value in (0.0, 12.0, -12.0):
+        moment.value = value
+        problem.solve()
+        problem.commit()
+        assert contact.resultants().force[-1] == pytest.approx(-40.0, rel=1e-9)
+        assert abs(turned_by(contact, about) - value) < 1e-9 * 40.0 * 2.0
+        angles.append(float(contact.free_angle.value))
+    # A force down has the moment of one to the left of the middle.
+    assert abs(angles[0]) < 1e-12
+    assert angles[1] > 1e-3
+    assert angles[2] == pytest.approx(-angles[1], rel=1e-7)
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_a_free_roller_rolls(cell, force):
+    """Moment 0, dragged by 0.2, an eighth of its diameter, and back: it rolls on friction.
+
+    No friction is left about the axis, 1e-9 of the force; the force aside is below 1 % of what
+    sliding takes. It turns by side/R, 5 %: the surface it rolls on is stretched, and it sinks in.
+    """
+    tool = Tool(cell, driven=True, force=force, **({"n": (16, 6)} if cell == "triangle" else {}))
+    sign = -1.0 if cell == "triangle" else 1.0  # in space about y, and to the right is along it
+    tool.down.value = -60.0
+    tool.go(0.0, -0.1)
+    for side in (0.05, 0.1, 0.2, 0.1, 0.0):
+        tool.side.value = side
+        tool.go(side, -0.1)
+        angle, normal = float(tool.contact.free_angle.value), -tool.resultant()[-1]
+        assert abs(moment_of(tool)) < 1e-9 * normal
+        if cell == "triangle":  # or else facets are few, and their edges hold it
+            assert abs(tool.resultant()[0]) < 0.01 * 0.3 * normal
+            assert angle == pytest.approx(sign * side / RADIUS, rel=0.05, abs=2e-3)
+        else:
+            assert angle == pytest.approx(sign * side / RADIUS, rel=0.25, abs=5e-3)
+
+
+def test_a_driven_roller_pulls():
+    """A roller that is held where it is, driven by M: it pulls by M/R, 3 % for what it sinks in.
+
+    More than μ N R it cannot: then there is no solution, and the state is as before.
+    """
+    tool = Tool(driven=True, n=(16, 6))
+    roll(tool, 0.0, -0.1, 0.0)
+    for moment in (2.0, 8.0, -8.0):
+        roll(tool, 0.0, -0.1, moment)
+        assert moment_of(tool) == pytest.approx(moment, rel=1e-9)
+        assert tool.resultant()[0] == pytest.approx(moment / RADIUS, rel=0.03)
+    before, angle = tool.problem.full.state(), float(tool.contact.free_angle.value)
+    tool.moment.value = 0.3 * RADIUS * -tool.resultant()[1] * 1.3
+    raised_everywhere(tool.problem.solve, fc.NotConverged, "about its axis")
+    assert np.array_equal(tool.problem.full.state(), before)
+    assert float(tool.contact.free_angle.value) == angle
+
+
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
+def test_given_moment_and_given_angle_are_two_ways_to_one_state(cell, enforcement):
+    """Drive by moments; then prescribe the angles that were found, by the tangent of old.
+
+    Tractions to 1e-7 of the largest, that of the balance of moments; energies likewise.
+    """
+    contact = {"enforcement": enforcement, "tolerance": 1e-9}
+    one, other = (Tool(cell, driven=driven, contact=contact) for driven in (True, False))
+    for side, up, moment in PATH:
+        step = roll(one, side, up, moment)
+        given = other.go(side, up, float(one.contact.free_angle.value))
+        assert close(other.tractions(), one.tractions(), 1e-7)
+        size = abs(step.energy.elastic) + abs(step.energy.work)
+        assert abs(step.energy.work - given.energy.work) < 1e-6 * size
+        assert abs(step.energy.imbalance) < 1e-9 * size
+    assert one.contact.resultants().slip > 0
+
+
+def test_turning_the_whole_scene_only_turns_the_answer():
+    """Pressed and rolled, then all turned by 1.2 rad about the origin, then rolled on.
+
+    Tractions are those of the scene that was not turned, turned, and the angle found is larger by
+    as much: 1e-9.
+    """
+    still, tool = (Tool(driven=True) for _ in range(2))
+    for side, up, moment in PATH[:3]:
+        roll(still, side, up, moment)
+        roll(tool, side, up, moment)
+    centre = tool.vector(0.0, tool.scene.height + RADIUS)
+    ways = [*((a, PATH[2]) for a in (0.4, 0.8, 1.2)), (1.2, PATH[3])]
+    for angle, (side, up, moment) in ways:
+        c, s = np.cos(angle), np.sin(angle)
+        matrix = np.array([[c, -s], [s, c]])
+        tool.scene.place(lambda x, matrix=matrix: matrix @ x)
+        to = matrix @ (centre + tool.vector(side, up)) - centre
+        tool.shift.value[:], tool.moment.value = to, moment
+        tool.problem.solve()
+        tool.problem.commit()
+        if (side, up, moment) == PATH[3]:
+            roll(still, side, up, moment)
+        assert close(tool.tractions(), still.tractions() @ matrix.T, 1e-9)
+        found = float(tool.contact.free_angle.value) - float(still.contact.free_angle.value)
+        assert found == pytest.approx(angle, abs=1e-9)
+
+
+def test_work_of_the_moment():
+    """A drum driven to and fro in small increments: what the moment does is the work, 2 %."""
+    tool = Tool(driven=True, n=(12, 6))
+    roll(tool, 0.0, -0.1, 0.0)
+    work, moment, angle = 0.0, 0.0, float(tool.contact.free_angle.value)
+    for value in (2.0, 4.0, 6.0, 8.0, 6.0, 2.0):
+        step = roll(tool, 0.0, -0.1, value)
+        turned = float(tool.contact.free_angle.value) - angle
+        work, moment, angle = (moment + value) / 2 * turned, value, angle + turned
+        assert step.energy.work == pytest.approx(work, rel=0.02)
+
+
+# ---- systems, files, input -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_condensed_and_not(cell):
+    """A linear body, condensed onto what contact touches and the angle: the same, 1e-8."""
+    found = []
+    for condensation in (True, False):
+        solver = {"kinematics": np.inf, "condensation": condensation}
+        solver |= {} if condensation else {"method": "newton"}
+        tool = Tool(cell, driven=True, force=True, linear=True, solver=solver)
+        for step in tool.increments(3.0):
+            assert step.contacts["contact"].force[-1] == pytest.approx(tool.down.value, rel=1e-8)
+        assert tool.problem.solver.condensed == condensation
+        found.append((tool.tractions(), float(tool.contact.free_angle.value)))
+    assert close(found[0][0], found[1][0], 1e-8)
+    assert found[0][1] == pytest.approx(found[1][1], rel=1e-8)
+
+
+HOW = {
+    "penalty": {},
+    "augmented": {"contact": {"enforcement": "augmented"}},
+    "by force": {"force": True, "linear": True, "solver": {"kinematics": np.inf}},
+    "profile": {"shape": "profile"},
+}
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_going_on_from_a_file(how, tmp_path):
+    """Broken off on the way, and taken up: the same digits on one rank, 1e-7 on more."""
+    folder = shared_folder(tmp_path)
+    goes_on(lambda: Tool(driven=True, n=(8, 4), **HOW[how]), folder, stop=5)
+
+
+def test_a_file_of_another_axis_or_moment_is_refused(tmp_path):
+    """Even where nothing has turned yet: with the axis elsewhere, or prescribed."""
+    path = shared_folder(tmp_path) / "state.npz"
+
+    def make(d=3, about=(0.0, 0.0, 1.8), axis=(0, 1, 0), moment=0.0, angle=None):
+        scene = rubber("hexahedron", 1, n=(2, 1))
+        turn = fc.Rotation(angle, about, axis, None if angle is not None else moment)
+        support = fc.Ball((0, 0, 1.8), 0.8, displacement=(0, 0, -0.05), rotation=turn)
+        return scene.problem(support, fc.Coulomb(0.3, 1e4, 1e4))[0]
+
+    for angle in (None, 0.0):
+        problem = make(angle=angle)
+        problem.solve()
+        problem.commit()
+        checkpoint.save(problem, path)
+        checkpoint.load(make(angle=angle), path)
+        for other, word in (
+            ({"about": (0.1, 0.0, 1.8)}, "about"),
+            ({"axis": (0, 1, 0.1)}, "axis"),
+            ({"moment": 0.1} if angle is None else {"angle": 0.1}, "free|turn"),
+            ({"angle": 0.0} if angle is None else {"angle": None}, "angle"),
+        ):
+            again = make(**({"angle": angle} | other))
+            raised_everywhere(lambda p=again: checkpoint.load(p, path), ValueError, word)
+
+
+def test_from_afar_in_increments_that_are_cut():
+    """Pressed, dragged and driven in one increment that is too long: cut until it is followed."""
+    tool = Tool(driven=True, n=(12, 6))
+
+    def load(t):
+        tool.shift.value[:] = tool.vector(0.3 * t, -0.15 * min(3 * t, 1.0))
+        tool.moment.value = 3.0 * max(3 * t - 1, 0.0)
+
+    steps = list(fc.increments(tool.problem, load, 0.0, 1.0, steps=1))
+    assert len(steps) > 1
+    assert moment_of(tool) == pytest.approx(6.0, rel=1e-9)
+
+
+def test_nothing_holds_a_smooth_roller():
+    """Without friction no force on a disc has a moment about its middle."""
+    scene = rubber(n=(4, 2))
+    support = disc(scene, RADIUS, displacement=(0, -0.1), moment=0.0)
+    raised_everywhere(
+        lambda: scene.problem(support, fc.Frictionless(1e4)), ValueError, "rotation about its axis"
+    )
+
+
+FLAT = {"point": (0, 1), "normal": (0, -1)}
+
+
+@pytest.mark.parametrize(
+    ("rotation", "options", "error", "text"),
+    [
+        (fc.Rotation(0.1, (0, 1), moment=1.0), {}, ValueError, "one of them"),
+        (fc.Rotation(None, (0, 1)), {}, ValueError, "one of them"),
+        (fc.Rotation(None, (0, 1), moment=(1.0, 2.0)), {}, TypeError, "moment of the Rotation"),
+        (fc.Rotation(None, (0, 1), moment="1"), {}, TypeError, "moment of the Rotation"),
+        (fc.Rotation(None, (0, 1, 0), moment=1.0), {}, ValueError, "about"),
+        (fc.Rotation(None, (0, 1), (0, 0, 1), moment=1.0), {}, ValueError, "takes none"),
+        (
+            fc.Rotation(None, (0, 1), moment=1.0),
+            {"kinematics": "small"},
+            ValueError,
+            'kinematics="finite"',
+        ),
+    ],
+)
+def test_refused(rotation, options, error, text):
+    """Before any work, on all ranks, with what to give instead."""
+    scene = rubber("triangle", 1, n=(2, 1))
+    raised_everywhere(
+        lambda: scene.contact(
+            fc.HalfSpace(**FLAT, rotation=rotation), fc.Frictionless(K), **options
+        ),
+        error,
+        text,
+    )
+
+
+def test_a_moment_that_is_no_number():
+    """NaN in a constant: no load."""
+    tool = Tool(driven=True, n=(4, 2))
+    tool.moment.value = np.nan
+    raised_everywhere(tool.problem.solve, ValueError, "not finite")
+    assert global_sum(COMM, np.count_nonzero(tool.problem.full.state())) == 0
