@@ -96,12 +96,12 @@ class Equations:
     def residual(self, x: PETSc.Vec, f: PETSc.Vec) -> Norms:
         """Compute the residual at ``x`` into ``f``, and its norms, kept too. Collective.
 
-        It is not a number where cells are turned inside out.
+        It is not a number where cells are turned inside out, or supports have turned too far.
         """
         self.set_state(x)
         contacts = self.system.contact_forces()
         total = sum(contacts, self.system.bulk_force())
-        if self._bulk.is_inverted():
+        if self._bulk.is_inverted() or self.system.is_twisted():
             total[:] = np.nan  # a line search takes a shorter step
         self.norms = self.system.norms(total, contacts, self.start)
         total[self.system.constrained] = 0.0
@@ -202,8 +202,8 @@ class Equations:
         return self.motions.held(self.full.operators)
 
     def tangents(self) -> Iterator[PETSc.Mat]:
-        """Consistent tangents of the contacts. Collective."""
-        return (operator.tangent() for operator in self.system.operators)
+        """Consistent tangents of the contacts, which are evaluated. Collective."""
+        return (operator.steadied(operator.tangent()) for operator in self.system.operators)
 
     def stiffnesses(self, *, everywhere: bool) -> Iterator[PETSc.Mat]:
         """The shares αK_n + φK_t of the contacts, as evaluated.

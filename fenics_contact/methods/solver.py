@@ -652,15 +652,15 @@ class Solver:
         """Unknowns of the system to start from, nearest to equilibrium first. Collective.
 
         The present state; that state moved on by as much as the last increment moved it: in
-        proportional loading that is the solution; that state with one step of Newton's method
-        on the tangent in which the last increment ended; what `follow` has found; and the present
-        state with supports that turn freely rolled to where they are now: where all points would
-        slip no tangent tells by how much. At the present state itself no point has slipped yet, and
-        all closed ones stick: from there Newton's method takes ten steps to let them slip again,
-        one after another from the edge of the contact inwards. The start by a step has the right
-        ones slipping, and comes first unless it is far off; or unless the load has turned round, so
-        that slipping points stick: then to go on is worse than to stay, by a step as by the last
-        increment.
+        proportional loading that is the solution; that state with one step of Newton's method on
+        the tangent in which the last increment ended; what `follow` has found; and that, or the
+        present state, with supports that turn freely rolled to where they are now: where all points
+        would slip no tangent tells by how much. At the present state itself no point has slipped
+        yet, and all closed ones stick: from there Newton's method takes ten steps to let them slip
+        again, one after another from the edge of the contact inwards. The start by a step has the
+        right ones slipping, and comes first unless it is far off; or unless the load has turned
+        round, so that slipping points stick: then to go on is worse than to stay, by a step as by
+        the last increment.
         """
         equations, system = self.equations, self.system
         present: Array = system.state()
@@ -679,11 +679,12 @@ class Solver:
             starts.append(self._predicted(present))
         if rate is not None and ahead and not cold:
             starts.append(present + ahead * system.part(rate))
+        moved = present
         if self._followed is not None:
-            starts.append(self._followed)
+            starts.append(moved := self._followed)
             self._followed = None
         if ahead and any(c.free_angle is not None for c in self._full.contacts):
-            starts.append(system.rolled(present))
+            starts.append(system.rolled(moved))
         residuals += [equations.residual_at(start) for start in starts[1:]]
         # A nonlinear bulk does not come back from far off: a support moved into open points.
         if predicts and self._full.bulk.linear and residuals[1] <= _FAR * min(residuals):

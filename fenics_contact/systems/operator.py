@@ -18,6 +18,7 @@ from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.point_law import PointTangent
+from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_sum
 from fenics_contact.systems.products import PointProduct
 from fenics_contact.systems.unknowns import Selection, Unknowns
@@ -230,6 +231,28 @@ class ContactOperator:
         """
         arms = np.asarray(self.contact.turning_rate() / self._length, dtype=np.float64)
         return arms if self.within is None else np.where(self.within[:, None], arms, 0.0)
+
+    def steadied(self, tangent: PETSc.Mat) -> PETSc.Mat:
+        """A tangent that is not singular by the angle where all points slip. Collective.
+
+        No friction changes then with the angle: it is held as if those that bear stuck, for steps
+        that may be too short but lead somewhere.
+
+        Args:
+            tangent: What `tangent` gave, at the evaluated state; it is changed.
+        """
+        contact, comm = self.contact, self.unknowns.comm
+        if self._turn is None or not contact.law.has_friction:
+            return tangent
+        closed, arms = contact.status != Status.OPEN, self._arms()
+        stiffness = np.einsum("qi,qij,qj->q", arms, contact.tangential_stiffness, arms)
+        sticking = np.count_nonzero(contact.status == Status.STICK)
+        held, n = global_sum(comm, [(contact.area * closed) @ stiffness, sticking])
+        if n == 0:
+            if self.unknowns.has_motions_here:
+                tangent.setValue(self._turn, self._turn, held, addv=PETSc.InsertMode.ADD_VALUES)
+            tangent.assemble()
+        return tangent
 
     def rolling(self) -> float:
         """By how much the angle's unknown has to change for the least slip. Collective.

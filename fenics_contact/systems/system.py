@@ -29,6 +29,9 @@ from fenics_contact.types import Array, Mask
 
 __all__ = ["System"]
 
+# How far a support may turn in an increment whose angle is found: a right angle.
+_TURN = np.pi / 2
+
 
 class System(ABC):
     """States, forces and matrices over some unknowns of a problem.
@@ -79,6 +82,7 @@ class System(ABC):
         self.outside: Array = np.zeros((2, n_bodies))
         self.farthest = np.inf
         self._motions = [motion for contact in contacts for motion in contact.motions]
+        self._started = self.motions()
         self._contact_vector = unknowns.vector()
         self._operators: tuple[list[int], list[ContactOperator]] | None = None
         self._parts: tuple[list[int], Parts] | None = None
@@ -200,12 +204,26 @@ class System(ABC):
         for motion, value in zip(self._motions, self.unknowns.motions(state), strict=True):
             motion.set_value(value)
 
+    def start_turning(self) -> None:
+        """Count the turn of supports from here."""
+        self._started = self.motions()
+
+    def is_twisted(self) -> bool:
+        """Whether a support that turns freely has turned too far in this increment.
+
+        A turn further its points are where they were: to a solution there are others.
+        """
+        pairs = zip(self._motions, self._started, strict=True)
+        turns = [(motion.value - start) / motion.length for motion, start in pairs if motion.turns]
+        return any(not abs(turn) < _TURN for turn in turns)
+
     def rolled(self, state: Array) -> Array:
         """A state with supports that turn freely turned to where they slip least. Collective.
 
         Args:
-            state: The present one.
+            state: What it is without; it becomes the present one.
         """
+        self.set_state(state)
         for contact in self.contacts:
             contact.evaluate()
         changes = [
