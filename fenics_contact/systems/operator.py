@@ -235,8 +235,9 @@ class ContactOperator:
     def steadied(self, tangent: PETSc.Mat) -> PETSc.Mat:
         """A tangent that is not singular by the angle where all points slip. Collective.
 
-        No friction changes then with the angle: it is held as if those that bear stuck, for steps
-        that may be too short but lead somewhere.
+        No friction changes then with the angle. It gets a stiffness by which a step of Newton's
+        method takes away the slip of those points that the moment left over turns back; where there
+        are none, that of all that bear if they stuck.
 
         Args:
             tangent: What `tangent` gave, at the evaluated state; it is changed.
@@ -244,14 +245,26 @@ class ContactOperator:
         contact, comm = self.contact, self.unknowns.comm
         if self._turn is None or not contact.law.has_friction:
             return tangent
-        closed, arms = contact.status != Status.OPEN, self._arms()
-        stiffness = np.einsum("qi,qij,qj->q", arms, contact.tangential_stiffness, arms)
-        sticking = np.count_nonzero(contact.status == Status.STICK)
-        held, n = global_sum(comm, [(contact.area * closed) @ stiffness, sticking])
-        if n == 0:
-            if self.unknowns.has_motions_here:
-                tangent.setValue(self._turn, self._turn, held, addv=PETSc.InsertMode.ADD_VALUES)
-            tangent.assemble()
+        values, arms, area = contact.values, self._arms(), contact.area
+        closed = contact.status != Status.OPEN
+        sums = [
+            np.count_nonzero(contact.status == Status.STICK),
+            np.sum(area[:, None] * arms * values.total_traction),
+            (area * closed) @ np.einsum("qi,qij,qj->q", arms, values.tangential_stiffness, arms),
+        ]
+        n, moment, stiffness = (float(v) for v in global_sum(comm, sums))
+        if n > 0:
+            return tangent
+        left = contact.motions[-1].force - moment
+        slip = np.sum(arms * values.increment, axis=1)
+        weight = area * contact.pressure * (closed & (slip * left > 0))
+        ways = [weight @ slip, weight @ np.sum(values.tangential(arms) ** 2, axis=1)]
+        way, size = (float(v) for v in global_sum(comm, ways))
+        if way * left > 0 and size > 0:
+            stiffness = left * size / way
+        if self.unknowns.has_motions_here:
+            tangent.setValue(self._turn, self._turn, stiffness, PETSc.InsertMode.ADD_VALUES)
+        tangent.assemble()
         return tangent
 
     def rolling(self) -> float:
