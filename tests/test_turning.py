@@ -339,23 +339,39 @@ def test_a_file_of_another_direction_of_the_axis_is_refused(tmp_path):
     raised_everywhere(lambda: checkpoint.load(problems[2], path), ValueError, "axis")
 
 
-def test_increments_that_are_cut():
-    """A small roller is dragged by more than a right angle in one increment, which is cut.
+def test_increments_are_cut_until_it_spins():
+    """Driven by more than friction bears, in one increment that is cut: it ends below the limit.
 
-    Its angle could be found up to full turns alone. The end has the moment given, 1e-9.
+    The limit is μ p at the radius that it has where it sinks in; within 5 % of it there is no next
+    increment that is not cut too often. The last state has its moment, 1e-9.
     """
-    radius = 0.4
-    tool = Tool(driven=True, n=(12, 6), radius=radius)
+    tool = Tool(driven=True, n=(8, 3), degree=1)
+    roll(tool, 0.0, -0.1, 0.0)
+    reached = []
 
-    def load(t):
-        tool.shift.value[:] = tool.vector(0.9 * t, -0.1 * min(3 * t, 1.0))
-        tool.moment.value = 1.5 * max(3 * t - 1, 0.0)
+    def drive():
+        for step in fc.increments(tool.problem, tool.moment, 0.0, 25.0, steps=1):
+            reached.append(step.load)
 
-    steps = list(fc.increments(tool.problem, load, 0.0, 1.0, steps=1))
-    assert len(steps) > 1
-    axis = tool.vector(0.0, tool.scene.height + radius)
-    assert turned_by(tool.contact, axis) == pytest.approx(3.0, rel=1e-9)
-    assert float(tool.contact.free_angle.value) < -np.pi / 2
+    raised_everywhere(drive, fc.NotConverged, "about its axis")
+    contact = tool.contact
+    arm = contact.measure * (RADIUS - contact.values.penetration)
+    limit = 0.3 * COMM.allreduce(float(arm @ contact.pressure))
+    assert len(reached) > 1
+    assert 0.95 * limit < reached[-1] < limit
+    assert moment_of(tool) == pytest.approx(reached[-1], rel=1e-9)
+
+
+def test_a_turn_of_more_than_a_right_angle_is_no_trial():
+    """A residual there is no number, so that a line search takes a shorter step."""
+    tool = Tool(driven=True, n=(4, 2))
+    roll(tool, 0.0, -0.05, 0.0)
+    system, unknowns = tool.problem.full, tool.problem.unknowns
+    start = system.state()
+    for angle, twisted in ((1.5, False), (-1.5, False), (1.6, True), (-7.0, True)):
+        turned = angle * tool.contact.motions[-1].length
+        system.set_state(start + unknowns.joined(np.zeros(unknowns.n_dofs), np.array([turned])))
+        assert system.is_twisted() == twisted
 
 
 def test_nothing_holds_a_smooth_roller():
