@@ -10,7 +10,7 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact import checkpoint
 from fenics_contact.parallel import global_max, global_sum
-from scenes.blocks import wave
+from scenes.blocks import BOTTOM, LEFT, TOP, block, wave
 from scenes.comparing import close, raised_everywhere, shared_folder
 from scenes.histories import goes_on
 from scenes.rubber import TIGHT, Tool, disc, rubber
@@ -187,6 +187,24 @@ def test_a_free_roller_rolls(cell, force):
             assert angle == pytest.approx(sign * side / RADIUS, rel=0.25, abs=5e-3)
 
 
+def test_long_increments_roll_less():
+    """Dragged by half of its radius at once, a roller turns by less than in eight increments.
+
+    By geometry between atan(s/R), as the first point that it comes to is seen, and s/R; 3 % for the
+    stretch of what it rolls on.
+    """
+    turned = []
+    for n in (1, 8):
+        tool = Tool(driven=True, force=True, n=(16, 6))
+        tool.down.value = -20.0
+        tool.go(0.0, 0.0)
+        for tool.side.value in 0.4 * np.arange(1, n + 1) / n:
+            tool.go(0.0, 0.0)
+        turned.append(-float(tool.contact.free_angle.value))
+    assert np.arctan(0.5) * 0.97 < turned[0] < turned[1] < 0.5 * 1.03
+    assert turned[1] == pytest.approx(0.5, rel=0.03)
+
+
 def test_a_driven_roller_pulls():
     """A roller that is held where it is, driven by M: it pulls by M/R, 5 % for what it sinks in.
 
@@ -269,6 +287,45 @@ def test_work_of_the_moment():
         assert step.energy.work == pytest.approx(work, rel=0.02)
 
 
+@pytest.mark.parametrize("options", [{"solver": {"method": "lbfgs"}}, {"mixed": "Taylor-Hood"}])
+def test_other_methods_and_bodies(options):
+    """L-BFGS, and a body with a pressure as second unknown: the moment is the one given, 1e-9."""
+    tool = Tool(driven=True, n=(8, 4), **options)
+    for side, up, moment in PATH:
+        roll(tool, side, up, moment)
+        assert moment_of(tool) == pytest.approx(moment, rel=1e-9, abs=1e-8)
+
+
+def test_two_rollers():
+    """Below a strip, pressed by a force, and above it: driven against each other, each has its own.
+
+    Moments 1e-9 of force times radius; the scene is its own image, and so are the angles: 1e-9.
+    """
+    scene = block("quadrilateral", 1, n=6)
+    force, *moments = (fem.Constant(scene.mesh, 0.0) for _ in range(3))
+    law, made = fc.Coulomb(0.4, 2e4, 1e4), []
+    up = fc.Motion(force=(None, force), displacement=(0.0, None))
+    for tag, y, move, moment in ((BOTTOM, -0.6, up, 0), (TOP, 1.6, (0.0, -0.01), 1)):
+        turn = fc.Rotation(None, (0.5, y), moment=moments[moment])
+        roller = fc.Cylinder((0.5, y), 0.6, displacement=move, rotation=turn)
+        surface = fc.ContactSurface(scene.mesh, scene.tags, tag)
+        name = f"roller {tag}"
+        made.append(fc.Contact(scene.u, surface, roller, law, kinematics="finite", name=name))
+    problem = fc.ContactProblem(
+        scene.F, scene.u, bcs=[scene.hold(LEFT, 0)], contacts=made, petsc_options=TIGHT
+    )
+    for force.value, turning in ((10.0, 0.0), (20.0, 0.0), (20.0, 1.0), (20.0, -1.0)):
+        moments[0].value, moments[1].value = turning, -turning
+        problem.solve()
+        problem.commit()
+        assert made[0].resultants().force[1] == pytest.approx(force.value, rel=1e-9)
+        for contact, y, sign in zip(made, (-0.6, 1.6), (1, -1), strict=True):
+            assert abs(turned_by(contact, (0.5, y)) - sign * turning) < 1e-9 * 20 * 0.6
+        angles = [float(contact.free_angle.value) for contact in made]
+        assert angles[0] == pytest.approx(-angles[1], rel=1e-9)
+    assert abs(angles[0]) > 1e-3
+
+
 # ---- systems, files, input -----------------------------------------------------------------------
 
 
@@ -289,7 +346,12 @@ def test_condensed_and_not():
 
 HOW = {
     "augmented": {"contact": {"enforcement": "augmented"}},
-    "by force": {"force": True, "linear": True, "solver": {"kinematics": np.inf}},
+    "by force": {
+        "force": True,
+        "linear": True,
+        "shape": "profile",
+        "solver": {"kinematics": np.inf},
+    },
 }
 
 
