@@ -477,6 +477,16 @@ def test_refused(rotation, options, error, text):
     )
 
 
+def test_a_moment_given_by_a_number_can_be_set():
+    """It is a parameter of the contact, as an angle is."""
+    scene = rubber("triangle", 1, n=(2, 1))
+    contact = scene.contact(disc(scene, RADIUS, moment=0.5), fc.Coulomb(0.3, K, K))
+    assert contact.applied_moment is contact.parameters["moment"]
+    assert contact.motions[0].force * contact.motions[0].length == 0.5
+    contact.parameters["moment"].value = -2.0
+    assert contact.motions[0].force * contact.motions[0].length == -2.0
+
+
 def test_a_moment_that_is_no_number():
     """NaN in a constant: no load."""
     tool = Tool(driven=True, n=(4, 2))
