@@ -264,7 +264,7 @@ class FacetSet:
         place: Array = self._middle.repeat(len(facet), axis=0)
         distance: Array = np.zeros(len(facet))
         singular = np.zeros(len(facet), dtype=bool)
-        rows = np.arange(len(facet))  # those still on their way
+        rows: Index = np.arange(len(facet))  # those still on their way
         for _ in range(_NEWTON_STEPS):
             position, tangents = self.positions(facet[rows], place[rows], u)
             rest = position - x[rows] - distance[rows, None] * ray[rows]

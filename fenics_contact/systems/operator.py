@@ -219,6 +219,7 @@ class ContactOperator:
         product = blocks.ptap(lifted)
         blocks.destroy()
         return product
+
     # ---- a support that is turned by a moment ----------------------------------------------------
 
     def _arms(self) -> Array:
