@@ -14,9 +14,12 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from fenics_contact import compat
 from fenics_contact.elasticity import NeoHookean
 from fenics_contact.systems.operator import ContactOperator
 from scenes.elasticity import displacement_space, hold
+from scenes.meshes import mesh_of
+from scenes.tags import near, tagged
 from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, two_blocks
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
@@ -272,6 +275,51 @@ def test_a_turned_patch_bears_a_uniform_pressure():
     nodal = pair.force().reshape(-1, 2)
     along = nodal @ turn(2, 0.5)[:, 0]
     assert np.abs(along).max(initial=0.0) <= 1e-12
+
+
+def slotted() -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
+    """A plate with a slot from its right side; tags of the slot's lips, of bottom and top end."""
+    whole = dolfinx.mesh.create_rectangle(
+        MPI.COMM_SELF, [[0, 0], [2, 1.1]], (20, 11), dolfinx.mesh.CellType.quadrilateral
+    )
+    x, cells = whole.geometry.x[:, :2].copy(), compat.geometry_dofmap(whole)
+    middle = x[cells].mean(axis=1)
+    slot = (middle[:, 0] > 0.5) & (np.abs(middle[:, 1] - 0.55) < 0.05)
+    mesh = mesh_of("quadrilateral", x, cells[~slot])
+    chosen = {
+        LOWER: lambda x, _: np.isclose(x[:, 1], 0.5) & (x[:, 0] > 0.5),
+        UPPER: lambda x, _: np.isclose(x[:, 1], 0.6) & (x[:, 0] > 0.5),
+        BOTTOM: near(1, 0.0),
+        TOP: lambda x, _: np.isclose(x[:, 1], 1.1) & (x[:, 0] > 1.4),
+    }
+    return mesh, tagged(mesh, chosen)
+
+
+def test_a_body_touches_itself():
+    """The lips of a slot: one surface without sides bears what two named ones do, to 1e-3.
+
+    Both lips have points then, and so each half of the stiffness; they are not at the same places.
+    """
+    forces = []
+    for own, opposite, share in ((UPPER, LOWER, 20), ([LOWER, UPPER], [LOWER, UPPER], 10)):
+        mesh, tags = slotted()
+        u = fem.Function(displacement_space(mesh, 1))
+        down = fem.Constant(mesh, 0.0)
+        contact = fc.Contact(
+            u,
+            fc.ContactSurface(mesh, tags, own),
+            fc.DeformableBody(tags, opposite),
+            fc.Coulomb(0.2, fc.Scaled(share), fc.Scaled(share)),
+            kinematics="finite",
+        )
+        body = NeoHookean(u, 100.0, 0.3, "plane strain")
+        bcs = [hold(u, tags, BOTTOM, i) for i in range(2)] + [hold(u, tags, TOP, 1, down)]
+        form = body.residual(ufl.TestFunction(u.function_space))
+        problem = fc.ContactProblem(form, u, bcs=bcs, contacts=[contact])
+        *_, step = fc.increments(problem, down, 0.0, -0.2, steps=4)
+        forces.append(step.contacts["contact"].normal_force)
+    assert forces[0] > 5.0
+    assert forces[1] == pytest.approx(forces[0], rel=1e-3)
 
 
 def test_condensation_is_refused():

@@ -173,8 +173,9 @@ class Contact(PointResults):
                 functions of the multipliers the penetration is that share of the penalty's.
             kinematics: "small": gap and normals are those of the undeformed body, and the verdict
                 looks at what that leaves out. "finite": displacements and rotations may be of any
-                size, on a rigid support whose place is known everywhere; the bulk form should bear
-                them, too. Tractions and stiffness are per undeformed area.
+                size, on a rigid support whose place is known everywhere or on a `DeformableBody`;
+                the bulk form should bear them, too. Tractions and stiffness are per undeformed
+                area.
             name: In messages and files.
 
         Raises:

@@ -29,6 +29,7 @@ from petsc4py import PETSc
 
 from fenics_contact.contact.kinematics import Seen, tangential
 from fenics_contact.contact.pairs import Pairs, PairsState
+from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Kinematics, Law, Response
 from fenics_contact.parallel import global_max
 from fenics_contact.supports.deformable import DeformableBody
@@ -219,6 +220,14 @@ class PresentPairs(Pairs):
     def depth(self, normal_displacement: Array) -> Array:
         """See `Pairs.depth`."""
         return np.where(self.paired, np.maximum(normal_displacement, 0.0), 0.0)
+
+    def true_gap(self, values: PointValues) -> tuple[Array, Array]:
+        """See `Contact.true_gap`: it is that of the pairs themselves."""
+        return np.where(self.paired, values.gap, np.nan), values.normal.copy()
+
+    def linear_gap(self, values: PointValues) -> Array:
+        """See `Pairs.linear_gap`: nothing is linearised."""
+        return np.where(self.paired, values.gap, np.nan)
 
     def _look_back(self, depth: float) -> tuple[LookBack, Array]:
         """See `Pairs`: in the bodies as they are."""

@@ -29,7 +29,8 @@ class DeformableBody(Support):
             by default.
         update: "never": the pairs are those of the undeformed bodies; "increment": they are found
             anew in the deformed bodies at every commit, for slip over many facets. Normals stay
-            those of the undeformed Γc (small rotations).
+            those of the undeformed Γc (small rotations). With `Contact(kinematics="finite")` they
+            are those of the present bodies, whatever this says.
         release: How far behind a point (length) its opposite may lie, where the bodies penetrate
             each other from the start. By default as far as they do, if they are two; in one and the
             same body half the height of the point's cell. In deformed bodies always twice as far
