@@ -23,6 +23,20 @@ def pytest_configure() -> None:
     _stderr = os.dup(2)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What runs on all kinds of cells is a long study on hexahedra, whose forms take the longest.
+
+    Not where cells and facets are found, and pairs made.
+    """
+    kept = ("test_surface", "test_pairs", "test_two_bodies", "test_present", "test_elasticity")
+    for item in items:
+        values = getattr(item, "callspec", None)
+        of_hexahedra = values is not None and "hexahedron" in values.id.split("-")
+        if of_hexahedra and item.path.stem not in kept:
+            item.add_marker(pytest.mark.slow)
+
+
 def pytest_exception_interact(report: pytest.TestReport) -> None:
     """In parallel, show at once what failed: the end of the run may never come."""
     if MPI.COMM_WORLD.size > 1:

@@ -16,6 +16,7 @@ pytestmark = [
 OPTIONS = ("--cells", "6", "--increments", "12")
 
 
+@pytest.mark.slow
 def test_sliding(tmp_path: Path) -> None:
     """Half-width and peak of Johnson's solution, numbers put in: 2 %, six cells per half-width.
 

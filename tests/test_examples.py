@@ -16,6 +16,8 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 NAMES = [path.stem for path in EXAMPLES]
 MOST_LINES = 40
 
+# Those that take the most to compile.
+LONG = ("cam", "roller")
 # What is printed, {} standing for the result and the reference behind it, which are compared here
 # again; and the relative error that the example allows itself.
 NUMBER = r"(-?[\d.]+(?:e[-+]\d+)?)"
@@ -76,7 +78,13 @@ def test_they_use_public_names_alone(path: Path) -> None:
 
 @pytest.mark.demo
 @pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own")
-@pytest.mark.parametrize("path", EXAMPLES, ids=NAMES)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in LONG))
+        for path in EXAMPLES
+    ],
+)
 def test_number(path: Path, tmp_path: Path) -> None:
     """The asserted number, on one rank and on two the same; nothing is written."""
     pattern, tolerance = PRINTED[path.stem]

@@ -43,7 +43,9 @@ def played(scene, **options):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("part", range(10))
+@pytest.mark.parametrize(
+    "part", [part if part < 5 else pytest.param(part, marks=pytest.mark.slow) for part in range(10)]
+)
 def test_scenes_are_not_wrong(part):
     # All of them on one rank, a fifth on several, where a scene takes longer.
     for scene in SCENES["scenes"][part::10][:: 1 if COMM.size == 1 else 5]:
