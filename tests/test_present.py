@@ -34,18 +34,30 @@ class Pair:
     """A small block on a larger one, their meshes do not match; displacements are written at will.
 
     Attributes:
-        mesh, u, contact: As made.
+        mesh, tags, u, contact: As made.
+        d: Dimension of space.
     """
 
     def __init__(
-        self, cell: str, law: fc.Law, *, degree: int = 1, n: tuple[int, int] = (4, 3), **options
+        self,
+        cell: str,
+        law: fc.Law,
+        *,
+        degree: int = 1,
+        n: tuple[int, int] = (4, 3),
+        like: Pair | None = None,
+        **options,
     ) -> None:
-        """Make them. Collective."""
+        """Make them, or take the mesh of others: of two that are equal ranks may get other parts.
+
+        Collective.
+        """
         widths, shift = ((1.0, 0.6), 0.17) if n == (4, 3) else ((1.0, 1.0), 0.0)
-        self.mesh, tags = two_blocks(cell, n, widths, shift)
-        self.d = self.mesh.geometry.dim
-        self.u = fem.Function(displacement_space(self.mesh, degree))
-        surface = fc.ContactSurface(self.mesh, tags, UPPER)
+        made = two_blocks(cell, n, widths, shift) if like is None else (like.mesh, like.tags)
+        self.mesh, self.tags = mesh, tags = made
+        self.d = mesh.geometry.dim
+        self.u = fem.Function(displacement_space(mesh, degree))
+        surface = fc.ContactSurface(mesh, tags, UPPER)
         opposite = fc.DeformableBody(tags, LOWER)
         self.contact = fc.Contact(self.u, surface, opposite, law, **options)
 
@@ -147,9 +159,9 @@ def test_points_of_the_derivatives_stick_and_slip():
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron"])
 def test_turned_bodies_have_turned_forces(cell):
     """A rotation of everything after the commit, about the normal too: 1e-10 of the forces."""
-    forces = []
+    forces, pair = [], None
     for angle in (0.0, 0.9, -2.5):
-        pair = Pair(cell, LAWS["coulomb"], kinematics="finite")
+        pair = Pair(cell, LAWS["coulomb"], like=pair, kinematics="finite")
         loaded(pair, 0.004)
         x = (pair.nodes + pair.u.x.array.reshape(-1, pair.d)) @ turn(pair.d, angle).T
         pair.place(x + 0.3)
@@ -181,11 +193,11 @@ def test_forces_on_both_bodies_cancel(cell):
 
 def test_small_displacements_are_the_limit():
     """Matching meshes: the difference to small kinematics falls with the square of the size."""
-    errors = []
+    errors, pair = [], None
     for size in (1e-3, 1e-4):
         tractions = []
         for kinematics in ("small", "finite"):
-            pair = Pair("triangle", LAWS["coulomb"], n=(5, 5), kinematics=kinematics)
+            pair = Pair("triangle", LAWS["coulomb"], n=(5, 5), like=pair, kinematics=kinematics)
             pair.place(pair.pressed(pair.wobbled(size, 2), 3 * size, 0.7 * size))
             tractions.append(pair.force() / size)
         errors.append(np.abs(tractions[0] - tractions[1]).max(initial=0.0))
