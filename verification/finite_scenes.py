@@ -17,7 +17,7 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.elasticity import NeoHookean
 from scenes.surfaces import ball, box, ring
-from verification.fuzz_scenes import TOP, Made, Scene, frictions
+from verification.fuzz_scenes import TOP, Made, Scene, dice, frictions
 
 __all__ = ["DEGREE", "KINDS", "FiniteMade", "draw", "pieces", "place_of"]
 
@@ -48,14 +48,7 @@ def draw(
     rng = np.random.default_rng([seed, 30])
     built = rng if family is None else np.random.default_rng([family, 31])
 
-    def chance(p: float, feature: str = "", of: np.random.Generator = built) -> bool:
-        return bool(of.random() < p) and feature not in without
-
-    def pick(*values: Any, of: np.random.Generator = built) -> Any:
-        return values[int(of.integers(len(values)))]
-
-    def log(low: float, high: float) -> float:
-        return float(f"{10 ** rng.uniform(low, high):.3g}")
+    chance, pick, log = dice(rng, built, without)
 
     def within(low: float, high: float) -> float:
         return float(f"{rng.uniform(low, high):.3g}")

@@ -26,7 +26,7 @@ import fenics_contact as fc
 from fenics_contact import compat
 from verification import reference_solver as reference
 
-__all__ = ["LAWS", "SUPPORTS", "Made", "draw", "frictions", "history", "model", "path"]
+__all__ = ["LAWS", "SUPPORTS", "Made", "dice", "draw", "frictions", "history", "model", "path"]
 
 Array = np.ndarray
 Scene = dict[str, Any]
@@ -50,6 +50,33 @@ NU_MAX = 0.45
 # ---- drawing -------------------------------------------------------------------------------------
 
 
+def dice(
+    rng: np.random.Generator, built: np.random.Generator, without: tuple[str, ...]
+) -> tuple[Callable[..., bool], Callable[..., Any], Callable[[float, float], float]]:
+    """What scenes are drawn by.
+
+    Args:
+        rng: For numbers.
+        built: For what a scene is built of, unless another is said.
+        without: Features that are never chosen.
+
+    Returns:
+        Whether something of a probability, with a feature's name, is so; one of some values; a
+        number between two powers of ten, to three digits.
+    """
+
+    def chance(p: float, feature: str = "", of: np.random.Generator = built) -> bool:
+        return bool(of.random() < p) and feature not in without
+
+    def pick(*values: Any, of: np.random.Generator = built) -> Any:
+        return values[int(of.integers(len(values)))]
+
+    def log(low: float, high: float) -> float:
+        return float(f"{10 ** rng.uniform(low, high):.3g}")
+
+    return chance, pick, log
+
+
 def draw(
     seed: int, *, without: tuple[str, ...] = (), ranks: int = 1, family: int | None = None
 ) -> Scene:
@@ -68,15 +95,7 @@ def draw(
     rng = np.random.default_rng([seed, 20])
     built = rng if family is None else np.random.default_rng([family, 21])
 
-    def chance(p: float, feature: str = "", of: np.random.Generator = built) -> bool:
-        return bool(of.random() < p) and feature not in without
-
-    def pick(*values: Any, of: np.random.Generator = built) -> Any:
-        return values[int(of.integers(len(values)))]
-
-    def log(low: float, high: float) -> float:
-        return float(f"{10 ** rng.uniform(low, high):.3g}")
-
+    chance, pick, log = dice(rng, built, without)
     space = chance(0.35, "space")
     cell = pick("tetrahedron", "hexahedron") if space else pick("triangle", "quadrilateral")
     d = 3 if space else 2

@@ -676,14 +676,13 @@ class Contact(PointResults):
 
     def _update_points(self) -> None:
         """Let the points be at the present ``u`` and data. Collective."""
-        if self._present is not None:
-            self._update_data()
-            data, history = self._data.values, self.history
-            multipliers = None if self.multipliers is None else self.multipliers.fields
-            self.displacement.follow()
-            self._present.follow(data["x"], data["normal"], history, multipliers or history)
-        self._update_jump()
         self._update_data()
+        if self._present is not None:
+            data, history = self._data.values, self.history
+            traction = history if self.multipliers is None else self.multipliers.fields
+            self.displacement.follow()
+            self._present.follow(data["x"], data["normal"], history, traction)
+        self._update_jump()
         if self._view is not None:
             if self._sampled is not None:
                 self._sampled[1].update()

@@ -21,7 +21,7 @@ import ufl
 from dolfinx import fem
 from ufl.algorithms.analysis import extract_constants, extract_type
 
-from fenics_contact.contact.kinematics import Seen, tangential
+from fenics_contact.contact.kinematics import Seen, combined, tangential
 from fenics_contact.laws.base import Kinematics, Law, Response
 from fenics_contact.supports.base import Placement
 from fenics_contact.surface.fields import PointFields
@@ -240,8 +240,7 @@ class SampledView:
         """See `View.framed`."""
         if not self._turns:
             return vector
-        axes = [self._fields.ufl(f"axis {i}") for i in range(self._d)]
-        return sum((vector[i] * axes[i] for i in range(1, self._d)), vector[0] * axes[0])
+        return combined(vector, [self._fields.ufl(f"axis {i}") for i in range(self._d)])
 
     def carried(self, name: str) -> Any:
         """See `View.carried`."""

@@ -7,7 +7,7 @@ relative to its support is constant (`ContactOperator`), and a linear bulk stays
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,7 @@ import ufl
 from fenics_contact.laws.base import Kinematics, Law, Response
 from fenics_contact.surface.fields import PointFields
 
-__all__ = ["Seen", "SmallKinematics", "tangential"]
+__all__ = ["Seen", "SmallKinematics", "combined", "tangential"]
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,11 @@ class SmallKinematics:
     def framed(self, vector: Any) -> Any:
         """A direction as the history has it (UFL): in space."""
         return vector
+
+
+def combined(vector: Any, axes: Sequence[Any]) -> Any:
+    """The sum of axes times the components of a vector (UFL)."""
+    return sum((vector[i] * axes[i] for i in range(1, len(axes))), vector[0] * axes[0])
 
 
 def tangential(vector: Any, normal: Any) -> Any:

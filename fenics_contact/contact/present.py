@@ -27,7 +27,7 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact.contact.kinematics import Seen, tangential
+from fenics_contact.contact.kinematics import Seen, combined, tangential
 from fenics_contact.contact.pairs import Pairs, PairsState
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Kinematics, Law, Response
@@ -130,7 +130,7 @@ class PresentPairs(Pairs):
         if comm.allreduce(int(changed)) or self._present is None:
             self._at = self._u.x.array.copy()
             self._find(history)
-        self._tell(history, traction)
+        self._feel(history, traction)
 
     def _find(self, history: PointFields) -> None:
         """The partners at the present displacement. Collective."""
@@ -160,23 +160,15 @@ class PresentPairs(Pairs):
         if self.number == 1:
             self._warn_of_unpaired(hits.reason)
         self._local = None
+        none, committed = np.zeros_like(normal), np.zeros_like(normal)
+        if "traction" in history:
+            committed = self.turned(history.values("traction"))
+        turns = {f"turn {i}": rotation[:, i] for i in range(self._gdim)}
+        told = {"jump": self._jump_since(), "foot": none, "committed": committed}
+        self.told.commit(told | turns)
 
-    def _tell(self, history: PointFields, traction: PointFields) -> None:
-        """Say what follows for the laws. Collective."""
-        assert self._present is not None
-        now, friction = self._present, "traction" in history
-
-        def turned(vectors: Array) -> Array:
-            return np.asarray(np.einsum("qij,qj->qi", now.rotation, vectors))
-
-        none = np.zeros_like(now.normal)
-        slip, start, committed = none, none, none
-        if friction:
-            slip = turned(now.way - history.values("jump"))
-            start = turned(traction.values("traction"))
-            committed = turned(history.values("traction"))
-        values = {"gap": now.gap, "normal": now.normal, "slip": slip, "traction": start}
-        self.felt.commit(values)
+    def _jump_since(self) -> Array:
+        """Displacement relative to the partner since the last commit, (n_points, d). Collective."""
         change = self._u.x.petsc_vec.copy()
         change.axpy(-1.0, self._before.x.petsc_vec)
         product = self.jump_map.createVecLeft()
@@ -184,8 +176,18 @@ class PresentPairs(Pairs):
         jump = product.array_r.reshape(-1, self._gdim).copy()
         for item in (change, product):
             item.destroy()
-        turns = {f"turn {i}": now.rotation[:, i] for i in range(self._gdim)}
-        self.told.commit({"jump": jump, "foot": none, "committed": committed} | turns)
+        return jump
+
+    def _feel(self, history: PointFields, traction: PointFields) -> None:
+        """What laws see, by the tractions to start from as they are. Collective."""
+        assert self._present is not None
+        now = self._present
+        slip, start = np.zeros_like(now.normal), np.zeros_like(now.normal)
+        if "traction" in history:
+            slip = self.turned(now.way - history.values("jump"))
+            start = self.turned(traction.values("traction"))
+        values = {"gap": now.gap, "normal": now.normal, "slip": slip, "traction": start}
+        self.felt.commit(values)
 
     def turned(self, vectors: Array) -> Array:
         """Vectors of the committed bodies as they have turned since, (n_points, d)."""
@@ -217,22 +219,18 @@ class PresentPairs(Pairs):
         self._before.x.array[:] = state.found_at.x.array
         self._forget()
 
-    def depth(self, normal_displacement: Array) -> Array:
-        """See `Pairs.depth`."""
-        return np.where(self.paired, np.maximum(normal_displacement, 0.0), 0.0)
-
     def true_gap(self, values: PointValues) -> tuple[Array, Array]:
         """See `Contact.true_gap`: it is that of the pairs themselves."""
         return np.where(self.paired, values.gap, np.nan), values.normal.copy()
 
     def linear_gap(self, values: PointValues) -> Array:
         """See `Pairs.linear_gap`: nothing is linearised."""
-        return np.where(self.paired, values.gap, np.nan)
+        return self.true_gap(values)[0]
 
     def _look_back(self, depth: float) -> tuple[LookBack, Array]:
         """See `Pairs`: in the bodies as they are."""
         assert self.search is not None
-        back = self.search.look_back_now(self._u, depth)
+        back = self.search.look_back(self._u, depth, present=True)
         return back, np.zeros_like(back.distance)
 
     # ---- derivatives -----------------------------------------------------------------------------
@@ -391,8 +389,7 @@ class PresentKinematics:
 
     def framed(self, vector: Any) -> Any:
         """A direction as the history has it (UFL): in the committed bodies."""
-        rows = [self._told.ufl(f"turn {i}") for i in range(len(vector))]
-        return sum((vector[i] * rows[i] for i in range(1, len(vector))), vector[0] * rows[0])
+        return combined(vector, [self._told.ufl(f"turn {i}") for i in range(len(vector))])
 
 
 def _reciprocal(tangents: Array) -> Array:

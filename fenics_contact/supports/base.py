@@ -158,7 +158,7 @@ class Rotation:
         c, s = np.cos(angle), np.sin(angle)
         if self.axis is None:
             return vectors @ np.array([[c, s], [-s, c]])
-        axis = nonzero_vector("axis of the Rotation", self.axis, 3)
+        axis = self.unit_axis(3)
         along = np.outer(vectors @ axis, axis)
         return np.asarray(along + c * (vectors - along) + s * np.cross(axis, vectors))
 

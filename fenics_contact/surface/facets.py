@@ -210,9 +210,8 @@ class FacetSet:
         near = min(_NEAREST, n_facets)
         away, candidates = scipy.spatial.cKDTree(middle).query(x, k=[*range(1, near + 1)])
         point, facet = np.repeat(np.arange(n), near), candidates.reshape(-1)
-        arm = middle[facet] - x[point]
-        along = np.einsum("pd,pd->p", arm, ray[point])
-        hopeful = np.linalg.norm(arm - along[:, None] * ray[point], axis=1) <= radius[facet]
+        _, off = _along_and_off(middle[facet] - x[point], ray[point])
+        hopeful = off <= radius[facet]
         self._keep_nearest(x, ray, (point[hopeful], facet[hopeful]), u, best, counts)
         if near == n_facets:
             return best
@@ -225,9 +224,7 @@ class FacetSet:
             step = max(1, _CHUNK // n_facets)
             for i in range(0, len(rows), step):
                 some = rows[i : i + step]
-                arm = middle[None] - x[some, None]
-                along = np.einsum("pfd,pd->pf", arm, ray[some])
-                off = np.linalg.norm(arm - along[..., None] * ray[some, None], axis=2)
+                along, off = _along_and_off(middle[None] - x[some, None], ray[some, None])
                 hopeful = off <= radius[None]
                 hopeful &= np.abs(along) <= np.abs(best[2][some, None]) + radius[None]
                 row, facet = np.nonzero(hopeful)
@@ -298,6 +295,12 @@ def tabulate(element: Any, derivatives: int, points: Array) -> Array:
         return element.tabulate(derivatives, points)
     n_tables = (1, 1 + points.shape[1])[derivatives]
     return np.zeros((n_tables, 0, element.dim, 1))
+
+
+def _along_and_off(arm: Array, ray: Array) -> tuple[Array, Array]:
+    """How far arms (…, d) reach along unit rays, and aside of them: (…)."""
+    along = np.asarray(np.einsum("...d,...d->...", arm, ray))
+    return along, np.asarray(np.linalg.norm(arm - along[..., None] * ray, axis=-1))
 
 
 def _side(tangents: Array, direction: Array) -> Array:

@@ -33,9 +33,9 @@ from fenics_contact.surface.projection import (
     facing_pairs,
     polynomials,
 )
-from fenics_contact.surface.rays import BEHIND, Rays, Side, interpolation_matrix
+from fenics_contact.surface.rays import BEHIND, Hits, Rays, Side, interpolation_matrix
 from fenics_contact.surface.surface import SurfaceQuadrature
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Index
 
 __all__ = ["LookBack", "Pairing"]
 
@@ -147,26 +147,44 @@ class Pairing:
             item.destroy()
         return matrix, gap, found.reason
 
-    def look_back(self, u: fem.Function | None, penetration: float) -> LookBack:
+    def look_back(
+        self, u: fem.Function | None, penetration: float, *, present: bool = False
+    ) -> LookBack:
         """Follow the normals of the opposite back to Γc. Collective.
 
         Args:
             u: Displacement of the bodies; none: they are undeformed.
             penetration: The largest between them (length).
+            present: By the normals and distances at ``u``, not those of the undeformed bodies.
         """
         here, there = self._sides
         facet, place = self._there.corners()
-        ray = self._there.normals(facet, place)
-        found = self.rays.follow(
-            facet, place, ray, u, np.full(len(there.body), penetration), back=True
-        )
+        undeformed = self._there.normals(facet, place)
+        ray = self._there.normals(facet, place, u) if present else undeformed
+        deep = np.full(len(there.body), penetration)
+        found = self.rays.follow(facet, place, ray, u, deep, back=True, undeformed=undeformed)
         x, _ = self._there.positions(facet, place)
+        kept = np.flatnonzero(found.facet >= 0)
+        distance = found.distance if present else np.einsum("qd,qd->q", found.place - x, ray)
+        hit = found.facet[kept]
+        return LookBack(
+            x[kept],
+            self.facets[facet[kept]],
+            hit,
+            distance[kept],
+            self._slack(here)[hit] + self._slack(there)[there.first + facet[kept]],
+            None if present else self._approach(facet, place, ray, kept, found),
+        )
+
+    def _approach(
+        self, facet: Index, place: Array, ray: Array, kept: Index, found: Hits
+    ) -> PETSc.Mat:
+        """See `LookBack`: of the kept ones of the corners and middles. Collective."""
         nodes, weights = self._there.interpolation(facet, place)
         n, space = len(facet), self._there.space
         own = interpolation_matrix(space, n, np.arange(n), nodes, weights)
         opposite = found.matrix(space)
         own.axpy(-1.0, opposite, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        kept = np.flatnonzero(found.facet >= 0)
         first, _ = own.getOwnershipRange()
         columns = first + self._d * kept[:, None] + np.arange(self._d)
         along = PETSc.Mat().createAIJ(
@@ -181,38 +199,7 @@ class Pairing:
         approach = along.matMult(own)
         for item in (along, own, opposite):
             item.destroy()
-        hit = found.facet[kept]
-        return LookBack(
-            x[kept],
-            self.facets[facet[kept]],
-            hit,
-            np.einsum("qd,qd->q", found.place - x, ray)[kept],
-            self._slack(here)[hit] + self._slack(there)[there.first + facet[kept]],
-            approach,
-        )
-
-    def look_back_now(self, u: fem.Function, penetration: float) -> LookBack:
-        """Follow the present normals of the opposite back to Γc. Collective.
-
-        Args:
-            u: Displacement of the bodies.
-            penetration: The largest between them (length).
-
-        Returns:
-            With the present distances, of which nothing is lost.
-        """
-        here, there = self._sides
-        facet, place = self._there.corners()
-        ray = self._there.normals(facet, place, u)
-        deep = np.full(len(there.body), penetration)
-        undeformed = self._there.normals(facet, place)
-        found = self.rays.follow(facet, place, ray, u, deep, back=True, undeformed=undeformed)
-        x, _ = self._there.positions(facet, place)
-        kept = np.flatnonzero(found.facet >= 0)
-        hit = found.facet[kept]
-        slack = self._slack(here)[hit] + self._slack(there)[there.first + facet[kept]]
-        source, distance = self.facets[facet[kept]], found.distance[kept]
-        return LookBack(x[kept], source, hit, distance, slack, None)
+        return approach
 
     def _slack(self, side: Side) -> Array:
         """How far from a smooth or a flat surface each of all facets may be (length). Collective.

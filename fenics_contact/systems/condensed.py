@@ -151,7 +151,6 @@ class CondensedSystem(System):
     def begin(self, load: Array) -> None:
         """Condense the load and the values prescribed. Collective."""
         self._full.begin(load)
-        self.start_turning()
         state = self._full.state()
         self.condensation.set_load(load, state)
         self.load = self.part(load)

@@ -109,7 +109,6 @@ class FullSystem(System):
     def begin(self, load: Array) -> None:
         """Start an increment under a load, u with its conditions. Collective."""
         self.load = load
-        self.start_turning()
         self.prescribed = self.state()[self.constrained]
 
     @property

@@ -173,7 +173,7 @@ class ContactOperator:
         blocks = self.contact.area[:, None, None] * stiffness
         if isinstance(self.unknowns, Selection) and self._turn is None:
             return self._product(blocks)
-        matrix = self._block_diagonal(blocks)
+        matrix = self._block_diagonal(blocks, self._map)
         if self._turn is None:
             product = matrix.ptap(self._map)
         else:
@@ -203,8 +203,8 @@ class ContactOperator:
             return self.springs(-tangent.by_jump)
         # Where the support moves its normals may turn: more than the opposite of ∂/∂jump.
         area = -self.contact.area[:, None, None]
-        jumps = self._block_diagonal(area * tangent.by_jump)
-        shifts = self._block_diagonal(area * tangent.by_shift)
+        jumps = self._block_diagonal(area * tangent.by_jump, self._map)
+        shifts = self._block_diagonal(area * tangent.by_shift, self._map)
         right, turned = jumps.matMult(self._of_bodies), shifts.matMult(self._motions)
         right.axpy(1.0, turned, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         product = self._map.transposeMatMult(right)
@@ -215,7 +215,7 @@ class ContactOperator:
     def _local_tangent(self, by_local: Array, local_map: PETSc.Mat) -> PETSc.Mat:
         """Of pairs that follow the bodies; see `PresentPairs.tangent`. Collective."""
         lifted = self.unknowns.widened(self.contact.displacement.lifted(local_map))
-        blocks = self._block_diagonal(-self.contact.area[:, None, None] * by_local)
+        blocks = self._block_diagonal(-self.contact.area[:, None, None] * by_local, lifted)
         product = blocks.ptap(lifted)
         blocks.destroy()
         return product
@@ -340,14 +340,13 @@ class ContactOperator:
     def _product(self) -> PointProduct:
         return PointProduct(self._map, self._gdim)
 
-    def _block_diagonal(self, blocks: Array) -> PETSc.Mat:
-        """One block per point, (n_points, d, d)."""
+    def _block_diagonal(self, blocks: Array, over: PETSc.Mat) -> PETSc.Mat:
+        """One block per point, (n_points, d, d), over the rows of a matrix."""
         n, d = blocks.shape[:2]
-        comm = self.contact.surface.mesh.comm
-        first = d * (comm.exscan(n) or 0)
+        first, _ = over.getOwnershipRange()
         columns = first + d * np.arange(n)[:, None, None] + np.arange(d)[None, None, :]
         columns = np.broadcast_to(columns, (n, d, d))
-        size = (n * d, None)
+        size = over.getSizes()[0]
         return PETSc.Mat().createAIJ(
             (size, size),
             csr=(
@@ -355,7 +354,7 @@ class ContactOperator:
                 columns.ravel().astype(PETSc.IntType),
                 blocks.ravel(),
             ),
-            comm=comm,
+            comm=self.contact.surface.mesh.comm,
         )
 
 

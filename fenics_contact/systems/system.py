@@ -82,7 +82,6 @@ class System(ABC):
         self.outside: Array = np.zeros((2, n_bodies))
         self.farthest = np.inf
         self._motions = [motion for contact in contacts for motion in contact.motions]
-        self._started = self.motions()
         self._contact_vector = unknowns.vector()
         self._operators: tuple[list[int], list[ContactOperator]] | None = None
         self._parts: tuple[list[int], Parts] | None = None
@@ -204,18 +203,13 @@ class System(ABC):
         for motion, value in zip(self._motions, self.unknowns.motions(state), strict=True):
             motion.set_value(value)
 
-    def start_turning(self) -> None:
-        """Count the turn of supports from here."""
-        self._started = self.motions()
-
     def is_twisted(self) -> bool:
         """Whether a support that turns freely has turned too far in this increment.
 
         A turn further its points are where they were: to a solution there are others.
         """
-        pairs = zip(self._motions, self._started, strict=True)
-        turns = [(motion.value - start) / motion.length for motion, start in pairs if motion.turns]
-        return any(not abs(turn) < _TURN for turn in turns)
+        turning = (c for c in self.contacts if c.free_angle is not None)
+        return any(not abs(contact.turned_by()) < _TURN for contact in turning)
 
     def rolled(self, state: Array) -> Array:
         """A state with supports that turn freely turned to where they slip least. Collective.
