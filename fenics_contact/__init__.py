@@ -11,6 +11,7 @@ from fenics_contact.estimates.adaptation import Level, adapt
 from fenics_contact.estimates.errors import ErrorBudget, estimate_errors
 from fenics_contact.histories import checkpoint
 from fenics_contact.histories.increments import increments
+from fenics_contact.joining import Joined, join_meshes
 from fenics_contact.laws.base import Kinematics, Law, Response
 from fenics_contact.laws.friction import Coulomb, FrictionLaw, Tresca
 from fenics_contact.laws.stiffness import Scaled, Springs
@@ -49,6 +50,7 @@ __all__ = [
     "FrictionLaw",
     "Frictionless",
     "HalfSpace",
+    "Joined",
     "Kinematics",
     "Law",
     "Level",
@@ -76,6 +78,7 @@ __all__ = [
     "elasticity",
     "estimate_errors",
     "increments",
+    "join_meshes",
     "model_to_mesh",
     "output",
     "plotting",

@@ -30,6 +30,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     Not where cells and facets are found, and pairs made.
     """
     kept = ("test_surface", "test_pairs", "test_two_bodies", "test_present", "test_elasticity")
+    kept += ("test_joined_meshes", "test_contact_pairs")
     for item in items:
         values = getattr(item, "callspec", None)
         of_hexahedra = values is not None and "hexahedron" in values.id.split("-")

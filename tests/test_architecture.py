@@ -27,7 +27,9 @@ ROOMS = [
     "histories",
 ]
 # Modules that stand in no room and know none of them.
-GROUND = {"compat", "parallel", "types", "meshes", "arguments", "elasticity", "_version"}
+GROUND = {
+    *("compat", "parallel", "types", "meshes", "joining", "arguments", "elasticity", "_version"),
+}
 # DOLFINx names its C++ objects so, and there is no other way to them.
 OF_DOLFINX = {"_cpp_object"}
 # What releases of DOLFINx have by different names or with different arguments.

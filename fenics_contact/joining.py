@@ -1,0 +1,360 @@
+"""Bodies that were meshed apart, in one mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import basix
+import dolfinx
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem, la
+from mpi4py import MPI
+
+from fenics_contact import compat
+from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.parallel import collective_errors
+from fenics_contact.types import Array, Index
+
+__all__ = ["Joined", "join_meshes"]
+
+Part: TypeAlias = dolfinx.mesh.Mesh | Sequence[Any]
+Numbers: TypeAlias = Mapping[Hashable, Mapping[int | None, int]]
+
+
+@dataclass(frozen=True)
+class Joined:
+    """One mesh of several bodies that share no node, and how their tags are numbered in it.
+
+    Tags count from 1, body by body in the order given, in each by ascending tag: no two bodies have
+    one in common.
+
+    Attributes:
+        mesh: All bodies.
+        cells: A tag for every cell of this rank, ghosts included.
+        facets: Tags of the facets that had one.
+        bodies: Names of the bodies, as given.
+        cell_numbers: New tags of cells by body and old tag; that of cells without is under None.
+        facet_numbers: New tags of facets by body and old tag.
+    """
+
+    mesh: dolfinx.mesh.Mesh
+    cells: dolfinx.mesh.MeshTags
+    facets: dolfinx.mesh.MeshTags
+    bodies: tuple[Hashable, ...]
+    cell_numbers: Numbers
+    facet_numbers: Numbers
+
+    def body(self, body: Hashable) -> tuple[int, ...]:
+        """All tags of the cells of a body, as ``ufl.Measure`` takes them.
+
+        Raises:
+            ValueError: There is no such body.
+        """
+        return tuple(self._of(self.cell_numbers, body).values())
+
+    def cell(self, body: Hashable, tag: int) -> int:
+        """The tag in ``cells`` of those that had ``tag`` in their body.
+
+        Raises:
+            ValueError: There is no such body, or it has no such tag.
+        """
+        return self._number("cell", self.cell_numbers, body, tag)
+
+    def facet(self, body: Hashable, tag: int) -> int:
+        """The tag in ``facets`` of those that had ``tag`` in their body.
+
+        Raises:
+            ValueError: There is no such body, or it has no such tag.
+        """
+        return self._number("facet", self.facet_numbers, body, tag)
+
+    def by_body(self, values: Mapping[Hashable, float]) -> fem.Function:
+        """A number for each body, such as its modulus, as a function of the cells. Collective.
+
+        Args:
+            values: One for every body, in any unit.
+
+        Raises:
+            ValueError: A body has none, there is no such body, or a value is no number.
+        """
+        if not isinstance(values, Mapping) or set(values) != set(self.bodies):
+            given = list(values) if isinstance(values, Mapping) else values
+            raise ValueError(
+                f"values are given for {given!r}; give one number for each of the bodies "
+                f"{list(self.bodies)!r}, as a dict"
+            )
+        for body, value in values.items():
+            if not is_number(value):
+                raise ValueError(f"the value of body {body!r} is {value!r}; give a number")
+        space = fem.functionspace(self.mesh, ("Discontinuous Lagrange", 0))
+        field = fem.Function(space)
+        of_cell = space.dofmap.list[self.cells.indices, 0]
+        for body in self.bodies:
+            field.x.array[of_cell[np.isin(self.cells.values, self.body(body))]] = values[body]
+        return field
+
+    def _of(self, numbers: Numbers, body: Hashable) -> Mapping[int | None, int]:
+        if body not in self.bodies:
+            raise ValueError(f"there is no body {body!r}; the bodies are {list(self.bodies)!r}")
+        return numbers[body]
+
+    def _number(self, what: str, numbers: Numbers, body: Hashable, tag: int) -> int:
+        known = self._of(numbers, body)
+        if tag is None or tag not in known:
+            tags = [old for old in known if old is not None]
+            raise ValueError(f"no {what} of body {body!r} had the tag {tag!r}; its tags are {tags}")
+        return known[tag]
+
+
+def join_meshes(parts: Mapping[Hashable, Part] | Iterable[Part]) -> Joined:
+    """Put bodies that were meshed apart into one mesh. Collective.
+
+    Nodes are never merged: bodies that touch stay apart, and a contact decides what happens between
+    them. DOLFINx distributes all cells anew, without ghost cells.
+
+    Args:
+        parts: Of every body its mesh, or (mesh, cell_tags, facet_tags), as `model_to_mesh` gives
+            them; tags may be None or left out. As a dict by the names of the bodies, or as a list:
+            then their names are 0, 1, …. The meshes have the same kind of cell, dimension and
+            geometric degree, and the same ranks.
+
+    Returns:
+        The mesh, its tags, and their new numbers.
+
+    Raises:
+        ValueError: No part; a part of another form; meshes that do not go together, both named;
+            tags of another dimension, or no whole numbers.
+    """
+    if isinstance(parts, Mapping):
+        names, given = tuple(parts), list(parts.values())
+    elif isinstance(parts, Iterable) and not isinstance(parts, str):
+        given = list(parts)
+        names = tuple(range(len(given)))
+    else:
+        raise ValueError(f"parts is {parts!r}; give a list of bodies, or a dict by their names")
+    if not given:
+        raise ValueError("parts is empty; give one body at least")
+    bodies = [_body(name, part) for name, part in zip(names, given, strict=True)]
+    _check_alike(names, [mesh for mesh, _, _ in bodies])
+    first = bodies[0][0]
+    comm, d = first.comm, first.topology.dim
+
+    cells, x = _cells_and_nodes([mesh for mesh, _, _ in bodies])
+    cell_numbers, facet_numbers, data = _renumbered(names, bodies)
+    domain = ufl.Mesh(first.ufl_domain().ufl_coordinate_element())
+    partitioner = compat.cell_partitioner(dolfinx.mesh.GhostMode.none)
+    mesh = dolfinx.mesh.create_mesh(comm, cells=cells, x=x, e=domain, partitioner=partitioner)
+
+    # Cells keep the order of their nodes, and with it that of their facets.
+    data = _rows(comm, data, np.asarray(mesh.topology.original_cell_index))
+    every = np.arange(len(data), dtype=np.int32)
+    cell_tags = dolfinx.mesh.meshtags(mesh, d, every, data[:, 0].astype(np.int32))
+    facet_tags = _facet_tags(mesh, data[:, 1:])
+    return Joined(mesh, cell_tags, facet_tags, names, cell_numbers, facet_numbers)
+
+
+Body: TypeAlias = tuple[
+    dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags | None, dolfinx.mesh.MeshTags | None
+]
+
+
+def _body(name: Hashable, part: Any) -> Body:
+    """A part, whole.
+
+    Raises:
+        ValueError: It is something else.
+    """
+    values = [part] if isinstance(part, dolfinx.mesh.Mesh) else part
+    if not (isinstance(values, Sequence) and 1 <= len(values) <= 3):
+        raise ValueError(
+            f"body {name!r} is {part!r}; give its mesh, or (mesh, cell_tags, facet_tags)"
+        )
+    mesh, cell_tags, facet_tags = [*values, None, None][:3]
+    check_instance(f"the mesh of body {name!r}", mesh, dolfinx.mesh.Mesh)
+    d = mesh.topology.dim
+    for what, tags, dim in (("cell_tags", cell_tags, d), ("facet_tags", facet_tags, d - 1)):
+        if tags is None:
+            continue
+        check_instance(f"{what} of body {name!r}", tags, dolfinx.mesh.MeshTags)
+        if tags.dim != dim:
+            raise ValueError(
+                f"{what} of body {name!r} are on entities of dimension {tags.dim}, and must be on "
+                f"those of dimension {dim}: the order is (mesh, cell_tags, facet_tags)"
+            )
+        if tags.values.dtype.kind != "i":
+            raise ValueError(
+                f"{what} of body {name!r} have values of type {tags.values.dtype}; give whole "
+                "numbers"
+            )
+    return mesh, cell_tags, facet_tags
+
+
+def _check_alike(names: Sequence[Hashable], meshes: Sequence[dolfinx.mesh.Mesh]) -> None:
+    """Refuse meshes that cannot be one.
+
+    Raises:
+        ValueError: It names the first body and the other one.
+    """
+
+    def kind(mesh: dolfinx.mesh.Mesh) -> str:
+        element = compat.geometry_element(mesh)
+        told = f"cells of type {mesh.topology.cell_name()} and geometric degree {element.degree}"
+        # Below, the nodes of all variants are the same.
+        variant = f", nodes {element.lagrange_variant.name}" if element.degree > 2 else ""
+        return f"{told}{variant} in {mesh.geometry.dim} dimensions"
+
+    for name, mesh in zip(names[1:], meshes[1:], strict=True):
+        if kind(mesh) != kind(meshes[0]):
+            raise ValueError(
+                f"body {names[0]!r} has {kind(meshes[0])}, and body {name!r} has {kind(mesh)}: "
+                "mesh them with the same"
+            )
+        same = MPI.Comm.Compare(mesh.comm, meshes[0].comm)
+        if same not in (MPI.IDENT, MPI.CONGRUENT):
+            raise ValueError(
+                f"body {names[0]!r} is on {meshes[0].comm.size} ranks, and body {name!r} is on "
+                f"{mesh.comm.size}, or on others: make all meshes with the same communicator"
+            )
+
+
+def _cells_and_nodes(meshes: Sequence[dolfinx.mesh.Mesh]) -> tuple[Index, Array]:
+    """This rank's own cells by new global numbers of nodes, and its own nodes. Collective."""
+    comm, d = meshes[0].comm, meshes[0].geometry.dim
+    maps = [mesh.geometry.index_map() for mesh in meshes]
+    n_own = np.array([nodes.size_local for nodes in maps])
+    counts = np.array(comm.allgather(n_own)).reshape(comm.size, len(meshes))
+    # Nodes stand rank by rank, and on every rank body by body.
+    new = np.cumsum(counts).reshape(counts.shape) - counts
+    old = np.cumsum(counts, axis=0) - counts
+    cells = []
+    for i, (mesh, nodes) in enumerate(zip(meshes, maps, strict=True)):
+        n_nodes = nodes.size_local + nodes.num_ghosts
+        owner = np.full(n_nodes, comm.rank)
+        owner[nodes.size_local :] = nodes.owners
+        number = nodes.local_to_global(np.arange(n_nodes, dtype=np.int32))
+        number = number - old[owner, i] + new[owner, i]
+        n_cells = mesh.topology.index_map(mesh.topology.dim).size_local
+        cells.append(number[compat.geometry_dofmap(mesh)[:n_cells]])
+    x = [mesh.geometry.x[:n, :d] for mesh, n in zip(meshes, n_own, strict=True)]
+    return np.concatenate(cells).astype(np.int64), np.concatenate(x)
+
+
+def _renumbered(names: Sequence[Hashable], bodies: Sequence[Body]) -> tuple[Numbers, Numbers, Any]:
+    """New numbers of cell tags and of facet tags, and these of this rank's own cells. Collective.
+
+    Returns:
+        Both numberings, and of every cell its tag, followed by the tag of each of its facets or
+        zero, (n_cells, 1 + n_facets).
+    """
+    cell_numbers: dict[Hashable, dict[int | None, int]] = {}
+    facet_numbers: dict[Hashable, dict[int | None, int]] = {}
+    rows, n_cell_tags, n_facet_tags = [], 0, 0
+    for name, (mesh, cell_tags, facet_tags) in zip(names, bodies, strict=True):
+        d = mesh.topology.dim
+        cell_map = mesh.topology.index_map(d)
+        n_cells, n_all = cell_map.size_local, cell_map.size_local + cell_map.num_ghosts
+        known, numbers = _numbered(mesh.comm, cell_tags, n_cell_tags)
+        of_cell = _dense(mesh.comm, f"cell_tags of body {name!r}", cell_tags, numbers, n_all)
+        if mesh.comm.allreduce(int(np.count_nonzero(of_cell[:n_cells] == 0))):
+            numbers[None] = n_cell_tags + len(known) + 1
+            of_cell[of_cell == 0] = numbers[None]
+        cell_numbers[name] = numbers
+        n_cell_tags += len(numbers)
+
+        mesh.topology.create_connectivity(d, d - 1)
+        facet_map = mesh.topology.index_map(d - 1)
+        n_all = facet_map.size_local + facet_map.num_ghosts
+        known, numbers = _numbered(mesh.comm, facet_tags, n_facet_tags)
+        what = f"facet_tags of body {name!r}"
+        of_facet = _dense(mesh.comm, what, facet_tags, numbers, n_all)
+        facet_numbers[name] = numbers
+        n_facet_tags += len(numbers)
+        facets = _facets_of_cells(mesh)[:n_cells]
+        rows.append(np.column_stack([of_cell[:n_cells], of_facet[facets]]))
+    return cell_numbers, facet_numbers, np.concatenate(rows)
+
+
+def _numbered(
+    comm: MPI.Comm, tags: dolfinx.mesh.MeshTags | None, before: int
+) -> tuple[list[int], dict[int | None, int]]:
+    """Tags of all ranks, ascending, and their new numbers after those before. Collective."""
+    mine = [] if tags is None else np.unique(tags.values).tolist()
+    known = sorted(set().union(*comm.allgather(mine)))
+    return known, {tag: before + 1 + i for i, tag in enumerate(known)}
+
+
+def _dense(
+    comm: MPI.Comm,
+    what: str,
+    tags: dolfinx.mesh.MeshTags | None,
+    numbers: Mapping[int | None, int],
+    n: int,
+) -> npt.NDArray[np.int64]:
+    """The new tag of every entity of this rank, or 0, (n,). Collective."""
+    found = np.zeros(n, dtype=np.int64)
+    with collective_errors(comm):
+        if tags is not None and len(tags.indices):
+            if tags.indices.max() >= n:
+                raise ValueError(
+                    f"{what} are on number {tags.indices.max()}, and the mesh has {n} there: give "
+                    "the tags of this mesh"
+                )
+            old, place = np.unique(tags.values, return_inverse=True)
+            found[tags.indices] = np.array([numbers[tag] for tag in old.tolist()])[place]
+    return found
+
+
+def _facets_of_cells(mesh: dolfinx.mesh.Mesh) -> Index:
+    """The facets of every cell of this rank in the order of the reference cell."""
+    d = mesh.topology.dim
+    mesh.topology.create_connectivity(d, d - 1)
+    of_cell = mesh.topology.connectivity(d, d - 1)
+    n = len(basix.topology(basix.CellType[mesh.topology.cell_name()])[d - 1])
+    return of_cell.array.reshape(-1, n)
+
+
+def _rows(comm: MPI.Comm, rows: Any, wanted: Index) -> Any:
+    """Rows by their numbers over all ranks, from the ranks that have them. Collective.
+
+    Args:
+        comm: The ranks.
+        rows: This rank's, (n, m).
+        wanted: Numbers, (k,).
+
+    Returns:
+        The rows, (k, m).
+    """
+    ends = np.cumsum(comm.allgather(len(rows)))
+    first = int(ends[comm.rank]) - len(rows)
+    owner = np.searchsorted(ends, wanted, side="right")
+    asked = comm.alltoall([wanted[owner == rank] for rank in range(comm.size)])
+    answers = comm.alltoall([rows[numbers - first] for numbers in asked])
+    found = np.empty((len(wanted), rows.shape[1]), dtype=rows.dtype)
+    for rank, answer in enumerate(answers):
+        found[owner == rank] = answer
+    return found
+
+
+def _facet_tags(mesh: dolfinx.mesh.Mesh, tags: Any) -> dolfinx.mesh.MeshTags:
+    """Tags of facets, the same on all ranks that share them. Collective.
+
+    Args:
+        mesh: The mesh.
+        tags: Of the facets of each cell of this rank, 0 where there is none, (n_cells, n).
+    """
+    d = mesh.topology.dim
+    facets = _facets_of_cells(mesh)
+    values = la.vector(mesh.topology.index_map(d - 1), 2)
+    tag = values.array.reshape(-1, 2)
+    # The tag of an inner facet may be known to one of its cells alone.
+    np.maximum.at(tag[:, 0], facets, tags)
+    tag[:, 1] = tag[:, 0] > 0
+    values.scatter_reverse(la.InsertMode.add)
+    tag[:, 0] /= np.maximum(tag[:, 1], 1)
+    values.scatter_forward()
+    tagged = np.flatnonzero(tag[:, 0] > 0).astype(np.int32)
+    return dolfinx.mesh.meshtags(mesh, d - 1, tagged, tag[tagged, 0].round().astype(np.int32))

@@ -1,0 +1,293 @@
+"""Meshes joined into one: what they contain, which tags it has, and what is refused.
+
+Volumes and areas are those of the parts, added up in another order: 1e-12.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import basix.ufl
+import dolfinx
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import CellType, GhostMode
+from mpi4py import MPI
+
+import fenics_contact as fc
+from scenes.blocks import BOTTOM, CELLS, LEFT, TOP, block_mesh, dimension
+from scenes.comparing import raised_everywhere
+from scenes.meshes import mesh_of
+
+COMM = MPI.COMM_WORLD
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+EXACT = 1e-12
+LOWER_HALF, REST = 7, 3
+
+
+def only(mesh: dolfinx.mesh.Mesh, tags: dolfinx.mesh.MeshTags, tag: Any) -> dict[str, Any]:
+    """For a measure, what has a tag (or several): always as 1, so that forms are the same."""
+    mine = tags.indices[np.isin(tags.values, tag)]
+    ones = dolfinx.mesh.meshtags(mesh, tags.dim, mine, np.ones(len(mine), dtype=np.int32))
+    return {"subdomain_data": ones, "subdomain_id": 1}
+
+
+def measure(
+    mesh: dolfinx.mesh.Mesh, tags: dolfinx.mesh.MeshTags, tag: Any, kind: str = ""
+) -> float:
+    """Length, area or volume of what has a tag."""
+    kind = kind or ("dx" if tags.dim == mesh.topology.dim else "ds")
+    one = fem.Constant(mesh, 1.0)
+    form = ufl.avg(one) if kind == "dS" else one
+    return total(form * ufl.Measure(kind, domain=mesh, **only(mesh, tags, tag)))
+
+
+def total(form: ufl.Form) -> float:
+    """The number that a form is, over all ranks."""
+    return COMM.allreduce(fem.assemble_scalar(fem.form(form)))
+
+
+def volume(mesh: dolfinx.mesh.Mesh) -> float:
+    """Of all cells."""
+    return total(fem.Constant(mesh, 1.0) * ufl.dx)
+
+
+def centre(mesh: dolfinx.mesh.Mesh, tags: dolfinx.mesh.MeshTags, tag: Any) -> np.ndarray:
+    """Integral of the coordinates over the cells that have a tag."""
+    x = ufl.SpatialCoordinate(mesh)
+    dx = ufl.Measure("dx", domain=mesh, **only(mesh, tags, tag))
+    return np.array([total(x[i] * dx) for i in range(mesh.geometry.dim)])
+
+
+def lower_half(mesh: dolfinx.mesh.Mesh, *, all_cells: bool = True) -> dolfinx.mesh.MeshTags:
+    """LOWER_HALF for cells whose middle is low; and REST for the others, or none."""
+    d = mesh.topology.dim
+    cells = mesh.topology.index_map(d)
+    every = np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
+    middle = dolfinx.mesh.compute_midpoints(mesh, d, every).reshape(-1, 3)[:, d - 1]
+    values = np.where(middle < 0.45, LOWER_HALF, REST).astype(np.int32)
+    kept = all_cells | (values == LOWER_HALF)
+    return dolfinx.mesh.meshtags(mesh, d, every[kept], values[kept])
+
+
+def bend(x: np.ndarray) -> np.ndarray:
+    """Bulge the top by a parabola."""
+    moved = x.copy()
+    moved[:, -1] += 0.2 * x[:, -1] * x[:, 0] * (1 - x[:, 0])
+    return moved
+
+
+@pytest.mark.parametrize(
+    ("curved", "ghost_mode"),
+    [(False, GhostMode.shared_facet), (True, GhostMode.none)],
+    ids=["straight", "curved"],
+)
+@pytest.mark.parametrize("cell", CELLS)
+def test_measures_by_tag_are_those_of_the_parts(
+    cell: str, curved: bool, ghost_mode: GhostMode
+) -> None:
+    """Two blocks in the same place, one with half of its cells tagged."""
+    options = {"shuffled": not curved, "ghost_mode": ghost_mode, "bend": bend if curved else None}
+    parts = {}
+    for name, n in (("coarse", 2), ("fine", 3)):
+        mesh, sides = block_mesh(cell, n=n, **options)
+        parts[name] = mesh, lower_half(mesh, all_cells=name == "fine"), sides
+    joined = fc.join_meshes(parts)
+    d = dimension(cell)
+    assert joined.bodies == ("coarse", "fine")
+    assert joined.mesh.topology.index_map(d).num_ghosts == 0
+    for what, numbers in (
+        (joined.cells, joined.cell_numbers),
+        (joined.facets, joined.facet_numbers),
+    ):
+        given = [number for body in joined.bodies for number in numbers[body].values()]
+        assert given == list(range(1, len(given) + 1))
+        present = np.unique(np.concatenate(COMM.allgather(what.values)))
+        assert present.tolist() == given
+    for name, (mesh, halves, sides) in parts.items():
+        for tag in (LOWER_HALF, REST) if name == "fine" else (LOWER_HALF,):
+            new = joined.cell(name, tag)
+            expected = measure(mesh, halves, tag)
+            assert measure(joined.mesh, joined.cells, new) == pytest.approx(expected, rel=EXACT)
+            found = centre(joined.mesh, joined.cells, new)
+            assert found == pytest.approx(centre(mesh, halves, tag), rel=EXACT)
+        for tag in (BOTTOM, TOP, LEFT):
+            expected = measure(mesh, sides, tag)
+            found = measure(joined.mesh, joined.facets, joined.facet(name, tag))
+            assert found == pytest.approx(expected, rel=EXACT)
+        whole = volume(mesh)
+        assert whole > 1 if curved else whole == pytest.approx(1)
+        found = measure(joined.mesh, joined.cells, joined.body(name))
+        assert found == pytest.approx(whole, rel=EXACT)
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_nodes_in_one_place_stay_two(cell: str) -> None:
+    """A body twice: twice the nodes, vertices and facets of the boundary; nothing is glued."""
+    mesh, _ = block_mesh(cell)
+    d = mesh.topology.dim
+    joined = fc.join_meshes([mesh, mesh]).mesh
+    sizes = []
+    for one in (mesh, joined):
+        one.topology.create_connectivity(d - 1, d)
+        exterior = dolfinx.mesh.exterior_facet_indices(one.topology)
+        owned = exterior[exterior < one.topology.index_map(d - 1).size_local]
+        nodes, vertices = one.geometry.index_map().size_global, one.topology.index_map(0)
+        sizes.append([nodes, vertices.size_global, COMM.allreduce(len(owned))])
+    assert sizes[1] == [2 * size for size in sizes[0]]
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_facets_inside_keep_their_tag(cell: str) -> None:
+    """A line through the middle, known to one rank alone for each facet, is so long on all."""
+    mesh, _ = block_mesh(cell, n=4)
+    inner = dolfinx.mesh.locate_entities(mesh, 1, lambda x: np.isclose(x[1], 0.5))
+    inner = inner[inner < mesh.topology.index_map(1).size_local]
+    tags = dolfinx.mesh.meshtags(mesh, 1, inner, np.full(len(inner), 5, dtype=np.int32))
+    other, sides = block_mesh(cell, n=3)
+    joined = fc.join_meshes([(other, None, sides), (mesh, None, tags)])
+    new = joined.facet(1, 5)
+    assert measure(joined.mesh, joined.facets, new, "dS") == pytest.approx(1)
+    # And every rank that has such a facet knows its tag.
+    found = dolfinx.mesh.locate_entities(joined.mesh, 1, lambda x: np.isclose(x[1], 0.5))
+    assert np.all(COMM.allgather(np.isin(joined.facets.find(new), found).all()))
+    tagged = np.isin(found, joined.facets.find(new))
+    assert np.all(COMM.allgather(bool(tagged.all())))
+
+
+def test_geometry_of_degree_three() -> None:
+    """Its nodes on edges have an order; joined, the volume is the same."""
+    nodes = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
+    cells = np.array([[0, 1, 2], [3, 2, 1]])
+    serial = mesh_of("triangle", nodes, cells, comm=MPI.COMM_SELF)
+    places = fem.functionspace(serial, ("Lagrange", 3))
+    x = places.tabulate_dof_coordinates()[:, :2]
+    bent = x.copy()
+    bent[:, 1] *= 1 + 0.3 * x[:, 0] * (1 - x[:, 0] ** 2)  # the top is a cubic, over 1 + 0.3 / 4
+    mesh = mesh_of("triangle", bent, places.dofmap.list, degree=3)
+    one = volume(mesh)
+    joined = fc.join_meshes([mesh, mesh])
+    for i in (0, 1):
+        found = measure(joined.mesh, joined.cells, joined.body(i))
+        assert found == pytest.approx(one, rel=EXACT)
+    assert one == pytest.approx(1.075)
+
+
+def test_numbers_by_body() -> None:
+    """A modulus for each body, as a function whose integral is that of the parts."""
+    meshes = [block_mesh("triangle", n=n, size=(1, h))[0] for n, h in ((2, 1.0), (3, 2.0))]
+    joined = fc.join_meshes(meshes)
+    assert joined.bodies == (0, 1)
+    field = joined.by_body({0: 5.0, 1: 7.0})
+    assert total(field * ufl.dx) == pytest.approx(5 * 1 + 7 * 2)
+    for values, words in (
+        ({0: 5.0}, ["[0]", "[0, 1]"]),
+        (5.0, ["5.0", "dict"]),
+        ({0: 5.0, 1: "7"}, ["body 1", "'7'"]),
+    ):
+        raised_everywhere(lambda values=values: joined.by_body(values), ValueError, *words)
+
+
+def test_a_body_on_one_rank_alone() -> None:
+    """Cells are distributed anew, wherever they were; ranks without any are nothing special."""
+
+    def on_the_last(comm: MPI.Comm, n: int, types: Any, cells: Any) -> Any:
+        count = cells[0].size // 4
+        owner = np.full(count, n - 1, dtype=np.int32)
+        lists = dolfinx.graph.adjacencylist(owner, np.arange(count + 1, dtype=np.int32))
+        return getattr(lists, "_cpp_object", lists)
+
+    mesh, sides = block_mesh("quadrilateral", n=6, partitioner=on_the_last)
+    joined = fc.join_meshes({"a": (mesh, None, sides), "b": (mesh, None, sides)})
+    for body in "ab":
+        for tag in (BOTTOM, TOP, LEFT):
+            size = measure(joined.mesh, joined.facets, joined.facet(body, tag))
+            assert size == pytest.approx(1)
+    if COMM.size > 1:
+        assert min(COMM.allgather(joined.mesh.topology.index_map(2).size_local)) > 0
+
+
+def test_unknown_bodies_and_tags() -> None:
+    """The error lists those that there are."""
+    mesh, sides = block_mesh("triangle")
+    joined = fc.join_meshes({"block": (mesh, None, sides)})
+    raised_everywhere(lambda: joined.facet("ball", 1), ValueError, "'ball'", "['block']")
+    raised_everywhere(lambda: joined.facet("block", 9), ValueError, "tag 9", "[1, 2, 3, 4]")
+    raised_everywhere(lambda: joined.cell("block", 1), ValueError, "cell", "tag 1", "[]")
+    raised_everywhere(lambda: joined.body(0), ValueError, "body 0", "['block']")
+
+
+def quadratic(cell: str) -> dolfinx.mesh.Mesh:
+    """A block of geometric degree 2."""
+    return block_mesh(cell, bend=lambda x: x)[0]
+
+
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [
+        (lambda: block_mesh("quadrilateral")[0], ["triangle", "quadrilateral"]),
+        (lambda: quadratic("triangle"), ["degree 1", "degree 2"]),
+        (lambda: block_mesh("tetrahedron")[0], ["2 dimensions", "3 dimensions"]),
+    ],
+    ids=["cell", "degree", "dimension"],
+)
+def test_meshes_that_do_not_go_together(other: Any, words: list[str]) -> None:
+    """Both are named."""
+    parts = {"upper": block_mesh("triangle")[0], "lower": other()}
+    raised_everywhere(lambda: fc.join_meshes(parts), ValueError, "'upper'", "'lower'", *words)
+
+
+@pytest.mark.skipif(COMM.size == 1, reason="one rank is all ranks")
+def test_meshes_of_other_ranks() -> None:
+    """A mesh that every rank has for itself is no part of one for all."""
+    own = dolfinx.mesh.create_unit_square(MPI.COMM_SELF, 1, 1, CellType.triangle)
+    parts = [block_mesh("triangle")[0], own]
+    words = f"{COMM.size} ranks", "on 1", "communicator"
+    raised_everywhere(lambda: fc.join_meshes(parts), ValueError, *words)
+
+
+def test_parts_that_are_none() -> None:
+    """What was given is named, and what is expected."""
+    mesh, sides = block_mesh("triangle")
+    cells = mesh.topology.index_map(2)
+    every = np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
+    halves = dolfinx.mesh.meshtags(mesh, 2, every, np.full(len(every), 0.5))
+    other, far = block_mesh("triangle", n=20)[0], None
+    n = other.topology.index_map(1)
+    last = np.array([n.size_local + n.num_ghosts - 1], dtype=np.int32)
+    far = dolfinx.mesh.meshtags(other, 1, last, np.ones(1, dtype=np.int32))
+    for parts, words in (
+        ([], ["empty"]),
+        (3, ["parts is 3"]),
+        ([None], ["body 0", "None", "facet_tags"]),
+        ([(mesh, None, sides, 1)], ["body 0", "facet_tags"]),
+        ([(sides,)], ["mesh of body 0", "MeshTags"]),
+        ([(mesh, sides)], ["cell_tags", "dimension 1", "dimension 2", "order"]),
+        ([(mesh, None, 4)], ["facet_tags of body 0", "int"]),
+        ([(mesh, halves)], ["float64", "whole numbers"]),
+    ):
+        raised_everywhere(lambda parts=parts: fc.join_meshes(parts), ValueError, *words)
+    with pytest.raises(ValueError, match=r"facet_tags of body 0 are on number .* of this mesh"):
+        fc.join_meshes([(mesh, None, far)])
+
+
+def test_a_mesh_with_another_variant_of_nodes() -> None:
+    """Of degree 3 nodes lie in other places by variant: refused, not moved."""
+    x, cells = np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]])
+    serial = mesh_of("triangle", x, cells, comm=MPI.COMM_SELF)
+    made = []
+    for variant in (basix.LagrangeVariant.gll_warped, basix.LagrangeVariant.equispaced):
+        element = basix.ufl.element("Lagrange", "triangle", 3, lagrange_variant=variant)
+        space = fem.functionspace(serial, element)
+        nodes, list_ = space.tabulate_dof_coordinates()[:, :2], space.dofmap.list
+        if COMM.rank:
+            nodes, list_ = nodes[:0], list_[:0]
+        vector = basix.ufl.blocked_element(element, shape=(2,))
+        made.append(
+            dolfinx.mesh.create_mesh(
+                COMM, cells=list_.astype(np.int64), x=nodes, e=ufl.Mesh(vector)
+            )
+        )
+    raised_everywhere(lambda: fc.join_meshes(made), ValueError, "gll_warped", "equispaced")
