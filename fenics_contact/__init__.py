@@ -6,6 +6,7 @@ from fenics_contact._version import __version__
 from fenics_contact.checks.verdict import Balance, NotConverged, Verdict
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.general import contact_pairs
 from fenics_contact.contact.values import Resultants, Status
 from fenics_contact.estimates.adaptation import Level, adapt
 from fenics_contact.estimates.errors import ErrorBudget, estimate_errors
@@ -75,6 +76,7 @@ __all__ = [
     "__version__",
     "adapt",
     "checkpoint",
+    "contact_pairs",
     "elasticity",
     "estimate_errors",
     "increments",

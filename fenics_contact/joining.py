@@ -154,6 +154,7 @@ def join_meshes(parts: Mapping[Hashable, Part] | Iterable[Part]) -> Joined:
     every = np.arange(len(data), dtype=np.int32)
     cell_tags = dolfinx.mesh.meshtags(mesh, d, every, data[:, 0].astype(np.int32))
     facet_tags = _facet_tags(mesh, data[:, 1:])
+    mesh.topology.create_connectivity(d - 1, d)  # for Dirichlet conditions on tagged facets
     return Joined(mesh, cell_tags, facet_tags, names, cell_numbers, facet_numbers)
 
 

@@ -12,7 +12,7 @@ import scipy.spatial
 
 from fenics_contact.types import Array
 
-__all__ = ["COVERED", "cut_lines", "cut_polygons", "facing_pairs", "polynomials"]
+__all__ = ["COVERED", "cut_lines", "cut_polygons", "facing_pairs", "near_pairs", "polynomials"]
 
 
 # Pieces of a facet smaller than this, relative to it, are left out; a facet is covered if what is
@@ -56,11 +56,18 @@ def facing_pairs(
     tree = scipy.spatial.cKDTree(other)
     nearest, _ = tree.query(centre)
     nearest = np.maximum(nearest, away)
-    found = tree.query_ball_point(centre, 1.01 * (np.hypot(nearest, radius + largest) + radius))
-    first = np.repeat(np.arange(len(here)), [len(f) for f in found])
-    second = np.concatenate([np.zeros(0, dtype=int), *(np.asarray(f, dtype=int) for f in found)])
+    reach = 1.01 * (np.hypot(nearest, radius + largest) + radius)
+    first, second = near_pairs(tree, centre, reach)
     facing = np.einsum("pd,pd->p", mean[first], looks[second]) < 0
     return first[facing], second[facing]
+
+
+def near_pairs(tree: scipy.spatial.cKDTree, centre: Array, reach: Array) -> tuple[Any, Any]:
+    """Pairs of places (n, d) and of those in a tree, no farther than each one's reach, (n,)."""
+    found = tree.query_ball_point(centre, reach)
+    first = np.repeat(np.arange(len(centre)), [len(f) for f in found])
+    second = np.concatenate([np.zeros(0, dtype=int), *(np.asarray(f, dtype=int) for f in found)])
+    return first, second
 
 
 def cut_lines(

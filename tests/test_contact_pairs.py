@@ -1,0 +1,325 @@
+"""Contacts between bodies that may touch, found by their distance.
+
+References are closed answers and equilibrium: 1e-10, where the solver's own tolerance on forces is
+1e-9 and linear scenes are met to round-off; what is solved for twice is the same to 1e-8.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import dolfinx
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import CellType
+from mpi4py import MPI
+
+import fenics_contact as fc
+from scenes.blocks import dimension
+from scenes.comparing import gathered, raised_everywhere
+from scenes.elasticity import displacement_space, hold
+from scenes.meshes import mesh_of
+from scenes.tags import near, tagged
+
+COMM = MPI.COMM_WORLD
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+FLOOR, ROOF, WEST, SOUTH = 1, 2, 3, 4
+Array = np.ndarray
+
+
+# ---- scenes --------------------------------------------------------------------------------------
+
+
+def box(cell: str, low: Sequence[float], high: Sequence[float], n: Sequence[int]) -> tuple:
+    """A box with FLOOR, ROOF, WEST and in space SOUTH, its mesh and tags as `join_meshes` asks."""
+    d = dimension(cell)
+    make = dolfinx.mesh.create_rectangle if d == 2 else dolfinx.mesh.create_box
+    mesh = make(COMM, [np.array(low, float), np.array(high, float)], n, CellType[cell])
+    sides = {FLOOR: near(d - 1, low[-1]), ROOF: near(d - 1, high[-1]), WEST: near(0, low[0])}
+    if d == 3:
+        sides[SOUTH] = near(1, low[1])
+    return mesh, None, tagged(mesh, sides)
+
+
+class Pressed:
+    """Bodies with ν = 0, joined; the roofs of some pressed, the floors of some held.
+
+    All stand on rollers at WEST and SOUTH, free on the other sides.
+    """
+
+    def __init__(
+        self,
+        parts: dict[str, tuple],
+        pressed: dict[str, float],
+        held: Sequence[str],
+        moduli: dict[str, float] | None = None,
+        degree: int = 1,
+    ) -> None:
+        """Join them. Collective."""
+        self.joined = joined = fc.join_meshes(parts)
+        self.mesh, self.d = joined.mesh, joined.mesh.geometry.dim
+        self.u = fem.Function(displacement_space(self.mesh, degree))
+        self.v = ufl.TestFunction(self.u.function_space)
+        E = joined.by_body(moduli or dict.fromkeys(joined.bodies, 1e3))
+        kind = "plane strain" if self.d == 2 else "3d"
+        self.body = fc.elasticity.LinearElastic(self.u, E, 0.0, kind)
+        self.F = self.body.residual(self.v)
+        ds = ufl.Measure("ds", domain=self.mesh, subdomain_data=joined.facets)
+        for body, pressure in pressed.items():
+            load = fem.Constant(self.mesh, pressure)
+            self.F += load * self.v[self.d - 1] * ds(joined.facet(body, ROOF))
+        self.bcs = [self.hold(body, FLOOR, self.d - 1) for body in held]
+        for body in parts:
+            self.bcs += [self.hold(body, side, i) for i, side in enumerate((WEST, SOUTH)[:-1])]
+            if self.d == 3:
+                self.bcs.append(self.hold(body, SOUTH, 1))
+
+    def hold(self, body: str, tag: int, component: int) -> fem.DirichletBC:
+        """No displacement of a side in one direction."""
+        return hold(self.u, self.joined.facets, self.joined.facet(body, tag), component)
+
+    def solve(self, contacts: list[fc.Contact], **options: Any) -> fc.Step:
+        """Of these contacts alone."""
+        problem = fc.ContactProblem(self.F, self.u, bcs=self.bcs, contacts=contacts, **options)
+        step = problem.solve()
+        problem.commit()
+        return step
+
+    def shortened(self, body: str) -> Array:
+        """Displacements along the height, of the nodes of a body's roof."""
+        facets = self.joined.facets.find(self.joined.facet(body, ROOF))
+        space = self.u.function_space.sub(self.d - 1)
+        dofs = fem.locate_dofs_topological(space, self.d - 1, facets)
+        return gathered(COMM, -self.u.x.array[dofs])
+
+
+def three_blocks(cell: str) -> Pressed:
+    """A stack of three unit blocks, 3, 5 and 4 cells wide, pressed by 2, on top of each other."""
+    d = dimension(cell)
+    parts = {}
+    for i, (body, n) in enumerate((("low", 3), ("mid", 5 if d == 2 else 2), ("top", 4))):
+        low, high = [0.0] * (d - 1) + [0.5 * i], [1.0] * (d - 1) + [0.5 * (i + 1)]
+        parts[body] = box(cell, low, high, [n] * (d - 1) + [2])
+    moduli = {"low": 1e3, "mid": 2e3, "top": 5e2}
+    return Pressed(parts, {"top": 2.0}, ["low"], moduli)
+
+
+def up(contact: fc.Contact) -> float:
+    """Force on the body that has Γc, along the height."""
+    return float(contact.resultants().force[-1])
+
+
+def facets_of(contact: fc.Contact) -> int:
+    """Number of facets of Γc."""
+    return COMM.allreduce(len(contact.surface.facets))
+
+
+# ---- equilibrium ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
+def test_a_stack_bears_its_load_through_every_joint(cell: str) -> None:
+    """Uniform stress, exactly: each joint bears the load, each block shortens by p h / E."""
+    scene = three_blocks(cell)
+    contacts = fc.contact_pairs(scene.u, fc.Frictionless(fc.Scaled(1e3)), 0.1, bodies=scene.joined)
+    assert [contact.name for contact in contacts] == ["low-mid", "mid-top"]
+    scene.solve(contacts)
+    bound = 0.0
+    for contact in contacts:
+        assert abs(up(contact)) == pytest.approx(2.0, rel=1e-10)
+        pressure = gathered(COMM, contact.pressure)
+        assert pressure == pytest.approx(np.full(pressure.shape, 2.0), rel=1e-9)
+        bound += contact.resultants().max_penetration
+    expected = 2.0 * 0.5 * (1 / 1e3 + 1 / 2e3 + 1 / 5e2) + bound
+    found = scene.shortened("top")
+    assert found == pytest.approx(np.full(found.shape, expected), rel=1e-9)
+
+
+def test_the_same_as_sides_named_by_hand() -> None:
+    """Contacts of tagged sides give the same displacements."""
+    found = []
+    for by_hand in (False, True):
+        scene = three_blocks("quadrilateral")
+        law, tags, joined = fc.Coulomb(0.3), scene.joined.facets, scene.joined
+        if by_hand:
+            contacts = [
+                fc.Contact(
+                    scene.u,
+                    fc.ContactSurface(scene.mesh, tags, joined.facet("mid", here)),
+                    fc.DeformableBody(tags, joined.facet(body, there)),
+                    law,
+                    name=body,
+                )
+                for body, here, there in (("low", FLOOR, ROOF), ("top", ROOF, FLOOR))
+            ]
+        else:
+            contacts = fc.contact_pairs(scene.u, law, 0.1, bodies=joined)
+        scene.solve(contacts)
+        found.append([scene.shortened("top"), *(np.array([up(c)]) for c in contacts)])
+    for one, other in zip(*found, strict=True):
+        assert np.sort(one) == pytest.approx(np.sort(other), rel=1e-8)
+
+
+@pytest.mark.parametrize("fine", ["base", "blocks"])
+def test_two_blocks_on_one(fine: str) -> None:
+    """Each of two blocks side by side hands its own load on; facets below the gap serve both."""
+    n = {"base": (30, 1), "blocks": (12, 8)}[fine]
+    parts = {
+        "base": box("quadrilateral", (0, 0), (2, 1), (n[0], 8)),
+        "left": box("quadrilateral", (0, 1), (0.98, 2), (n[1], 2)),
+        "right": box("quadrilateral", (1.02, 1), (2, 2), (n[1], 2)),
+    }
+    scene = Pressed(parts, {"left": 3.0, "right": 5.0}, ["base"])
+    contacts = fc.contact_pairs(scene.u, fc.Frictionless(), 0.1, bodies=scene.joined)
+    names = [contact.name for contact in contacts]
+    # The blocks face each other across the gap, which stays open.
+    assert names == ["base-left", "base-right", "left-right"]
+    scene.solve(contacts)
+    forces = dict(zip(names, (contact.resultants().force for contact in contacts), strict=True))
+    assert abs(forces["base-left"][1]) == pytest.approx(3 * 0.98, rel=1e-10)
+    assert abs(forces["base-right"][1]) == pytest.approx(5 * 0.98, rel=1e-10)
+    if fine == "base":  # Γc of both contacts is on the base
+        facets = [contact.surface.facets for contact in contacts[:2]]
+        assert COMM.allreduce(len(np.intersect1d(*facets))) > 0
+
+
+# ---- which are found, and which side is Γc -------------------------------------------------------
+
+
+def disc(centre: Sequence[float], radius: float, n: int) -> tuple:
+    """A disc of triangles, (mesh, None, None)."""
+    rings, places = np.arange(1, n + 1), [np.zeros((1, 2))]
+    for ring in rings:
+        angle = np.arange(6 * ring) * 2 * np.pi / (6 * ring)
+        places.append(radius * ring / n * np.column_stack([np.cos(angle), np.sin(angle)]))
+    x = np.concatenate(places)
+    import scipy.spatial
+
+    cells = scipy.spatial.Delaunay(x).simplices
+    return mesh_of("triangle", x + np.asarray(centre, float), cells), None, None
+
+
+def test_bodies_far_apart_are_not_paired(caplog: pytest.LogCaptureFixture) -> None:
+    """Discs 1 apart: no contact below that distance, one above it, and it is said."""
+    joined = fc.join_meshes([disc((0, 0), 1, 4), disc((3, 0), 1, 5)])
+    u = fem.Function(displacement_space(joined.mesh, 1))
+    with caplog.at_level(logging.INFO, "fenics_contact"):
+        assert fc.contact_pairs(u, fc.Frictionless(), 0.9) == []
+    if COMM.rank == 0:
+        assert "no two of the bodies [1, 2] are within 0.9" in caplog.text
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "fenics_contact"):
+        (contact,) = fc.contact_pairs(u, fc.Frictionless(), 1.3)
+    assert contact.name == "1-2"
+    if COMM.rank == 0:
+        # Γc on the finer one, from its corner at distance 1 from the other's.
+        assert "1-2: Γc on 2 with" in caplog.text and "; 1 to 1." in caplog.text
+    x = gathered(COMM, contact.points)
+    assert np.all(x[:, 0] > 1.9) and facets_of(contact) > 3
+
+
+def test_back_sides_are_not_paired() -> None:
+    """A pile of plates thinner than the distance: neighbours only face each other."""
+    parts = [box("quadrilateral", (0, 0.1 * i), (1, 0.1 * (i + 1)), (8 + i, 1)) for i in range(3)]
+    joined = fc.join_meshes(parts)
+    u = fem.Function(displacement_space(joined.mesh, 1))
+    contacts = fc.contact_pairs(u, fc.Frictionless(), 0.15, bodies=joined, itself=True)
+    names = [contact.name for contact in contacts]
+    # Across the plate between them the outer two face each other, too: open while it is there.
+    assert names == ["0-1", "0-2", "1-2"]
+    for contact, y in zip(contacts, (0.1, 0.2, 0.2), strict=True):
+        x = gathered(COMM, contact.points)
+        assert x[:, 1] == pytest.approx(np.full(len(x), y))
+    close = fc.contact_pairs(u, fc.Frictionless(), 0.09, bodies=joined)
+    assert [contact.name for contact in close] == ["0-1", "1-2"]
+
+
+def test_which_side_is_the_surface() -> None:
+    """The finer one; of equal ones that with fewer facets; or what the caller says."""
+    law = fc.Frictionless()
+    for n, width, expected in ((8, 1.0, 1), (3, 1.0, 0), (4, 0.5, 0), (2, 0.5, 1)):
+        parts = [
+            box("quadrilateral", (0, 0), (1, 0.5), (4, 2)),
+            box("quadrilateral", (0, 0.5), (width, 1), (n, 2)),
+        ]
+        joined = fc.join_meshes(parts)
+        u = fem.Function(displacement_space(joined.mesh, 1))
+        (contact,) = fc.contact_pairs(u, law, 0.3, bodies=joined)
+        side = contact.surface.quadrature(1)
+        assert side is not None
+        on_upper = facets_of(contact) == n
+        assert on_upper == bool(expected), (n, width)
+        for order, chosen in (((0,), 0), ((1,), 1), ((1, 0), 1), ((0, 1), 0)):
+            (contact,) = fc.contact_pairs(u, law, 0.3, bodies=joined, surface_on=order)
+            looks = COMM.allreduce(contact.values.normal[:, 1].sum()) > 0
+            assert looks == (chosen == 0)
+
+
+def test_cell_tags_and_connected_parts_name_bodies() -> None:
+    """The same two bodies under three kinds of names; only some facets are looked at."""
+    parts = {
+        "a": box("triangle", (0, 0), (1, 1), (3, 3)),
+        "b": box("triangle", (0, 1), (1, 2), (4, 4)),
+    }
+    joined = fc.join_meshes(parts)
+    u = fem.Function(displacement_space(joined.mesh, 1))
+    tags = dolfinx.mesh.meshtags(
+        joined.mesh, 2, joined.cells.indices, 10 * joined.cells.values.astype(np.int32)
+    )
+    for bodies, name in ((None, "1-2"), (joined, "a-b"), (tags, "10-20")):
+        (contact,) = fc.contact_pairs(u, fc.Frictionless(), 0.1, bodies=bodies)
+        assert contact.name == name and facets_of(contact) == 4
+    floors = [joined.facet(body, FLOOR) for body in "ab"]
+    only = {"facet_tags": joined.facets, "tags": floors}
+    assert fc.contact_pairs(u, fc.Frictionless(), 0.1, **only) == []
+    only["tags"] = [*floors, joined.facet("a", ROOF)]
+    assert len(fc.contact_pairs(u, fc.Frictionless(), 0.1, **only)) == 1
+
+
+def test_a_law_for_each_pair() -> None:
+    """It is asked by the names of both bodies."""
+    scene = three_blocks("quadrilateral")
+    asked = []
+
+    def law(a: Any, b: Any) -> fc.Law:
+        asked.append((a, b))
+        return fc.Coulomb(0.3) if a == "low" else fc.Frictionless()
+
+    contacts = fc.contact_pairs(scene.u, law, 0.1, bodies=scene.joined, enforcement="augmented")
+    assert asked == [("low", "mid"), ("mid", "top")]
+    assert [contact.law.has_friction for contact in contacts] == [True, False]
+    assert all(contact.multipliers is not None for contact in contacts)
+
+
+def test_bad_arguments() -> None:
+    """What was given and what is expected, on every rank."""
+    mesh, _, facets = box("triangle", (0, 0), (1, 1), (2, 2))
+    joined = fc.join_meshes([mesh, mesh])
+    u = fem.Function(displacement_space(joined.mesh, 1))
+    law = fc.Frictionless()
+    half = joined.cells.indices[joined.cells.values == 1]
+    some = dolfinx.mesh.meshtags(joined.mesh, 2, half, np.ones(len(half), dtype=np.int32))
+    ready: dict[str, Any] = {"u": u, "law": law, "distance": 0.1}
+    for given, words in (
+        ({"distance": 0.0}, ["distance is 0.0", "greater than zero"]),
+        ({"distance": "near"}, ["'near'"]),
+        ({"law": 3}, ["law is a int", "Law"]),
+        ({"law": fc.Frictionless}, ["law is the class Frictionless"]),
+        ({"law": lambda a, b: None}, ["1-2", "law", "NoneType"]),
+        ({"bodies": 2}, ["bodies is 2", "join_meshes"]),
+        ({"bodies": fc.join_meshes([mesh])}, ["another mesh"]),
+        ({"bodies": joined.facets}, ["dimension 1", "dimension 2"]),
+        ({"bodies": some}, ["8 cells have no tag"]),
+        ({"surface_on": ["ball"]}, ["'ball'", "[1, 2]"]),
+        ({"facet_tags": joined.facets}, ["together"]),
+        ({"name": "joint"}, ["name is given"]),
+        ({"kinematics": "large"}, ["'large'"]),
+        ({"update": "often"}, ["'often'"]),
+    ):
+        near_ones = {"distance": 0.1, "surface_on": ()} | given
+        with_default = ready | near_ones
+        raised_everywhere(lambda a=with_default: fc.contact_pairs(**a), ValueError, *words)
