@@ -30,6 +30,7 @@ PRINTED = {
     "own_law": (r"closed up by {} mm; h ln\(p/p0\) = {} mm", 1e-5),
     "plastic_block": (r"force {} N/mm, limit {} N/mm", 1e-5),
     "roller": (r"turned by {} rad, way / R = {} rad", 1e-2),
+    "stack": (r"plastic-brass: {} N/mm, the load is {} N/mm", 1e-9),
     "two_bodies": (r"the blocks shorten by {} mm, two springs by {} mm", 1e-5),
 }
 

@@ -15,7 +15,7 @@ from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.contact.contact import Contact
 from fenics_contact.joining import Joined
 from fenics_contact.laws.base import Law
-from fenics_contact.parallel import agreed
+from fenics_contact.parallel import agreed, collective_errors
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.displacement import Displacement
@@ -58,6 +58,10 @@ def contact_pairs(
     Γc is the side whose facets are smaller on the mean; of sides as fine (to 1 %) that with fewer
     facets, of which no point looks past the other; or else that of the first body. A stiffness
     cannot be known here: where the softer body is to have Γc, say so by ``surface_on``.
+
+    Bodies are looked at once, undeformed; where they overlap from the start by more than half the
+    height of their cells no contact is found. Facets all of whose displacements are prescribed can have
+    no contact, and `ContactProblem` refuses them: leave them out by ``facet_tags`` and ``tags``.
 
     A facet that is near several bodies is part of several contacts: each of its points meets one
     body at a time, and is open in the other contacts.
@@ -122,7 +126,7 @@ def contact_pairs(
 
 
 def _check(
-    law: Any, distance: Any, bodies: Any, facet_tags: Any, tags: Any, options: dict[str, Any]
+    law: object, distance: Any, bodies: Any, facet_tags: Any, tags: Any, options: dict[str, Any]
 ) -> None:
     """Refuse what has no sense."""
     if not callable(law) or isinstance(law, type):
@@ -169,6 +173,12 @@ def _bodies(
         )
     known = sorted(set().union(*comm.allgather(np.unique(bodies.values).tolist())))
     number = np.full(n, -1, dtype=np.int64)
+    with collective_errors(comm):
+        if bodies.indices.max(initial=-1) >= n:
+            raise ValueError(
+                f"bodies has a tag on cell {bodies.indices.max()}, and the mesh of u has {n} on "
+                "this rank; give tags of its cells"
+            )
     number[bodies.indices] = np.searchsorted(known, bodies.values)
     n_without = comm.allreduce(int(np.count_nonzero(number[: cells.size_local] < 0)))
     if n_without:

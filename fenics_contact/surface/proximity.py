@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -74,11 +76,15 @@ class _Facets:
 
     def of(self, rows: Index | Mask) -> _Facets:
         """Some of them."""
-        return _Facets(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+        return self._each(lambda values: values[rows])
 
     def gathered(self, comm: MPI.Comm) -> _Facets:
         """Those of all ranks, in the order of the ranks. Collective."""
-        return _Facets(**{f.name: gather_rows(comm, getattr(self, f.name)) for f in fields(self)})
+        return self._each(lambda values: gather_rows(comm, values))
+
+    def _each(self, change: Callable[[Any], Any]) -> _Facets:
+        changed: dict[str, Any] = {f.name: change(getattr(self, f.name)) for f in fields(self)}
+        return _Facets(**changed)
 
     @property
     def middle(self) -> Array:
