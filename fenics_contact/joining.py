@@ -135,7 +135,9 @@ def join_meshes(parts: Mapping[Hashable, Part] | Iterable[Part]) -> Joined:
         given = list(parts)
         names = tuple(range(len(given)))
     else:
-        raise ValueError(f"parts is {parts!r}; give a list of bodies, or a dict by their names")
+        raise ValueError(
+            f"parts is a {type(parts).__name__}; give a list of bodies, or a dict by their names"
+        )
     if not given:
         raise ValueError("parts is empty; give one body at least")
     bodies = [_body(name, part) for name, part in zip(names, given, strict=True)]
@@ -171,8 +173,11 @@ def _body(name: Hashable, part: Any) -> Body:
     """
     values = [part] if isinstance(part, dolfinx.mesh.Mesh) else part
     if not (isinstance(values, Sequence) and 1 <= len(values) <= 3):
+        kinds = type(part).__name__
+        if isinstance(values, Sequence):
+            kinds += f" of ({', '.join(type(value).__name__ for value in values)})"
         raise ValueError(
-            f"body {name!r} is {part!r}; give its mesh, or (mesh, cell_tags, facet_tags)"
+            f"body {name!r} is a {kinds}; give its mesh, or (mesh, cell_tags, facet_tags)"
         )
     mesh, cell_tags, facet_tags = [*values, None, None][:3]
     check_instance(f"the mesh of body {name!r}", mesh, dolfinx.mesh.Mesh)

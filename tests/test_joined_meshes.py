@@ -256,9 +256,9 @@ def test_parts_that_are_none() -> None:
     far = dolfinx.mesh.meshtags(other, 1, last, np.ones(1, dtype=np.int32))
     for parts, words in (
         ([], ["empty"]),
-        (3, ["parts is 3"]),
-        ([None], ["body 0", "None", "facet_tags"]),
-        ([(mesh, None, sides, 1)], ["body 0", "facet_tags"]),
+        (3, ["parts is a int"]),
+        ([None], ["body 0 is a NoneType", "facet_tags"]),
+        ([(mesh, None, sides, 1)], ["tuple of (Mesh, NoneType, MeshTags, int)"]),
         ([(sides,)], ["mesh of body 0", "MeshTags"]),
         ([(mesh, sides)], ["cell_tags", "dimension 1", "dimension 2", "order"]),
         ([(mesh, None, 4)], ["facet_tags of body 0", "int"]),

@@ -60,8 +60,9 @@ def contact_pairs(
     cannot be known here: where the softer body is to have Γc, say so by ``surface_on``.
 
     Bodies are looked at once, undeformed; where they overlap from the start by more than half the
-    height of their cells no contact is found. Facets all of whose displacements are prescribed can have
-    no contact, and `ContactProblem` refuses them: leave them out by ``facet_tags`` and ``tags``.
+    height of their cells no contact is found. Facets all of whose displacements are prescribed can
+    have no contact, and `ContactProblem` refuses them: leave them out by ``facet_tags`` and
+    ``tags``.
 
     A facet that is near several bodies is part of several contacts: each of its points meets one
     body at a time, and is open in the other contacts.
@@ -135,8 +136,8 @@ def _check(
         raise ValueError(f"distance is {distance!r}; it must be a length greater than zero")
     if bodies is not None and not isinstance(bodies, Joined | dolfinx.mesh.MeshTags):
         raise ValueError(
-            f"bodies is {bodies!r}; give what join_meshes returned, tags of all cells, or nothing "
-            "for the connected parts of the mesh"
+            f"bodies is a {type(bodies).__name__}; give what join_meshes returned, tags of all "
+            "cells, or nothing for the connected parts of the mesh"
         )
     if (facet_tags is None) != (tags is None):
         raise ValueError("facet_tags and tags belong together; give both, or none for all facets")
