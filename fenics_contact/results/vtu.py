@@ -1,0 +1,172 @@
+"""Files of the Visualization Toolkit (VTK), which ParaView reads: grids, and series of them.
+
+A grid is an XML file of unstructured cells (``.vtu``), its arrays in base64; a series is a list of
+such files with their times (``.pvd``). Cells share no nodes, so that fields may jump between them.
+On the calling rank only.
+"""
+
+from __future__ import annotations
+
+import base64
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import numpy.typing as npt
+
+from fenics_contact.types import Array
+
+__all__ = ["CELLS", "Cell", "Grid", "read_series", "write_grid", "write_series"]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A kind of cell as VTK has it.
+
+    Attributes:
+        number: VTK's, of cells of degree 1 and 2.
+        corners: The corners in VTK's order, by the numbers of Basix.
+        middles: Of every node that degree 2 has beyond the corners, the corners (by VTK's numbers)
+            in the middle of which it is.
+    """
+
+    number: tuple[int, int]
+    corners: tuple[int, ...]
+    middles: tuple[tuple[int, ...], ...]
+
+    def nodes(self, corners: Array, degree: int) -> Array:
+        """Places of the nodes in VTK's order, (n_nodes, d).
+
+        Args:
+            corners: Places of the corners in the order of Basix.
+            degree: 1 or 2.
+        """
+        at = corners[list(self.corners)]
+        if degree == 1:
+            return at
+        return np.vstack([at, *(at[list(some)].mean(axis=0) for some in self.middles)])
+
+
+_SQUARE = ((0, 1), (1, 2), (2, 3), (3, 0))
+_CUBE = (
+    *(*_SQUARE, (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)),
+    *((0, 3, 4, 7), (1, 2, 5, 6), (0, 1, 4, 5), (2, 3, 6, 7), (0, 1, 2, 3), (4, 5, 6, 7)),
+    tuple(range(8)),
+)
+# By DOLFINx's names. The orders are those of the VTK file formats.
+CELLS = {
+    "point": Cell((1, 1), (0,), ()),
+    "interval": Cell((3, 21), (0, 1), ((0, 1),)),
+    "triangle": Cell((5, 22), (0, 1, 2), ((0, 1), (1, 2), (2, 0))),
+    "quadrilateral": Cell((9, 28), (0, 1, 3, 2), (*_SQUARE, (0, 1, 2, 3))),
+    "tetrahedron": Cell((10, 24), (0, 1, 2, 3), ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))),
+    "hexahedron": Cell((12, 29), (0, 1, 3, 2, 4, 5, 7, 6), _CUBE),
+}
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Cells of one kind, each with nodes of its own.
+
+    Attributes:
+        kind: VTK's number of the kind.
+        points: Places of the nodes, (n_cells, n_nodes, d).
+        at_nodes: Fields at the nodes by name, (n_cells, n_nodes, …).
+        in_cells: Fields in the cells by name, (n_cells, …).
+        numbers: Of the whole, by name.
+    """
+
+    kind: int
+    points: Array
+    at_nodes: Mapping[str, npt.NDArray[np.generic]] = field(default_factory=dict)
+    in_cells: Mapping[str, npt.NDArray[np.generic]] = field(default_factory=dict)
+    numbers: Mapping[str, float] = field(default_factory=dict)
+
+
+def write_grid(path: Path, grid: Grid) -> None:
+    """Write a ``.vtu`` file. Vectors and tensors in the plane get the rows they lack, zero.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    n_cells, n_nodes = grid.points.shape[:2]
+    n = n_cells * n_nodes
+    topology = {
+        "connectivity": np.arange(n, dtype=np.int64),
+        "offsets": np.arange(1, n_cells + 1, dtype=np.int64) * n_nodes,
+        "types": np.full(n_cells, grid.kind, dtype=np.uint8),
+    }
+    at_nodes = {name: _rows(values, 2) for name, values in grid.at_nodes.items()}
+    in_cells = {name: _rows(values, 1) for name, values in grid.in_cells.items()}
+    with open(path, "w", encoding="ascii", errors="xmlcharrefreplace") as file:
+        file.write('<?xml version="1.0"?>\n<VTKFile type="UnstructuredGrid" version="1.0" ')
+        file.write('byte_order="LittleEndian" header_type="UInt64">\n<UnstructuredGrid>\n')
+        file.write("<FieldData>\n")
+        for name, number in grid.numbers.items():
+            file.write(_array(name, np.array([number]), ' NumberOfTuples="1"'))
+        file.write("</FieldData>\n")
+        file.write(f'<Piece NumberOfPoints="{n}" NumberOfCells="{n_cells}">\n')
+        for section, arrays in (
+            ("Points", {"points": _rows(grid.points, 2)}),
+            ("Cells", topology),
+            ("PointData", at_nodes),
+            ("CellData", in_cells),
+        ):
+            file.write(f"<{section}>\n")
+            for name, values in arrays.items():
+                file.write(_array(name, values))
+            file.write(f"</{section}>\n")
+        file.write("</Piece>\n</UnstructuredGrid>\n</VTKFile>\n")
+
+
+def write_series(path: Path, states: list[tuple[float, str]]) -> None:
+    """Write a ``.pvd`` file: the times, and the names of the files beside it.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    lines = [
+        f'<DataSet timestep="{time!r}" part="0" file={quoteattr(name)}/>' for time, name in states
+    ]
+    head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>'
+    path.write_text("\n".join([head, *lines, "</Collection>\n</VTKFile>\n"]), encoding="utf-8")
+
+
+def read_series(path: Path) -> list[tuple[float, str]]:
+    """Times and names of files of a ``.pvd`` file; none if it is not there.
+
+    Raises:
+        ValueError: It is none of `write_series`.
+        OSError: It cannot be read.
+    """
+    if not path.exists():
+        return []
+    try:
+        sets = ElementTree.parse(path).getroot().iter("DataSet")
+        return [(float(each.attrib["timestep"]), each.attrib["file"]) for each in sets]
+    except (ElementTree.ParseError, KeyError, ValueError):
+        raise ValueError(
+            f"{path} is no series of this package, or is damaged; remove it to begin a new one"
+        ) from None
+
+
+def _rows(values: npt.NDArray[np.generic], axes: int) -> npt.NDArray[np.generic]:
+    """Fields as rows of 1, 3 or 9 numbers; the first axes count the rows."""
+    values = np.reshape(values, (-1, *values.shape[axes:]))
+    missing = [(0, 0)] + [(0, 3 - size) for size in values.shape[1:]]
+    return np.pad(values, missing).reshape(len(values), 3 ** (values.ndim - 1))
+
+
+def _array(name: str, values: npt.NDArray[np.generic], more: str = "") -> str:
+    """One array as XML: its length in bytes and its bytes, in base64."""
+    values = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
+    kind = {"f": "Float", "i": "Int", "u": "UInt"}[values.dtype.kind] + str(8 * values.itemsize)
+    size = values.shape[1] if values.ndim > 1 else 1
+    data = np.uint64(values.nbytes).astype("<u8").tobytes() + values.tobytes()
+    return (
+        f'<DataArray type="{kind}" Name={quoteattr(name)} NumberOfComponents="{size}"{more} '
+        f'format="binary">{base64.b64encode(data).decode()}</DataArray>\n'
+    )

@@ -1,0 +1,336 @@
+"""Time series for ParaView: the body, Γc, and the quadrature points of Γc."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import basix
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.values import Status
+from fenics_contact.parallel import collective_errors
+from fenics_contact.problem import ContactProblem, Step
+from fenics_contact.results import files, vtu
+from fenics_contact.surface.facets import FacetSet
+from fenics_contact.types import Array
+
+__all__ = ["Writer", "facet_values"]
+
+# Directions in which the points of a facet reach less far than this, by the farthest, are none.
+_FLAT = 1e-6
+
+
+class Writer:
+    """Results of a problem as time series for ParaView, one state a call of `write`.
+
+    In a folder there are, for all ranks together,
+
+    - ``body.pvd``: displacement and, if given, stress and von_mises;
+    - ``CONTACT.pvd`` for every contact, by its name: Γc, whose facets have what `facet_values`
+      makes of the values at their points; the status is that of most of them;
+    - ``CONTACT_points.pvd``: the quadrature points of Γc, with the values themselves.
+
+    Both of a contact have displacement, pressure, tangential_traction (on the body), gap, slip
+    (accumulated and committed, the sum of the modes), status (`Status`), normal (from body to
+    support); with finite kinematics true_pressure, per deformed area, the others being nominal; and
+    if the support is deformable paired, the share of points with an opposite. Where nothing is
+    opposite the gap is NaN. All are on the undeformed body: "Warp By Vector" with the displacement
+    moves body, Γc and points alike.
+
+    Every file is complete or as before, whenever writing ends, and nothing has to be closed.
+    """
+
+    def __init__(
+        self, folder: str | os.PathLike[str], problem: ContactProblem, *, stress: Any = None
+    ) -> None:
+        """Make the folder, and read what series it has. Collective.
+
+        Args:
+            folder: Where to. A series that is there is gone on with: see `write`.
+            problem: Whose results.
+            stress: UFL tensor (d, d) or (3, 3) on the body. It is interpolated one degree below the
+                displacement, from points inside the cells. The von Mises stress comes with (3, 3)
+                alone: without the stress across a plane body it is not known.
+
+        Raises:
+            ValueError: The stress has another shape, a contact's name is none of a file, or there
+                is a series that cannot be read. On all ranks.
+            OSError: The folder cannot be made or written to. On all ranks.
+        """
+        check_instance("problem", problem, ContactProblem)
+        self.folder, self._problem = Path(folder), problem
+        self._mesh = problem.u.function_space.mesh
+        self._comm = self._mesh.comm
+        self._body = _Body(problem, stress)
+        self._surfaces = [_Surface(contact) for contact in problem.contacts]
+        names = [series for s in self._surfaces for series in s.series]
+        for name in names:
+            if not re.fullmatch(r"[\w. +-]+", name) or [*names, "body"].count(name) > 1:
+                raise ValueError(
+                    f"a contact's files would be called {name}.pvd: no name of a file, or one that "
+                    "another series has; give the contact another name, Contact(name=...)"
+                )
+        self._series: dict[str, list[tuple[float, str]]] = {}
+        with collective_errors(self._comm):
+            if self._comm.rank == 0:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                for name in ("body", *names):
+                    self._series[name] = vtu.read_series(self._path(name))
+                tempfile.TemporaryFile(dir=self.folder).close()  # whether it can be written to
+        self._last = -np.inf
+
+    def write(self, state: Step | float) -> None:
+        """Add the present state to the series. Collective.
+
+        States that the folder has of this time and of later ones are replaced, the earlier ones
+        stay: a history that goes on from a checkpoint goes on with its series, on any number of
+        ranks, and one that starts anew replaces them. If u is behind it is completed first
+        (`ContactProblem.complete`).
+
+        Args:
+            state: The step that was made: its time is the number of the increment, which rises
+                where the load returns, and the load is the number "load" of the file. Or a time.
+
+        Raises:
+            ValueError: It is neither, or a time that is not later than the last one written.
+            OSError: A file cannot be written; what was written before is as it was. On all ranks.
+        """
+        numbers = {}
+        if isinstance(state, Step):
+            time = float(state.increment)
+            if state.load is not None:
+                numbers["load"] = float(state.load)
+        elif is_number(state) and np.isfinite(state):
+            time = float(state)
+        else:
+            raise ValueError(f"state is {state!r}; it must be a Step, or a time (a finite number)")
+        if not time > self._last:
+            raise ValueError(
+                f"the time is {time:g}, and the last one written is {self._last:g}; times must "
+                "rise: give the step, or a number of your own that does"
+            )
+        self._problem.complete()
+        grids = {"body": self._body.grid()}
+        for surface in self._surfaces:
+            grids |= dict(zip(surface.series, surface.grids(), strict=True))
+        # The ranks' cells one after another, on the first rank.
+        whole = {name: _gathered(self._comm, grid) for name, grid in grids.items()}
+        with collective_errors(self._comm):
+            if self._comm.rank == 0:
+                self._put(time, {name: replace(g, numbers=numbers) for name, g in whole.items()})
+        self._last = time
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}.pvd"
+
+    def _put(self, time: float, grids: dict[str, vtu.Grid]) -> None:
+        """Write the grids, and the lists that name them. On the first rank."""
+        states, dropped = {}, []
+        with contextlib.ExitStack() as stack:  # in place when all are written, the lists at last
+            for name in grids:
+                kept = [state for state in self._series[name] if state[0] < time]
+                states[name] = [*kept, (time, f"{name}_{len(kept):04d}.vtu")]
+                dropped += [file for _, file in self._series[name][len(kept) + 1 :]]
+                vtu.write_series(
+                    stack.enter_context(files.replacing(self._path(name))), states[name]
+                )
+            for name, grid in grids.items():
+                path = self.folder / states[name][-1][1]
+                vtu.write_grid(stack.enter_context(files.replacing(path)), grid)
+        self._series = states
+        for file in dropped:
+            (self.folder / Path(file).name).unlink(missing_ok=True)
+
+
+class _Body:
+    """The cells of the body and what is written of them."""
+
+    def __init__(self, problem: ContactProblem, stress: Any) -> None:
+        """Compile. Collective."""
+        self._displacement = problem.displacement
+        self._mesh = mesh = problem.u.function_space.mesh
+        d, name = mesh.geometry.dim, mesh.topology.cell_name()
+        kind, degree = basix.CellType[name], problem.displacement.degree
+        order = min(degree, 2)
+        self._number = vtu.CELLS[name].number[order - 1]
+        nodes = vtu.CELLS[name].nodes(basix.geometry(kind), order)
+        places = ufl.SpatialCoordinate(mesh), problem.displacement.expression
+        parts = [e[i] for e in places for i in range(d)]
+        self._n_nodes, self._places = len(nodes), fem.Expression(ufl.as_vector(parts), nodes)
+        self._stress: fem.Expression | None = None
+        if stress is None:
+            return
+        stress = ufl.as_ufl(stress)
+        if stress.ufl_shape not in ((d, d), (3, 3)):
+            raise ValueError(
+                f"stress has shape {stress.ufl_shape}; it must be ({d}, {d}) or (3, 3)"
+            )
+        # Points inside the cells: on an axis, or at a tip, the stress may have no value.
+        inside = basix.create_element(
+            basix.ElementFamily.P,
+            kind,
+            degree - 1,
+            basix.LagrangeVariant.gl_isaac,
+            discontinuous=True,
+        )
+        self._shape = stress.ufl_shape
+        self._basis = inside.tabulate(0, nodes)[0, :, :, 0]
+        self._stress = fem.Expression(stress, inside.points)
+
+    def grid(self) -> vtu.Grid:
+        """The cells of this rank as they are now."""
+        mesh, d = self._mesh, self._mesh.geometry.dim
+        cells = np.arange(mesh.topology.index_map(mesh.topology.dim).size_local, dtype=np.int32)
+        places = self._places.eval(mesh, cells).reshape(len(cells), self._n_nodes, 2 * d)
+        fields = {"displacement": places[:, :, d:]}
+        if self._stress is not None:
+            inside = self._stress.eval(mesh, cells).reshape(
+                len(cells), self._basis.shape[1], *self._shape
+            )
+            stress = np.einsum("np,cpij->cnij", self._basis, inside)
+            fields["stress"] = stress
+            if self._shape == (3, 3):
+                mean = np.trace(stress, axis1=2, axis2=3)[:, :, None, None] / 3
+                deviator = stress - mean * np.eye(3)
+                fields["von_mises"] = np.sqrt(1.5 * np.sum(deviator**2, axis=(2, 3)))
+        return vtu.Grid(self._number, places[:, :, :d], fields)
+
+
+class _Surface:
+    """Γc of a contact and what is written of it.
+
+    Attributes:
+        series: Names of its two series.
+    """
+
+    def __init__(self, contact: Contact) -> None:
+        """Find the nodes of the facets, and compile. Collective."""
+        self.series = (contact.name, f"{contact.name}_points")
+        self._contact = contact
+        surface, displacement = contact.surface, contact.displacement
+        self._u = displacement.u
+        facets = FacetSet(self._u.function_space, surface.facets)
+        name = surface.submesh.topology.cell_name()
+        order = min(displacement.degree, 2)
+        self._number = vtu.CELLS[name].number[order - 1]
+        nodes = vtu.CELLS[name].nodes(basix.geometry(basix.CellType[name]), order)
+        every = np.arange(len(surface.facets))
+        self._facets, self._shape = facets, (len(every), len(nodes), surface.mesh.geometry.dim)
+        self._where = np.repeat(every, len(nodes)), np.tile(nodes, (len(every), 1))
+        self._rows = contact.quadrature.point_rows()
+
+    def grids(self) -> tuple[vtu.Grid, vtu.Grid]:
+        """This rank's facets and points as they are now. Collective."""
+        contact, rows = self._contact, self._rows
+        contact.displacement.follow()
+        places, _ = self._facets.positions(*self._where)
+        moved, _ = self._facets.positions(*self._where, self._u)
+        nodes = places.reshape(self._shape)
+        at_points = self._values()
+        measure = contact.quadrature.weights[rows]
+        at_nodes = {
+            name: facet_values(contact.points[rows], measure, values[rows], nodes)
+            for name, values in at_points.items()
+        }
+        at_nodes = {"displacement": (moved - places).reshape(self._shape)} | at_nodes
+        status = contact.status
+        counts = np.stack([np.sum(status[rows] == s, axis=1) for s in Status])
+        in_facets = {"status": counts.argmax(axis=0).astype(np.int8)}
+        at_points = {"displacement": contact.own_displacement()} | at_points | {"status": status}
+        if not contact.rigid:
+            in_facets["paired"] = np.mean(contact.paired[rows], axis=1)
+            at_points["paired"] = contact.paired.astype(np.float64)
+        order = np.ravel(rows)  # facet by facet, whatever the ranks
+        points = {name: values[order][:, None] for name, values in at_points.items()}
+        return (
+            vtu.Grid(self._number, nodes, at_nodes, in_facets),
+            vtu.Grid(vtu.CELLS["point"].number[0], contact.points[order][:, None], points),
+        )
+
+    def _values(self) -> dict[str, Array]:
+        """What is known at the points, by name. Collective."""
+        contact = self._contact
+        found = {"pressure": contact.pressure + 0.0}  # no -0
+        if contact.finite:
+            found["true_pressure"] = contact.pressure / contact.area_stretch()
+        return found | {
+            "tangential_traction": contact.tangential_traction,
+            "gap": contact.gap,
+            "slip": contact.slip.sum(axis=1),
+            "normal": contact.values.normal,
+        }
+
+
+def facet_values(points: Array, measure: Array, values: Array, nodes: Array) -> Array:
+    """Values at nodes of facets from those at points in them, within what the points have.
+
+    On every facet the linear function that fits the values at its points best, flattened about
+    their mean until none of its nodes is above the largest or below the smallest of them: no
+    pressure where none of the points has any, no pull where none pulls, and the mean, with it the
+    force, is that of the points. Where some of the values are NaN it is the mean of the others.
+
+    Args:
+        points: Places, (n_facets, n_points, d).
+        measure: Area that each stands for, (n_facets, n_points).
+        values: At the points, (n_facets, n_points) or (n_facets, n_points, k).
+        nodes: Places, (n_facets, n_nodes, d).
+
+    Returns:
+        (n_facets, n_nodes) or (n_facets, n_nodes, k).
+    """
+    shape = (*nodes.shape[:2], *values.shape[2:])
+    values = values.reshape(*values.shape[:2], int(np.prod(values.shape[2:])))
+    known = np.isfinite(values).all(axis=2)
+    share = np.where(known, measure, 0.0)
+    total = share.sum(axis=1, keepdims=True)
+    share = np.divide(share, total, out=np.full_like(share, np.nan), where=total > 0)
+    filled = np.where(known[:, :, None], values, 0.0)
+    mean = np.einsum("fp,fpk->fk", share, filled)[:, None]
+    share = np.nan_to_num(share)
+    middle = np.einsum("fp,fpd->fd", share, points)[:, None]
+    root = np.sqrt(share)[:, :, None]
+    # Along the facet alone: its points, and those of a curved one nearly, are in a plane.
+    _, size, ways = np.linalg.svd(root * (points - middle), full_matrices=False)
+    size, ways = size[:, : points.shape[2] - 1], ways[:, : points.shape[2] - 1]
+    used = (size > _FLAT * size[:, :1].clip(min=1e-300)) & known.all(axis=1)[:, None]
+    inverse = np.divide(1.0, size**2, out=np.zeros_like(size), where=used)
+    along = np.einsum("fpd,fwd->fpw", points - middle, ways)
+    slope = np.einsum("fw,fpw,fp,fpk->fwk", inverse, along, share, filled)
+    change = np.einsum("fnd,fwd,fwk->fnk", nodes - middle, ways, slope)
+    # How much of the change the range of the points allows, by facet and component.
+    low, high = filled.min(axis=1, keepdims=True), filled.max(axis=1, keepdims=True)
+    with np.errstate(over="ignore"):  # of changes next to nothing
+        room = np.where(change > 0, high - mean, low - mean)
+        room = np.divide(room, change, out=np.ones_like(change), where=np.abs(change) > 0)
+    allowed = np.clip(room.min(axis=1, keepdims=True), 0.0, 1.0)
+    fitted = mean + allowed * change
+    whole = known.all(axis=1)
+    fitted[whole] = np.clip(fitted[whole], low[whole], high[whole])  # to the last digit
+    return fitted.reshape(shape)
+
+
+def _gathered(comm: MPI.Comm, grid: vtu.Grid) -> vtu.Grid:
+    """The cells of all ranks, one after another, on the first one; else this rank's. Collective."""
+
+    def whole(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        parts = comm.gather(values)
+        return values if parts is None else np.concatenate(parts)
+
+    return replace(
+        grid,
+        points=whole(grid.points),
+        at_nodes={name: whole(values) for name, values in grid.at_nodes.items()},
+        in_cells={name: whole(values) for name, values in grid.in_cells.items()},
+    )

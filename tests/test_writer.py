@@ -1,0 +1,383 @@
+"""Files for ParaView, read back by their format (`scenes.vtu`), against fields known otherwise.
+
+References: polynomials that the elements contain, met to round-off (1e-10 of the largest value),
+and the contact's own values at its points, which are written as they are.
+"""
+
+import os
+
+import numpy as np
+import pytest
+import ufl
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.results.writer import facet_values
+from scenes import vtu
+from scenes.blocks import CELLS, GRID, dimension, polynomial
+from scenes.comparing import close, raised_everywhere, shared_folder
+from scenes.elasticity import stress
+from scenes.histories import Press
+from scenes.rubber import Tool
+from scenes.rubbing import Rub
+
+COMM = MPI.COMM_WORLD
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+
+# Where VTK's own classes of cells say that their nodes are, in reference coordinates.
+NODES = {
+    21: "000 200 100",
+    22: "000 200 020 100 110 010",
+    28: "000 200 220 020 100 210 120 010 110",
+    24: "000 200 020 002 100 110 010 001 101 011",
+    29: "000 200 220 020 002 202 222 022 100 210 120 010 102 212 122 012 001 201 221 021 "
+    "011 211 101 121 110 112 111",
+}
+LINEAR = {3: 21, 5: 22, 9: 28, 10: 24, 12: 29}
+VTK = {"triangle": (5, 3), "quadrilateral": (9, 3), "tetrahedron": (10, 5), "hexahedron": (12, 9)}
+# Volume of a reference cell by that of the box its edges span.
+PART = {3: 1, 5: 1 / 2, 9: 1, 10: 1 / 6, 12: 1}
+
+
+def reference(kind):
+    """Reference coordinates of the nodes of a kind of cell."""
+    places = NODES[LINEAR.get(kind, kind)].split()
+    places = np.array([[int(c) / 2 for c in place] for place in places])
+    return places[np.all(places % 1 == 0, axis=1)] if kind in LINEAR else places
+
+
+def linear_kind(kind):
+    return {second: first for first, second in LINEAR.items()}.get(kind, kind)
+
+
+def content(grid):
+    """Sum of the cells' lengths, areas or volumes, by their corners."""
+    kind = linear_kind(grid.kind)
+    corners = len(reference(kind))
+    x = grid.x[:, :corners]
+    d = {3: 1, 5: 2, 9: 2, 10: 3, 12: 3}[kind]
+    at = reference(kind)
+    points = np.array([[0.5 - 0.5 / 3**0.5], [0.5 + 0.5 / 3**0.5]])
+    if kind in (5, 10):
+        rule = np.full((1, d), 1 / (d + 1))
+    else:
+        rule = np.stack(np.meshgrid(*[points[:, 0]] * d), axis=-1).reshape(-1, d)
+    total = 0.0
+    for place in rule:
+        if kind in (5, 10):
+            slopes = np.vstack([-np.ones(d), np.eye(d)])
+        else:
+            factors = np.where(at[:, :d] > 0, place, 1 - place)
+            signs = np.where(at[:, :d] > 0, 1.0, -1.0)
+            slopes = np.stack(
+                [signs[:, i] * np.delete(factors, i, axis=1).prod(axis=1) for i in range(d)], axis=1
+            )
+        jacobian = np.einsum("cni,nj->cij", x, slopes)
+        gram = np.einsum("cij,cik->cjk", jacobian, jacobian)
+        total += np.sqrt(np.linalg.det(gram)).sum() * PART[kind] / len(rule)
+    return total
+
+
+def in_plane(values, d):
+    return values[..., :d]
+
+
+@pytest.mark.parametrize("cell,degree", GRID)
+def test_cells_nodes_and_fields(cell, degree, tmp_path):
+    """Cells turned at random, on any number of ranks: all of the body and of Γc, once each."""
+    folder, d = shared_folder(tmp_path), dimension(cell)
+    made = Rub(cell=cell, degree=degree, mesh={"n": 2, "shuffled": True})
+    field = polynomial(d, degree, 3, 0.1)
+    made.scene.u.interpolate(field)
+    tensor = stress(made.scene.u, made.scene.E, made.scene.nu)
+    fc.Writer(folder, made.problem, stress=tensor).write(0.5)
+    assert vtu.series(folder / "body.pvd") == [(0.5, "body_0000.vtu")]
+
+    body = vtu.read(folder / "body_0000.vtu")
+    surface = vtu.read(folder / "contact_0000.vtu")
+    kinds = VTK[cell] if degree == 1 else tuple(LINEAR[kind] for kind in VTK[cell])
+    assert (body.kind, surface.kind) == kinds
+    assert abs(content(body) - 1) <= 1e-12 and abs(content(surface) - 1) <= 1e-12
+    assert np.abs(surface.x[..., d - 1]).max() <= 1e-15
+    for grid in (body, surface):
+        # Nodes lie where the reference coordinates say, by the corners' own interpolation.
+        at, corners = reference(grid.kind), reference(linear_kind(grid.kind))
+        if linear_kind(grid.kind) in (5, 10):
+            weights = np.column_stack([1 - at.sum(axis=1), at[:, : corners.shape[1]]])
+            weights = weights[:, : len(corners)]
+        else:
+            weights = np.where(corners > 0, at[:, None], 1 - at[:, None]).prod(axis=2)
+        places = np.einsum("nk,cki->cni", weights, grid.x[:, : len(corners)])
+        assert close(grid.x, places, 1e-14)
+        exact = field(grid.x.reshape(-1, 3).T).T.reshape(*grid.x.shape[:2], d)
+        assert close(in_plane(grid.at_nodes["displacement"], d), exact, 1e-12)
+        assert np.all(grid.at_nodes["displacement"][..., d:] == 0)
+
+    step = 1e-3  # central differences are exact for polynomials of degree 2
+    x = body.x.reshape(-1, 3)[:, :d].T
+    gradient = np.stack(
+        [
+            (field(x + step * e[:, None]) - field(x - step * e[:, None])) / 2 / step
+            for e in np.eye(d)
+        ]
+    ).transpose(2, 1, 0)
+    E, nu = 1000.0, 0.3
+    strain = (gradient + gradient.transpose(0, 2, 1)) / 2
+    trace = np.trace(strain, axis1=1, axis2=2)[:, None, None] * np.eye(d)
+    exact = E / (1 + nu) * (strain + nu / (1 - 2 * nu) * trace)
+    written = body.at_nodes["stress"].reshape(-1, 3, 3)
+    assert close(written[:, :d, :d], exact, 1e-10)
+    assert ("von_mises" in body.at_nodes) == (d == 3)
+    if d == 3:
+        s = exact - np.trace(exact, axis1=1, axis2=2)[:, None, None] * np.eye(3) / 3
+        mises = np.sqrt(1.5 * np.einsum("nij,nij->n", s, s))
+        assert close(body.at_nodes["von_mises"].ravel(), mises, 1e-10)
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_values_of_the_points(cell, tmp_path):
+    """At the points what the contact has; in facets nothing beyond their points, and the force."""
+    folder, d = shared_folder(tmp_path), dimension(cell)
+    made = Rub(cell=cell, degree=2, mesh={"n": 3})
+    made.problem.kinematics = np.inf
+    writer = fc.Writer(folder, made.problem)
+    for step in fc.increments(made.problem, made.load, 0, 2, steps=2):
+        writer.write(step)
+    contact = made.contact
+    expected = contact.gather()
+    points = vtu.read(folder / "contact_points_0001.vtu")
+    assert points.kind == 1 and points.numbers == {"load": 2.0}
+    x = points.x[:, 0]
+    order = np.lexsort(np.round(x[:, :d], 9).T[::-1])
+    assert close(x[order][:, :d], expected["x"], 1e-12)
+    found = {name: values[order, 0] for name, values in points.at_nodes.items()}
+    for name in ("pressure", "gap", "slip", "status"):
+        assert np.array_equal(found[name], expected[name]), name
+    for name in ("normal", "tangential_traction"):
+        assert np.array_equal(found[name][:, :d], expected[name]), name
+    shown = np.unique(found["status"]).tolist()
+    assert fc.Status.OPEN in shown and fc.Status.SLIP in shown
+
+    facets = vtu.read(folder / "contact_0001.vtu")
+    pressure = facets.at_nodes["pressure"]
+    assert pressure.min() == 0.0 and pressure.max() <= expected["pressure"].max()
+    # The force of linear fields: their mean by the corners, on equal facets.
+    corners = {3: 2, 5: 3, 9: 4}[linear_kind(facets.kind)]
+    force = pressure[:, :corners].mean(axis=1).sum() / len(pressure)
+    assert close(force, step.contacts["contact"].normal_force, 1e-10)
+    per_facet = len(points.x) // len(facets.x)
+    by_facet = points.at_nodes["status"][:, 0].reshape(-1, per_facet)
+    most = [np.bincount(row, minlength=3).argmax() for row in by_facet]
+    assert np.array_equal(facets.in_cells["status"], most)
+    # Facets and points are in the same order, and move alike.
+    middle = points.x[:, 0].reshape(-1, per_facet, 3).mean(axis=1)
+    assert close(facets.x[:, :corners].mean(axis=1), middle, 1e-12)
+    moved = points.at_nodes["displacement"][:, 0]
+    mine = contact.own_displacement()
+    comm = contact.surface.mesh.comm
+    mine = np.concatenate(comm.allgather(np.column_stack([contact.points, mine])))
+    mine = mine[np.lexsort(np.round(mine[:, :d], 9).T[::-1])][:, d:]
+    assert close(moved[order][:, :d], mine, 1e-12)
+
+
+def test_facets_stay_within_their_points():
+    """What is linear is kept between the points; beyond, nothing leaves their range."""
+    rng = np.random.default_rng(1)
+    gauss = 0.5 + 0.5 * np.array([-(0.6**0.5), 0.0, 0.6**0.5])
+    weights = np.array([5, 8, 5]) / 18
+    points = np.column_stack([gauss, 2 * gauss])[None].repeat(200, axis=0)
+    measure = np.tile(weights, (200, 1))
+    ends = np.array([[0.0, 0.0], [1.0, 2.0]])[None].repeat(200, axis=0)
+    values = rng.uniform(-1, 1, (200, 3, 2)) ** 3
+    values[0] = [[0.0, 1], [0.0, 2], [1000.0, 3]]
+    found = facet_values(points, measure, values, ends)
+    assert np.all(found >= values.min(axis=1, keepdims=True))
+    assert np.all(found <= values.max(axis=1, keepdims=True))
+    assert close(found.mean(axis=1), np.einsum("p,fpk->fk", weights, values), 1e-13)
+    assert found[0, 0, 0] == 0.0  # a fit alone has -368 here
+    assert close(found[0, :, 1], [1.0, 3.0], 1e-13)  # rises on all the way
+    # At the points themselves what is linear is met.
+    line = 3 - 2 * points[:, :, 0] + points[:, :, 1] ** 0
+    assert close(facet_values(points, measure, line, points), line, 1e-13)
+    # One point tells a constant; points without a value do not count.
+    one = facet_values(points[:1, :1], measure[:1, :1], np.array([[7.0]]), ends[:1])
+    assert one.tolist() == [[7.0, 7.0]]
+    holes = np.array([[np.nan, 2.0, 4.0], [np.nan] * 3])
+    found = facet_values(points[:2], measure[:2], holes, ends[:2])
+    assert found[0] == pytest.approx((8 * 2 + 5 * 4) / 13) and np.isnan(found[1]).all()
+    assert facet_values(points[:0], measure[:0], values[:0], ends[:0]).shape == (0, 2, 2)
+
+
+def files(folder):
+    COMM.barrier()
+    found = {name: (folder / name).read_bytes() for name in sorted(os.listdir(folder))}
+    COMM.barrier()
+    return found
+
+
+def written(folder, name="floor"):
+    """Times, loads and largest pressures of a series."""
+    states = [(time, vtu.read(folder / file)) for time, file in vtu.series(folder / f"{name}.pvd")]
+    return [(t, grid.numbers["load"], grid.at_nodes["pressure"].max()) for t, grid in states]
+
+
+def test_a_history_that_is_resumed(tmp_path):
+    """Its series goes on: nothing twice, nothing lost, earlier files as they were."""
+    folder = shared_folder(tmp_path)
+    whole, made = Press(), Press()
+    writer = fc.Writer(folder / "whole", whole.problem)
+    for step in whole.increments(4.0):  # there and back: loads come twice, increments do not
+        writer.write(step)
+    writer = fc.Writer(folder / "parts", made.problem)
+    for step in made.increments(4.0, checkpoint=folder / "state.npz", checkpoint_every=2):
+        writer.write(step)
+        if step.increment == 5:  # beyond the checkpoint, which is of 4
+            break
+    before = files(folder / "parts")
+    again = Press()
+    writer = fc.Writer(folder / "parts", again.problem)
+    assert files(folder / "parts") == before
+    for step in again.increments(4.0, checkpoint=folder / "state.npz"):
+        if step.increment == 5:
+            assert [time for time, *_ in written(folder / "parts")] == [1, 2, 3, 4, 5]
+        writer.write(step)
+    after, expected = written(folder / "parts"), written(folder / "whole")
+    assert [row[:2] for row in after] == [row[:2] for row in expected]
+    assert [row[0] for row in after] == [*range(1, 9)]
+    assert close([row[2] for row in after], [row[2] for row in expected], whole.tolerance)
+    kept = [n for n in before if n.endswith(".vtu") and int(n[-8:-4]) < 4]
+    assert len(kept) == 12
+    now = files(folder / "parts")
+    assert all(now[name] == before[name] for name in kept)
+
+    # Anew: the first state of it takes the place of all.
+    fresh = Press()
+    writer = fc.Writer(folder / "parts", fresh.problem)
+    writer.write(next(iter(fresh.increments(4.0))))
+    names = sorted(
+        f"{n}{end}" for n in ("body", "floor", "floor_points") for end in (".pvd", "_0000.vtu")
+    )
+    assert sorted(files(folder / "parts")) == names
+
+
+def test_wrong_input(tmp_path):
+    """Errors on all ranks that say what to do; nothing is written."""
+    folder = shared_folder(tmp_path)
+    made = Rub()
+    (folder / "file").touch()
+    COMM.barrier()
+    error = (OSError, NotADirectoryError)
+    raised_everywhere(lambda: fc.Writer(folder / "file" / "in", made.problem), error, "file")
+    raised_everywhere(lambda: fc.Writer(folder, made.contact), ValueError, "ContactProblem")
+    vector = made.scene.u
+    raised_everywhere(
+        lambda: fc.Writer(folder, made.problem, stress=vector), ValueError, "(2,)", "(3, 3)"
+    )
+    odd = Rub(contact={"name": "a/b"})
+    raised_everywhere(lambda: fc.Writer(folder, odd.problem), ValueError, "a/b", "name")
+    odd = Rub(contact={"name": "body"})
+    raised_everywhere(lambda: fc.Writer(folder, odd.problem), ValueError, "body.pvd")
+    assert sorted(files(folder)) == ["file"]
+    writer = fc.Writer(folder, made.problem)
+    for state in (None, "1", float("nan"), True):
+        raised_everywhere(lambda state=state: writer.write(state), ValueError, "time")
+    writer.write(1)
+    raised_everywhere(lambda: writer.write(1.0), ValueError, "must rise")
+    if COMM.rank == 0:
+        (folder / "contact.pvd").write_text("<broken")
+    COMM.barrier()
+    raised_everywhere(lambda: fc.Writer(folder, made.problem), ValueError, "contact.pvd", "remove")
+
+
+def test_a_write_that_fails(tmp_path, monkeypatch):
+    """The series is as before, and goes on when there is room again."""
+    folder = shared_folder(tmp_path)
+    made = Rub()
+    writer = fc.Writer(folder, made.problem)
+    writer.write(1)
+    before = files(folder)
+    replace, calls = os.replace, []
+
+    def full(*names):
+        raise OSError("no space left")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", full)
+        raised_everywhere(lambda: writer.write(2), OSError, "no space left")
+    assert files(folder) == before and not calls and os.replace is replace
+    writer.write(2)
+    assert [time for time, _ in vtu.series(folder / "contact.pvd")] == [1, 2]
+    assert {**files(folder), **{n: before[n] for n in before if ".vtu" in n}} == files(folder)
+
+
+def test_a_field_that_is_behind(tmp_path):
+    """It is completed first: the body in the file is that of the increment."""
+    folder = shared_folder(tmp_path)
+    grids = []
+    for name, field in (("every", "every"), ("last", "last")):
+        made = Rub(condensation=True)
+        made.problem.kinematics = np.inf
+        writer = fc.Writer(folder / name, made.problem)
+        for step in fc.increments(made.problem, made.load, 0, 1, steps=2, field=field):
+            if step.increment == 1:
+                assert step.complete == (field == "every")
+                writer.write(step)
+        grids.append(vtu.read(folder / name / "body_0000.vtu").at_nodes["displacement"])
+    assert np.abs(grids[0]).max() > 0.01
+    assert close(grids[1], grids[0], 1e-8)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_finite_kinematics(cell, tmp_path):
+    """True pressures beside nominal ones, by the stretch of Γc where it has moved to."""
+    folder = shared_folder(tmp_path)
+    made = Tool(cell)
+    writer = fc.Writer(folder, made.problem, stress=made.scene.body.stress)
+    for step in made.increments(1.0, steps=2):
+        writer.write(step)
+    points = vtu.read(folder / "contact_points_0001.vtu").at_nodes
+    contact = made.contact
+    stretch = np.concatenate(COMM.allgather(contact.area_stretch()))
+    pressure = np.concatenate(COMM.allgather(contact.pressure))
+    closed = pressure > 0
+    assert np.abs(stretch[closed] - 1).max() > 0.01
+    ratio = np.sort((points["true_pressure"] / np.maximum(points["pressure"], 1e-9))[:, 0])
+    expected = np.sort(np.where(closed, 1 / stretch, 0.0))
+    assert close(ratio, expected, 1e-12)
+    body = vtu.read(folder / "body_0001.vtu").at_nodes
+    assert body["von_mises"].min() >= 0 and body["von_mises"].max() > 0
+
+
+def test_an_axis_has_a_stress(tmp_path):
+    """Where u_r/r is 0/0 the file has the value that the points inside lead to."""
+    folder = shared_folder(tmp_path)
+    made = Rub(degree=2)
+    body = fc.elasticity.LinearElastic(made.scene.u, 1000.0, 0.3, "axisymmetric")
+    made.scene.u.interpolate(lambda x: np.vstack([1e-3 * x[0], 0 * x[0]]))
+    fc.Writer(folder, made.problem, stress=body.stress).write(0)
+    grid = vtu.read(folder / "body_0000.vtu")
+    assert np.any(grid.x[..., 0] == 0)
+    lame, shear = 1000 * 0.3 / 1.3 / 0.4, 1000 / 2.6
+    exact = np.diag([lame * 2e-3 + 2e-3 * shear, lame * 2e-3, lame * 2e-3 + 2e-3 * shear])
+    assert close(grid.at_nodes["stress"], np.tile(exact.ravel(), (*grid.x.shape[:2], 1)), 1e-10)
+
+
+def test_a_mixed_function(tmp_path):
+    """The displacement is that part of it; Γc moves with the body."""
+    folder = shared_folder(tmp_path)
+    made = Tool(mixed="Taylor-Hood", nu=0.5, law=fc.Frictionless(1e4))
+    writer = fc.Writer(folder, made.problem, stress=made.scene.body.stress)
+    for step in made.increments(0.5, steps=1):
+        writer.write(step)
+    body, top = (vtu.read(folder / f"{n}_0000.vtu") for n in ("body", "contact"))
+    places = {tuple(x): u for x, u in zip(*flat(body), strict=True)}
+    assert len(top.x) and all(
+        np.allclose(places[tuple(x)], u, atol=1e-12) for x, u in zip(*flat(top), strict=True)
+    )
+    assert np.abs(top.at_nodes["displacement"]).max() > 0.01
+    assert ufl.as_ufl(made.scene.displacement).ufl_shape == (2,)
+
+
+def flat(grid):
+    return grid.x.reshape(-1, 3).round(9), grid.at_nodes["displacement"].reshape(-1, 3)
