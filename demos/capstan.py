@@ -66,7 +66,7 @@ class Run:
 
     thickness: float
     tension: float
-    contact: fc.Contact
+    problem: fc.ContactProblem
     rubber: NeoHookean
     dofs: int
     path: list[tuple[float, float]] = field(default_factory=list)
@@ -161,7 +161,7 @@ def solve(thickness: float, cells: int) -> Run:
     reaction = fem.form(ufl.action(rubber.residual(v), lift))
 
     tension = STRAIN * E * thickness
-    run = Run(thickness, tension, contact, rubber, V.dofmap.index_map.size_global * 2)
+    run = Run(thickness, tension, problem, rubber, V.dofmap.index_map.size_global * 2)
     quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
     for step in fc.increments(problem, weight, 0.0, tension):
         run.iterations.append(step.iterations)
@@ -254,10 +254,9 @@ def main() -> int:
         "paths": [run.path for run in runs],
         "wall_seconds": time.perf_counter() - start,
     }
-    output.write_body(arguments.output, last.contact.u, last.rubber.stress)
-    output.write_surface(arguments.output, last.contact)
+    fc.Writer(arguments.output, last.problem, stress=last.rubber.stress).write(TURN[-1])
     plotting.plot_deformation(
-        arguments.output / "band.png", runs[0].contact.u, title=f"t = {runs[0].thickness:g} mm"
+        arguments.output / "band.png", runs[0].problem.u, title=f"t = {runs[0].thickness:g} mm"
     )
     if comm.rank == 0:
         print(output.table(result["references"]))

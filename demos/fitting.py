@@ -122,8 +122,10 @@ class Fitting:
             fem.dirichletbc(zero, axis, V.sub(0)),
         ]
 
-    def pull(self, friction: float, load: float, steps: int = 1) -> tuple[fc.Contact, np.ndarray]:
-        """Load it from nothing; the contact, and a copy of the displacements. Collective."""
+    def pull(
+        self, friction: float, load: float, steps: int = 1
+    ) -> tuple[fc.ContactProblem, np.ndarray]:
+        """Load it from nothing; the problem, and a copy of the displacements. Collective."""
         self.u.x.array[:] = 0.0
         contact = fc.Contact(
             self.u,
@@ -141,7 +143,7 @@ class Fitting:
             petsc_options={"snes_rtol": 1e-12},  # what is compared below is equal to 1e-8
         )
         list(fc.increments(problem, self.load, 0.0, load, steps=steps))
-        return contact, self.u.x.array.copy()
+        return problem, self.u.x.array.copy()
 
     def reaction(self) -> float:
         """Vertical force that the support at the top exerts. Collective."""
@@ -208,12 +210,13 @@ def main() -> int:
     angle = np.arctan2((arguments.a - arguments.c) / 2, arguments.f)
     half = LOAD * THICKNESS * arguments.c / 2
 
-    smooth, _ = fitting.pull(0.0, LOAD)
+    smooth = fitting.pull(0.0, LOAD)[0].contacts[0]
     drawn = [("μ = 0", smooth.gather())]
     without = smooth.resultants().normal_force
     _, twice = fitting.pull(friction, 2 * LOAD)
     _, often = fitting.pull(friction, LOAD, arguments.increments)
-    contact, once = fitting.pull(friction, LOAD)
+    problem, once = fitting.pull(friction, LOAD)
+    (contact,) = problem.contacts
     drawn.append((f"μ = {friction:g}", contact.gather()))
     forces = contact.resultants()
     normal = forces.normal_force
@@ -244,8 +247,7 @@ def main() -> int:
         "dofs": fitting.u.function_space.dofmap.index_map.size_global * 2,
         "wall_seconds": time.perf_counter() - start,
     }
-    output.write_body(folder, fitting.u, fitting.body.stress)
-    output.write_surface(folder, contact)
+    fc.Writer(folder, problem, stress=fitting.body.stress).write(LOAD)
     output.write_json(folder / "result.json", result, comm)
     title = f"Male-female fitting (right half), μ = {friction:g}"
     plotting.plot_deformation(folder / "mesh.png", fitting.u, title=title, magnification=50)

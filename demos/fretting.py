@@ -177,8 +177,7 @@ def main() -> int:
         parser.error("--share must lie between 0 and 1: beyond, the cylinders slide off")
     scene, result = solve(arguments)
     comm, folder = MPI.COMM_WORLD, arguments.output
-    output.write_body(folder, scene.contact.u, scene.body.stress)
-    output.write_surface(folder, scene.contact)
+    fc.Writer(folder, scene.problem, stress=scene.body.stress).write(scene.problem.increment)
     output.write_json(folder / "result.json", result, comm)
     if comm.rank == 0:
         draw(folder / "loop.png", result)

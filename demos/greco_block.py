@@ -61,7 +61,7 @@ def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
     return mesh, dolfinx.mesh.meshtags(mesh, 1, facets[order], values[order])
 
 
-def solve(arguments: argparse.Namespace) -> tuple[fc.Contact, dict[str, Any]]:
+def solve(arguments: argparse.Namespace) -> tuple[fc.ContactProblem, dict[str, Any]]:
     """Build and load the block, and measure. Collective."""
     start = time.perf_counter()
     mesh, tags = make_mesh(arguments.cells)
@@ -107,7 +107,7 @@ def solve(arguments: argparse.Namespace) -> tuple[fc.Contact, dict[str, Any]]:
     if arguments.errors:
         budget = fc.estimate_errors(problem, stress, increment_error=made[-1].increment_error)
         result["errors"] = budget.numbers()
-    return contact, result
+    return problem, result
 
 
 def along_bottom(u: fem.Function) -> np.ndarray:
@@ -162,15 +162,15 @@ def main() -> int:
     parser.add_argument("--errors", action="store_true", help="estimate the errors, part by part")
     parser.add_argument("--output", type=Path, default=Path("output/greco_block"), help="folder")
     arguments, _ = parser.parse_known_args()
-    contact, result = solve(arguments)
+    problem, result = solve(arguments)
+    (contact,) = problem.contacts
     comm, folder = MPI.COMM_WORLD, arguments.output
     if comm.rank == 0:
         folder.mkdir(parents=True, exist_ok=True)
         report(result)
     comm.barrier()
     output.write_json(folder / "result.json", result, comm)
-    output.write_body(folder, contact.u)
-    output.write_surface(folder, contact)
+    fc.Writer(folder, problem).write(1)
     plotting.plot_deformation(
         folder / "mesh.png",
         contact.u,

@@ -331,8 +331,7 @@ def show(value: Any) -> str:
 def write(folder: Path, scene: Scene, result: dict[str, Any]) -> None:
     """Pictures and ParaView files of one case. Collective."""
     friction, load = result["friction"], result["load"]
-    output.write_body(folder, scene.u, scene.stress, time=load)
-    output.write_surface(folder, scene.contact, time=load)
+    fc.Writer(folder, scene.problem, stress=scene.stress).write(load)
     title = f"Half-cylinder on a rigid plane, μ = {friction:g}, q = {load:g} MPa"
     plotting.plot_deformation(
         folder / "mesh.png", scene.u, title=title, support=[[0.0, 0.0], [0.7 * R, 0.0]]

@@ -86,7 +86,7 @@ class Block:
         return float(slip / points["measure"].sum())
 
 
-def tilt(arguments: argparse.Namespace) -> tuple[Block, dict[str, Any]]:
+def tilt(arguments: argparse.Namespace) -> dict[str, Any]:
     """Tilt the plane until the block is refused; halve the interval. Collective."""
     friction = arguments.friction
     block = Block(arguments, 0.0, friction)
@@ -109,7 +109,7 @@ def tilt(arguments: argparse.Namespace) -> tuple[Block, dict[str, Any]]:
         along, across = block.contact.resultants().force
         row = {"slope": share * friction, "T/N": float(-along / across)}
         rows.append(row | {"slip": block.slipping()})
-    return block, {
+    return {
         "friction": friction,
         "rows": rows,
         "limit": friction * (holds + refused) / 2,
@@ -118,7 +118,9 @@ def tilt(arguments: argparse.Namespace) -> tuple[Block, dict[str, Any]]:
     }
 
 
-def push(arguments: argparse.Namespace, friction: float) -> tuple[Block, dict[str, Any]]:
+def push(
+    arguments: argparse.Namespace, friction: float
+) -> tuple[fc.ContactProblem, Block, dict[str, Any]]:
     """Push the block up the slope by its lower end. Collective."""
     block = Block(arguments, WEDGE_SLOPE, friction)
     V = block.u.function_space
@@ -137,7 +139,7 @@ def push(arguments: argparse.Namespace, friction: float) -> tuple[Block, dict[st
     record()
     for _ in fc.increments(problem, pushed, 0.0, arguments.push, steps=arguments.increments):
         record()
-    return block, {"friction": friction, "rows": rows}
+    return problem, block, {"friction": friction, "rows": rows}
 
 
 def draw(path: Path, tilted: dict[str, Any], pushed: list[dict[str, Any]]) -> None:
@@ -191,19 +193,18 @@ def main() -> int:
     arguments, _ = parser.parse_known_args()
     start, comm, folder = time.perf_counter(), MPI.COMM_WORLD, arguments.output
 
-    block, tilted = tilt(arguments)
+    tilted = tilt(arguments)
     values = {"slope refused": tilted["limit"], "T/N over tan α, error": tilted["ratio_error"]}
     references = {"slope refused": (arguments.friction, STATICS)}
     references["T/N over tan α, error"] = (0.0, STATICS)
     pushed = []
     for friction in WEDGE_FRICTIONS:
-        block, run = push(arguments, friction)
+        problem, block, run = push(arguments, friction)
         pushed.append(run)
         name = f"F/G, μ = {friction:g}"
         values[name] = run["rows"][-1]["F/G"]
         references[name] = (sliding(friction), SLIDING)
-    output.write_body(folder, block.u, block.body.stress)
-    output.write_surface(folder, block.contact)
+    fc.Writer(folder, problem, stress=block.body.stress).write(arguments.push)
     title = "Pushed uphill, μ = 0.3"
     line = [[0.0, 0.0], [LENGTH, WEDGE_SLOPE * LENGTH]]
     plotting.plot_deformation(

@@ -98,7 +98,7 @@ def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
 
 def solve(
     arguments: argparse.Namespace,
-) -> tuple[fc.Contact, LinearElastic, list[dict[str, float]], dict[str, Any]]:
+) -> tuple[fc.ContactProblem, LinearElastic, list[dict[str, float]], dict[str, Any]]:
     """Press, drag, and note every increment of the drag. Collective."""
     start = time.perf_counter()
     mesh, tags = make_mesh(arguments.cells)
@@ -158,7 +158,7 @@ def solve(
     if arguments.errors:
         budget = fc.estimate_errors(problem, body.stress, strain=body.strain(u))
         info["errors"] = budget.numbers()
-    return contact, body, path, info
+    return problem, body, path, info
 
 
 def compare(path: list[dict[str, float]]) -> dict[str, Any]:
@@ -240,11 +240,10 @@ def main() -> int:
     parser.add_argument("--errors", action="store_true", help="estimate the errors, part by part")
     parser.add_argument("--output", type=Path, default=Path("output/ironing"), help="folder")
     arguments, _ = parser.parse_known_args()
-    contact, body, path, info = solve(arguments)
+    problem, body, path, info = solve(arguments)
     comm, result = MPI.COMM_WORLD, {"references": compare(path)} | info | {"path": path}
-    output.write_body(arguments.output, contact.u, body.stress)
-    output.write_surface(arguments.output, contact)
-    points = contact.gather()
+    fc.Writer(arguments.output, problem, stress=body.stress).write(path[-1]["along"])
+    points = problem.contacts[0].gather()
     if comm.rank == 0:
         print(output.table(result["references"]))
         if "errors" in result:

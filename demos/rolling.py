@@ -50,7 +50,7 @@ GETFEM = {
 }
 
 
-def solve(moved: str) -> tuple[list[dict[str, float]], fc.Contact, NeoHookean, int]:
+def solve(moved: str) -> tuple[list[dict[str, float]], fc.ContactProblem, NeoHookean, int]:
     """Press, turn and drag; ``moved`` along x is "disc" or "block". Collective."""
     corners, n = (
         [(-WIDTH / 2, 0.0), (WIDTH / 2, HEIGHT)],
@@ -113,7 +113,7 @@ def solve(moved: str) -> tuple[list[dict[str, float]], fc.Contact, NeoHookean, i
                 "iterations": step.iterations,
             }
         )
-    return path, contact, rubber, V.dofmap.index_map.size_global * 2
+    return path, problem, rubber, V.dofmap.index_map.size_global * 2
 
 
 def compare(path: list[dict[str, float]], other: list[dict[str, float]]) -> dict[str, Any]:
@@ -165,7 +165,7 @@ def main() -> int:
     parser.add_argument("--output", type=Path, default=Path("output/rolling"), help="folder")
     arguments, _ = parser.parse_known_args()
     start = time.perf_counter()
-    path, contact, rubber, dofs = solve("disc")
+    path, problem, rubber, dofs = solve("disc")
     other, *_ = solve("block")
     comm = MPI.COMM_WORLD
     result: dict[str, Any] = {
@@ -174,10 +174,9 @@ def main() -> int:
         "path": path,
         "wall_seconds": time.perf_counter() - start,
     }
-    output.write_body(arguments.output, contact.u, rubber.stress)
-    output.write_surface(arguments.output, contact)
+    fc.Writer(arguments.output, problem, stress=rubber.stress).write(TIMES[-1])
     plotting.plot_deformation(
-        arguments.output / "block.png", contact.u, title="Pressed, turned and dragged"
+        arguments.output / "block.png", problem.u, title="Pressed, turned and dragged"
     )
     if comm.rank == 0:
         print(output.table(result["references"]))

@@ -84,9 +84,8 @@ class Run:
 
     name: str
     cells: int
-    u: fem.Function
+    problem: fc.ContactProblem
     rubber: NeoHookean
-    contacts: list[fc.Contact]
     dofs: int
     squeeze: list[float] = field(default_factory=list)
     lid: list[float] = field(default_factory=list)
@@ -159,7 +158,7 @@ def solve(name: str, cells: int) -> Run:
     problem = fc.ContactProblem(rubber.residual(v, dx, q=q), w, contacts=contacts)
 
     length = 2 * np.pi * RING
-    run = Run(name, cells, contacts[0].u, rubber, contacts, W.dofmap.index_map.size_global)
+    run = Run(name, cells, problem, rubber, W.dofmap.index_map.size_global)
     ends = D * np.array(CLOSING)
     history: Any = fc.increments(problem, closing, 0.0, ends[-1], steps=ends)
     quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
@@ -251,11 +250,11 @@ def main() -> int:
         "forces": {run.name: run.lid for run in runs[1::2]},
         "wall_seconds": time.perf_counter() - start,
     }
-    output.write_body(arguments.output, last.u, last.rubber.stress)
-    for contact in last.contacts:
-        output.write_surface(arguments.output, contact)
+    fc.Writer(arguments.output, last.problem, stress=last.rubber.stress).write(CLOSING[-1])
     plotting.plot_deformation(
-        arguments.output / "section.png", runs[-2].u, title="In a groove, one with the lid closed"
+        arguments.output / "section.png",
+        runs[-2].problem.displacement.u,
+        title="In a groove, one with the lid closed",
     )
     if comm.rank == 0:
         print(output.table(result["references"]))

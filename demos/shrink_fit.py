@@ -107,7 +107,7 @@ def make_mesh(h: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
 
 def solve(
     arguments: argparse.Namespace, kind: str
-) -> tuple[fc.Contact, LinearElastic, dict[str, Any]]:
+) -> tuple[fc.ContactProblem, LinearElastic, dict[str, Any]]:
     """Fit the rings together, and measure. Collective."""
     start = time.perf_counter()
     mesh, tags = make_mesh(arguments.h)
@@ -154,7 +154,7 @@ def solve(
     if arguments.errors:
         budget = fc.estimate_errors(problem, body.stress, strain=body.strain(u))
         result["errors"] = budget.numbers()
-    return contact, body, result
+    return problem, body, result
 
 
 def draw(folder: Path, contact: fc.Contact, body: LinearElastic, result: dict[str, Any]) -> None:
@@ -214,11 +214,10 @@ def main() -> int:
     arguments, _ = parser.parse_known_args()
     comm, runs = MPI.COMM_WORLD, []
     for kind in arguments.kinds:
-        contact, body, result = solve(arguments, kind)
+        problem, body, result = solve(arguments, kind)
         folder = arguments.output / kind.replace(" ", "-")
-        output.write_body(folder, contact.u, body.stress)
-        output.write_surface(folder, contact)
-        draw(folder, contact, body, result)
+        fc.Writer(folder, problem, stress=body.stress).write(1)
+        draw(folder, problem.contacts[0], body, result)
         if comm.rank == 0:
             print(f"{kind}: {result['dofs']} dofs, {result['iterations']} iterations, ", end="")
             print(f"{result['wall_seconds']:.2f} s")

@@ -105,7 +105,7 @@ def hertz(case: str, depth: float, force: float) -> dict[str, float]:
 
 def solve(
     arguments: argparse.Namespace, case: str
-) -> tuple[fc.Contact, LinearElastic, dict[str, Any]]:
+) -> tuple[fc.ContactProblem, LinearElastic, dict[str, Any]]:
     """Press, and measure; all of the forces by four times those on the quarter. Collective."""
     start = time.perf_counter()
     mesh, tags = make_mesh(case, np.sqrt(R * arguments.depth), arguments.cells)
@@ -153,7 +153,7 @@ def solve(
     if arguments.errors:
         budget = fc.estimate_errors(problem, body.stress, strain=body.strain(u))
         result["errors"] = budget.numbers()
-    return contact, body, result
+    return problem, body, result
 
 
 def draw(path: Path, runs: list[tuple[dict[str, Any], dict[str, np.ndarray]]]) -> None:
@@ -197,10 +197,9 @@ def main() -> int:
     arguments, _ = parser.parse_known_args()
     comm, drawn = MPI.COMM_WORLD, []
     for case in arguments.cases:
-        contact, body, result = solve(arguments, case)
-        output.write_body(arguments.output / case, contact.u, body.stress)
-        output.write_surface(arguments.output / case, contact)
-        drawn.append((result, contact.gather()))
+        problem, body, result = solve(arguments, case)
+        fc.Writer(arguments.output / case, problem, stress=body.stress).write(arguments.depth)
+        drawn.append((result, problem.contacts[0].gather()))
         if comm.rank == 0:
             print(f"{case}: {result['dofs']} dofs, {result['iterations']} iterations, ", end="")
             print(f"{result['wall_seconds']:.2f} s")

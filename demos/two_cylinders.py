@@ -233,8 +233,7 @@ def main() -> int:
     scene, result = solve(arguments)
     contact = scene.contact
     comm, folder = MPI.COMM_WORLD, arguments.output
-    output.write_body(folder, contact.u, scene.body.stress)
-    output.write_surface(folder, contact)
+    fc.Writer(folder, scene.problem, stress=scene.body.stress).write(SHEAR)
     output.write_json(folder / "result.json", result, comm)
     plotting.plot_deformation(folder / "mesh.png", contact.u, title="Two half-cylinders")
     points = contact.gather()

@@ -41,7 +41,7 @@ def test_paper_mesh_writes_everything(tmp_path: Path) -> None:
         folder = tmp_path / f"friction-{friction}"
         for name in ("traction.png", "mesh.png"):
             assert (folder / name).read_bytes()[:4] == b"\x89PNG"
-        for name in ("displacement", "stress", "contact"):
+        for name in ("body", "contact", "contact_points"):
             assert (folder / f"{name}.pvd").exists()
 
 

@@ -31,7 +31,7 @@ def test_lame(tmp_path: Path) -> None:
         assert all(entry["passed"] for entry in run["references"].values())
         folder = tmp_path / run["kind"].replace(" ", "-")
         assert (folder / "stress.png").read_bytes()[:4] == b"\x89PNG"
-        for name in ("displacement", "stress", "contact"):
+        for name in ("body", "contact", "contact_points"):
             assert (folder / f"{name}.pvd").exists()
 
 

@@ -30,7 +30,7 @@ def test_hertz(tmp_path: Path) -> None:
     assert values(ball)["radius [mm]"] == pytest.approx(radius, rel=0.02)
     assert (tmp_path / "pressure.png").read_bytes()[:4] == b"\x89PNG"
     for case in ("block", "ball"):
-        for name in ("displacement", "stress", "contact"):
+        for name in ("body", "contact", "contact_points"):
             assert (tmp_path / case / f"{name}.pvd").exists()
 
 

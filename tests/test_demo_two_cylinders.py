@@ -29,7 +29,7 @@ def test_cattaneo_mindlin(tmp_path: Path) -> None:
     assert found["largest pressure [MPa]"] == pytest.approx(9.3514, rel=0.02)
     for name in ("shear", "traction", "mesh"):
         assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
-    for name in ("displacement", "stress", "contact"):
+    for name in ("body", "contact", "contact_points"):
         assert (tmp_path / f"{name}.pvd").exists()
 
 

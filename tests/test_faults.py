@@ -335,7 +335,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="the limit would hit what MPI keeps in files, too")
-@pytest.mark.parametrize("kind", ["checkpoint", "json", "body", "surface", "picture"])
+@pytest.mark.parametrize("kind", ["checkpoint", "json", "series", "picture"])
 @pytest.mark.parametrize("first", [True, False])
 def test_a_full_disk(kind, first, tmp_path):
     """A file that could not be written is not there, or as it was; the next one is whole."""
@@ -345,8 +345,7 @@ def test_a_full_disk(kind, first, tmp_path):
     write = {
         "checkpoint": lambda: fc.checkpoint.save(made.problem, tmp_path / "state.npz"),
         "json": lambda: output.write_json(tmp_path / "r.json", {"x": [1.5] * 1000}, COMM),
-        "body": lambda: output.write_body(tmp_path, made.scene.u),
-        "surface": lambda: output.write_surface(tmp_path, made.contact),
+        "series": lambda: fc.Writer(tmp_path, made.problem).write(1),
         "picture": lambda: plotting.plot_tractions(tmp_path / "p.png", points),
     }[kind]
     if kind == "picture":
@@ -367,15 +366,14 @@ def test_a_full_disk(kind, first, tmp_path):
         assert json.loads(after["r.json"])["x"] == [1.5] * 1000
 
 
-@pytest.mark.parametrize("kind", ["json", "body", "surface"])
+@pytest.mark.parametrize("kind", ["json", "series"])
 def test_writing_fails_on_one_rank(kind, tmp_path, monkeypatch):
     """All ranks end, and no half of it is there."""
     folder = shared_folder(tmp_path)
     made = Rub()
     write = {
         "json": lambda: output.write_json(folder / "r.json", {"x": 1}, COMM),
-        "body": lambda: output.write_body(folder, made.scene.u),
-        "surface": lambda: output.write_surface(folder, made.contact),
+        "series": lambda: fc.Writer(folder, made.problem).write(1),
     }[kind]
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", failing(os.replace, 0, OSError))
@@ -383,17 +381,6 @@ def test_writing_fails_on_one_rank(kind, tmp_path, monkeypatch):
     assert files(folder) == {}
     write()
     assert files(folder)
-
-
-def test_files_in_parallel_are_read_again(tmp_path):
-    """Every file that a collection names is beside it (one for each rank, and one for all)."""
-    folder = shared_folder(tmp_path)
-    made = Rub()
-    output.write_body(folder, made.scene.u)
-    found = files(folder)
-    named = [w.split(b'"')[1].decode() for w in found["displacement.pvd"].split(b"file=")[1:]]
-    assert named and all(name in found for name in named)
-    assert all(data.rstrip().endswith(b"</VTKFile>") for data in found.values())
 
 
 def test_errors_are_shared():

@@ -15,10 +15,10 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact import output
 from fenics_contact.checks.verdict import check_laws
+from scenes import vtu
 from scenes.bodies import Bodies, boxes
-from scenes.comparing import close, raised_everywhere
+from scenes.comparing import close, raised_everywhere, shared_folder
 from scenes.meshes import mesh_of
 from scenes.stacks import FLOOR, LOWER, OUTSIDE, ROOF, SIDES, UPPER, E, joint, rings, stack
 from scenes.tags import between, either, near, tagged
@@ -294,17 +294,31 @@ def test_a_prescribed_gap_over_an_edge(cell, name, enforcement):
         energy = step.energy
         size = abs(energy.work) + abs(energy.elastic) + 1e-12
         assert abs(energy.imbalance) <= 1e-6 * size
-        fields = output.surface_fields(contact)
-        assert np.isfinite(fields["gap"].x.array).all()
-        empty = fields["unpaired"].x.array == 1.0
-        assert np.all(fields["status"].x.array[empty] == fc.Status.OPEN)
-        pressure = fields["pressure"]
-        cells = np.flatnonzero(empty[fields["unpaired"].function_space.dofmap.list[:, 0]])
-        dofs = pressure.function_space.dofmap.list[cells]
-        assert np.abs(pressure.x.array[dofs]).max(initial=0.0) <= 1e-9 * max(r.max_pressure, 1.0)
         problem.commit()
     budget = fc.estimate_errors(problem, body.stress)
     assert all(np.isfinite(v) for part in budget.parts.values() for v in part.values())
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_files_tell_what_has_no_opposite(cell, tmp_path):
+    """No gap there (NaN), no pressure, open; and "paired" says where."""
+    folder = shared_folder(tmp_path)
+    body, contact, outside = overhang(cell, fc.Coulomb(0.3, 1e7, 1e7))
+    problem = body.problem(contact)
+    problem.solve()
+    fc.Writer(folder, problem).write(1)
+    points = vtu.read(folder / "joint 1_points_0000.vtu").at_nodes
+    alone = points["paired"][:, 0] == 0.0
+    assert np.count_nonzero(alone) == np.count_nonzero(outside)
+    assert np.array_equal(np.isnan(points["gap"][:, 0]), alone)
+    facets = vtu.read(folder / "joint 1_0000.vtu")
+    share = facets.in_cells["paired"]
+    assert np.array_equal(np.isnan(facets.at_nodes["gap"]).all(axis=1), share == 0.0)
+    assert np.isfinite(facets.at_nodes["gap"][share > 0.0]).all()
+    assert np.all(facets.at_nodes["pressure"][share == 0.0] == 0.0)
+    assert np.all(facets.in_cells["status"][share == 0.0] == fc.Status.OPEN)
+    assert facets.at_nodes["pressure"].min() == 0.0 < facets.at_nodes["pressure"].max()
+    assert 0 < np.count_nonzero(share == 0.0) < len(share)
 
 
 def test_checks_see_tractions_where_nothing_is_opposite():

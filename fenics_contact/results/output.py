@@ -1,22 +1,19 @@
-"""Results in files, ParaView collections and JSON; values at points, tables of references met."""
+"""Values at nodes and in cells, tables of references met, and JSON."""
 
 from __future__ import annotations
 
 import json
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import basix
 import dolfinx
 import numpy as np
 import ufl
-from dolfinx import fem, io
+from dolfinx import fem
 from mpi4py import MPI
 
-from fenics_contact import compat
-from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_min
 from fenics_contact.results import files
 from fenics_contact.types import Array
@@ -25,110 +22,9 @@ __all__ = [
     "at_node",
     "compare",
     "sample",
-    "surface_fields",
     "table",
-    "write_body",
     "write_json",
-    "write_surface",
 ]
-
-
-def surface_fields(contact: Contact) -> dict[str, fem.Function]:
-    """The results on Γc as functions on its submesh. Collective.
-
-    On every facet the linear function that fits the values at the quadrature points best (a
-    constant where the rule has too few points); the status is that of most of the facet's points.
-
-    Args:
-        contact: An evaluated contact.
-
-    Returns:
-        pressure, tangential_traction, gap, slip (length, sum of the modes) and status, by name. A
-        gap of 0 stands for points without an opposite, whose share of a facet is "unpaired", there
-        if the support is deformable.
-    """
-    submesh = contact.surface.submesh
-    points, weights = contact.quadrature.space().ufl_element().custom_quadrature()
-    linear = fem.functionspace(submesh, ("DG", 1))
-    n_basis = linear.dofmap.dof_layout.num_dofs
-    degree = 1 if len(points) >= n_basis else 0
-    cells = submesh.topology.index_map(submesh.topology.dim)
-    rows = contact.quadrature.space().dofmap.list[: cells.size_local]
-
-    values = {
-        "pressure": contact.pressure,
-        "tangential_traction": contact.tangential_traction,
-        "gap": np.nan_to_num(contact.gap),
-        "slip": contact.slip.sum(axis=1),
-    }
-    result = {}
-    for name, value in values.items():
-        shape = value.shape[1:]
-        space = fem.functionspace(submesh, ("DG", degree, shape) if shape else ("DG", degree))
-        if degree == 0:
-            fit = (weights / weights.sum())[None, :]
-        else:
-            basis = linear.element.basix_element.tabulate(0, points)[0, :, :, 0]
-            root = np.sqrt(weights)[:, None]
-            fit = np.linalg.lstsq(root * basis, root * np.eye(len(points)), rcond=None)[0]
-        function = fem.Function(space, name=name)
-        # (facets, points, …) -> (facets, basis, …), then to the dofs of each facet.
-        fitted = np.einsum("bq,fq...->fb...", fit, value[rows])
-        dofs = space.dofmap.list[: cells.size_local]
-        function.x.array.reshape((-1, *shape))[dofs] = fitted
-        function.x.scatter_forward()
-        result[name] = function
-    if not contact.rigid:
-        unpaired = fem.Function(fem.functionspace(submesh, ("DG", 0)), name="unpaired")
-        dofs = unpaired.function_space.dofmap.list[: cells.size_local, 0]
-        unpaired.x.array[dofs] = np.mean(~contact.paired[rows], axis=1)
-        unpaired.x.scatter_forward()
-        result["unpaired"] = unpaired
-    status = fem.Function(fem.functionspace(submesh, ("DG", 0)), name="status")
-    counts = np.stack([(contact.status[rows] == s).sum(axis=1) for s in range(3)])
-    status.x.array[status.function_space.dofmap.list[: cells.size_local, 0]] = counts.argmax(axis=0)
-    status.x.scatter_forward()
-    result["status"] = status
-    return result
-
-
-def write_surface(folder: str | os.PathLike[str], contact: Contact, time: float = 0.0) -> None:
-    """Write `surface_fields` as one ParaView collection, ``NAME.pvd``. Collective.
-
-    It is one state, which replaces what was there: give every state of a series its own folder.
-
-    Args:
-        folder: Where to.
-        contact: Evaluated.
-        time: Time stamp, such as the load.
-    """
-    _write(Path(folder) / f"{contact.name}.pvd", list(surface_fields(contact).values()), time)
-
-
-def write_body(
-    folder: str | os.PathLike[str], u: fem.Function, stress: Any = None, time: float = 0.0
-) -> None:
-    """Write ``displacement.pvd`` and, if a stress is given, ``stress.pvd``. Collective.
-
-    It is one state, as in `write_surface`.
-
-    Args:
-        folder: Where to.
-        u: The displacement.
-        stress: UFL tensor of shape (gdim, gdim); it is interpolated into discontinuous functions
-            one degree below ``u``.
-        time: Time stamp, such as the load.
-    """
-    _write(Path(folder) / "displacement.pvd", [u], time)
-    if stress is None:
-        return
-    mesh = u.function_space.mesh
-    degree = max(0, u.function_space.ufl_element().degree - 1)
-    space = fem.functionspace(mesh, ("DG", degree, ufl.as_ufl(stress).ufl_shape))
-    points = compat.interpolation_points(space.element)
-    function = fem.Function(space, name="stress")
-    function.interpolate(fem.Expression(stress, points))
-    _write(Path(folder) / "stress.pvd", [function], time)
 
 
 def at_node(u: fem.Function, point: Sequence[float]) -> Array:
@@ -223,22 +119,3 @@ def write_json(path: str | os.PathLike[str], data: Mapping[str, Any], comm: MPI.
             text = json.dumps(data, indent=2, default=float, allow_nan=False) + "\n"
             with files.replacing(path) as temporary:
                 temporary.write_text(text)
-
-
-def _write(path: Path, functions: list[fem.Function], time: float) -> None:
-    comm = functions[0].function_space.mesh.comm
-    with files.replacing_set(comm, path, b"</VTKFile>") as temporary:
-        with collective_errors(comm):
-            failure = _write_vtk(comm, temporary, functions, time)
-            if failure:
-                raise OSError(f"{path} cannot be written: {failure}")
-
-
-def _write_vtk(comm: MPI.Comm, path: Path, functions: list[fem.Function], time: float) -> str:
-    """What went wrong. The error itself would keep the file, whose destructor writes again."""
-    try:
-        with io.VTKFile(comm, str(path), "w") as file:
-            file.write_function(functions, time)
-    except RuntimeError as error:
-        return str(error)
-    return ""

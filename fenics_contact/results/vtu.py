@@ -12,6 +12,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -81,8 +82,8 @@ class Grid:
 
     kind: int
     points: Array
-    at_nodes: Mapping[str, npt.NDArray[np.generic]] = field(default_factory=dict)
-    in_cells: Mapping[str, npt.NDArray[np.generic]] = field(default_factory=dict)
+    at_nodes: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+    in_cells: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
     numbers: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -94,7 +95,7 @@ def write_grid(path: Path, grid: Grid) -> None:
     """
     n_cells, n_nodes = grid.points.shape[:2]
     n = n_cells * n_nodes
-    topology = {
+    topology: dict[str, npt.NDArray[Any]] = {
         "connectivity": np.arange(n, dtype=np.int64),
         "offsets": np.arange(1, n_cells + 1, dtype=np.int64) * n_nodes,
         "types": np.full(n_cells, grid.kind, dtype=np.uint8),
@@ -109,12 +110,13 @@ def write_grid(path: Path, grid: Grid) -> None:
             file.write(_array(name, np.array([number]), ' NumberOfTuples="1"'))
         file.write("</FieldData>\n")
         file.write(f'<Piece NumberOfPoints="{n}" NumberOfCells="{n_cells}">\n')
-        for section, arrays in (
-            ("Points", {"points": _rows(grid.points, 2)}),
-            ("Cells", topology),
-            ("PointData", at_nodes),
-            ("CellData", in_cells),
-        ):
+        sections: dict[str, Mapping[str, npt.NDArray[Any]]] = {
+            "Points": {"points": _rows(grid.points, 2)},
+            "Cells": topology,
+            "PointData": at_nodes,
+            "CellData": in_cells,
+        }
+        for section, arrays in sections.items():
             file.write(f"<{section}>\n")
             for name, values in arrays.items():
                 file.write(_array(name, values))
@@ -153,14 +155,14 @@ def read_series(path: Path) -> list[tuple[float, str]]:
         ) from None
 
 
-def _rows(values: npt.NDArray[np.generic], axes: int) -> npt.NDArray[np.generic]:
+def _rows(values: npt.NDArray[Any], axes: int) -> npt.NDArray[Any]:
     """Fields as rows of 1, 3 or 9 numbers; the first axes count the rows."""
     values = np.reshape(values, (-1, *values.shape[axes:]))
     missing = [(0, 0)] + [(0, 3 - size) for size in values.shape[1:]]
     return np.pad(values, missing).reshape(len(values), 3 ** (values.ndim - 1))
 
 
-def _array(name: str, values: npt.NDArray[np.generic], more: str = "") -> str:
+def _array(name: str, values: npt.NDArray[Any], more: str = "") -> str:
     """One array as XML: its length in bytes and its bytes, in base64."""
     values = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
     kind = {"f": "Float", "i": "Int", "u": "UInt"}[values.dtype.kind] + str(8 * values.itemsize)

@@ -24,7 +24,7 @@ from fenics_contact.parallel import collective_errors
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.results import files, vtu
 from fenics_contact.surface.facets import FacetSet
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Mask
 
 __all__ = ["Writer", "facet_values"]
 
@@ -248,12 +248,13 @@ class _Surface:
         status = contact.status
         counts = np.stack([np.sum(status[rows] == s, axis=1) for s in Status])
         in_facets = {"status": counts.argmax(axis=0).astype(np.int8)}
-        at_points = {"displacement": contact.own_displacement()} | at_points | {"status": status}
+        moves = {"displacement": contact.own_displacement()}
+        all_points: dict[str, npt.NDArray[Any]] = {**moves, **at_points, "status": status}
         if not contact.rigid:
             in_facets["paired"] = np.mean(contact.paired[rows], axis=1)
-            at_points["paired"] = contact.paired.astype(np.float64)
-        order = np.ravel(rows)  # facet by facet, whatever the ranks
-        points = {name: values[order][:, None] for name, values in at_points.items()}
+            all_points["paired"] = contact.paired.astype(np.float64)
+        order = np.ravel(rows)  # facet by facet, as the facets
+        points = {name: values[order][:, None] for name, values in all_points.items()}
         return (
             vtu.Grid(self._number, nodes, at_nodes, in_facets),
             vtu.Grid(vtu.CELLS["point"].number[0], contact.points[order][:, None], points),
@@ -292,7 +293,8 @@ def facet_values(points: Array, measure: Array, values: Array, nodes: Array) -> 
     """
     shape = (*nodes.shape[:2], *values.shape[2:])
     values = values.reshape(*values.shape[:2], int(np.prod(values.shape[2:])))
-    known = np.isfinite(values).all(axis=2)
+    known: Mask = np.all(np.isfinite(values), axis=2)
+    whole: Mask = np.all(known, axis=1)
     share = np.where(known, measure, 0.0)
     total = share.sum(axis=1, keepdims=True)
     share = np.divide(share, total, out=np.full_like(share, np.nan), where=total > 0)
@@ -304,7 +306,7 @@ def facet_values(points: Array, measure: Array, values: Array, nodes: Array) -> 
     # Along the facet alone: its points, and those of a curved one nearly, are in a plane.
     _, size, ways = np.linalg.svd(root * (points - middle), full_matrices=False)
     size, ways = size[:, : points.shape[2] - 1], ways[:, : points.shape[2] - 1]
-    used = (size > _FLAT * size[:, :1].clip(min=1e-300)) & known.all(axis=1)[:, None]
+    used = (size > _FLAT * size[:, :1].clip(min=1e-300)) & whole[:, None]
     inverse = np.divide(1.0, size**2, out=np.zeros_like(size), where=used)
     along = np.einsum("fpd,fwd->fpw", points - middle, ways)
     slope = np.einsum("fw,fpw,fp,fpk->fwk", inverse, along, share, filled)
@@ -316,7 +318,6 @@ def facet_values(points: Array, measure: Array, values: Array, nodes: Array) -> 
         room = np.divide(room, change, out=np.ones_like(change), where=np.abs(change) > 0)
     allowed = np.clip(room.min(axis=1, keepdims=True), 0.0, 1.0)
     fitted = mean + allowed * change
-    whole = known.all(axis=1)
     fitted[whole] = np.clip(fitted[whole], low[whole], high[whole])  # to the last digit
     return fitted.reshape(shape)
 
