@@ -16,6 +16,7 @@ from dolfinx import fem
 from fenics_contact.checks.verdict import Attempt, NotConverged
 from fenics_contact.estimates.errors import quantities
 from fenics_contact.histories import checkpoint as states
+from fenics_contact.histories.table import Table
 from fenics_contact.parallel import collective_errors
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.types import Array
@@ -44,6 +45,7 @@ def increments(
     field: str | int = "every",
     fields: Sequence[fem.Function] = (),
     changed: str = "refuse",
+    history: str | Path | None = None,
 ) -> Iterator[Step]:
     """Lead the load parameter from ``start`` to ``end``; solve and commit increments. Collective.
 
@@ -87,6 +89,12 @@ def increments(
         changed: What to do with a checkpoint of other data (stiffness, laws and their parameters,
             supports, conditions, loads): "refuse" it, or "continue" from its state with the data as
             they are now.
+        history: File for a table of the increments (CSV), one row each, written as soon as it is
+            committed: load, forces, moment, area, counts of points and largest pressure of every
+            contact, energies, iterations, cuts, and the errors that ``estimate`` tells; the header
+            says the units in words. Rows that the file has of increments behind the last committed
+            one (all, where a history starts; those behind the checkpoint, where it goes on) are
+            replaced, those before it stay, so that several calls may share a file.
 
     Yields:
         The step, after its commit; ``load`` is its load parameter, and ``attempts`` has what was
@@ -96,7 +104,7 @@ def increments(
         ValueError: An argument has no sense, at the call; or, at the first increment, the
             checkpoint is damaged, of another problem or history, or of one without ``estimate``:
             problem and file are as before.
-        OSError: The checkpoint cannot be read or written.
+        OSError: The checkpoint or the table cannot be read or written.
         NotConverged: An increment failed even when cut; u, history and load are those of the last
             committed one.
     """
@@ -132,9 +140,14 @@ def increments(
         with collective_errors(comm):
             set_load(value)
 
+    if not isinstance(history, str | Path | None):
+        raise ValueError(f"history is {history!r}; it must be the name of a file")
+    table = None
+    if history is not None:
+        table = Table(Path(history), problem, tuple(quantities(problem)) if estimate else ())
     leg = _Leg(float(start), ends, float(start), estimate)
     every = max_cuts, checkpoint_every, field
-    return _Started(_history(problem, apply, leg, file, every, list(fields), changed))
+    return _Started(_history(problem, apply, leg, file, every, list(fields), changed, table))
 
 
 class _Started(Iterator[Step]):
@@ -170,6 +183,7 @@ def _history(
     every: tuple[int, int, str | int],
     fields: Sequence[fem.Function],
     changed: str,
+    table: Table | None,
 ) -> Generator[Step, None, None]:
     """What `increments` returns, its arguments checked. Collective."""
     (max_cuts, checkpoint_every, field), comm = every, problem.u.function_space.mesh.comm
@@ -205,6 +219,8 @@ def _history(
     if checkpoint is not None:
         _calls[problem][checkpoint.absolute()] = calls
     watch = _Watch(problem, fields) if checkpoint is not None else None
+    if table is not None:
+        table.begin()
 
     def write() -> None:
         leg.reached = at.load
@@ -265,6 +281,10 @@ def _history(
                 found = dict(error)
             behind = 0 if step.complete else behind + 1
             unsaved += 1
+            tried, failed = (*failed, *step.attempts), []
+            step = dataclasses.replace(step, load=goal, attempts=tried, increment_error=found)
+            if table is not None:  # before the checkpoint, behind which rows are replaced
+                table.add(step)
             # Halves belong together: between them the whole one's results would be lost.
             due = checkpoint is not None and (
                 goal == end or (unsaved >= checkpoint_every and not halves)
@@ -274,10 +294,9 @@ def _history(
             if due and not fields:
                 write()
             leg.reached = goal
-            tried, failed = (*failed, *step.attempts), []
             if watch is not None:
                 watch.look()
-            yield dataclasses.replace(step, load=goal, attempts=tried, increment_error=found)
+            yield step
             if watch is not None:
                 watch.compare()
             if due and fields:

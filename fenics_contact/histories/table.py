@@ -1,0 +1,178 @@
+"""A history as a table in a file: one row an increment, for spreadsheets and plots."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from fenics_contact.contact.contact import Contact
+from fenics_contact.parallel import collective_errors
+from fenics_contact.problem import ContactProblem, Step
+from fenics_contact.results import files
+
+__all__ = ["Table"]
+
+_AXES = "xyz"
+_ENERGIES = ("work", "elastic", "springs", "dissipation", "remainder")
+# How every table begins: a file that begins otherwise is not overwritten.
+_FIRST = ("increment", "load")
+
+
+class Table:
+    """A file of comma-separated values (CSV), written by the first rank.
+
+    A row is there as soon as its increment is committed. In the plane forces, moments and energies
+    are per thickness, unless the contacts' weight has it.
+    """
+
+    def __init__(self, path: Path, problem: ContactProblem, errors: Sequence[str] = ()) -> None:
+        """See that the file can be written. Collective.
+
+        Args:
+            path: The file.
+            problem: Whose history.
+            errors: Quantities whose errors the steps will have.
+
+        Raises:
+            ValueError: Its folder is not there, or there is a file that is no such table. On all
+                ranks.
+            OSError: It cannot be written. On all ranks.
+        """
+        self._path, self._problem, self._errors = path, problem, tuple(errors)
+        self._comm = problem.u.function_space.mesh.comm
+        names = [*_FIRST]
+        for contact in problem.contacts:
+            names += [f"{contact.name}: {column}" for column in _columns(contact)]
+        names += [f"{name} (force length)" for name in _ENERGIES]
+        names += ["residual (share of the forces)", "method", "iterations", "cuts"]
+        names += [f"error of {name} by the increments ({_unit(name)})" for name in self._errors]
+        self._header = _line(names)
+        with collective_errors(self._comm):
+            if self._comm.rank == 0:
+                self._check()
+
+    def _check(self) -> None:
+        if not self._path.parent.is_dir():
+            raise ValueError(
+                f"history is {self._path}, and there is no folder {self._path.parent}; make it"
+            )
+        there = self._path.exists()
+        with open(self._path, "a+", newline="", encoding="utf-8") as file:
+            file.seek(0)
+            try:
+                first = file.readline()
+            except UnicodeDecodeError:
+                first = "no text"
+        if not there:
+            self._path.unlink()
+        if first and not first.startswith(",".join(_FIRST)):
+            raise ValueError(
+                f"history is {self._path}, which is there and is no table of a history; it would "
+                "be overwritten: give another name, or remove it"
+            )
+
+    def begin(self) -> None:
+        """Keep the rows of the increments that the problem has committed. Collective.
+
+        Raises:
+            ValueError: They have other columns, or are damaged. On all ranks.
+            OSError: The file cannot be written; it is as before. On all ranks.
+        """
+        with collective_errors(self._comm):
+            if self._comm.rank == 0:
+                kept = self._rows() if self._problem.increment else []
+                with files.replacing(self._path) as path:
+                    path.write_bytes("".join([self._header, *kept]).encode())
+
+    def _rows(self) -> list[str]:
+        """Lines of the file up to the committed increment."""
+        if not self._path.exists():
+            return []
+        header, *lines = self._path.read_bytes().decode().splitlines(keepends=True) or [""]
+        if header not in ("", self._header):
+            raise ValueError(
+                f"{self._path} is of other contacts, or of a history with other estimates: its "
+                "columns differ; give another name, or remove it"
+            )
+        if lines and not lines[-1].endswith("\n"):
+            lines.pop()  # what ended the run ended it in the middle
+        kept, n = [], len(next(csv.reader([self._header])))
+        for number, line in enumerate(lines, start=2):
+            row = next(csv.reader([line]))
+            if len(row) != n or not row[0].isdigit():
+                raise ValueError(f"{self._path} is damaged in line {number}; remove it")
+            if int(row[0]) <= self._problem.increment:
+                kept.append(line)
+        return kept
+
+    def add(self, step: Step) -> None:
+        """Append the row of a committed increment. Collective.
+
+        Raises:
+            OSError: It cannot be written; the file is as before. On all ranks.
+        """
+        row: list[object] = [step.increment, "" if step.load is None else step.load]
+        for contact in self._problem.contacts:
+            row += _values(contact, step)
+        row += [getattr(step.energy, name) for name in _ENERGIES]
+        row += [step.verdict.relative_residual, step.method, step.iterations]
+        row.append(sum(attempt.method == "cut" for attempt in step.attempts))
+        found = step.increment_error or {}
+        row += [found.get(name, "") for name in self._errors]
+        with collective_errors(self._comm):
+            if self._comm.rank == 0:
+                self._append(_line(row).encode())
+
+    def _append(self, line: bytes) -> None:
+        before = self._path.stat().st_size
+        try:
+            with open(self._path, "ab") as file:
+                file.write(line)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError:
+            os.truncate(self._path, before)
+            raise
+
+
+def _columns(contact: Contact) -> list[str]:
+    """Names and units of what a contact has in a row."""
+    d = contact.surface.mesh.geometry.dim
+    turns = _AXES if d == 3 else "z"
+    return [
+        *(f"force {axis} (force)" for axis in _AXES[:d]),
+        "normal force (force)",
+        "friction as the sum of sizes (force)",
+        *(f"moment {axis} about the origin (force length)" for axis in turns),
+        "closed area (area)",
+        "largest pressure (stress)",
+        "largest penetration (length)",
+        *(f"{state} (points)" for state in ("open", "stick", "slip")),
+    ]
+
+
+def _values(contact: Contact, step: Step) -> list[object]:
+    """The same in numbers. Collective."""
+    r = step.contacts[contact.name]
+    moment = contact.moment([0.0] * contact.surface.mesh.geometry.dim)
+    return [
+        *(float(value) for value in r.force),
+        *(r.normal_force, r.tangential_force),
+        *(float(value) for value in moment),
+        *(r.area, r.max_pressure, r.max_penetration, r.open, r.stick, r.slip),
+    ]
+
+
+def _unit(quantity: str) -> str:
+    """Of a quantity of an `ErrorBudget`."""
+    kind = quantity.rsplit(" ", 1)[-1]
+    return {"force": "force", "pressure": "stress", "displacement": "length"}[kind]
+
+
+def _line(row: Sequence[object]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(row)
+    return text.getvalue()

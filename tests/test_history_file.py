@@ -1,0 +1,225 @@
+"""The table of a history: what is in a row, and that none is lost, doubled or half written.
+
+References: the steps that `increments` yields, whose numbers are written with all digits.
+"""
+
+import csv
+import os
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import fenics_contact as fc
+from scenes.comparing import close, raised_everywhere, shared_folder
+from scenes.histories import Press
+from scenes.rubber import Tool
+from scenes.rubbing import Rub
+
+COMM = MPI.COMM_WORLD
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+
+
+def table(path):
+    """Rows by column, as text."""
+    COMM.barrier()
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    COMM.barrier()
+    return rows
+
+
+def numbers(rows, column):
+    return [float(row[column]) for row in rows]
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_a_row_is_a_step(cell, tmp_path):
+    """There and back in two calls with one file; every row is there when its step comes out."""
+    path = shared_folder(tmp_path) / "history.csv"
+    made = Press(cell=cell, wall=True)
+    steps, moments = [], []
+    for start, end in ((0.0, 2.0), (2.0, 3.0)):
+        for step in made.increments(end, start, history=path):
+            steps.append(step)
+            contacts = made.problem.contacts
+            moments.append({c.name: c.moment([0.0] * made.scene.dim) for c in contacts})
+            assert len(table(path)) == len(steps)
+    rows = table(path)
+    assert [int(row["increment"]) for row in rows] == [step.increment for step in steps]
+    assert numbers(rows, "load") == [step.load for step in steps]
+    for name in ("floor", "wall"):
+        for i, axis in enumerate("xyz"[: made.scene.dim]):
+            forces = [step.contacts[name].force[i] for step in steps]
+            assert numbers(rows, f"{name}: force {axis} (force)") == forces
+        for i, axis in enumerate("xyz" if made.scene.dim == 3 else "z"):
+            column = numbers(rows, f"{name}: moment {axis} about the origin (force length)")
+            assert close(column, [moment[name][i] for moment in moments], 1e-12)
+        for column, attribute in (
+            ("normal force (force)", "normal_force"),
+            ("friction as the sum of sizes (force)", "tangential_force"),
+            ("closed area (area)", "area"),
+            ("largest pressure (stress)", "max_pressure"),
+            ("largest penetration (length)", "max_penetration"),
+            ("open (points)", "open"),
+            ("stick (points)", "stick"),
+            ("slip (points)", "slip"),
+        ):
+            expected = [getattr(step.contacts[name], attribute) for step in steps]
+            assert numbers(rows, f"{name}: {column}") == expected
+    for name in ("work", "elastic", "springs", "dissipation", "remainder"):
+        expected = [getattr(step.energy, name) for step in steps]
+        assert numbers(rows, f"{name} (force length)") == expected
+    assert [row["method"] for row in rows] == [step.method for step in steps]
+    assert numbers(rows, "iterations") == [step.iterations for step in steps]
+    assert numbers(rows, "cuts") == [0.0] * len(steps)
+
+
+def test_a_resumed_history(tmp_path):
+    """Rows behind the checkpoint are replaced, those before it are as they were."""
+    folder = shared_folder(tmp_path)
+    whole, made, again = Press(), Press(), Press()
+    list(whole.increments(3.0, history=folder / "whole.csv"))
+    files = {"checkpoint": folder / "state.npz", "history": folder / "parts.csv"}
+    for step in made.increments(3.0, checkpoint_every=2, **files):
+        if step.increment == 5:
+            break
+    before = table(folder / "parts.csv")
+    assert [row["increment"] for row in before] == ["1", "2", "3", "4", "5"]
+    if COMM.rank == 0:  # the run was killed in the middle of a row
+        with open(folder / "parts.csv", "a", encoding="utf-8") as file:
+            file.write("6,3.0,12.")
+    COMM.barrier()
+    for step in again.increments(3.0, **files):
+        if step.increment == 5:
+            assert table(folder / "parts.csv")[:4] == before[:4]
+    rows, expected = table(folder / "parts.csv"), table(folder / "whole.csv")
+    assert [row["increment"] for row in rows] == [row["increment"] for row in expected]
+    for column in ("load", "floor: normal force (force)", "floor: force x (force)"):
+        assert close(numbers(rows, column), numbers(expected, column), whole.tolerance)
+    # What is done is not done again, and leaves the table alone.
+    done = Press()
+    assert list(done.increments(3.0, **files)) == []
+    assert table(folder / "parts.csv") == rows
+    # A history that starts anew has a table of its own.
+    next(iter(Press().increments(3.0, history=files["history"])))
+    assert [row["increment"] for row in table(folder / "parts.csv")] == ["1"]
+
+
+def test_cuts_errors_and_failures(tmp_path, monkeypatch):
+    """What `estimate` tells, and how often an increment was cut; rows outlive what ends the run."""
+    folder = shared_folder(tmp_path)
+    made = Press()
+    solve, calls = made.problem.solve, []
+
+    def failing(**options):
+        calls.append(options)
+        if len(calls) == 2:  # the second increment as a whole
+            made.problem.kinematics = 1e-12
+        try:
+            return solve(**options)
+        finally:
+            made.problem.kinematics = 0.2
+
+    with monkeypatch.context() as patch:
+        patch.setattr(made.problem, "solve", failing)
+        list(made.increments(1.5, steps=2, max_cuts=3, history=folder / "cut.csv"))
+    cuts = numbers(table(folder / "cut.csv"), "cuts")
+    assert cuts == [0.0, 1.0, 0.0]
+
+    made = Press()
+    steps = list(made.increments(1.0, steps=2, estimate=True, history=folder / "errors.csv"))
+    rows = table(folder / "errors.csv")
+    for name, unit in (("normal force", "force"), ("peak pressure", "stress")):
+        found = [row[f"error of {name} by the increments ({unit})"] for row in rows]
+        expected = [s.increment_error and s.increment_error[name] for s in steps]
+        assert found == ["" if e is None else str(float(e)) for e in expected]
+        assert found[0] == "" != found[1]
+
+    made = Press()
+    path = folder / "failed.csv"
+    history = made.increments(1.5, steps=2, max_cuts=0, history=path)
+    next(history)
+    made.problem.kinematics = 1e-12
+    with pytest.raises(fc.NotConverged):
+        next(history)
+    assert [row["increment"] for row in table(path)] == ["1"]
+
+
+def test_wrong_input(tmp_path):
+    """Errors on all ranks before any work, and what is there stays."""
+    folder = shared_folder(tmp_path)
+    made = Rub()
+    if COMM.rank == 0:
+        (folder / "letter.txt").write_text("Dear reader")
+    COMM.barrier()
+
+    def call(history, problem=made, **options):
+        return lambda: next(
+            iter(fc.increments(problem.problem, problem.load, history=history, **options))
+        )
+
+    raised_everywhere(call(3), ValueError, "history", "name of a file")
+    raised_everywhere(call(folder / "no" / "h.csv"), ValueError, "no folder", "make it")
+    raised_everywhere(call(folder / "letter.txt"), ValueError, "letter.txt", "overwritten")
+    raised_everywhere(call(folder), OSError, str(folder.name))
+    assert sorted(os.listdir(folder)) == ["letter.txt"] and made.problem.increment == 0
+    assert (folder / "letter.txt").read_text() == "Dear reader"
+
+    path = folder / "h.csv"
+    call(path, steps=2)()
+    other = Rub(contact={"name": "other"})
+    call(folder / "other.csv", other, steps=2)()
+    before = path.read_bytes()
+    again = lambda: next(  # noqa: E731
+        iter(fc.increments(other.problem, other.load, 0.5, 1.0, history=path))
+    )
+    raised_everywhere(again, ValueError, "columns differ")
+    assert path.read_bytes() == before
+    COMM.barrier()
+    if COMM.rank == 0:
+        path.write_bytes(before + before.splitlines(keepends=True)[1][:20] + b"\n")
+    COMM.barrier()
+    again = lambda: next(  # noqa: E731
+        iter(fc.increments(made.problem, made.load, 0.5, 1.0, history=path))
+    )
+    raised_everywhere(again, ValueError, "damaged in line 3")
+
+
+def test_a_row_that_cannot_be_written(tmp_path, monkeypatch):
+    """The error is everywhere, no half of a row is left, and the committed state stays."""
+    path = shared_folder(tmp_path) / "h.csv"
+    made = Rub()
+    history = fc.increments(made.problem, made.load, steps=3, history=path)
+    next(history)
+    before = path.read_bytes()
+    COMM.barrier()
+
+    def full(*_):
+        raise OSError("no space left")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        raised_everywhere(lambda: next(history), OSError, "no space left")
+    assert path.read_bytes() == before
+    COMM.barrier()
+    assert made.problem.increment == 2
+
+
+def test_finite_kinematics(tmp_path):
+    """Moments act where Γc has moved to; the number of the row's points is that of all ranks."""
+    path = shared_folder(tmp_path) / "h.csv"
+    made = Tool(law=fc.Frictionless(1e4))
+    (step,) = made.increments(1.0, steps=1, history=path)
+    (row,) = table(path)
+    moment = float(row["contact: moment z about the origin (force length)"])
+    assert close([moment], made.contact.moment((0.0, 0.0)), 1e-12)
+    points = sum(int(row[f"contact: {s} (points)"]) for s in ("open", "stick", "slip"))
+    assert points == COMM.allreduce(len(made.contact.points))
+    # By the lever of the contact force: the origin is the middle of the block's bottom.
+    x = made.contact.points + made.contact.own_displacement()
+    force = made.contact.measure[:, None] * made.contact.traction
+    lever = COMM.allreduce(np.sum(x[:, 0] * force[:, 1] - x[:, 1] * force[:, 0]))
+    size = abs(step.contacts["contact"].normal_force)
+    assert abs(moment - lever) <= 1e-9 * size
