@@ -25,6 +25,7 @@ ROOMS = [
     "results",
     "estimates",
     "histories",
+    "__main__",
 ]
 # Modules that stand in no room and know none of them.
 GROUND = {

@@ -1,0 +1,74 @@
+"""What the installation tells of itself, beside what is known by another way."""
+
+import importlib
+import sys
+from pathlib import Path
+
+import dolfinx
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import fenics_contact as fc
+from fenics_contact import __main__ as program
+from scenes.comparing import raised_everywhere
+
+COMM = MPI.COMM_WORLD
+
+pytestmark = pytest.mark.mpi
+
+
+def test_what_is_there():
+    """Versions of what is imported; numbers of this run."""
+    found = program.information()
+    assert found["fenics_contact"] == fc.__version__
+    assert found["DOLFINx"] == dolfinx.__version__ and found["numpy"] == np.__version__
+    assert found["Python"] == ".".join(map(str, sys.version_info[:3]))
+    assert found["scalars"] == np.zeros(1, PETSc.ScalarType).dtype.name
+    assert int(found["indices"].removeprefix("int")) == 8 * PETSc.IntType().itemsize
+    assert f"{COMM.size} rank(s)" in found["MPI"]
+    for name in ("ufl", "basix", "ffcx", "scipy", "mpi4py", "petsc4py", "PETSc"):
+        assert found[name][0].isdigit(), found[name]
+    folder = Path(found["compiled forms"].split(" (")[0])
+    assert folder.is_dir() and any(folder.glob("*.so"))  # the scenes' forms
+    for path in found["BLAS"].split("; ")[0].split(", "):
+        assert Path(path).exists()
+
+
+def test_orderings_are_tried():
+    """AMD and QAMD are parts of MUMPS itself; one that does not exist is not taken for one."""
+    found = program.information()["direct solver"]
+    words = found.split(";")[0].removeprefix("MUMPS, orderings ").split(", ")
+    assert {"AMD", "AMF", "QAMD"} <= set(words) <= {"AMD", "AMF", "QAMD", "PORD", "SCOTCH", "METIS"}
+
+
+def test_what_is_missing_and_what_it_costs(monkeypatch):
+    """It is told, with the reason, and nothing ends."""
+    real = importlib.import_module
+
+    def without(name, *rest):
+        if name == "gmsh":
+            raise OSError("libGLU.so.1: cannot open shared object file")
+        return real(name, *rest)
+
+    monkeypatch.setattr(importlib, "import_module", without)
+    found = program.information()["gmsh"]
+    assert found.startswith("missing (libGLU.so.1") and "model_to_mesh" in found
+
+
+def test_the_program(capsys):
+    """One line each, on the first rank alone; another word is refused."""
+    assert program.main(["info"]) == 0
+    printed = capsys.readouterr().out
+    lines = COMM.bcast(printed).splitlines()
+    assert any(line.split() == ["DOLFINx", dolfinx.__version__] for line in lines)
+    assert (printed == "") == (COMM.rank != 0)
+    raised_everywhere(lambda: exits(["formation"]), RuntimeError, "2")
+
+
+def exits(words):
+    try:
+        program.main(words)
+    except SystemExit as error:
+        raise RuntimeError(f"exit {error.code}") from None
