@@ -21,6 +21,7 @@ from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.verdict import Attempt, NotConverged, Verdict
 from fenics_contact.contact.contact import Contact, Found
 from fenics_contact.contact.values import Resultants, Status
+from fenics_contact.markup import shown
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
 from fenics_contact.methods.solver import METHODS, Settings, Solver
 from fenics_contact.parallel import fail_together, global_max, global_min
@@ -44,6 +45,8 @@ logger = logging.getLogger("fenics_contact")
 _TOUCHING = 1e-12
 # Contact that bears less than this share of the load on a free motion bears nothing yet.
 _IDLE = 1e-3
+# Of a vector's largest component, what of another is the solver's tolerance.
+_NOTHING = 1e-9
 # How parts of a mixed function are prescribed.
 _OF_A_PART = (
     "; on a part of a mixed one it is dirichletbc(value, dofs, W.sub(0)), where dofs are those of "
@@ -92,7 +95,11 @@ class Step:
     complete: bool = True
 
     def summary(self) -> str:
-        """One line for people; friction is ∫|τ| over the points, not the size of its resultant."""
+        """One line for people.
+
+        Of every contact "force" is ∫ -r_n, "friction ∫|τ|" the sum of the sizes over the points,
+        and "resultant" the force on the body, in which tractions of opposite ways cancel.
+        """
         parts = [f"increment {self.increment}"]
         if self.load is not None:
             parts.append(f"load {self.load:.6g}")
@@ -103,10 +110,39 @@ class Step:
         for name, r in self.contacts.items():
             parts.append(
                 f"{name}: force {r.normal_force:.6g}, friction ∫|τ| "
-                f"{r.tangential_force:.6g}, area {r.area:.4g}, {r.stick} stick {r.slip} slip "
-                f"{r.open} open"
+                f"{r.tangential_force:.6g}, resultant {_components(r.force)}, "
+                f"area {r.area:.4g}, {r.stick} stick {r.slip} slip {r.open} open"
             )
         return "; ".join(parts)
+
+    def _repr_html_(self) -> str:
+        """The same as a table, for notebooks."""
+        title = f"Increment {self.increment}"
+        if self.load is not None:
+            title += f", load {self.load:.6g}"
+        header = ("contact", "∫ pressure", "friction ∫|τ|", "resultant on the body", "area")
+        rows = [
+            (
+                name,
+                f"{r.normal_force:.6g}",
+                f"{r.tangential_force:.6g}",
+                _components(r.force),
+                f"{r.area:.4g}",
+                *(str(number) for number in (r.stick, r.slip, r.open)),
+            )
+            for name, r in self.contacts.items()
+        ]
+        remarks = [
+            f"{self.method}: {self.iterations} iterations; residual "
+            f"{self.verdict.relative_residual:.1e} of the forces"
+        ]
+        return shown(title, (*header, "stick", "slip", "open"), rows, remarks)
+
+
+def _components(vector: Array) -> str:
+    """In words; what is next to nothing beside the largest is 0."""
+    size = np.abs(vector).max(initial=0.0)
+    return "(" + ", ".join(f"{v if abs(v) > _NOTHING * size else 0:.6g}" for v in vector) + ")"
 
 
 @dataclass(frozen=True)

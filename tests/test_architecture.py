@@ -29,7 +29,8 @@ ROOMS = [
 ]
 # Modules that stand in no room and know none of them.
 GROUND = {
-    *("compat", "parallel", "types", "meshes", "joining", "arguments", "elasticity", "_version"),
+    *("compat", "parallel", "types", "meshes", "joining", "arguments", "elasticity", "markup"),
+    "_version",
 }
 # DOLFINx names its C++ objects so, and there is no other way to them.
 OF_DOLFINX = {"_cpp_object"}

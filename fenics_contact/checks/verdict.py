@@ -10,6 +10,7 @@ import numpy as np
 from fenics_contact.checks.kinematics import Linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.contact.contact import Contact
+from fenics_contact.markup import shown
 from fenics_contact.parallel import global_max
 from fenics_contact.types import Array
 
@@ -132,6 +133,22 @@ class Verdict:
     @staticmethod
     def _worst(balances: dict[str, Balance]) -> Balance:
         return max(balances.values(), key=Balance.excess)
+
+    def _repr_html_(self) -> str:
+        """What is left of what must vanish, and what passes, for notebooks."""
+        balances = {f"equations, {name}": b for name, b in self.equations.items()}
+        balances |= {f"sums of forces, {name}": b for name, b in self.sums.items()}
+        balances |= {f"second route, {name}": b for name, b in self.routes.items()}
+        rows = [(n, f"{b.residual:.2e}", f"{b.tolerance:.2e}") for n, b in balances.items()]
+        for contact, laws in self.laws.items():
+            for law, violation in laws.items():
+                rows.append((f"{law}, {contact}", f"{violation:.2e}", f"{_LAW_TOLERANCE:.2e}"))
+        for contact, error in self.enforcement.items():
+            allowed = f"{self.enforcement_tolerance[contact]:.2e}"
+            rows.append((f"enforcement, {contact}", f"{error:.2e}", allowed))
+        failures = self.failures
+        title = "Verdict: " + ("does not hold" if failures else "holds")
+        return shown(title, ("check", "left", "passes"), rows, failures)
 
     @property
     def failures(self) -> list[str]:

@@ -21,6 +21,7 @@ from fenics_contact import compat
 from fenics_contact.checks.kinematics import Deviation, LinearSprings
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
+from fenics_contact.markup import shown
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.problem import ContactProblem
 from fenics_contact.surface.mass import assembled, mass_solver
@@ -124,14 +125,31 @@ class ErrorBudget:
 
     def __str__(self) -> str:
         """The table of parts and quantities, in per cent, and what to change."""
-        names = list(self.values)
-        width = max(14, *(len(name) + 2 for name in names))
-        lines = [f"{'error in %':<16}" + "".join(f"{name:>{width}}" for name in names)]
+        width = max(14, *(len(name) + 2 for name in self.values))
+        lines = ["error in %".ljust(16) + "".join(f"{name:>{width}}" for name in self.values)]
+        for part, *cells in self._rows():
+            lines.append(f"{part:<16}" + "".join(f"{cell:>{width}}" for cell in cells))
+        return "\n".join([*lines, *self._remarks()])
+
+    def _repr_html_(self) -> str:
+        """The same for notebooks, and all parts together."""
+        total = self.total
+        together = ("together", *(f"{100 * total[name]:.2g}" for name in self.values))
+        header = ("error in %", *self.values)
+        return shown("Error budget", header, [*self._rows(), together], self._remarks())
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        """Every part with its errors in per cent."""
+        rows = []
         for part in _REMEDIES:
             found = self.relative(part) if part in self.parts else {}
-            cells = [f"{100 * found[n]:.2g}" if n in found else "not told" for n in names]
-            lines.append(f"{part:<16}" + "".join(f"{cell:>{width}}" for cell in cells))
-        lines.append(f"{self.dominant} dominates: {_REMEDIES[self.dominant]} would help most")
+            cells = (f"{100 * found[n]:.2g}" if n in found else "not told" for n in self.values)
+            rows.append((part, *cells))
+        return rows
+
+    def _remarks(self) -> list[str]:
+        """What to change, and how far the table can be trusted."""
+        lines = [f"{self.dominant} dominates: {_REMEDIES[self.dominant]} would help most"]
         if 0 < self.across < _FEW:
             lines.append(
                 f"only some {self.across:.0f} facets in a row bear pressure: discretisation is not "
@@ -141,7 +159,7 @@ class ErrorBudget:
             size = f"facets of {self.h_wanted:.2g} at the contact, now {self.h:.2g}"
             enough = "the mesh is fine enough" if self.h_wanted >= self.h else f"it takes {size}"
             lines.append(f"for the accuracy of {self.wanted:.2g} {enough}")
-        return "\n".join(lines)
+        return lines
 
 
 def quantities(problem: ContactProblem) -> dict[str, float]:

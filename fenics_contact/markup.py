@@ -1,0 +1,34 @@
+"""Tables in HTML, as notebooks show objects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from html import escape
+
+__all__ = ["shown"]
+
+
+def shown(
+    title: str,
+    header: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    remarks: Iterable[str] = (),
+) -> str:
+    """A table with a title, the first cell of each row its name, and lines below it.
+
+    Args:
+        title: Text, as all that follows: what would be markup is escaped.
+        header: Of the columns.
+        rows: As long as the header.
+        remarks: Lines.
+    """
+    lines = [f"<table><caption>{escape(title)}</caption><thead><tr>"]
+    lines += [f"<th>{escape(name)}</th>" for name in header]
+    lines.append("</tr></thead><tbody>")
+    for name, *cells in rows:
+        lines.append(f"<tr><th>{escape(name)}</th>")
+        lines += [f"<td>{escape(cell)}</td>" for cell in cells]
+        lines.append("</tr>")
+    lines.append("</tbody></table>")
+    lines += [f"<p>{escape(remark)}</p>" for remark in remarks]
+    return "".join(lines)

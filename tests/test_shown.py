@@ -1,0 +1,96 @@
+"""What notebooks show: well-formed tables with the object's numbers, and no markup of a name's."""
+
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+
+import fenics_contact as fc
+from scenes.elasticity import stress
+from scenes.rubbing import Rub
+
+pytestmark = pytest.mark.mpi
+
+NAME = "<b>one & two</b>"
+
+
+@pytest.fixture(scope="module")
+def solved():
+    """A block slipped to and fro, under a name that would be markup, and its last step."""
+    made = Rub(contact={"name": NAME}, degree=2)
+    made.problem.kinematics = np.inf
+    *_, step = fc.increments(made.problem, made.load, 0, 2, steps=4, estimate=True)
+    return made, step
+
+
+def table(thing):
+    """Title, rows and lines below, by a parser of XML."""
+    root = ElementTree.fromstring(f"<div>{thing._repr_html_()}</div>")
+    rows = [[cell.text for cell in row] for row in root.iter("tr")]
+    assert len({len(row) for row in rows}) == 1
+    assert {e.tag for e in root.iter()} <= set("div table caption thead tbody tr th td p".split())
+    return root.find(".//caption").text, rows, [p.text for p in root.iter("p")]
+
+
+def test_a_step(solved):
+    """Its summary and its table tell the resultant and the sum of sizes apart."""
+    _, step = solved
+    r = step.contacts[NAME]
+    title, (header, row), (remark,) = table(step)
+    assert title == f"Increment {step.increment}, load 2"
+    shown = dict(zip(header, row, strict=True))
+    assert shown["contact"] == NAME
+    assert shown["friction ∫|τ|"] == f"{r.tangential_force:.6g}"
+    assert shown["∫ pressure"] == f"{r.normal_force:.6g}"
+    force = [float(v) for v in shown["resultant on the body"].strip("()").split(", ")]
+    assert force == pytest.approx(r.force.tolist(), rel=1e-5)
+    assert [shown[s] for s in ("stick", "slip", "open")] == [
+        str(n) for n in (r.stick, r.slip, r.open)
+    ]
+    assert f"{step.iterations} iterations" in remark
+    # Friction is against the motion everywhere here, and the ball's flanks press aside.
+    text = step.summary()
+    assert (
+        f"friction ∫|τ| {r.tangential_force:.6g}, resultant {shown['resultant on the body']}"
+        in text
+    )
+    assert abs(abs(force[0]) - r.tangential_force) > 1e-3 * r.tangential_force
+
+
+def test_a_verdict(solved):
+    """Every balance and law with what passes; failures below."""
+    made, step = solved
+    title, rows, remarks = table(step.verdict)
+    assert title == "Verdict: holds" and remarks == []
+    names = [name for name, *_ in rows]
+    assert f"cone, {NAME}" in names
+    assert len(rows) - 1 == len(step.verdict.equations) + len(step.verdict.sums) + len(
+        step.verdict.laws[NAME]
+    )
+    for _, left, passes in rows[1:]:
+        assert float(left) <= 2 * float(passes)
+    made.problem.kinematics = 1e-12
+    made.load(2.5)
+    with pytest.raises(fc.NotConverged) as error:
+        made.problem.solve()
+    made.problem.kinematics = np.inf
+    title, _, remarks = table(error.value.verdict)
+    assert title == "Verdict: does not hold" and remarks == error.value.verdict.failures
+
+
+def test_an_error_budget(solved):
+    """The cells are those of the text; the last row is all parts together."""
+    made, step = solved
+    scene = made.scene
+    tensor = stress(scene.u, scene.E, scene.nu)
+    budget = fc.estimate_errors(made.problem, tensor, increment_error=step.increment_error)
+    title, (header, *rows), remarks = table(budget)
+    assert title == "Error budget" and header[1:] == list(budget.values)
+    lines = str(budget).splitlines()
+    for line, row in zip(lines[1:], rows[:-1], strict=False):
+        assert " ".join(line.split()) == " ".join(row)
+    assert rows[-1][0] == "together"
+    assert [float(c) for c in rows[-1][1:]] == pytest.approx(
+        [100 * t for t in budget.total.values()], rel=0.06
+    )
+    assert remarks == lines[len(rows) :]
