@@ -1,0 +1,119 @@
+"""Pictures without a screen: what is drawn, taken from the figure that is about to be saved."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact import plotting
+from scenes.blocks import CELLS, dimension
+from scenes.comparing import close, raised_everywhere, shared_folder
+from scenes.rubbing import Rub
+
+matplotlib = pytest.importorskip("matplotlib")
+COMM = MPI.COMM_WORLD
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+
+CORNERS = {"triangle": 3, "quadrilateral": 4, "tetrahedron": 3, "hexahedron": 4}
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures, kept open."""
+    figures, save = [], plotting._save
+
+    def keep(figure, path):
+        figures.append(figure)
+        save(figure, path)
+
+    monkeypatch.setattr(plotting, "_save", keep)
+    return figures
+
+
+def on_first(check):
+    """Run it on the first rank, fail on all of them."""
+    error = None
+    if COMM.rank == 0:
+        try:
+            check()
+        except AssertionError as caught:
+            error = str(caught) or repr(caught)
+    assert COMM.bcast(error) is None
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_pictures_of_any_body(cell, tmp_path, drawn):
+    """Whole on any number of ranks: every facet once, its colour and place; axes with units."""
+    folder, d = shared_folder(tmp_path), dimension(cell)
+    made = Rub(cell=cell, mesh={"n": 4})
+    made.problem.kinematics = np.inf
+    (step,) = fc.increments(made.problem, made.load, 0, 2, steps=1)
+    plotting.plot_pressure(folder / "p.png", made.contact, length="m", stress="Pa", title="Title")
+    plotting.plot_status(folder / "s.png", made.contact, length="m")
+    plotting.plot_deformation(folder / "d.png", made.scene.u, unit="m", magnification=2.0)
+    points = made.contact.gather()
+    n_facets = {2: 4, 3: 16}[d] * (2 if cell == "tetrahedron" else 1)
+    n_shapes = {"triangle": 32, "quadrilateral": 16, "tetrahedron": 192, "hexahedron": 96}[cell]
+
+    def check():
+        assert len(drawn) == 3
+        pressure, status, deformed = drawn
+        for figure in drawn:
+            axes = figure.axes[0]
+            assert axes.get_xlabel() == "x [m]" and axes.get_ylabel() == "y [m]"
+        assert pressure.axes[1].get_ylabel() == "contact pressure [Pa]"
+        assert pressure.axes[0].get_title() == "Title"
+        body, surface = pressure.axes[0].collections
+        assert len(shapes(body)) == n_shapes and len(shapes(surface)) == n_facets
+        # The colour scale goes up to the largest mean, and as many facets as bear are coloured.
+        by_facet = per_facet(points, cell)
+        assert close(pressure.axes[1].get_ylim(), [0.0, by_facet.max()], 1e-12)
+        colours = surface.get_facecolor() if d == 3 else surface.get_color()
+        grey = matplotlib.colors.to_rgba("#d8d8d8")
+        bears = ~np.all(np.isclose(np.asarray(colours), grey), axis=1)
+        assert np.count_nonzero(bears) == np.count_nonzero(by_facet > 0)
+        names = [text.get_text() for text in status.legends[0].get_texts()]
+        assert names == ["open", "sticking", "slipping"]
+        # Displacements by twice their size: the top moves by 0.1 along and 0.03 down.
+        before, after = (np.concatenate(shapes(c)) for c in deformed.axes[0].collections)
+        assert close(before.max(axis=0)[: d - 1], np.ones(d - 1), 1e-12)
+        assert close([after[:, 0].max()], [1.2], 1e-9)
+        assert close([after[:, -1].max()], [1 - 0.06], 1e-9)
+        assert len(shapes(deformed.axes[0].collections[0])[0]) in (CORNERS[cell], CORNERS[cell] + 1)
+        for name in ("p.png", "s.png", "d.png"):
+            assert (folder / name).read_bytes()[:4] == b"\x89PNG"
+
+    assert step.contacts["contact"].normal_force > 0
+    on_first(check)
+
+
+def shapes(collection):
+    """Corners of what is in a collection, as given."""
+    if hasattr(collection, "_vec"):  # in space: rows x, y, z, 1 of all corners one after another
+        if hasattr(collection, "_faces"):
+            return [np.asarray(face) for face in collection._faces]
+        return [collection._vec[:3, s].T for s in collection._segslices]
+    return [path.vertices for path in collection.get_paths()]
+
+
+def per_facet(points, cell):
+    """Mean pressure by facets of a grid of four a side, triangles by their halves."""
+    x = points["x"][:, :-1]
+    number = np.floor(4 * x).astype(int) @ [1, 4][: x.shape[1]]
+    if cell == "tetrahedron":
+        inside = 4 * x - np.floor(4 * x)
+        number = 2 * number + (inside[:, 0] > inside[:, 1])
+    sums = np.bincount(number, points["measure"] * points["pressure"])
+    return sums / np.bincount(number, points["measure"])
+
+
+def test_wrong_folder(tmp_path):
+    """The first rank's error, and no picture."""
+    made = Rub()
+    path = shared_folder(tmp_path) / "no" / "p.png"
+    for call in (
+        lambda: plotting.plot_pressure(path, made.contact),
+        lambda: plotting.plot_deformation(path, made.scene.u),
+    ):
+        raised_everywhere(call, OSError, "no")
