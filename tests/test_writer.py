@@ -341,7 +341,7 @@ def test_finite_kinematics(cell, tmp_path):
     stretch = np.concatenate(COMM.allgather(contact.area_stretch()))
     pressure = np.concatenate(COMM.allgather(contact.pressure))
     closed = pressure > 0
-    assert np.abs(stretch[closed] - 1).max() > 0.01
+    assert np.abs(stretch[closed] - 1).max() > 1e-3  # else nothing would be told apart
     ratio = np.sort((points["true_pressure"] / np.maximum(points["pressure"], 1e-9))[:, 0])
     expected = np.sort(np.where(closed, 1 / stretch, 0.0))
     assert close(ratio, expected, 1e-12)
