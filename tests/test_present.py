@@ -260,6 +260,18 @@ def test_a_block_slides_far(enforcement):
     assert taken == pytest.approx(0.6 * 0.2 * force.normal_force, rel=0.1)  # N is nearly constant
 
 
+def test_sliding_takes_few_steps_forth_and_back():
+    """A start in which those points slip that did: 34 and 31 steps, 53 and 38 if all stick in it.
+
+    Way back included, at whose first increment all points stick again and no start slips.
+    """
+    blocks = Blocks("triangle", fc.Coulomb(0.3), (12, 6))
+    forth = [step.iterations for step in blocks.history(2.0, WAY)]
+    rest = fc.increments(blocks.problem, blocks.load, 2.0, 1.5, steps=10)
+    back = [step.iterations for step in rest]
+    assert sum(forth) <= 40 and sum(back) <= 34 and back[0] <= 4
+
+
 def test_a_history_goes_on_where_it_stopped(tmp_path):
     """Resumed from a checkpoint it has the digits of one without a stop."""
     path = MPI.COMM_WORLD.bcast(tmp_path) / "state"

@@ -81,7 +81,7 @@ def contact_pairs(
         surface_on: Names of bodies that are to have Γc, the first before the others.
         itself: Whether a body may touch itself, too. Its facets are divided into two sides that
             face each other. Where that cannot be, as in a hole that closes, all of them are Γc and
-            all opposite: every two places are then two pairs, each of which bears half.
+            all opposite: every two places are then two pairs, which share what they bear.
         update: Of the `DeformableBody` opposite.
         release: Likewise.
         **options: For every `Contact`, such as ``kinematics`` and ``enforcement``.

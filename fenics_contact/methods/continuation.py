@@ -50,6 +50,7 @@ class Continuation:
 
     Attributes:
         snes: Newton's method for one stiffness, prefix "continuation_" behind the problem's.
+        by_newton: Whether that found the last solution, so that the tangent is factored near it.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class Continuation:
             equations, defaults, (prefix, "continuation_"), OPTIONS, solver, consistent=True
         )
         self.snes = self._newton.snes
+        self.by_newton = False
         self._coarse = 0.0
 
     def solve(self) -> tuple[int, int]:
@@ -90,6 +92,7 @@ class Continuation:
                 self._soften(share)
                 made, reason = self._solve_one()
                 iterations += made
+                self.by_newton = reason > 0
                 if reason <= 0:
                     kept.copy(equations.solution)
                     if solved and factor > _LEAST_FACTOR:

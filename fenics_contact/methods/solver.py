@@ -169,7 +169,8 @@ class Solver:
         self._automatic = settings.method is None
         self.method = settings.method or "lbfgs"
         self.methods: dict[str, Method] = {}
-        self._followed: Array | None = None
+        self._led: Continuation
+        self._moved: Array | None = None  # of the values prescribed, since the last increment
         self._quasi_newton = True
         self.snes: PETSc.SNES
         self.main: SnesMethod
@@ -259,8 +260,8 @@ class Solver:
                 "minimise; use another method"
             )
         inside = newton_solver(equations.symmetric(True))
-        continuation = Continuation(equations, alternation, options, prefix, inside)
-        self.methods = {"alternating": alternation, "continuation": continuation}
+        self._led = Continuation(equations, alternation, options, prefix, inside)
+        self.methods = {"alternating": alternation, _LAST_RESORT: self._led}
         equations.rtol = snes.getTolerances()[0]
 
     def expect(self, increments: int) -> None:
@@ -326,7 +327,8 @@ class Solver:
         self.equations.take(system)
 
     def _present_pairings(self) -> list[int]:
-        return [c.pairings for c in self._full.contacts]
+        # Matrices of pairs that follow the bodies are made for each anew, and no one is kept.
+        return [0 if c.follows else c.pairings for c in self._full.contacts]
 
     def is_current(self) -> bool:
         """Whether bulk and pairs are those of the last solution. Collective."""
@@ -478,41 +480,17 @@ class Solver:
                 self._configure_anew()
 
     def follow(self, before: Array) -> None:
-        """Find where the body goes with the values prescribed now, for a start. Collective.
-
-        By one step on the tangent at the state before: next to conditions that moved far a
-        nonlinear bulk may be turned inside out, and no iteration comes back from there. The present
-        state stays.
+        """Take note of how far the values prescribed now have moved, for a start. Collective.
 
         Args:
             before: The state in which the last increment ended.
         """
-        equations, full = self.equations, self._full
-        self._followed = None
-        now = full.state()
-        change, image, step = full.vector(), full.vector(), full.vector()
-        change.array[:] = now - before
-        if full.bulk.linear or not change.norm() > 0:
-            return
+        full = self._full
+        change = full.vector()
+        change.array[:] = full.state() - before
+        moved = not full.bulk.linear and change.norm() > 0
+        self._moved = change.array.copy() if moved else None
         self._update_pairs()
-        full.set_state(before)
-        full.update_stiffness()
-        for contact in full.contacts:
-            contact.evaluate()
-        matrix = equations.matrix(True)
-        held = equations.held()
-        parts = equations.tangents() if held else equations.stiffnesses(everywhere=True)
-        equations.assemble(matrix, parts)
-        assert full.stiffness is not None
-        full.stiffness.mult(change, image)
-        image.array[full.constrained] = 0.0
-        image.scale(-1.0 / full.bulk.scale)
-        ksp = equations.solvers[True]
-        ksp.solve(image, step)
-        if ksp.getConvergedReason() > 0:
-            self._followed = now + step.array_r
-        linear.forget_failure(ksp.getPC())
-        full.set_state(now)
 
     def restart(self) -> None:
         """Drop what is kept from earlier increments. Collective."""
@@ -618,9 +596,9 @@ class Solver:
             if self._comm.rank == 0:
                 logger.info("%s", attempts[-1])
         equations.set_state(equations.solution)
-        newton = method not in self.methods and not self._quasi_newton
+        newton = method not in self.methods or (method == _LAST_RESORT and self._led.by_newton)
         made = sum(attempt.iterations for attempt in attempts[-1:])
-        self.predicts = reason > 0 and newton and (factored or made > 0)
+        self.predicts = reason > 0 and newton and self.main.consistent and (factored or made > 0)
         return int(reason), attempts
 
     @property
@@ -653,18 +631,17 @@ class Solver:
 
         The present state; that state moved on by as much as the last increment moved it: in
         proportional loading that is the solution; that state with one step of Newton's method on
-        the tangent in which the last increment ended; what `follow` has found; and that, or the
+        the tangent in which the last increment ended; what `_followed` finds; and that, or the
         present state, with supports that turn freely rolled to where they are now: where all points
         would slip no tangent tells by how much. At the present state itself no point has slipped
         yet, and all closed ones stick: from there Newton's method takes ten steps to let them slip
-        again, one after another from the edge of the contact inwards. The start by a step has the
-        right ones slipping, and comes first unless it is far off; or unless the load has turned
-        round, so that slipping points stick: then to go on is worse than to stay, by a step as by
-        the last increment.
+        again, one after another from the edge of the contact inwards. The start by a step on the
+        tangent of the last solution has the right ones slipping, and comes first unless it is far
+        off; or unless the load has turned round, so that slipping points stick: then to go on is
+        worse than to stay, by a step as by the last increment.
         """
         equations, system = self.equations, self.system
         present: Array = system.state()
-        starts = [present]
         # What a step from here takes away leaves the round-off of what was there.
         terms: Array = system.by_body(system.terms(present))[0]
         terms = np.asarray(np.hypot(terms, system.outside[1]), dtype=np.float64)
@@ -672,30 +649,90 @@ class Solver:
         # the round-off of the first one's start, too.
         terms = np.where(np.isfinite(terms), terms, 0.0)
         equations.start = np.maximum(equations.start, terms)
-        residuals = [equations.residual_at(present)]
+        starts: list[Array] = []
+        residuals: list[float] = []
+
+        def add(start: Array) -> int:
+            starts.append(start)
+            residual = equations.residual_at(start)
+            residuals.append(residual if np.isfinite(residual) else np.inf)
+            return len(starts) - 1
+
+        add(present)
         # Where nothing was borne yet the last increment tells nothing of this one.
         predicts = self.predicts and not cold
+        self.predicts = False
+        first, moved = None, present
         if predicts:
-            starts.append(self._predicted(present))
+            step = self._predicted if self._moved is None else self._followed
+            first = add(step(present))
+            moved = starts[first]
+        last = None
         if rate is not None and ahead and not cold:
-            starts.append(present + ahead * system.part(rate))
-        moved = present
-        if self._followed is not None:
-            starts.append(moved := self._followed)
-            self._followed = None
+            last = add(present + ahead * system.part(rate))
+        if self._moved is None:
+            # A nonlinear bulk does not come back from far off: a support moved into open points.
+            first = first if self._full.bulk.linear else None
+            moved = present
+        elif first is None or not residuals[first] < residuals[0] or self._turns(rate):
+            first = None
+            moved = starts[add(self._followed(present, anew=True))]
+        self._moved = None
         if ahead and any(c.free_angle is not None for c in self._full.contacts):
-            starts.append(system.rolled(moved))
-        residuals += [equations.residual_at(start) for start in starts[1:]]
-        # A nonlinear bulk does not come back from far off: a support moved into open points.
-        if predicts and self._full.bulk.linear and residuals[1] <= _FAR * min(residuals):
-            turned = len(starts) > 2 and residuals[0] < min(residuals[1] / _TURNED, residuals[2])
-            if not turned:
-                residuals[1] = 0.0
+            add(system.rolled(moved))
+        if first is not None and residuals[first] <= _FAR * min(residuals):
+            stays = residuals[0] < residuals[first] / _TURNED
+            if not (stays and last is not None and residuals[0] < residuals[last]):
+                residuals[first] = 0.0
         return [starts[i] for i in np.argsort(residuals, kind="stable")]
+
+    def _turns(self, rate: Array | None) -> bool:
+        """Whether the values prescribed go back to where they came from. Collective."""
+        if self._moved is None or rate is None:
+            return False
+        return bool(self._comm.allreduce(float(self._moved @ rate)) < 0.0)
+
+    def _followed(self, present: Array, *, anew: bool = False) -> Array:
+        """Where the body goes with the values prescribed now, by one step from before. Collective.
+
+        Next to conditions that moved far a nonlinear bulk may be turned inside out, and no
+        iteration comes back from there.
+
+        Args:
+            present: The state with the values prescribed now.
+            anew: Whether to step on the tangent where the last increment ended, at which all closed
+                points stick; or else on that factored last, in which those slip that did.
+
+        Returns:
+            The state; the present one where no step is found.
+        """
+        equations, full = self.equations, self._full
+        change, image, step = full.vector(), full.vector(), full.vector()
+        assert self._moved is not None
+        change.array[:] = self._moved
+        full.set_state(present - self._moved)
+        full.update_stiffness()
+        ksp = equations.solvers[True]
+        if anew:
+            for contact in full.contacts:
+                contact.evaluate()
+            matrix = equations.matrix(True)
+            held = equations.held()
+            parts = equations.tangents() if held else equations.stiffnesses(everywhere=True)
+            equations.assemble(matrix, parts)
+        assert full.stiffness is not None
+        full.stiffness.mult(change, image)
+        image.array[full.constrained] = 0.0
+        image.scale(-1.0 / full.bulk.scale)
+        ksp.solve(image, step)
+        found = ksp.getConvergedReason() > 0
+        linear.forget_failure(ksp.getPC())
+        full.set_state(present)
+        full.update_stiffness()
+        return present + step.array_r if found else present
 
     def _predicted(self, present: Array) -> Array:
         """One Newton step on the tangent factored last; the residual is there. Collective."""
-        self.predicts = False
         equations, ksp = self.equations, self.equations.solvers[True]
         step = equations.solution.duplicate()
         ksp.solve(equations.function, step)
