@@ -1,0 +1,34 @@
+"""The shallow ironing demo, run as its user runs it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mpi4py import MPI
+from running import run_demo, values
+
+pytestmark = [
+    pytest.mark.demo,
+    pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own"),
+]
+
+
+def test_pressed_and_begun_to_slide(tmp_path: Path) -> None:
+    """V(1) between the published ones; all points slip soon, at up to 8 steps an increment."""
+    options = ("--increments", "250", "--until", "1.08")
+    result = run_demo("shallow_ironing", tmp_path, *options)
+    assert 268.0 < values(result)["V, t = 1"] < 332.0
+    sliding = [row for row in result["path"] if row["time"] > 1.05]
+    assert all(row["stick"] == 0 and row["slip"] > 0 for row in sliding)
+    assert sum(row["iterations"] for row in sliding) <= 8 * len(sliding)
+    for name in ("forces.png", "bodies.png"):
+        assert (tmp_path / name).read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.slow
+def test_dragged_by_four_times_the_die(tmp_path: Path) -> None:
+    """V(1.5) and H(1.5) between the published ones, too."""
+    found = values(run_demo("shallow_ironing", tmp_path, "--until", "1.5"))
+    assert 337.0 < found["V, t = 1.5"] < 421.0
+    assert 102.0 < found["H, t = 1.5"] < 189.0
