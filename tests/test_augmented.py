@@ -440,7 +440,7 @@ def test_failure_leaves_no_trace(what: str, monkeypatch: pytest.MonkeyPatch) -> 
     else:
         problem.snes.setTolerances(max_it=0)
         problem.solver.main.max_it = 0
-        problem.solver.predicts = False  # that guess can be the solution
+        problem.solver.starts.predict = False  # that guess can be the solution
     scene.load(up=-30.0, side=5.0)
     words = ("elastic slip",) if what == "rounds" else ("increment 2",)
     raised_everywhere(problem.solve, fc.NotConverged, *words)

@@ -23,7 +23,8 @@ from fenics_contact.methods.method import Method, Newton, SnesMethod
 from fenics_contact.methods.neighbourhood import linearised, respond
 from fenics_contact.methods.options import Defaults, take_command_line
 from fenics_contact.methods.quasi_newton import QuasiNewton
-from fenics_contact.systems import dense, linear
+from fenics_contact.methods.starts import Starts
+from fenics_contact.systems import linear
 from fenics_contact.systems.candidates import acting, distances, nearest, touched
 from fenics_contact.systems.choice import linear_kind, obstacle_to_condensation
 from fenics_contact.systems.condensed import CondensedSystem, all_kept, inexpensive, worthwhile
@@ -41,11 +42,6 @@ _MAX_ROUNDS = 80
 # Residual, relative, to which the first round is solved; share of a round's error to which the next
 # is; and the error, in units of the tolerance, from which on the next may be the last one.
 _FIRST_ROUND, _INNER, _NEARLY = 1e-4, 1e-2, 10.0
-# A start with up to this many times the residual of the best is taken first if its points slip.
-_FAR = 100.0
-# By how much a step makes the residual larger where the load has turned round: 4 measured in
-# fretting, and up to 1.5 where it has not.
-_TURNED = 2.0
 # Iterations that Newton's method gets where it is slow, see `Solver._hurries`.
 _ENOUGH = 15
 # Increments expected where nothing is said.
@@ -127,7 +123,7 @@ class Solver:
         condensed: Whether the unknowns that contact touches are iterated on alone.
         expected: How many increments are expected.
         methods: Further methods, by name.
-        predicts: Whether the tangent factored last is that of a solution.
+        starts: Where the iteration starts from.
     """
 
     def __init__(
@@ -150,7 +146,7 @@ class Solver:
         """
         self.equations = Equations(full, motions, alpha=alpha, phi=phi)
         self.expected = _EXPECTED
-        self.predicts = False
+        self.starts = Starts(self.equations)
         self._full, self._settings = full, settings
         self._comm = full.unknowns.comm
         self._obstacle: str | None = None  # to condensation, as last said
@@ -170,7 +166,6 @@ class Solver:
         self.method = settings.method or "lbfgs"
         self.methods: dict[str, Method] = {}
         self._led: Continuation
-        self._moved: Array | None = None  # of the values prescribed, since the last increment
         self._quasi_newton = True
         self.snes: PETSc.SNES
         self.main: SnesMethod
@@ -485,11 +480,7 @@ class Solver:
         Args:
             before: The state in which the last increment ended.
         """
-        full = self._full
-        change = full.vector()
-        change.array[:] = full.state() - before
-        moved = not full.bulk.linear and change.norm() > 0
-        self._moved = change.array.copy() if moved else None
+        self.starts.moved_from(before)
         self._update_pairs()
 
     def restart(self) -> None:
@@ -510,7 +501,7 @@ class Solver:
 
     def _forget_matrices(self) -> None:
         self.equations.forget_matrices()
-        self.predicts = False
+        self.starts.predict = False
 
     # ---- solving ---------------------------------------------------------------------------------
 
@@ -571,8 +562,8 @@ class Solver:
         """
         equations = self.equations
         reason, attempts = int(_REASONS.DIVERGED_LINEAR_SOLVE), []
-        factored = self.predicts
-        starts = [s / equations.length for s in self._starts(ahead, rate, cold)]
+        factored = self.starts.predict
+        starts = [s / equations.length for s in self.starts.of(ahead, rate, cold)]
         tries = [(start, self.method) for start in starts]
         goes_on = self.may_go_on()
         first = cold and ahead > 0.0  # and no later round of multipliers
@@ -596,9 +587,11 @@ class Solver:
             if self._comm.rank == 0:
                 logger.info("%s", attempts[-1])
         equations.set_state(equations.solution)
-        newton = method not in self.methods or (method == _LAST_RESORT and self._led.by_newton)
+        newton = not self._quasi_newton and (
+            method not in self.methods or (method == _LAST_RESORT and self._led.by_newton)
+        )
         made = sum(attempt.iterations for attempt in attempts[-1:])
-        self.predicts = reason > 0 and newton and self.main.consistent and (factored or made > 0)
+        self.starts.predict = reason > 0 and newton and (factored or made > 0)
         return int(reason), attempts
 
     @property
@@ -626,121 +619,6 @@ class Solver:
             and self.main.max_it >= (_COMMON | METHODS[self.method])["snes_max_it"]
         )
 
-    def _starts(self, ahead: float, rate: Array | None, cold: bool) -> list[Array]:
-        """Unknowns of the system to start from, nearest to equilibrium first. Collective.
-
-        The present state; that state moved on by as much as the last increment moved it: in
-        proportional loading that is the solution; that state with one step of Newton's method on
-        the tangent in which the last increment ended; what `_followed` finds; and that, or the
-        present state, with supports that turn freely rolled to where they are now: where all points
-        would slip no tangent tells by how much. At the present state itself no point has slipped
-        yet, and all closed ones stick: from there Newton's method takes ten steps to let them slip
-        again, one after another from the edge of the contact inwards. The start by a step on the
-        tangent of the last solution has the right ones slipping, and comes first unless it is far
-        off; or unless the load has turned round, so that slipping points stick: then to go on is
-        worse than to stay, by a step as by the last increment.
-        """
-        equations, system = self.equations, self.system
-        present: Array = system.state()
-        # What a step from here takes away leaves the round-off of what was there.
-        terms: Array = system.by_body(system.terms(present))[0]
-        terms = np.asarray(np.hypot(terms, system.outside[1]), dtype=np.float64)
-        # The last matrix may be that of a step that overflowed. Later rounds of multipliers have
-        # the round-off of the first one's start, too.
-        terms = np.where(np.isfinite(terms), terms, 0.0)
-        equations.start = np.maximum(equations.start, terms)
-        starts: list[Array] = []
-        residuals: list[float] = []
-
-        def add(start: Array) -> int:
-            starts.append(start)
-            residual = equations.residual_at(start)
-            residuals.append(residual if np.isfinite(residual) else np.inf)
-            return len(starts) - 1
-
-        add(present)
-        # Where nothing was borne yet the last increment tells nothing of this one.
-        predicts = self.predicts and not cold
-        self.predicts = False
-        first, moved = None, present
-        if predicts:
-            step = self._predicted if self._moved is None else self._followed
-            first = add(step(present))
-            moved = starts[first]
-        last = None
-        if rate is not None and ahead and not cold:
-            last = add(present + ahead * system.part(rate))
-        if self._moved is None:
-            # A nonlinear bulk does not come back from far off: a support moved into open points.
-            first = first if self._full.bulk.linear else None
-            moved = present
-        elif first is None or not residuals[first] < residuals[0] or self._turns(rate):
-            first = None
-            moved = starts[add(self._followed(present, anew=True))]
-        self._moved = None
-        if ahead and any(c.free_angle is not None for c in self._full.contacts):
-            add(system.rolled(moved))
-        if first is not None and residuals[first] <= _FAR * min(residuals):
-            stays = residuals[0] < residuals[first] / _TURNED
-            if not (stays and last is not None and residuals[0] < residuals[last]):
-                residuals[first] = 0.0
-        return [starts[i] for i in np.argsort(residuals, kind="stable")]
-
-    def _turns(self, rate: Array | None) -> bool:
-        """Whether the values prescribed go back to where they came from. Collective."""
-        if self._moved is None or rate is None:
-            return False
-        return bool(self._comm.allreduce(float(self._moved @ rate)) < 0.0)
-
-    def _followed(self, present: Array, *, anew: bool = False) -> Array:
-        """Where the body goes with the values prescribed now, by one step from before. Collective.
-
-        Next to conditions that moved far a nonlinear bulk may be turned inside out, and no
-        iteration comes back from there.
-
-        Args:
-            present: The state with the values prescribed now.
-            anew: Whether to step on the tangent where the last increment ended, at which all closed
-                points stick; or else on that factored last, in which those slip that did.
-
-        Returns:
-            The state; the present one where no step is found.
-        """
-        equations, full = self.equations, self._full
-        change, image, step = full.vector(), full.vector(), full.vector()
-        assert self._moved is not None
-        change.array[:] = self._moved
-        full.set_state(present - self._moved)
-        full.update_stiffness()
-        ksp = equations.solvers[True]
-        if anew:
-            for contact in full.contacts:
-                contact.evaluate()
-            matrix = equations.matrix(True)
-            held = equations.held()
-            parts = equations.tangents() if held else equations.stiffnesses(everywhere=True)
-            equations.assemble(matrix, parts)
-        assert full.stiffness is not None
-        full.stiffness.mult(change, image)
-        image.array[full.constrained] = 0.0
-        image.scale(-1.0 / full.bulk.scale)
-        ksp.solve(image, step)
-        found = ksp.getConvergedReason() > 0
-        linear.forget_failure(ksp.getPC())
-        full.set_state(present)
-        full.update_stiffness()
-        return present + step.array_r if found else present
-
-    def _predicted(self, present: Array) -> Array:
-        """One Newton step on the tangent factored last; the residual is there. Collective."""
-        equations, ksp = self.equations, self.equations.solvers[True]
-        step = equations.solution.duplicate()
-        ksp.solve(equations.function, step)
-        dense.raise_kept(ksp)
-        moved = present - equations.length * step.array_r
-        step.destroy()
-        return np.asarray(moved, dtype=np.float64)
-
     # ---- the neighbourhood of a solution ---------------------------------------------------------
 
     def linearised(
@@ -751,7 +629,7 @@ class Solver:
             self.change(anew=True)
         # After a history that was taken up and is at its end nothing has been assembled yet.
         self.update_system(self._full.update_stiffness())
-        self.predicts = False  # by the matrix that is about to be used
+        self.starts.predict = False  # by the matrix that is about to be used
         self.system.begin(load)
         return linearised(self.equations, springs)
 

@@ -1,0 +1,170 @@
+"""Where the iteration for an increment starts: states that may be near its solution, best first."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fenics_contact.methods.equations import Equations
+from fenics_contact.systems import dense, linear
+from fenics_contact.types import Array
+
+__all__ = ["Starts"]
+
+
+# A start with up to this many times the residual of the best is taken first if its points slip.
+_FAR = 100.0
+# By how much a step makes the residual larger where the load has turned round: 4 measured in
+# fretting, and up to 1.5 where it has not.
+_TURNED = 2.0
+
+
+class Starts:
+    """States to start from, by what is known of the last increment.
+
+    Attributes:
+        predict: Whether the consistent tangent factored last is that of a solution.
+    """
+
+    def __init__(self, equations: Equations) -> None:
+        """Nothing is known yet."""
+        self.predict = False
+        self._equations = equations
+        self._moved: Array | None = None  # of the values prescribed, since the last increment
+
+    def moved_from(self, before: Array) -> None:
+        """Take note of how far the values prescribed now have moved. Collective.
+
+        Args:
+            before: The state of the full system in which the last increment ended.
+        """
+        full = self._equations.full
+        change = full.vector()
+        change.array[:] = full.state() - before
+        moved = not full.bulk.linear and change.norm() > 0
+        self._moved = change.array.copy() if moved else None
+
+    def of(self, ahead: float, rate: Array | None, cold: bool) -> list[Array]:
+        """Unknowns of the system to start from, nearest to equilibrium first. Collective.
+
+        The present state; that state moved on by as much as the last increment moved it: in
+        proportional loading that is the solution; that state with one step of Newton's method on
+        the tangent of the last solution; with a nonlinear bulk what `_followed` finds; and the
+        state moved, or the present one, with supports that turn freely rolled to where they are
+        now: where all points would slip no tangent tells by how much.
+
+        At the present state itself no point has slipped yet, and all closed ones stick: from there
+        Newton's method takes ten steps to let them slip again, one after another from the edge of
+        the contact inwards; and a body that others slide over is dragged along by all of the way,
+        in a state that is near equilibrium and far from the solution. The start by a step on the
+        tangent of the last solution has the right ones slipping, and comes first unless it is far
+        off; or unless the load has turned round, so that slipping points stick: then to go on is
+        worse than to stay, by a step as by the last increment.
+
+        Args:
+            ahead: Size of the increment in units of the last one.
+            rate: By how much that moved all unknowns; None: there was none.
+            cold: Whether nothing was borne before.
+        """
+        equations, system = self._equations, self._equations.system
+        present: Array = system.state()
+        # What a step from here takes away leaves the round-off of what was there.
+        terms: Array = system.by_body(system.terms(present))[0]
+        terms = np.asarray(np.hypot(terms, system.outside[1]), dtype=np.float64)
+        # The last matrix may be that of a step that overflowed. Later rounds of multipliers have
+        # the round-off of the first one's start, too.
+        terms = np.where(np.isfinite(terms), terms, 0.0)
+        equations.start = np.maximum(equations.start, terms)
+        starts: list[Array] = []
+        residuals: list[float] = []
+
+        def add(start: Array) -> int:
+            starts.append(start)
+            residual = equations.residual_at(start)
+            residuals.append(residual if np.isfinite(residual) else np.inf)
+            return len(starts) - 1
+
+        add(present)
+        # Where nothing was borne yet the last increment tells nothing of this one.
+        predicts = self.predict and not cold
+        self.predict = False
+        first = None
+        if predicts:
+            step = self._predicted if self._moved is None else self._followed
+            first = add(step(present))
+        last = None
+        if rate is not None and ahead and not cold:
+            last = add(present + ahead * system.part(rate))
+        moved = present
+        if self._moved is not None:
+            if first is None or not residuals[first] < residuals[0] or self._turns(rate):
+                first = None
+                moved = starts[add(self._followed(present, anew=True))]
+            else:
+                moved = starts[first]
+        elif not equations.full.bulk.linear:
+            # It does not come back from far off: a support moved into open points.
+            first = None
+        self._moved = None
+        if ahead and any(c.free_angle is not None for c in equations.contacts):
+            add(system.rolled(moved))
+        if first is not None and residuals[first] <= _FAR * min(residuals):
+            stays = residuals[0] < residuals[first] / _TURNED
+            if not (stays and last is not None and residuals[0] < residuals[last]):
+                residuals[first] = 0.0
+        return [starts[i] for i in np.argsort(residuals, kind="stable")]
+
+    def _turns(self, rate: Array | None) -> bool:
+        """Whether the values prescribed go back to where they came from. Collective."""
+        if self._moved is None or rate is None:
+            return False
+        comm = self._equations.full.unknowns.comm
+        return bool(comm.allreduce(float(self._moved @ rate)) < 0.0)
+
+    def _followed(self, present: Array, *, anew: bool = False) -> Array:
+        """Where the body goes with the values prescribed now, by one step from before. Collective.
+
+        Next to conditions that moved far a nonlinear bulk may be turned inside out, and no
+        iteration comes back from there.
+
+        Args:
+            present: The state with the values prescribed now.
+            anew: Whether to step on the tangent where the last increment ended, at which all closed
+                points stick; or else on that factored last, in which those slip that did.
+
+        Returns:
+            The state; the present one where no step is found.
+        """
+        equations, full = self._equations, self._equations.full
+        change, image, step = full.vector(), full.vector(), full.vector()
+        assert self._moved is not None
+        change.array[:] = self._moved
+        full.set_state(present - self._moved)
+        full.update_stiffness()
+        ksp = equations.solvers[True]
+        if anew:
+            for contact in full.contacts:
+                contact.evaluate()
+            matrix = equations.matrix(True)
+            held = equations.held()
+            parts = equations.tangents() if held else equations.stiffnesses(everywhere=True)
+            equations.assemble(matrix, parts)
+        assert full.stiffness is not None
+        full.stiffness.mult(change, image)
+        image.array[full.constrained] = 0.0
+        image.scale(-1.0 / full.bulk.scale)
+        ksp.solve(image, step)
+        found = ksp.getConvergedReason() > 0
+        linear.forget_failure(ksp.getPC())
+        full.set_state(present)
+        full.update_stiffness()
+        return present + step.array_r if found else present
+
+    def _predicted(self, present: Array) -> Array:
+        """One Newton step on the tangent factored last; the residual is there. Collective."""
+        equations, ksp = self._equations, self._equations.solvers[True]
+        step = equations.solution.duplicate()
+        ksp.solve(equations.function, step)
+        dense.raise_kept(ksp)
+        moved = present - equations.length * step.array_r
+        step.destroy()
+        return np.asarray(moved, dtype=np.float64)
