@@ -312,7 +312,9 @@ class Judge:
         # However large the tractions are: what is inside is not by as much as anyone can see.
         if contact.law.has_normal:
             deep = np.where(found["r_n"] < 0, contact.project @ found["closing"], 0.0).max()
-            self._check(name, "inside", deep, _INSIDE * np.ptp(contact.x, axis=0).max())
+            # Γc may be one point.
+            size = np.ptp(contact.x, axis=0).max() or np.ptp(self.problem.body.places, axis=0).max()
+            self._check(name, "inside", deep, _INSIDE * size)
 
     def _check_through(self, name: str, u: Array, found: list[dict], now: dict[str, Any]) -> None:
         """Whether the other body sees far more contact than Γc does: it has passed through."""
