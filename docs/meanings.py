@@ -1,0 +1,300 @@
+"""What the package's texts mean and what to do, by hand; `messages` puts both together.
+
+``tests/test_docs.py`` looks that every text has its place here, and every place a text.
+"""
+
+from __future__ import annotations
+
+# Errors: their groups in the order in which a script meets them, the modules of each, and what
+# they have in common. The text of an error itself says what was given and what to give.
+GROUPS: list[tuple[str, list[str], str]] = [
+    (
+        "Installation",
+        ["compat"],
+        "`python -m fenics_contact info` tells what an installation is made of.",
+    ),
+    (
+        "Meshes",
+        ["meshes", "joining"],
+        "A mesh from gmsh has its cells in physical groups that do not overlap. Meshes that are "
+        "joined "
+        "have the same kind of cell, geometric degree and communicator.",
+    ),
+    (
+        "Types of arguments",
+        ["arguments"],
+        "An argument is of another class than is expected, often because the order of the "
+        "arguments "
+        "is another, or because the brackets of a class are missing.",
+    ),
+    (
+        "Surface and displacement",
+        ["surface.surface", "surface.displacement", "surface.fields", "surface.modulus"],
+        "Γc is made of tagged exterior facets. The displacement is a continuous, vector-valued "
+        "Lagrange function on the mesh of Γc, or that part of a mixed function which `ufl.split` "
+        "gives.",
+    ),
+    (
+        "Supports",
+        [
+            "supports.base",
+            "supports.rigid",
+            "supports.profile",
+            "supports.meshed",
+            "supports.facets",
+            "supports.stl",
+            "supports.deformable",
+        ],
+        "Vectors have as many components as the mesh has dimensions, an axis is given in space "
+        "only. "
+        "Of facets and points the order says which side is outside.",
+    ),
+    (
+        "Laws and stiffness",
+        ["laws.base", "laws.friction", "laws.unilateral", "laws.stiffness"],
+        "k_n and k_t are stresses per length. A law of one's own says its `response`, and its "
+        "potential where it has no k_n: [](learn/own-law.md).",
+    ),
+    (
+        "Contacts",
+        [
+            "contact.contact",
+            "contact.inputs",
+            "contact.finite",
+            "contact.general",
+            "contact.accuracy",
+        ],
+        "The parts do not go together, or a value is out of range at a point of Γc; the text "
+        "begins "
+        "with the name of the contact. What finite kinematics need is on [its page](finite.md).",
+    ),
+    (
+        "Bulk form",
+        ["systems.bulk", "elasticity"],
+        "F is the residual of the bulk in the function that is solved for and one test function, "
+        "loads "
+        "included, contact not.",
+    ),
+    (
+        "Problem and choice of the method",
+        ["problem", "methods.solver", "systems.choice"],
+        "[](choose.md) says which method and linear solver are for what.",
+    ),
+    (
+        "Loads that nothing balances, bodies that nothing holds",
+        ["checks.rigid_motions"],
+        "Found before any iteration, by the rigid motions that Dirichlet conditions leave to each "
+        "body. Contact can only push along its normals and rub within the cone of friction. Look "
+        "at "
+        "the sign of the load first, then at the normal of the support, then at what is to hold "
+        "the "
+        "body. The text names the motion, and the largest force that contact can bear along it.",
+    ),
+    (
+        "Linear algebra",
+        [
+            "methods.callbacks",
+            "methods.neighbourhood",
+            "systems.dissection",
+            "systems.substructure",
+            "systems.unknowns",
+        ],
+        "A factorisation was refused, or a matrix is singular though contact is held: a part of "
+        "the "
+        "body is held by nothing, or memory is short. `condensation=False` iterates on all "
+        "unknowns, "
+        '`linear_solver="multigrid"` takes memory that grows as their number.',
+    ),
+    (
+        "Increments",
+        ["histories.increments", "histories.table"],
+        "Arguments of `increments`, and files of another history: make the same calls in the same "
+        "order, or remove the file.",
+    ),
+    (
+        "Checkpoints",
+        ["histories.checkpoint"],
+        "A file is taken up by the scene that wrote it alone; the text names what differs. "
+        '`changed="continue"` goes on with other data (stiffness, laws, supports, conditions, '
+        "loads), "
+        "never with another mesh or element.",
+    ),
+    (
+        "Error estimates and adaptation",
+        ["estimates.errors", "estimates.adaptation"],
+        "The stress is a UFL tensor on the body; meshes that are adapted are straight triangles or "
+        "tetrahedra.",
+    ),
+    (
+        "Results",
+        ["results.output", "results.vtu", "results.writer"],
+        "Files of another program are never overwritten.",
+    ),
+]
+
+# What else is said, by a piece of its text: what it means, and what to do.
+MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
+    "NotConverged": {
+        "did not converge": (
+            "No state of this increment passed. u, history and loads are as before it. "
+            "The text has the reason of SNES, what the last state does not satisfy (next table), "
+            "and "
+            "every attempt with its outcome.",
+            "Read the attempts from the left. Then the ladder above.",
+        ),
+    },
+    "verdict": {
+        "residual of": (
+            "The equations of a body, a free support or a contact are left with more than 1e-9 of "
+            "the "
+            "forces on it (or what `accuracy` asks for).",
+            "It is what a failed method leaves: see the attempts. Alone, after a method that says "
+            "converged: forces are far smaller than those of the increment before.",
+        ),
+        "forces on": (
+            "Load, reactions and tractions at the points do not sum to zero.",
+            "As for the residual.",
+        ),
+        "differ from those of the boundary form": (
+            "With `second_route=True`: forces on Γc are not those that DOLFINx assembles.",
+            "No state of yours makes this: please report it.",
+        ),
+        "violated by": (
+            "A law does not hold at a point: complementarity, stiffness, cone, slip, dissipation.",
+            "With a law of your own: its `response` and its limit contradict each other.",
+        ),
+        "penetration or elastic slip left": (
+            "Multipliers have not settled within their rounds.",
+            "k_n and k_t near 10 E/h, a larger `tolerance`; take facets out of Γc that a Dirichlet "
+            "condition holds inside of the support.",
+        ),
+        "friction would drive the slip": (
+            "The state is one of several, and friction would give energy in it.",
+            "Smaller increments; `increments` cuts by itself.",
+        ),
+        "cannot be told": (
+            "A body is held against nothing but springs of contact, so that what small "
+            "displacements "
+            "leave out cannot be estimated.",
+            "Hold the body by a condition or a weak spring, or `ContactProblem(kinematics=inf)`.",
+        ),
+        "too large to be taken as small: with": (
+            "Gap and normals where the body has moved to would change force or pressure by more "
+            "than "
+            "`ContactProblem(kinematics=0.2)`.",
+            '`Contact(..., kinematics="finite")`; or describe the motion as one of the support; '
+            "between "
+            'bodies `update="increment"`.',
+        ),
+        "times as large as the mesh": (
+            "A displacement is that of a body which nothing holds.",
+            "Dirichlet conditions; units of stiffness and loads.",
+        ),
+        "turned inside out": (
+            "det(I + grad u) ≤ 0 at a point of a nonlinear bulk.",
+            "Smaller increments, finer cells there.",
+        ),
+        "passes through Γc between its points": (
+            "A corner or middle of the opposite body is on the other side, where Γc has no point. "
+            "Smaller increments do not help, and the increment is not cut.",
+            "Let the finer surface be Γc, refine it there, or add a second contact with the "
+            "surfaces "
+            "swapped.",
+        ),
+        "the distance of the Obstacle changes": (
+            "`Obstacle(distance=...)` is no distance where contact is.",
+            "Divide it by the length of its gradient.",
+        ),
+        "half of its radius of curvature": (
+            "A point is so deep in a curved support that it is about to leave on the other side.",
+            'A larger k_n, or `enforcement="augmented"`.',
+        ),
+        "has gone through Γc": (
+            "The support is on the other side of Γc after one increment.",
+            "Smaller increments; `increments` cuts by itself.",
+        ),
+        "rad in one increment": (
+            "The support turns by more than a right angle in one increment, with friction.",
+            "More increments; `increments` cuts by itself.",
+        ),
+    },
+    "attempt": {
+        "iterations used up": (
+            "The method reached its limit (`-contact_snes_max_it`).",
+            "Something follows by itself, unless `fallback=False`.",
+        ),
+        "no progress": (
+            "The line search finds no step that makes the residual smaller.",
+            "The next method, or a cut, follows by itself.",
+        ),
+        "the matrix is singular": (
+            "The tangent of the present state holds a body nowhere.",
+            "If the last attempt ends so: look for a body that nothing holds where contact opens.",
+        ),
+        "the residual is not finite": (
+            "A law, the bulk form or a load gives NaN or infinity, or cells are turned inside out.",
+            "Smaller increments; look at divisions and roots in your own form.",
+        ),
+        "chatters": (
+            "Points keep changing their status while the residual does not fall; the place is "
+            "told.",
+            "Smaller increments, a lower k_t, then a lower k_n.",
+        ),
+    },
+    "warning": {
+        "displacements are taken as small": (
+            "What small displacements leave out is more than 1 % of force or pressure.",
+            'Accept it, or take `kinematics="finite"`. From 20 % on the increment fails.',
+        ),
+        "points into the body": (
+            "The support's normal is the wrong way round at every point of Γc.",
+            "Turn it round. Where the body is deep inside, it is an error.",
+        ),
+        "have no opposite": (
+            "More than half of Γc looks past the other body.",
+            "Tags of Γc and of the opposite, `search_distance`, `release`.",
+        ),
+        "with changed data": (
+            'A checkpoint is gone on with by other data, as `changed="continue"` allows.',
+            "Nothing, if the list is what you changed.",
+        ),
+        "nothing was solved": (
+            "`increments` returns what is to be iterated over.",
+            "`for step in fc.increments(...)`, or `list(...)`.",
+        ),
+        "did not converge: cut to": (
+            "The increment is tried again with half of its size.",
+            "Nothing, if the history goes on; see the ladder above.",
+        ),
+        "is changed between increments": (
+            "A function in the bulk form is changed by the loop and is not in the checkpoint.",
+            "`increments(..., fields=[...])`.",
+        ),
+        "no solver has read": (
+            "A PETSc option under the problem's prefix has had no effect.",
+            "Its spelling; whether its solver is in use.",
+        ),
+        "the reference BLAS": (
+            "Factorisations take up to eight times longer than they need.",
+            "Install OpenBLAS.",
+        ),
+        "failed alone": (
+            "One rank raised an error that the others cannot know of; all are ended.",
+            "The error is shown above it.",
+        ),
+        "penetrates its support": (
+            "Body and support overlap before any load.",
+            "An interference that is meant belongs in `Contact(gap=...)`; else the place of the "
+            "support.",
+        ),
+    },
+    "log": {
+        "no two of the bodies": ("`contact_pairs` found nothing.", "A larger `distance`."),
+        "are done": ("The checkpoint has all increments of this call.", "Nothing."),
+        "going on from": ("A history goes on behind its checkpoint.", "Nothing."),
+        "accuracy": ("What `accuracy=` has chosen.", "Nothing."),
+        "iterating on all unknowns": ("Why the problem is not condensed.", "Nothing."),
+        "linear systems of": ("Which linear solver, and why.", "Nothing."),
+        "condensed onto": ("How many unknowns are iterated on.", "Nothing."),
+    },
+}

@@ -1,0 +1,259 @@
+"""Every text with which the package refuses, fails or warns, read from its sources.
+
+    python docs/messages.py             # the pages' tables, on the terminal
+
+Sources are parsed, not imported. What a text has from the run is shown as …, words that stand in a
+constant or a variable of the function are filled in where they can be told.
+"""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from meanings import GROUPS, MEANINGS
+
+PACKAGE = Path(__file__).resolve().parent.parent / "fenics_contact"
+HOLE = "…"
+# More ways than this to fill a hole are left open.
+_MOST = 4
+# Functions whose strings are parts of a verdict, and of what is told of an attempt.
+_VERDICT, _ATTEMPT = {"failures"}, {"chattering"}
+
+
+@dataclass(frozen=True)
+class Message:
+    """A text of the package.
+
+    Attributes:
+        module: Where it stands, with dots, without the package's name.
+        line: There.
+        kind: Class of the error, "warning", "log", "verdict" (what a state does not satisfy) or
+            "attempt" (what became of a method).
+        text: The text.
+    """
+
+    module: str
+    line: int
+    kind: str
+    text: str
+
+    @property
+    def says(self) -> bool:
+        """Whether it has words of its own; else it passes on another's."""
+        return re.search("[a-z]{2}", self.text) is not None
+
+
+class _Module:
+    """A module, with what is needed to tell its texts."""
+
+    def __init__(self, path: Path, package: Path) -> None:
+        self.path = path
+        self.package = package
+        self.tree = ast.parse(path.read_text(encoding="utf-8"))
+        self.name = ".".join(path.relative_to(package).with_suffix("").parts)
+        self.functions = {
+            node.name: node for node in ast.walk(self.tree) if isinstance(node, ast.FunctionDef)
+        }
+        self.around: dict[ast.AST, ast.FunctionDef] = {}
+        for function in self.functions.values():  # the innermost is seen last
+            for node in ast.walk(function):
+                self.around[node] = function
+
+    # ---- texts -----------------------------------------------------------------------------------
+
+    def texts(self, node: ast.AST, within: ast.AST | None, depth: int = 0) -> list[str]:
+        """All texts that an expression may have."""
+        if depth > 4:
+            return [HOLE]
+        if isinstance(node, ast.Constant):
+            return [node.value if isinstance(node.value, str) else str(node.value)]
+        if isinstance(node, ast.JoinedStr):
+            return self._joined([self.texts(part, within, depth) for part in node.values])
+        if isinstance(node, ast.FormattedValue):
+            plain = node.format_spec is None and node.conversion == -1
+            plain = plain and isinstance(node.value, ast.Name | ast.IfExp | ast.Call)
+            return self.texts(node.value, within, depth + 1) if plain else [HOLE]
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+            return self._joined(
+                [self.texts(part, within, depth) for part in (node.left, node.right)]
+            )
+        if isinstance(node, ast.IfExp):
+            return self.texts(node.body, within, depth) + self.texts(node.orelse, within, depth)
+        if isinstance(node, ast.Name):
+            return self._named(node.id, within, depth)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            function = self.functions.get(node.func.id)
+            if function is not None:
+                made = [
+                    n.value for n in ast.walk(function) if isinstance(n, ast.Return) and n.value
+                ]
+                return self._some([t for n in made for t in self.texts(n, function, depth + 1)])
+        return [HOLE]
+
+    def _joined(self, parts: list[list[str]]) -> list[str]:
+        return self._some(["".join(each) for each in itertools.product(*parts)]) or [
+            "".join(part[0] if len(part) == 1 else HOLE for part in parts)
+        ]
+
+    @staticmethod
+    def _some(texts: list[str]) -> list[str]:
+        """They, if they are few."""
+        texts = list(dict.fromkeys(texts))
+        return texts if len(texts) <= _MOST else []
+
+    def _named(self, name: str, within: ast.AST | None, depth: int) -> list[str]:
+        """What a variable of the function, or a constant of a module, stands for."""
+        for scope in (within, self.tree):
+            body = ast.walk(scope) if scope is within and scope is not None else self.tree.body
+            found = [
+                node.value
+                for node in body
+                if isinstance(node, ast.Assign)
+                for target in node.targets
+                if isinstance(target, ast.Name) and target.id == name
+            ]
+            texts = [t for n in found for t in self.texts(n, within, depth + 1)]
+            if texts and all(re.search("[a-z]{2}", t) for t in texts):
+                return self._some(texts) or [HOLE]
+            if found:
+                return [HOLE]
+        for node in self.tree.body:
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
+                "fenics_contact."
+            ):
+                if any((alias.asname or alias.name) == name for alias in node.names):
+                    parts = (node.module or "").split(".")[1:]
+                    path = self.package.joinpath(*parts).with_suffix(".py")
+                    if path.is_file():
+                        return _Module(path, self.package)._named(name, None, depth + 1)
+        return [HOLE]
+
+    # ---- messages --------------------------------------------------------------------------------
+
+    def messages(self) -> Iterator[Message]:
+        """All that it has, in its order."""
+        for node in ast.walk(self.tree):
+            within = self.around.get(node)
+            for kind, expression in self._said(node, within):
+                for text in self.texts(expression, within) or [HOLE]:
+                    text = re.sub(r"%[-+.\d]*[a-z]", HOLE, text) if kind in _LOGGED else text
+                    text = re.sub(f"{HOLE}+", HOLE, re.sub(r"\s+", " ", text)).strip()
+                    yield Message(self.name, node.lineno, kind, text)
+
+    def _said(
+        self, node: ast.AST, within: ast.FunctionDef | None
+    ) -> Iterator[tuple[str, ast.expr]]:
+        """Kinds of messages, and the expressions of their texts, that begin at a node."""
+        name = within.name if within is not None else ""
+        told = {**dict.fromkeys(_VERDICT, "verdict"), **dict.fromkeys(_ATTEMPT, "attempt")}
+        if isinstance(node, ast.AugAssign) and name in told:
+            value = node.value
+            if isinstance(value, ast.ListComp):
+                yield told[name], value.elt
+        if isinstance(node, ast.Assign | ast.AnnAssign) and isinstance(node.value, ast.Dict):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            if any(isinstance(t, ast.Name) and t.id == "_OUTCOMES" for t in targets):
+                yield from (("attempt", value) for value in node.value.values)
+        if not isinstance(node, ast.Call) or not node.args:
+            return
+        function, first = node.func, node.args[0]
+        if isinstance(function, ast.Name):
+            if re.fullmatch(r"\w+Error", function.id):
+                yield function.id, first
+            elif function.id == "warn":
+                yield "warning", node.args[-1]
+        elif isinstance(function, ast.Attribute):
+            base = ast.unparse(function.value)
+            if base == "warnings" and function.attr == "warn":
+                yield "warning", first
+            elif base == "logger" and function.attr in ("warning", "critical"):
+                yield "warning", first
+            elif base == "logger" and function.attr == "info":
+                yield "log", first
+            elif base == "super()" and function.attr == "__init__" and self._of_error(node):
+                yield self._of_error(node), first
+            elif function.attr == "append" and name in told:
+                yield told[name], first
+
+    def _of_error(self, call: ast.Call) -> str:
+        """The class that a call stands in, if it is an error; else empty."""
+        for node in ast.walk(self.tree):
+            if isinstance(node, ast.ClassDef) and any(n is call for n in ast.walk(node)):
+                if any(ast.unparse(base).endswith("Error") for base in node.bases):
+                    return node.name
+        return ""
+
+
+_LOGGED = {"warning", "log"}
+
+
+def read(package: Path = PACKAGE) -> list[Message]:
+    """All messages that have words of their own, by module and line."""
+    found = {
+        message
+        for path in sorted(package.rglob("*.py"))
+        for message in _Module(path, package).messages()
+        if message.says
+    }
+    return sorted(found, key=lambda m: (m.module, m.line, m.text))
+
+
+# ---- pages ---------------------------------------------------------------------------------------
+
+
+def meant(message: Message) -> list[tuple[str, str]]:
+    """What `meanings` says of a message that is no plain error; there must be one."""
+    return [said for piece, said in MEANINGS[message.kind].items() if piece in message.text]
+
+
+def grouped(found: list[Message]) -> list[tuple[str, str, list[Message]]]:
+    """Plain errors by group: title, what they have in common, messages."""
+    errors = [m for m in found if m.kind not in MEANINGS]
+    return [
+        (title, hint, [m for m in errors if m.module in names]) for title, names, hint in GROUPS
+    ]
+
+
+def _cell(text: str) -> str:
+    """A text as it stands, in a table of Markdown."""
+    return re.sub(r"([\\`*_\[\]<>|#$~{}])", r"\\\1", text)
+
+
+def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = ["| " + " | ".join(cells) + " |" for cells in (header, ("---",) * len(header), *rows)]
+    return "\n".join(lines) + "\n"
+
+
+def pages(found: list[Message]) -> dict[str, str]:
+    """The tables, by name of the file that a page includes."""
+    made = {}
+    for kind in MEANINGS:
+        rows = [
+            (_cell(text), *said)
+            for text, said in {m.text: s for m in found if m.kind == kind for s in meant(m)}.items()
+        ]
+        made[f"{kind}.md"] = _table(("text", "what it means", "what to do"), rows)
+    parts = []
+    for title, hint, messages in grouped(found):
+        rows = list(dict.fromkeys((_cell(m.text), f"`{m.kind}`") for m in messages))
+        parts.append(f"### {title}\n\n{hint}\n\n" + _table(("text", "error"), rows))
+    return made | {"errors.md": "\n".join(parts)}
+
+
+def write(folder: Path) -> None:
+    """Write the tables where they are others than are there."""
+    folder.mkdir(exist_ok=True)
+    for name, text in pages(read()).items():
+        path = folder / name
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    for text in pages(read()).values():
+        print(text)
