@@ -123,14 +123,11 @@ class _Module:
             if found:
                 return [HOLE]
         for node in self.tree.body:
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
-                "fenics_contact."
-            ):
-                if any((alias.asname or alias.name) == name for alias in node.names):
-                    parts = (node.module or "").split(".")[1:]
-                    path = self.package.joinpath(*parts).with_suffix(".py")
-                    if path.is_file():
-                        return _Module(path, self.package)._named(name, None, depth + 1)
+            if isinstance(node, ast.ImportFrom) and any(alias.name == name for alias in node.names):
+                path = self.package.parent.joinpath(*str(node.module).split("."))
+                path = path.with_suffix(".py")
+                if path.is_file():
+                    return _Module(path, self.package)._named(name, None, depth + 1)
         return [HOLE]
 
     # ---- messages --------------------------------------------------------------------------------

@@ -1,0 +1,209 @@
+"""The pages of docs/, as far as it takes no Sphinx: nothing is missing, and what they show runs."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from mpi4py import MPI
+from running import ROOT, environment
+
+import fenics_contact
+
+sys.path.insert(0, str(ROOT / "docs"))
+
+import meanings
+import messages
+
+DOCS = ROOT / "docs"
+SCRIPTS = sorted((DOCS / "scripts").glob("*.py"))
+# The parts of benchmarks.md are no pages, and what is generated is included.
+PAGES = sorted(
+    path
+    for path in DOCS.rglob("*.md")
+    if path.parent.name != "_generated"
+    if path.parent.parent.name != "benchmarks"
+)
+BLOCK = re.compile(r"^```\{(\S+)\} ?([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def name(path: Path) -> str:
+    """Of a page, as it is in messages of pytest."""
+    return path.relative_to(DOCS).with_suffix("").as_posix()
+
+
+def entries(page: Path) -> list[Path]:
+    """The pages in a page's toctrees."""
+    found = []
+    for kind, _, body in BLOCK.findall(page.read_text()):
+        if kind == "toctree":
+            lines = [line for line in body.splitlines() if line and not line.startswith(":")]
+            found += [re.sub(r".*<(.*)>", r"\1", line) for line in lines]
+    return [page.parent / f"{entry}.md" for entry in found]
+
+
+def test_every_page_is_in_one_toctree() -> None:
+    """From the index on, each once; and every entry is a page."""
+    listed = [path for page in PAGES for path in entries(page)]
+    assert sorted([DOCS / "index.md", *listed]) == PAGES
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_code_is_that_of_files_that_run(page: Path) -> None:
+    """What is included exists, from a line to a later one; Python is not copied into pages."""
+    text = page.read_text()
+    # Pieces for a reader who knows the rest; all of it is tested by the files that it names.
+    assert page.stem == "finite" or "```python" not in text
+    for kind, target, body in BLOCK.findall(text):
+        if kind != "literalinclude":
+            continue
+        file = (page.parent / target).resolve()
+        assert file in [ROOT / "README.md", *SCRIPTS] or file.parent == ROOT / "examples", file
+        lines = file.read_text().splitlines()
+        options = dict(re.findall(r'^:([\w-]+): "?(.*?)"?$', body, flags=re.MULTILINE))
+        first = options.get("start-at") or options.get("start-after")
+        last = options.get("end-before")
+        begin = next((i for i, line in enumerate(lines) if first and first in line), None)
+        assert begin is not None, f"{target} has no {first!r}"
+        if last:
+            assert any(last in line for line in lines[begin + 1 :]), f"{target}: {last!r}"
+
+
+def documented() -> list[str]:
+    """Names in the reference, with dots."""
+    text = "".join(page.read_text() for page in PAGES if page.parent.name == "reference")
+    return re.findall(r"^\.\. autoapi\w+:: (\S+)$", text, flags=re.MULTILINE)
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    """Those of the package, and of its public modules all that they have in ``__all__``."""
+    wanted = []
+    for public in set(fenics_contact.__all__) - {"__version__"}:
+        value = getattr(fenics_contact, public)
+        if isinstance(value, ModuleType):
+            wanted += [f"{value.__name__}.{each}" for each in value.__all__]
+        else:
+            wanted.append(f"fenics_contact.{public}")
+    assert sorted(documented()) == sorted(wanted)
+    assert "`fenics_contact.__version__`" in (DOCS / "reference" / "index.md").read_text()
+
+
+# ---- texts ---------------------------------------------------------------------------------------
+
+
+def raised() -> dict[tuple[str, int], str]:
+    """Every ``raise`` that makes an error from arguments: module and line, and what it is."""
+    found = {}
+    for path in messages.PACKAGE.rglob("*.py"):
+        module = ".".join(path.relative_to(messages.PACKAGE).with_suffix("").parts)
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args:
+                found[module, node.lineno] = ast.unparse(node.exc)
+    return found
+
+
+def test_every_error_is_told() -> None:
+    """Each ``raise`` with a text is among the messages; others pass on what is said elsewhere."""
+    told = {(m.module, m.line) for m in messages.read() if m.kind not in ("warning", "log")}
+    missing = [text for place, text in raised().items() if place not in told]
+    assert sorted(missing) == [
+        "NotConverged(number, reason, verdict, prefix=self.prefix)",
+        "OSError(text)",
+        "SystemExit(main())",
+        "ValueError(f'{name}: {error}')",
+        "self._not_converged(reason, verdict, tried)",
+        "self._not_converged(reason, verdict, tried)",
+    ]
+    assert len(told) > 200
+
+
+def test_every_warning_is_told() -> None:
+    """By name of the call, as it stands in the sources."""
+    told = Counter(m.module for m in messages.read() if m.kind == "warning")
+    for path in messages.PACKAGE.rglob("*.py"):
+        module = ".".join(path.relative_to(messages.PACKAGE).with_suffix("").parts)
+        calls = re.findall(r"\b(?:logger\.(?:warning|critical)|warn)\($", path.read_text(), re.M)
+        calls += re.findall(r"\blogger\.warning\((?=\S)", path.read_text())
+        passed_on = 2 if module == "parallel" else 0  # `parallel.warn` itself
+        assert told[module] >= len(calls) - passed_on, module
+
+
+def test_texts_are_found_wherever_they_stand(tmp_path: Path) -> None:
+    """Holes, pieces, alternatives, constants of another module, and formats of the log."""
+    package = tmp_path / "package"
+    package.mkdir()
+    (package / "words.py").write_text('REMEDY = "remove it"\n')
+    (package / "work.py").write_text(
+        "from package.words import REMEDY\n"
+        "def hint(x):\n    return f'is {x!r}'\n"
+        "def work(x, many):\n"
+        "    why = 'is small' if many else 'is large'\n"
+        "    if x:\n        raise ValueError(f'{x} {why}; {REMEDY}')\n"
+        "    logger.warning('%d of %s', x, many)\n"
+        "    raise TypeError('it ' + hint(x))\n"
+    )
+    found = [(m.line, m.kind, m.text) for m in messages.read(package)]
+    assert found == [
+        (7, "ValueError", "… is large; remove it"),
+        (7, "ValueError", "… is small; remove it"),
+        (8, "warning", "… of …"),
+        (9, "TypeError", "it is …"),
+    ]
+
+
+def test_every_text_has_its_meaning() -> None:
+    """Errors a group, all else what to do, once; and no group and no meaning is left over."""
+    found = messages.read()
+    modules = [module for _, names, _ in meanings.GROUPS for module in names]
+    assert sorted(modules) == sorted({m.module for m in found if m.kind not in meanings.MEANINGS})
+    others = [m for m in found if m.kind in meanings.MEANINGS]
+    assert [m for m in others if len(messages.meant(m)) != 1] == []
+    for kind, pieces in meanings.MEANINGS.items():
+        texts = [m.text for m in others if m.kind == kind]
+        assert [piece for piece in pieces if not any(piece in text for text in texts)] == []
+
+
+def test_the_tables_have_every_text(tmp_path: Path) -> None:
+    """As rows of Markdown, in files that the page includes."""
+    messages.write(tmp_path)
+    page = (DOCS / "messages.md").read_text()
+    made = {file.name: file.read_text() for file in tmp_path.iterdir()}
+    assert sorted(made) == sorted(re.findall(r"\{include\} _generated/(\S+)", page))
+    rows = [line for text in made.values() for line in text.splitlines() if line.startswith("| ")]
+    plain = [re.sub(r"\\(.)", r"\1", row) for row in rows]
+    for message in messages.read():
+        assert any(row.startswith(f"| {message.text} |") for row in plain), message
+
+
+# ---- scripts -------------------------------------------------------------------------------------
+
+
+@pytest.mark.demo
+@pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own")
+@pytest.mark.parametrize("path", SCRIPTS, ids=[path.stem for path in SCRIPTS])
+def test_scripts_run(path: Path, tmp_path: Path) -> None:
+    """They end with 0, having asserted a number or written what the page says."""
+    done = subprocess.run(
+        [sys.executable, str(path)],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    if path.stem != "results":
+        assert "assert " in path.read_text()
+        return
+    written = {each.name for each in (tmp_path / "output").iterdir()}
+    assert written >= {"body.pvd", "contact.pvd", "contact_points.pvd", "state.npz", "history.csv"}
+    assert written >= {"pressure.png", "status.png", "deformation.png"}
+    assert len((tmp_path / "output" / "history.csv").read_text().splitlines()) >= 1 + 5
+    assert "INFO:fenics_contact:condensed onto" in done.stderr
+    assert done.stdout.count("increment ") == 5
