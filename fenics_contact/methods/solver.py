@@ -587,9 +587,11 @@ class Solver:
             if self._comm.rank == 0:
                 logger.info("%s", attempts[-1])
         equations.set_state(equations.solution)
-        newton = not self._quasi_newton and (
-            method not in self.methods or (method == _LAST_RESORT and self._led.by_newton)
-        )
+        # With a linear bulk a start by the tangent comes first even where it is far off, which a
+        # load that falls to nothing does not forgive after continuation.
+        led = self._led.by_newton and not self._full.bulk.linear
+        by_newton = method not in self.methods or (method == _LAST_RESORT and led)
+        newton = by_newton and not self._quasi_newton
         made = sum(attempt.iterations for attempt in attempts[-1:])
         self.starts.predict = reason > 0 and newton and (factored or made > 0)
         return int(reason), attempts
