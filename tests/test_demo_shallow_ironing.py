@@ -16,10 +16,10 @@ pytestmark = [
 
 def test_pressed_and_begun_to_slide(tmp_path: Path) -> None:
     """V(1) between the published ones; all points slip soon, at up to 8 steps an increment."""
-    options = ("--increments", "250", "--until", "1.08")
+    options = ("--increments", "250", "--until", "1.06")
     result = run_demo("shallow_ironing", tmp_path, *options)
     assert 268.0 < values(result)["V, t = 1"] < 332.0
-    sliding = [row for row in result["path"] if row["time"] > 1.05]
+    sliding = [row for row in result["path"] if row["time"] > 1.045]
     assert all(row["stick"] == 0 and row["slip"] > 0 for row in sliding)
     assert sum(row["iterations"] for row in sliding) <= 8 * len(sliding)
     for name in ("forces.png", "bodies.png"):
