@@ -17,6 +17,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import collective_errors, global_sum
 from fenics_contact.results import files
+from fenics_contact.results.writer import facet_status
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.types import Array
 
@@ -147,9 +148,7 @@ def plot_status(
         magnification: Factor by which the displacement is drawn.
         view: As for `plot_pressure`.
     """
-    rows = contact.quadrature.point_rows()
-    status = np.stack([np.sum(contact.status[rows] == s, axis=1) for s in Status]).argmax(axis=0)
-    drawn = _surface(contact, status, magnification)
+    drawn = _surface(contact, facet_status(contact), magnification)
     with collective_errors(contact.surface.mesh.comm):
         if drawn is None:
             return

@@ -26,7 +26,7 @@ from fenics_contact.results import files, vtu
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.types import Array, Mask
 
-__all__ = ["Writer", "facet_values"]
+__all__ = ["Writer", "facet_status", "facet_values"]
 
 # Directions in which the points of a facet reach less far than this, by the farthest, are none.
 _FLAT = 1e-6
@@ -245,11 +245,9 @@ class _Surface:
             for name, values in at_points.items()
         }
         at_nodes = {"displacement": (moved - places).reshape(self._shape)} | at_nodes
-        status = contact.status
-        counts = np.stack([np.sum(status[rows] == s, axis=1) for s in Status])
-        in_facets = {"status": counts.argmax(axis=0).astype(np.int8)}
+        in_facets: dict[str, npt.NDArray[Any]] = {"status": facet_status(contact)}
         moves = {"displacement": contact.own_displacement()}
-        all_points: dict[str, npt.NDArray[Any]] = {**moves, **at_points, "status": status}
+        all_points: dict[str, npt.NDArray[Any]] = {**moves, **at_points, "status": contact.status}
         if not contact.rigid:
             in_facets["paired"] = np.mean(contact.paired[rows], axis=1)
             all_points["paired"] = contact.paired.astype(np.float64)
@@ -272,6 +270,12 @@ class _Surface:
             "slip": contact.slip.sum(axis=1),
             "normal": contact.values.normal,
         }
+
+
+def facet_status(contact: Contact) -> npt.NDArray[np.int8]:
+    """`Status` of most of the points of every facet of this rank, (n_facets,)."""
+    status = contact.status[contact.quadrature.point_rows()]
+    return np.stack([np.sum(status == s, axis=1) for s in Status]).argmax(axis=0).astype(np.int8)
 
 
 def facet_values(points: Array, measure: Array, values: Array, nodes: Array) -> Array:
