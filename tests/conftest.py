@@ -3,7 +3,10 @@
 import faulthandler
 import gc
 import os
+import zlib
+from collections import defaultdict
 from collections.abc import Iterator
+from math import ceil
 
 import pytest
 from mpi4py import MPI
@@ -25,16 +28,27 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What runs on all kinds of cells is a long study on hexahedra, whose forms take the longest.
+    """Of the cases of a test, one in four is run each time, and the rest by ``pytest -m slow``.
 
-    Not where cells and facets are found, and pairs made.
+    Which ones is drawn from their names, so that they lie anywhere among the products of what is
+    varied, and are the same on all ranks and in all runs. Two at least; all of what is marked
+    ``whole``. What runs on all kinds of cells is a long study on hexahedra, whose forms take the
+    longest, except where cells and facets are found, and pairs made.
     """
     kept = ("test_surface", "test_pairs", "test_two_bodies", "test_present", "test_elasticity")
     kept += ("test_joined_meshes", "test_contact_pairs")
+    cases = defaultdict(list)
     for item in items:
         values = getattr(item, "callspec", None)
-        of_hexahedra = values is not None and "hexahedron" in values.id.split("-")
-        if of_hexahedra and item.path.stem not in kept:
+        if values is None or item.get_closest_marker("whole"):
+            continue
+        if "hexahedron" in values.id.split("-") and item.path.stem not in kept:
+            item.add_marker(pytest.mark.slow)
+        elif not item.get_closest_marker("slow"):
+            cases[item.nodeid.partition("[")[0]].append(item)
+    for those in cases.values():
+        those.sort(key=lambda item: zlib.crc32(item.nodeid.encode()))
+        for item in those[max(2, ceil(len(those) / 4)) :]:
             item.add_marker(pytest.mark.slow)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.whole
 PACKAGE = Path(__file__).resolve().parent.parent / "fenics_contact"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 # From below upwards; a room may import from itself and from those before it.

@@ -21,6 +21,7 @@ sys.path.insert(0, str(ROOT / "docs"))
 import meanings
 import messages
 
+pytestmark = pytest.mark.whole
 DOCS = ROOT / "docs"
 SCRIPTS = sorted((DOCS / "scripts").glob("*.py"))
 # The parts of benchmarks.md are no pages, and what is generated is included.

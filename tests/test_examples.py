@@ -12,6 +12,7 @@ import pytest
 from mpi4py import MPI
 from running import ROOT, environment
 
+pytestmark = pytest.mark.whole
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 NAMES = [path.stem for path in EXAMPLES]
 MOST_LINES = 40
