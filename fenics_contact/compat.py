@@ -20,6 +20,7 @@ __all__ = [
     "LONGEST_STEP",
     "NOT_FINITE",
     "cell_partitioner",
+    "collapsed",
     "compile_form",
     "create_facet_submesh",
     "geometry_dofmap",
@@ -94,6 +95,15 @@ def cell_partitioner(ghost_mode: dolfinx.mesh.GhostMode) -> Any:
         return dolfinx.mesh.create_cell_partitioner(ghost_mode, 2)
     except TypeError:  # DOLFINx < 0.11
         return dolfinx.mesh.create_cell_partitioner(ghost_mode)
+
+
+def collapsed(space: fem.FunctionSpace) -> tuple[fem.FunctionSpace, npt.NDArray[np.int32]]:
+    """A subspace as a space of its own, and the dof of the whole for each of its dofs. Collective.
+
+    The dofs come as a list of numbers, since 0.11 as a list of one array.
+    """
+    own, dofs = space.collapse()
+    return own, np.asarray(dofs, dtype=np.int32).ravel()
 
 
 def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:

@@ -200,7 +200,7 @@ def test_cells_turned_inside_out_by_bubbles_are_seen():
     """det(I + grad u) takes the bubbles in: they alone make it negative, or pass if smaller."""
     scene = rubber("triangle", n=(4, 2), mixed="MINI", nu=0.5)
     problem, _ = scene.problem(disc(scene, 0.8), fc.Frictionless(1e4))
-    _, bubbles = scene.u.function_space.sub(1).collapse()
+    _, bubbles = compat.collapsed(scene.u.function_space.sub(1))
     for size, inverted in ((1e-3, False), (1.0, True)):
         scene.u.x.array[:] = 0.0
         scene.u.x.array[bubbles] = size

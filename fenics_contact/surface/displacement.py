@@ -17,6 +17,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.arguments import check_instance
+from fenics_contact.compat import collapsed
 from fenics_contact.types import Array, Indices
 
 __all__ = ["Displacement", "check_kind"]
@@ -60,9 +61,8 @@ class Displacement:
             _check_unmixed(u, name)
         else:
             self.whole, self._part = _parts(u, name)
-            space, numbers = self.whole.function_space.sub(self._part).collapse()
+            space, self.dofs = collapsed(self.whole.function_space.sub(self._part))
             self.u = fem.Function(space, name="u")
-            self.dofs = np.asarray(numbers, dtype=np.int32)
             self.follow()
         self.degree = _degree(self.u, mesh or self.u.function_space.mesh, name)
 
@@ -148,8 +148,7 @@ class Displacement:
         if self.dofs is None:
             return []
         space = self.whole.function_space
-        parts = (space.sub(i).collapse() for i in range(space.num_sub_spaces) if i != self._part)
-        return [(part, np.asarray(numbers, dtype=np.int32)) for part, numbers in parts]
+        return [collapsed(space.sub(i)) for i in range(space.num_sub_spaces) if i != self._part]
 
 
 def is_mixed(space: fem.FunctionSpace) -> bool:
