@@ -301,6 +301,57 @@ def test_a_turned_patch_bears_a_uniform_pressure():
     assert np.abs(along).max(initial=0.0) <= 1e-12
 
 
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+@pytest.mark.parametrize(
+    ("ways", "through"),
+    [
+        ([(0.05, 0.0)], False),  # pressed, as penalties let it be
+        ([(0.2, 0.0)], False),  # less deep than a cell is high: it still has its opposite
+        ([(0.7, 0.1)], True),
+        ([(1.2, -0.1)], True),  # out at the back
+        ([(-2.0, 0.0), (0.7, 0.1)], True),  # from far off
+        ([(0.0, 2.0), (1.2, 2.0), (1.2, 0.0)], False),  # round the edge, and below it
+        ([(0.05, 0.0), (0.05, 0.3), (-1.0, 0.0)], False),
+    ],
+)
+def test_points_that_go_through_a_body_are_seen(cell, ways, through):
+    """Those that go straight through its surface in an increment, turned bodies as any."""
+    pair = Pair(cell, fc.Coulomb(0.3, k_n=1e3, k_t=5e2), kinematics="finite")
+    for down, along in ways:
+        pair.contact.commit()
+        pair.place(pair.pressed(pair.nodes, down, along) @ turn(pair.d, 0.4).T)
+        pair.contact.evaluate()
+    passed = np.flatnonzero(pair.contact.passed_through())
+    n = MPI.COMM_WORLD.allreduce(len(passed))
+    points = MPI.COMM_WORLD.allreduce(len(pair.contact.points))
+    assert n == (points if through else 0)
+
+
+def test_no_body_is_pressed_through_the_other():
+    """Two cells deep in one increment: it fails, or is cut; the force is that of small increments.
+
+    Without friction nothing tells how many increments there were: 1e-8, by the residuals.
+    """
+    forces = []
+    for steps in (1, 4):
+        blocks = Blocks("triangle", fc.Frictionless(), (12, 8))
+
+        def load(t, blocks=blocks):
+            blocks.top[-1].value = 0.2 - 0.4 * t
+
+        load(0.0)
+        blocks.problem.solve()
+        blocks.problem.commit()
+        if steps == 1:
+            load(1.0)
+            with pytest.raises(fc.NotConverged, match="gone through"):
+                blocks.problem.solve()
+        *_, step = fc.increments(blocks.problem, load, 0.0, 1.0, steps=steps)
+        forces.append(step.contacts["contact"].force)
+    assert forces[1][1] > 5.0
+    np.testing.assert_allclose(forces[0], forces[1], atol=1e-8 * forces[1][1])
+
+
 def slotted() -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
     """A plate with a slot from its right side; tags of the slot's lips, of bottom and top end."""
     whole = dolfinx.mesh.create_rectangle(

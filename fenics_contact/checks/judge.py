@@ -113,7 +113,11 @@ class Judge:
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
             # Of the opposite only what Γc meets is known before u is complete.
             unseen=self._passing() if system is self._full else {},
-            obstacles={c.name: ObstacleCheck.of(c) for c in self._contacts if laws and c.rigid},
+            obstacles={
+                c.name: ObstacleCheck.of(c)
+                for c in self._contacts
+                if laws and (c.rigid or c.follows)
+            },
             kinematics=self._linearisation(respond) if respond else {},
             kinematics_allowed=self.kinematics,
             displacement=global_max(self._comm, np.abs(self._full.displacement.u.x.array))

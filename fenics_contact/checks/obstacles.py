@@ -1,4 +1,4 @@
-"""Whether a rigid support is what contact takes it for, where the body has moved to."""
+"""Whether a support is what contact takes it for, where the body has moved to."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TURN = np.pi / 2 + 1e-9
 
 @dataclass(frozen=True)
 class ObstacleCheck:
-    """Of one contact with a rigid support, the same on every rank.
+    """Of one contact with a rigid support, or with a body that goes far; the same on every rank.
 
     Attributes:
         slope: Length of the gradient of the distance at closed points, where it is farthest from 1.
@@ -44,6 +44,8 @@ class ObstacleCheck:
     def of(cls, contact: Contact) -> ObstacleCheck:
         """At the evaluated state of a contact. Collective."""
         comm, closed = contact.surface.mesh.comm, contact.status != Status.OPEN
+        if not contact.rigid:
+            return cls(1.0, 0.0, _passed(contact))
         slopes = contact.distance_slope()[closed]
         ends = global_min(comm, slopes, empty=1.0), global_max(comm, slopes, empty=1.0)
         slope = max(ends, key=lambda value: abs(value - 1.0))
@@ -56,8 +58,7 @@ class ObstacleCheck:
             bend = np.full(len(sunk), np.inf)
             bend[known] = np.linalg.eigvalsh(curvature[known]).max(axis=1, initial=0.0)
             depth = global_max(comm, sunk * bend)
-            gone = comm.allgather(contact.points[contact.passed_through()].tolist())
-            passed = next((places[0] for places in gone if places), None)
+            passed = _passed(contact)
         rubs = contact.law.has_friction and comm.allreduce(int(closed.any())) > 0
         turn = abs(contact.turned_by()) if rubs else 0.0
         return cls(slope, depth, passed, turn)
@@ -89,3 +90,9 @@ class ObstacleCheck:
                 "right angle in each"
             )
         return found
+
+
+def _passed(contact: Contact) -> list[float] | None:
+    """A place of the undeformed Γc that has gone through the support. Collective."""
+    gone = contact.surface.mesh.comm.allgather(contact.points[contact.passed_through()].tolist())
+    return next((places[0] for places in gone if places), None)

@@ -73,7 +73,7 @@ class Verdict:
         enforcement_tolerance: What passes, by name.
         unseen: How deep the opposite body passes through Γc between its points (length), and where,
             by the names of the contacts where it does; see `Contact.unseen_penetration`.
-        obstacles: What is found of rigid supports, by contact.
+        obstacles: What is found of supports that are rigid or go far, by contact.
         kinematics: What taking displacements as small changes, relative, by contact.
         kinematics_allowed: What passes; where it is finite no displacement passes that is more than
             ten times as large as the mesh, and as the motions and gaps that are imposed.

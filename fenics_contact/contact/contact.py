@@ -1023,7 +1023,7 @@ class Contact(PointResults):
         return self.angle() - self.committed_angle
 
     def passed_through(self) -> Mask:
-        """Points that have gone through a rigid support since the last commit, (n_points,).
+        """Points that have gone through the support since the last commit, (n_points,).
 
         Of points that go straight on, and a support that turns evenly, with finite kinematics.
         Collective.
@@ -1033,6 +1033,8 @@ class Contact(PointResults):
         """
         if not self.finite:
             raise ValueError(f'{self.name}: there is none without kinematics="finite"')
+        if self._present is not None:
+            return self._present.passed_through()
         x, jump, rotation = self.points, self.values.jump, self.support.rotation
         angle = self.turned_by()
 

@@ -35,15 +35,17 @@ from fenics_contact.parallel import global_max
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.pairing import LookBack
-from fenics_contact.surface.rays import Hits
+from fenics_contact.surface.rays import BEHIND, Hits
 from fenics_contact.surface.surface import SurfaceQuadrature
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Mask
 
 __all__ = ["PresentKinematics", "PresentPairs"]
 
 
 # A weight below this is the round-off of one that is zero.
 _NO_WEIGHT = 1e-14
+# Parts of an increment, in each of which a point is seen to go through at most one surface.
+_PARTS = 8
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,7 @@ class _Present:
         way: V, (n_points, d) (length).
         rotation: R, (n_points, d, d).
         stretch: Of the surface from the committed to the present one, Rᵀ F, (n_points, d, d).
+        deep: How deep the bodies were in each other at the last commit, at all facets (length).
     """
 
     along: Array
@@ -82,6 +85,7 @@ class _Present:
     way: Array
     rotation: Array
     stretch: Array
+    deep: Array
 
 
 class PresentPairs(Pairs):
@@ -155,7 +159,9 @@ class PresentPairs(Pairs):
         gradient += normal[:, :, None] * before.normal[:, None, :]
         rotation = _polar(gradient)
         stretch = np.einsum("qji,qjk->qik", rotation, gradient)
-        self._present = _Present(_reciprocal(tangents), normal, gap, hits, way, rotation, stretch)
+        self._present = _Present(
+            _reciprocal(tangents), normal, gap, hits, way, rotation, stretch, deep
+        )
         self._set_pairs(hits.matrix(self._u.function_space), paired)
         if self.number == 1:
             self._warn_of_unpaired(hits.reason)
@@ -226,6 +232,41 @@ class PresentPairs(Pairs):
     def linear_gap(self, values: PointValues) -> Array:
         """See `Pairs.linear_gap`: nothing is linearised."""
         return self.true_gap(values)[0]
+
+    def passed_through(self) -> Mask:
+        """Points that have gone through the opposite since the last commit, (n_points,).
+
+        They are behind it, deeper than bodies may be in each other, nothing else of that body is
+        opposite them, and they were in front: seen in parts of the increment, in which all goes
+        straight on. Collective.
+        """
+        assert self._present is not None and self._where is not None and self.search is not None
+        now, before = self._present, self._before
+        passed = np.zeros(len(now.gap), dtype=np.bool_)
+        some = now.hits.reason >= BEHIND
+        if not self._mesh.comm.allreduce(int(some.any())):
+            return passed
+        here, body = self._rays.here.facets, self._rays.there.body
+        facet, place = self._rays.facet[some], self._where[0][some]
+        # What counted as in front at the start may have been that deep.
+        depth = 2 * now.deep[self._rays.here.first + facet] + self.search.round_off
+        now_body = np.where(now.hits.facet >= 0, body[now.hits.facet], -1)[some]
+        earlier, later = before.copy(), before.copy()
+        gone = np.zeros(len(facet), dtype=np.bool_)
+        for part in range(1, _PARTS + 1):
+            share = part / _PARTS
+            later.x.array[:] = (1 - share) * before.x.array + share * self._u.x.array
+            ray = here.normals(facet, place, later)
+            hits = self._rays.follow(
+                facet, place, ray, later, now.deep, before=earlier, behind=True
+            )
+            x, _ = here.positions(facet, place, earlier)
+            ahead = np.sum((hits.partner.before - x) * here.normals(facet, place, earlier), axis=1)
+            met = hits.facet >= 0
+            gone |= met & (ahead >= -depth) & (body[hits.facet] != now_body)
+            earlier.x.array[:] = later.x.array
+        passed[some] = gone
+        return passed
 
     def _look_back(self, depth: float) -> tuple[LookBack, Array]:
         """See `Pairs`: in the bodies as they are."""
