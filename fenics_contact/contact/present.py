@@ -152,7 +152,9 @@ class PresentPairs(Pairs):
             facet, place, normal, self._u, deep, undeformed=undeformed, before=self._before
         )
         paired = hits.facet >= 0
-        gap = np.where(paired, hits.distance, 0.0)
+        # Of bodies that touch the half of the points would be closed by round-off.
+        apart = paired & ~(np.abs(hits.distance) <= self.search.round_off)
+        gap = np.where(apart, hits.distance, 0.0)
         way = hits.partner.before - before.x - gap[:, None] * before.normal
         way[~paired] = 0.0
         gradient = np.einsum("qia,qja->qij", tangents, before.along)
