@@ -104,7 +104,7 @@ class Joined:
 
     def _number(self, what: str, numbers: Numbers, body: Hashable, tag: int) -> int:
         known = self._of(numbers, body)
-        if tag is None or tag not in known:
+        if not isinstance(tag, Hashable) or tag is None or tag not in known:
             tags = [old for old in known if old is not None]
             raise ValueError(f"no {what} of body {body!r} had the tag {tag!r}; its tags are {tags}")
         return known[tag]

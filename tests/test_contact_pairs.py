@@ -465,6 +465,8 @@ def test_bad_arguments() -> None:
         ({"bodies": joined.facets}, ["dimension 1", "dimension 2"]),
         ({"bodies": some}, ["8 cells have no tag"]),
         ({"surface_on": ["ball"]}, ["'ball'", "[1, 2]"]),
+        ({"surface_on": "ball"}, ["surface_on is 'ball'", "list", "[1, 2]"]),
+        ({"surface_on": 2}, ["surface_on is 2", "list"]),
         ({"facet_tags": joined.facets}, ["together"]),
         ({"name": "joint"}, ["name is given"]),
         ({"kinematics": "large"}, ["'large'"]),

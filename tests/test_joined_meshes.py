@@ -211,6 +211,8 @@ def test_unknown_bodies_and_tags() -> None:
     joined = fc.join_meshes({"block": (mesh, None, sides)})
     raised_everywhere(lambda: joined.facet("ball", 1), ValueError, "'ball'", "['block']")
     raised_everywhere(lambda: joined.facet("block", 9), ValueError, "tag 9", "[1, 2, 3, 4]")
+    several: Any = [1, 2]
+    raised_everywhere(lambda: joined.facet("block", several), ValueError, "tag [1, 2]")
     raised_everywhere(lambda: joined.cell("block", 1), ValueError, "cell", "tag 1", "[]")
     raised_everywhere(lambda: joined.body(0), ValueError, "body 0", "['block']")
 

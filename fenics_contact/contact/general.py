@@ -98,6 +98,10 @@ def contact_pairs(
     space = Displacement(u, None, "contact_pairs").u.function_space
     mesh, comm = space.mesh, space.mesh.comm
     names, of_cell = _bodies(space, bodies)
+    if isinstance(surface_on, str) or not isinstance(surface_on, Sequence):
+        raise ValueError(
+            f"surface_on is {surface_on!r}; give a list of names of bodies, which are {names!r}"
+        )
     unknown = [body for body in surface_on if body not in names]
     if unknown:
         raise ValueError(f"surface_on names {unknown!r}; the bodies are {names!r}")
