@@ -290,6 +290,21 @@ def test_wrong_input(tmp_path):
     raised_everywhere(lambda: fc.Writer(folder, made.problem), ValueError, "contact.pvd", "remove")
 
 
+def test_two_writers_in_a_folder(tmp_path):
+    """The second one would overwrite files that the series of the first one names."""
+    folder = shared_folder(tmp_path)
+    made = Rub()
+    first, second = (fc.Writer(folder, made.problem) for _ in range(2))
+    first.write(1)
+    before = files(folder)
+    raised_everywhere(lambda: second.write(2), ValueError, "body.pvd", "another one writes")
+    assert files(folder) == before
+    first.write(2)
+    fc.Writer(folder, made.problem).write(3)  # takes over
+    raised_everywhere(lambda: first.write(4), ValueError, "folder of its own")
+    assert [time for time, _ in vtu.series(folder / "body.pvd")] == [1, 2, 3]
+
+
 def test_a_write_that_fails(tmp_path, monkeypatch):
     """The series is as before, and goes on when there is room again."""
     folder = shared_folder(tmp_path)

@@ -104,7 +104,8 @@ class Writer:
                 where the load returns, and the load is the number "load" of the file. Or a time.
 
         Raises:
-            ValueError: It is neither, or a time that is not later than the last one written.
+            ValueError: It is neither, or a time that is not later than the last one written; or
+                something else has written to the folder since. On all ranks.
             OSError: A file cannot be written; what was written before is as it was. On all ranks.
         """
         numbers = {}
@@ -137,6 +138,13 @@ class Writer:
 
     def _put(self, time: float, grids: dict[str, vtu.Grid]) -> None:
         """Write the grids, and the lists that name them. On the first rank."""
+        for name in grids:
+            if vtu.read_series(self._path(name)) != self._series[name]:
+                raise ValueError(
+                    f"{self._path(name)} has changed since this Writer wrote or read it: another "
+                    "one writes to this folder; give each problem a folder of its own, and one "
+                    "Writer"
+                )
         states, dropped = {}, []
         with contextlib.ExitStack() as stack:  # in place when all are written, the lists at last
             for name in grids:
