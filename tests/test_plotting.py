@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
@@ -117,3 +118,14 @@ def test_wrong_folder(tmp_path):
         lambda: plotting.plot_deformation(path, made.scene.u),
     ):
         raised_everywhere(call, OSError, "no")
+
+
+def test_what_is_no_displacement(tmp_path):
+    """It is said, not left to DOLFINx."""
+    u = Rub().scene.u
+    scalar = fem.Function(fem.functionspace(u.function_space.mesh, ("Lagrange", 1)))
+    path = shared_folder(tmp_path) / "u.png"
+    raised_everywhere(
+        lambda: plotting.plot_deformation(path, scalar), ValueError, "shape ()", "contact.u"
+    )
+    raised_everywhere(lambda: plotting.plot_deformation(path, "u"), ValueError, "u is a str")

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.mesh import CellType, exterior_facet_indices
 
+from fenics_contact.arguments import check_instance
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import collective_errors, global_sum
@@ -54,7 +55,17 @@ def plot_deformation(
         magnification: Factor by which the displacement is drawn.
         support: End points of a line to draw as the rigid support, shape (2, gdim).
         view: In space where to look from: elevation and azimuth in degrees.
+
+    Raises:
+        ValueError: u is no displacement.
     """
+    check_instance("u", u, fem.Function)
+    d = u.function_space.mesh.geometry.dim
+    if u.ufl_shape != (d,):
+        raise ValueError(
+            f"u has shape {u.ufl_shape}; give a displacement of {d} components, of a mixed "
+            "function that of its Contact, contact.u"
+        )
     original, deformed = _shapes(u, magnification)
     with collective_errors(u.function_space.mesh.comm):
         if original is None or deformed is None:
