@@ -1,0 +1,82 @@
+"""What packages say of the project is what the project says of itself."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from running import ROOT
+
+import fenics_contact
+
+tomllib = pytest.importorskip("tomllib", reason="of Python 3.11 and later")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+RECIPE = (ROOT / "packaging" / "conda" / "recipe.yaml").read_text()
+SPACK = ROOT / "packaging" / "spack_repo" / "fenics_contact" / "packages" / "py_fenics_contact"
+
+
+def name_and_bound(requirement: str) -> tuple[str, str]:
+    """Of ``a>=1``, ``a >=1`` and ``a@1:+variant``: a and 1."""
+    name, bound = re.fullmatch(r"([a-z0-9-]+)\s*(?:(?:>=|@)([\d.]+))?.*", requirement).groups()
+    return name, bound or ""
+
+
+DEPENDENCIES = sorted(map(name_and_bound, PROJECT["dependencies"]))
+PYTHON = PROJECT["requires-python"].removeprefix(">=")
+
+
+def test_the_version_is_one() -> None:
+    """Of the package, the citation and the recipe; and the changelog has it, or has no release."""
+    version = fenics_contact.__version__
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert re.findall(r"^version: (\S+)$", citation, re.MULTILINE) == [version]
+    assert re.findall(r'^  version: "(\S+)"$', RECIPE, re.MULTILINE) == [version]
+    released = re.findall(r"^## \[([\d.]+)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert released[:1] in ([], [version])
+
+
+def test_the_recipe_requires_what_the_package_does() -> None:
+    """conda-forge's names are those of PyPI; it says besides that PETSc is real."""
+    run = re.search(r"\n  run:\n(.*?)\n\n", RECIPE, re.DOTALL).group(1)
+    wanted = re.findall(r"^    - (.*)$", run, re.MULTILINE)
+    assert wanted[0] == "python >=${{ python_min }}" and wanted[-1] == "petsc * real_*"
+    assert sorted(map(name_and_bound, wanted[1:-1])) == DEPENDENCIES
+    assert f'python_min: "{PYTHON}"' in RECIPE
+
+
+def test_spack_requires_what_the_package_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its package.py runs with stand-ins for Spack that note what it says."""
+    said: list[tuple[str, tuple[Any, ...]]] = []
+
+    def directive(word: str) -> Any:
+        return lambda *values, **options: said.append((word, values))
+
+    words = {word: directive(word) for word in ("license", "version", "variant", "depends_on")}
+    words |= {word: lambda *values, **options: nullcontext() for word in ("default_args", "when")}
+    python = {"PythonPackage": type("PythonPackage", (), {})}
+    modules = {"spack.package": words, "spack_repo.builtin.build_systems.python": python}
+    for full, names in modules.items():
+        parts = full.split(".")
+        for end in range(1, len(parts) + 1):
+            module = ModuleType(".".join(parts[:end]))
+            monkeypatch.setitem(sys.modules, module.__name__, module)
+        vars(module).update(names)
+
+    spec = importlib.util.spec_from_file_location("package", SPACK / "package.py")
+    package = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(package)
+
+    assert Path(package.PyFenicsContact.git.removeprefix("file://")) == ROOT
+    assert ("license", (PROJECT["license"],)) in said
+    wanted = [name_and_bound(values[0]) for word, values in said if word == "depends_on"]
+    names = {f"py-{name}": bound for name, bound in DEPENDENCIES}
+    extra = [re.sub(r"[>=].*", "", each) for each in PROJECT["optional-dependencies"]["demo"]]
+    names |= {f"py-{name}": "" for name in extra}
+    names |= {"py-setuptools": "77", "python": PYTHON, "petsc": ""}
+    assert dict(wanted) == names and len(wanted) == len(names)
