@@ -31,6 +31,8 @@ PAGES = sorted(
     if path.parent.name != "_generated"
     if path.parent.parent.name != "benchmarks"
 )
+# What is read where the project is hosted, or in it.
+OTHERS = sorted([*ROOT.glob("*.md"), *(ROOT / "packaging").glob("*.md")])
 BLOCK = re.compile(r"^```\{(\S+)\} ?([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -74,6 +76,33 @@ def test_code_is_that_of_files_that_run(page: Path) -> None:
         assert begin is not None, f"{target} has no {first!r}"
         if last:
             assert any(last in line for line in lines[begin + 1 :]), f"{target}: {last!r}"
+
+
+def anchors(page: Path) -> set[str]:
+    """Those of a page's headings, as GitHub and MyST make them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", OTHERS, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_links_of_other_texts(page: Path) -> None:
+    """To files and headings that are there; Sphinx looks after those of the pages."""
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if not link.startswith("https://"):
+            path, _, anchor = link.partition("#")
+            target = (page.parent / path) if path else page
+            assert target.exists(), link
+            assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.parametrize("page", [*OTHERS, *PAGES], ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_files_that_are_named_exist(page: Path) -> None:
+    """What stands in backticks or a command and begins with a folder of the project."""
+    if page.stem == "CHANGELOG":
+        return  # It tells of files that were there.
+    folders = "benchmarks|demos|docker|docs|examples|packaging|scenes|tests|verification"
+    named = re.findall(rf"[` ]((?:{folders})/[\w./-]*\w)", page.read_text())
+    assert [name for name in named if not (ROOT / name).exists()] == []
 
 
 def documented() -> list[str]:
