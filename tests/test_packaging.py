@@ -41,6 +41,13 @@ def test_the_version_is_one() -> None:
     assert released[:1] in ([], [version])
 
 
+def test_one_release_of_the_linter() -> None:
+    """In the checks and before a commit, and in the extra "dev"; sdists are without the former."""
+    files = [ROOT / ".ci" / "run", ROOT / ".pre-commit-config.yaml", ROOT / "pyproject.toml"]
+    text = "".join(file.read_text() for file in files if file.exists())
+    assert len(set(re.findall(r"\"ruff(==.*?)\"", text))) == 1
+
+
 def test_the_recipe_requires_what_the_package_does() -> None:
     """conda-forge's names are those of PyPI; it says besides that PETSc is real."""
     run = re.search(r"\n  run:\n(.*?)\n\n", RECIPE, re.DOTALL).group(1)
