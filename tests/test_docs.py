@@ -12,9 +12,9 @@ from types import ModuleType
 
 import pytest
 from mpi4py import MPI
-from running import ROOT, environment
 
 import fenics_contact
+from scenes.processes import ROOT, command, environment
 
 sys.path.insert(0, str(ROOT / "docs"))
 
@@ -209,6 +209,21 @@ def test_the_tables_have_every_text(tmp_path: Path) -> None:
     plain = [re.sub(r"\\(.)", r"\1", row) for row in rows]
     for message in messages.read():
         assert any(row.startswith(f"| {message.text} |") for row in plain), message
+
+
+@pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own")
+def test_the_line_that_ends_all_ranks(tmp_path: Path) -> None:
+    """With it a rank that raises is not waited for: all end, and its error is shown."""
+    (line,) = re.findall(r"```text\n(.*?)```", (DOCS / "learn" / "parallel.md").read_text(), re.S)
+    script = tmp_path / "script.py"
+    script.write_text(
+        f"import sys\nfrom mpi4py import MPI\n{line}"
+        'if MPI.COMM_WORLD.rank == 1:\n    raise ValueError("on one rank")\n'
+        "MPI.COMM_WORLD.Barrier()\n"
+    )
+    words = command(2, script)
+    done = subprocess.run(words, env=environment(), capture_output=True, text=True, timeout=60)
+    assert done.returncode != 0 and "ValueError: on one rank" in done.stderr
 
 
 # ---- scripts -------------------------------------------------------------------------------------

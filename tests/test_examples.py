@@ -49,10 +49,12 @@ def run(path: Path, folder: Path, ranks: int) -> str:
 
 
 def test_each_is_run_and_named() -> None:
-    """Each of them is run below, and named in the README."""
+    """Each of them is run below, and named in the page of examples."""
     assert sorted(PRINTED) == NAMES
-    readme = (ROOT / "README.md").read_text()
-    assert all(f"`{name}.py`" in readme for name in NAMES)
+    page = (ROOT / "docs" / "learn" / "examples.md").read_text()
+    assert all(f"`{name}.py`" in page for name in NAMES)
+    demos = [path.stem for path in (ROOT / "demos").glob("[!_]*.py")]
+    assert all(f"`{name}`" in page or f"demos/{name}.py" in page for name in demos)
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=NAMES)
