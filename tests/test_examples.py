@@ -5,12 +5,12 @@ from __future__ import annotations
 import ast
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from mpi4py import MPI
-from running import ROOT, environment
+
+from scenes.processes import ROOT, command, environment
 
 pytestmark = pytest.mark.whole
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -38,11 +38,9 @@ PRINTED = {
 
 def run(path: Path, folder: Path, ranks: int) -> str:
     """What the script prints; it must end with 0."""
-    command = [sys.executable, str(path)]
-    if ranks > 1:
-        command = ["mpirun", "--oversubscribe", "-n", str(ranks), *command]
+    words = command(ranks, path)
     done = subprocess.run(
-        command, cwd=folder, env=environment(), capture_output=True, text=True, timeout=300
+        words, cwd=folder, env=environment(), capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
