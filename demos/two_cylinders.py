@@ -167,12 +167,12 @@ def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
     made = [scene.step, *bar]
 
     points, resultants = contact.gather(), contact.resultants()
-    stuck = points["measure"] @ (points["status"] == fc.Status.STICK)
+    extents = resultants.extents
     values = {
         "force along y [N/mm]": resultants.force[1],
         "force along x [N/mm]": -resultants.force[0],
-        "half-width of contact [mm]": resultants.area / 2,
-        "half-width of stick zone [mm]": stuck / 2,
+        "half-width of contact [mm]": extents["contact"].area / 2,
+        "half-width of stick zone [mm]": extents["stick"].area / 2,
         "largest pressure [MPa]": resultants.max_pressure,
         "largest shear [MPa]": float(np.abs(points["tangential_traction"][:, 0]).max()),
     }

@@ -7,7 +7,7 @@ from fenics_contact.checks.verdict import Balance, NotConverged, Verdict
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.general import contact_pairs
-from fenics_contact.contact.values import Resultants, Status
+from fenics_contact.contact.values import Extent, Resultants, Status
 from fenics_contact.estimates.adaptation import Level, adapt
 from fenics_contact.estimates.errors import ErrorBudget, estimate_errors
 from fenics_contact.histories import checkpoint
@@ -48,6 +48,7 @@ __all__ = [
     "Cylinder",
     "DeformableBody",
     "ErrorBudget",
+    "Extent",
     "Foundation",
     "FrictionLaw",
     "Frictionless",

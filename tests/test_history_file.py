@@ -59,7 +59,7 @@ def test_a_row_is_a_step(cell, tmp_path):
         for column, attribute in (
             ("normal force (force)", "normal_force"),
             ("friction as the sum of sizes (force)", "tangential_force"),
-            ("closed area (area)", "area"),
+            ("area in contact (area)", "area"),
             ("largest pressure (stress)", "max_pressure"),
             ("largest penetration (length)", "max_penetration"),
             ("open (points)", "open"),
@@ -68,6 +68,17 @@ def test_a_row_is_a_step(cell, tmp_path):
         ):
             expected = [getattr(step.contacts[name], attribute) for step in steps]
             assert numbers(rows, f"{name}: {column}") == expected
+        for state in ("contact", "stick", "slip"):
+            extents = [step.contacts[name].extents[state] for step in steps]
+            assert numbers(rows, f"{name}: area in {state} (area)") == [e.area for e in extents]
+            for i, axis in enumerate("xyz"[: made.scene.dim]):
+                for word, ends in (
+                    ("from", [e.low for e in extents]),
+                    ("to", [e.high for e in extents]),
+                ):
+                    found = [row[f"{name}: {state} {word} {axis} (length)"] for row in rows]
+                    told = ["" if np.isnan(end[i]) else str(end[i]) for end in ends]
+                    assert found == told
     for name in ("work", "elastic", "springs", "dissipation", "remainder"):
         expected = [getattr(step.energy, name) for step in steps]
         assert numbers(rows, f"{name} (force length)") == expected

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from fenics_contact.contact.values import PointValues, Resultants, Status
+from fenics_contact.contact.values import Extent, PointValues, Resultants, Status
 from fenics_contact.laws.base import Law
 from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_sum
 from fenics_contact.surface.fields import PointFields
@@ -124,8 +125,12 @@ class PointResults(ABC):
         """Area that each point stands for, the contact's weight included, shape (n_points,)."""
         return self.quadrature.weights * self.values.weight
 
+    @abstractmethod
+    def moment(self, about: Sequence[float]) -> Array:
+        """Moment of the contact forces on the body about a point. Collective."""
+
     def resultants(self) -> Resultants:
-        """Forces, area and counts. Collective."""
+        """Forces, moment, counts and extents. Collective."""
         comm = self.surface.mesh.comm
         measure, status = self.measure, self.status
         tangential = np.linalg.norm(self.tangential_traction, axis=1)
@@ -135,7 +140,6 @@ class PointResults(ABC):
             [
                 measure @ self.pressure,
                 measure @ tangential,
-                measure @ (status != Status.OPEN),
                 *(np.count_nonzero(status == s) for s in Status),
             ],
         )
@@ -143,13 +147,33 @@ class PointResults(ABC):
             force=force,
             normal_force=float(sums[0]),
             tangential_force=float(sums[1]),
-            area=float(sums[2]),
-            open=int(sums[3]),
-            stick=int(sums[4]),
-            slip=int(sums[5]),
+            moment=self.moment([0.0] * self.points.shape[1]),
+            extents=self._extents(),
+            open=int(sums[2]),
+            stick=int(sums[3]),
+            slip=int(sums[4]),
             max_pressure=global_max(comm, self.pressure),
             max_penetration=global_max(comm, self.values.penetration),
         )
+
+    def _extents(self) -> dict[str, Extent]:
+        """Of the points that are closed, that stick and that slip. Collective."""
+        comm, x, status = self.surface.mesh.comm, self.points, self.status
+        states = {
+            "contact": status != Status.OPEN,
+            "stick": status == Status.STICK,
+            "slip": status == Status.SLIP,
+        }
+        areas = global_sum(comm, [self.measure @ points for points in states.values()])
+        mine = [
+            (x[points].min(axis=0, initial=np.inf), x[points].max(axis=0, initial=-np.inf))
+            for points in states.values()
+        ]
+        ends = np.array(comm.allgather(mine))  # by rank and state
+        low, high = ends[:, :, 0].min(axis=0), ends[:, :, 1].max(axis=0)
+        low, high = (np.where(low <= high, end, np.nan) for end in (low, high))
+        rows = zip(states, areas, low, high, strict=True)
+        return {name: Extent(float(area), *each) for name, area, *each in rows}
 
     def gather(self) -> dict[str, Array]:
         """All of Γc on every rank, for pictures and tables, ordered by coordinates. Collective.

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fenics_contact.types import Array, Mask
 
-__all__ = ["PointValues", "Resultants", "Status"]
+__all__ = ["Extent", "PointValues", "Resultants", "Status"]
 
 
 class Status(IntEnum):
@@ -24,14 +24,42 @@ class Status(IntEnum):
 
 
 @dataclass(frozen=True)
+class Extent:
+    """Where the quadrature points of one state are on Γc, the same on every rank.
+
+    The state ends between the outermost of them and the next point: coordinates and half of a
+    length are known to within the distance of two points, which is less than a facet.
+
+    Attributes:
+        area: That they stand for, the contact's weight included (in the plane a length).
+        low, high: Their least and largest coordinates on the undeformed Γc, (gdim,) (length); NaN
+            where there are no such points.
+    """
+
+    area: float
+    low: Array
+    high: Array
+
+    @property
+    def size(self) -> Array:
+        """How far they reach along each axis, (gdim,) (length); NaN where there are none.
+
+        Of a strip about a line of contact in the plane half of it is the half-width.
+        """
+        return self.high - self.low
+
+
+@dataclass(frozen=True)
 class Resultants:
-    """Integrals over Γc and counts of its points, the same on every rank.
+    """Integrals over Γc, counts and extents of its points, the same on every rank.
 
     Attributes:
         force: Contact force on the body, ∫ (r_n n + τ), shape (gdim,) (2D: per thickness).
         normal_force: ∫ -r_n, tension counted negative.
         tangential_force: ∫ |τ|.
-        area: Measure of the closed part; all that has a support where the law bears tension.
+        moment: Of the force about the origin, as `Contact.moment` gives it, (1,) or (3,).
+        extents: `Extent` of "contact" (the closed part; all that has a support where the law bears
+            tension), and in it of "stick" and of "slip".
         open, stick, slip: Numbers of quadrature points.
         max_pressure: Largest -r_n at a point (stress).
         max_penetration: Largest δ₋ (length).
@@ -40,12 +68,18 @@ class Resultants:
     force: Array
     normal_force: float
     tangential_force: float
-    area: float
+    moment: Array
+    extents: Mapping[str, Extent]
     open: int
     stick: int
     slip: int
     max_pressure: float
     max_penetration: float
+
+    @property
+    def area(self) -> float:
+        """Measure of the closed part."""
+        return self.extents["contact"].area
 
 
 @dataclass(frozen=True)

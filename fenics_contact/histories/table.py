@@ -8,7 +8,10 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.values import Resultants
 from fenics_contact.parallel import collective_errors
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.results import files
@@ -16,6 +19,7 @@ from fenics_contact.results import files
 __all__ = ["Table"]
 
 _AXES = "xyz"
+_STATES = ("contact", "stick", "slip")
 _ENERGIES = ("work", "elastic", "springs", "dissipation", "remainder")
 # How every table begins: a file that begins otherwise is not overwritten.
 _FIRST = ("increment", "load")
@@ -116,7 +120,7 @@ class Table:
         """
         row: list[object] = [step.increment, "" if step.load is None else step.load]
         for contact in self._problem.contacts:
-            row += _values(contact, step)
+            row += _values(step.contacts[contact.name])
         row += [getattr(step.energy, name) for name in _ENERGIES]
         row += [step.verdict.relative_residual, step.method, step.iterations]
         row.append(sum(attempt.method == "cut" for attempt in step.attempts))
@@ -147,22 +151,30 @@ def _columns(contact: Contact) -> list[str]:
         "normal force (force)",
         "friction as the sum of sizes (force)",
         *(f"moment {axis} about the origin (force length)" for axis in turns),
-        "closed area (area)",
+        *(f"area in {state} (area)" for state in _STATES),
+        *(
+            f"{state} {end} {axis} (length)"
+            for state in _STATES
+            for end in ("from", "to")
+            for axis in _AXES[:d]
+        ),
         "largest pressure (stress)",
         "largest penetration (length)",
         *(f"{state} (points)" for state in ("open", "stick", "slip")),
     ]
 
 
-def _values(contact: Contact, step: Step) -> list[object]:
-    """The same in numbers. Collective."""
-    r = step.contacts[contact.name]
-    moment = contact.moment([0.0] * contact.surface.mesh.geometry.dim)
+def _values(r: Resultants) -> list[object]:
+    """The same in numbers; empty where no point is of a state."""
+    extents = [r.extents[state] for state in _STATES]
+    ends = np.concatenate([end for e in extents for end in (e.low, e.high)])
     return [
         *(float(value) for value in r.force),
         *(r.normal_force, r.tangential_force),
-        *(float(value) for value in moment),
-        *(r.area, r.max_pressure, r.max_penetration, r.open, r.stick, r.slip),
+        *(float(value) for value in r.moment),
+        *(e.area for e in extents),
+        *("" if np.isnan(end) else float(end) for end in ends),
+        *(r.max_pressure, r.max_penetration, r.open, r.stick, r.slip),
     ]
 
 

@@ -1,0 +1,85 @@
+"""How far contact, stick and slip reach, against closed forms and the points themselves."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import fenics_contact as fc
+from demos import two_cylinders as cylinders
+from scenes.blocks import CELLS, dimension
+from scenes.comparing import close
+from scenes.rubbing import PATH, Rub, walk
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+
+CELLS_IN_A = 20
+
+
+def half_widths(extent):
+    """By its measure, and by its coordinates along the line of contact."""
+    return extent.area / 2, extent.size[0] / 2
+
+
+def test_hertz_and_cattaneo_mindlin():
+    """Pressed: a of Hertz. Sheared: c of Cattaneo and Mindlin, and slip from c to a on both sides.
+
+    Within one facet, a/20: the extents are those of points, and the state may end anywhere between
+    two of them; half-discs of a/R = 0.085 for half-planes cost a fifth of that.
+    """
+    scene = cylinders.press(CELLS_IN_A, 2, 10.0)
+    a, c, facet = cylinders.A, cylinders.C, cylinders.A / CELLS_IN_A
+    pressed = scene.step.contacts["contact"].extents
+    for width in half_widths(pressed["contact"]):
+        assert abs(width - a) < facet
+    assert pressed["stick"].area == 0.0 and np.isnan(pressed["stick"].size).all()
+    (step,) = fc.increments(scene.problem, scene.shear, 0.0, cylinders.SHEAR)
+    sheared = step.contacts["contact"].extents
+    for state, expected in (("contact", a), ("stick", c)):
+        for width in half_widths(sheared[state]):
+            assert abs(width - expected) < facet, state
+        middle = (sheared[state].low[0] + sheared[state].high[0]) / 2
+        assert abs(middle) < facet / 2
+    slip = sheared["slip"]
+    assert abs(slip.area - 2 * (a - c)) < 2 * facet
+    assert close([slip.low[0], slip.high[0]], [-a, a], facet / a)
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_they_are_those_of_the_points(cell):
+    """In the plane and in space, all states, and none: what `gather` has, to the last digits.
+
+    And on any number of ranks, some of them without points of a state.
+    """
+    made, d = Rub(cell=cell), dimension(cell)
+    made.problem.kinematics = np.inf
+    seen = set()
+    for step in walk(made, path=[(0.0, -0.01), *PATH]):
+        found, points = step.contacts["contact"], made.contact.gather()
+        if step.increment < len(PATH) + 1:
+            continue  # the points are those of the last step
+        closed = points["status"] != fc.Status.OPEN
+        states = {
+            "contact": closed,
+            "stick": points["status"] == fc.Status.STICK,
+            "slip": points["status"] == fc.Status.SLIP,
+        }
+        for name, mask in states.items():
+            extent = found.extents[name]
+            assert close([extent.area], [points["measure"] @ mask], 1e-12, scale=1.0)
+            if mask.any():
+                seen.add(name)
+                assert np.array_equal(extent.low, points["x"][mask].min(axis=0))
+                assert np.array_equal(extent.high, points["x"][mask].max(axis=0))
+            else:
+                assert np.isnan(extent.low).all() and extent.low.shape == (d,)
+        assert found.area == found.extents["contact"].area
+    assert "contact" in seen
+
+
+def test_the_moment_is_that_about_the_origin():
+    """Of a step, as `Contact.moment` has it, on any number of ranks."""
+    made = Rub()
+    made.problem.kinematics = np.inf
+    *_, step = fc.increments(made.problem, made.load, 0, 1.5, steps=3)
+    assert close(step.contacts["contact"].moment, made.contact.moment([0, 0]), 1e-12)
+    assert MPI.COMM_WORLD.allreduce(abs(float(step.contacts["contact"].moment[0]))) > 0
