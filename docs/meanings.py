@@ -127,7 +127,13 @@ GROUPS: list[tuple[str, list[str], str]] = [
     ),
     (
         "Results",
-        ["results.output", "results.vtu", "results.writer"],
+        [
+            "results.output",
+            "results.vtu",
+            "results.writer",
+            "results.drawing",
+            "results.plotting",
+        ],
         "Files of another program are never overwritten.",
     ),
 ]

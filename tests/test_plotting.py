@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import plotting
+from fenics_contact.results import drawing
 from scenes.blocks import CELLS, dimension
 from scenes.comparing import close, raised_everywhere, shared_folder
 from scenes.rubbing import Rub
@@ -22,13 +24,13 @@ CORNERS = {"triangle": 3, "quadrilateral": 4, "tetrahedron": 3, "hexahedron": 4}
 @pytest.fixture
 def drawn(monkeypatch):
     """The figures, kept open."""
-    figures, save = [], plotting._save
+    figures, save = [], drawing.save
 
     def keep(figure, path):
         figures.append(figure)
         save(figure, path)
 
-    monkeypatch.setattr(plotting, "_save", keep)
+    monkeypatch.setattr(drawing, "save", keep)
     return figures
 
 
@@ -86,6 +88,63 @@ def test_pictures_of_any_body(cell, tmp_path, drawn):
             assert (folder / name).read_bytes()[:4] == b"\x89PNG"
 
     assert step.contacts["contact"].normal_force > 0
+    on_first(check)
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_fields_and_stress(cell, tmp_path, drawn):
+    """Means of the facets and values at the points, as `gather` has them; von Mises in closed form.
+
+    The stress is that of a stretch along x that grows with x: E ε, where E is along x alone.
+    """
+    folder, d = shared_folder(tmp_path), dimension(cell)
+    made = Rub(cell=cell, mesh={"n": 4})
+    made.problem.kinematics = np.inf
+    list(fc.increments(made.problem, made.load, 0, 2, steps=2))
+    fields = ("pressure", "friction", "gap", "slip")
+    for field in fields:
+        plotting.plot_field(folder / f"{field}.png", made.contact, field)
+    if d == 2:
+        plotting.plot_along(folder / "along.png", made.contact)
+    else:
+        raised_everywhere(
+            lambda: plotting.plot_along(folder / "a.png", made.contact), ValueError, "plot_field"
+        )
+    raised_everywhere(
+        lambda: plotting.plot_field(folder / "a.png", made.contact, "heat"), ValueError, "'heat'"
+    )
+    points = made.contact.gather()
+    points["friction"] = np.linalg.norm(points["tangential_traction"], axis=1)
+    u = fem.Function(fem.functionspace(made.scene.mesh, ("Lagrange", 2, (d,))))
+    u.interpolate(lambda x: np.vstack([0.05 * x[0] ** 2, *(0 * x[1:d])]))
+    zero = 0.0 * u[0]
+    rows = [[1000 * u[0].dx(0), zero, zero], [zero, zero, zero], [zero, zero, zero]]
+    plotting.plot_deformation(folder / "u.png", u, stress=ufl.as_tensor(rows))
+    tensor = ufl.as_tensor(rows)[0, 0]
+    raised_everywhere(
+        lambda: plotting.plot_deformation(folder / "a.png", u, stress=tensor), ValueError, "(3, 3)"
+    )
+
+    def check():
+        for field, figure in zip(fields, drawn, strict=False):
+            means = per_facet(points | {"pressure": points[field]}, cell)
+            ends = [min(0.0, means.min()), max(0.0, means.max())]
+            assert close(figure.axes[1].get_ylim(), ends, 1e-12), field
+        if d == 2:
+            upper, lower = drawn[4].axes
+            curves = {line.get_label(): line.get_data() for line in (*upper.lines, *lower.lines)}
+            names = {"pressure": "pressure", "|tangential traction|": "friction", "gap": "gap"}
+            for label, name in (names | {"accumulated slip": "slip"}).items():
+                x, y = curves[label]
+                assert len(x) > 2 and x.min() >= 0 and x.max() <= 1
+                near = (points["x"][:, 0] >= x.min()) & (points["x"][:, 0] <= x.max())
+                assert np.array_equal(np.sort(y), np.sort(points[name][near]))
+        # In the middle of the last cells along x, and colours from yellow to the largest.
+        body = drawn[-1].axes[0].collections[1]
+        largest = {"triangle": 11 / 12, "tetrahedron": 15 / 16}.get(cell, 7 / 8)
+        assert close(drawn[-1].axes[1].get_ylim(), [0, 100 * largest], 1e-9)
+        assert len(np.unique(np.asarray(body.get_facecolor()), axis=0)) >= 4
+
     on_first(check)
 
 

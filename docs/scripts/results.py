@@ -1,4 +1,4 @@
-"""A block is pressed and pushed on a floor; its results go to ParaView, a table and pictures."""
+"""A block is pressed and pushed on a floor: results for ParaView, a table and pictures."""
 
 import logging
 

@@ -5,31 +5,34 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
-from dolfinx.mesh import CellType, exterior_facet_indices
 
-from fenics_contact.arguments import check_instance
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import collective_errors, global_sum
-from fenics_contact.results import files
+from fenics_contact.parallel import collective_errors
+from fenics_contact.results import drawing
 from fenics_contact.results.writer import facet_status
-from fenics_contact.surface.facets import FacetSet
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Mask
 
-__all__ = ["figure", "plot_deformation", "plot_pressure", "plot_status", "plot_tractions"]
+__all__ = [
+    "figure",
+    "plot_along",
+    "plot_deformation",
+    "plot_field",
+    "plot_pressure",
+    "plot_status",
+    "plot_tractions",
+]
 
-
-_COLOURS = {
-    "pressure": "#1f5fa8",
-    "tangential": "#c8502a",
-    "mesh": "#9a9a9a",
-    "open": "#d8d8d8",
+# Fields of `plot_field` and what their colours are called; units are of stress or of length.
+_FIELDS = {
+    "pressure": ("contact pressure", "stress"),
+    "friction": ("size of the tangential traction", "stress"),
+    "gap": ("gap", "length"),
+    "slip": ("accumulated slip", "length"),
 }
 
 
@@ -37,7 +40,9 @@ def plot_deformation(
     path: str | os.PathLike[str],
     u: fem.Function,
     *,
+    stress: Any = None,
     unit: str = "mm",
+    stress_unit: str = "MPa",
     title: str = "",
     magnification: float = 1.0,
     support: Sequence[Sequence[float]] | None = None,
@@ -50,53 +55,32 @@ def plot_deformation(
     Args:
         path: PNG or PDF to write.
         u: Displacement.
+        stress: UFL tensor (3, 3) on the body: cells have the colour of its von Mises stress in
+            their middle, in space facets that of their cell.
         unit: Unit of length, for the axes.
+        stress_unit: Unit of stress, for the colours.
         title: Title.
         magnification: Factor by which the displacement is drawn.
         support: End points of a line to draw as the rigid support, shape (2, gdim).
         view: In space where to look from: elevation and azimuth in degrees.
 
     Raises:
-        ValueError: u is no displacement.
+        ValueError: u is no displacement, or the stress has another shape. On all ranks.
+        OSError: The file cannot be written; it is as before. On all ranks.
     """
-    check_instance("u", u, fem.Function)
-    d = u.function_space.mesh.geometry.dim
-    if u.ufl_shape != (d,):
-        raise ValueError(
-            f"u has shape {u.ufl_shape}; give a displacement of {d} components, of a mixed "
-            "function that of its Contact, contact.u"
-        )
-    original, deformed = _shapes(u, magnification)
+    shape = drawing.ShapeOf(u, stress)()
     with collective_errors(u.function_space.mesh.comm):
-        if original is None or deformed is None:
-            return
-        true = magnification == 1.0
-        label = "deformed (true scale)" if true else f"displacement × {magnification:g}"
-        figure, axes = _axes(np.concatenate([original, deformed]), unit, title, view)
-        plane = original.shape[2] == 2  # in space what is behind is hidden
-        axes.add_collection(_polygons(original, "#ffffff00", _COLOURS["mesh"], 0.4))
-        faces = "#1f5fa818" if plane else "#e3ebf5e8"
-        axes.add_collection(_polygons(deformed, faces, _COLOURS["pressure"], 0.5 if plane else 0.3))
-        from matplotlib.lines import Line2D
-
-        handles = [
-            Line2D([], [], color=_COLOURS["mesh"], label="original"),
-            Line2D([], [], color=_COLOURS["pressure"], label=label),
-        ]
-        if support is not None:
-            ends = np.asarray(support)
-            handles += axes.plot(
-                ends[:, 0], ends[:, 1], color="black", linewidth=2, label="rigid support"
+        if shape is not None:
+            figure = drawing.deformed(
+                shape, (unit, stress_unit), title, magnification, support, view
             )
-            axes.autoscale()
-            axes.margins(0.03)
-        figure.legend(handles=handles, loc="outside lower center", ncols=3)
-        _save(figure, path)
+            drawing.save(figure, path)
 
 
-def plot_pressure(
+def plot_field(
     path: str | os.PathLike[str],
     contact: Contact,
+    field: str = "pressure",
     *,
     length: str = "mm",
     stress: str = "MPa",
@@ -104,38 +88,75 @@ def plot_pressure(
     magnification: float = 1.0,
     view: tuple[float, float] | None = None,
 ) -> None:
-    """Draw the pressure on the facets of Γc, and the deformed body about it. Collective.
+    """Draw values on the facets of Γc, and the deformed body about it. Collective.
 
-    Every facet has the mean of its points, nominal with finite kinematics; open ones are grey.
+    Every facet has the mean of its points. Where pressure, friction and slip are zero, and where
+    the gap of none of the points is known, it is grey.
 
     Args:
         path: PNG or PDF to write.
         contact: Evaluated.
-        length: Unit of length, for the axes.
+        field: "pressure" (nominal with finite kinematics), "friction" (the size of the tangential
+            traction), "gap", or "slip" (accumulated and committed, the sum of the modes).
+        length: Unit of length, for the axes, and the colours of gap and slip.
         stress: Unit of stress, for the colours.
         title: Title.
         magnification: Factor by which the displacement is drawn.
         view: In space where to look from, elevation and azimuth in degrees; by default so that Γc
             is in front.
+
+    Raises:
+        ValueError: There is no such field. On all ranks.
+        OSError: The file cannot be written; it is as before. On all ranks.
     """
-    rows, weights = contact.quadrature.point_rows(), contact.quadrature.weights
-    pressure = np.sum((weights * contact.pressure)[rows], axis=1) / weights[rows].sum(axis=1)
-    drawn = _surface(contact, pressure, magnification)
+    if field not in _FIELDS:
+        raise ValueError(f"field is {field!r}; use one of {list(_FIELDS)}")
+    at_points = _field(contact, field)
+    rows = contact.quadrature.point_rows()
+    values, weights = at_points[rows], contact.quadrature.weights[rows]
+    known = np.isfinite(values)
+    total = np.sum(weights * known, axis=1)
+    means = np.sum(weights * np.where(known, values, 0.0), axis=1)
+    means = np.divide(means, total, out=np.full_like(total, np.nan), where=total > 0)
+    drawn = drawing.surface_of(contact, means, magnification)
     with collective_errors(contact.surface.mesh.comm):
         if drawn is None:
             return
         figure, axes = drawn.axes(length, title, view)
-        pressure = drawn.values
-        from matplotlib.cm import ScalarMappable
-        from matplotlib.colors import Normalize, to_rgba
+        from matplotlib.colors import to_rgba
 
-        low, high = min(0.0, pressure.min()), max(0.0, pressure.max())
-        colours = ScalarMappable(Normalize(low, high if high > low else low + 1.0), "viridis_r")
-        faces = colours.to_rgba(pressure)
-        faces[pressure == 0.0] = to_rgba(_COLOURS["open"])
-        axes.add_collection(_on_surface(drawn.facets, faces))
-        figure.colorbar(colours, ax=axes, label=f"contact pressure [{stress}]", shrink=0.8)
-        _save(figure, path)
+        means = drawn.values
+        low, high = (end(means, initial=0.0) for end in (np.nanmin, np.nanmax))
+        colours = drawing.scale_of(low, high)
+        faces = colours.to_rgba(means)
+        faces[np.isnan(means) | ((means == 0.0) & (field != "gap"))] = to_rgba(
+            drawing.COLOURS["open"]
+        )
+        axes.add_collection(drawing.on_surface(drawn.facets, faces))
+        name, kind = _FIELDS[field]
+        unit = {"stress": stress, "length": length}[kind]
+        figure.colorbar(colours, ax=axes, label=f"{name} [{unit}]", shrink=0.8)
+        drawing.save(figure, path)
+
+
+def _field(contact: Contact, name: str) -> Array:
+    """One of `_FIELDS` at this rank's points."""
+    if name == "pressure":
+        return contact.pressure
+    if name == "friction":
+        return np.asarray(np.linalg.norm(contact.tangential_traction, axis=1))
+    return contact.gap if name == "gap" else np.asarray(contact.slip.sum(axis=1))
+
+
+def plot_pressure(path: str | os.PathLike[str], contact: Contact, **options: Any) -> None:
+    """`plot_field` of the pressure. Collective.
+
+    Args:
+        path: PNG or PDF to write.
+        contact: Evaluated.
+        **options: Those of `plot_field`.
+    """
+    plot_field(path, contact, "pressure", **options)
 
 
 def plot_status(
@@ -159,19 +180,19 @@ def plot_status(
         magnification: Factor by which the displacement is drawn.
         view: As for `plot_pressure`.
     """
-    drawn = _surface(contact, facet_status(contact), magnification)
+    drawn = drawing.surface_of(contact, facet_status(contact), magnification)
     with collective_errors(contact.surface.mesh.comm):
         if drawn is None:
             return
         figure, axes = drawn.axes(length, title, view)
         from matplotlib.patches import Patch
 
-        colours = np.array([_COLOURS[name] for name in ("open", "pressure", "tangential")])
-        axes.add_collection(_on_surface(drawn.facets, list(colours[drawn.values])))
+        colours = np.array([drawing.COLOURS[name] for name in ("open", "pressure", "tangential")])
+        axes.add_collection(drawing.on_surface(drawn.facets, list(colours[drawn.values])))
         names = {Status.OPEN: "open", Status.STICK: "sticking", Status.SLIP: "slipping"}
         patches = [Patch(fc=colours[s], ec="#555555", label=name) for s, name in names.items()]
         figure.legend(handles=patches, loc="outside lower center", ncols=3)
-        _save(figure, path)
+        drawing.save(figure, path)
 
 
 def plot_tractions(
@@ -197,34 +218,16 @@ def plot_tractions(
         stress: Unit of stress, for the axes.
         title: Title.
     """
-    plt = _pyplot()
+    plt = drawing.pyplot()
     figure, axes = plt.subplots(figsize=(7.6, 4.8), layout="constrained")
     x, status = points["x"][:, 0], points["status"]
     closed = status != Status.OPEN
     # Somewhat beyond the contact, but not beyond Γc.
     reach = min(1.15 * np.abs(x[closed]).max(initial=0.0), np.abs(x).max(initial=0.0)) or 1.0
     near = np.abs(x) <= reach
-    axes.plot(x[near], points["pressure"][near], ".-", color=_COLOURS["pressure"], label="pressure")
     # The shear on the body, along x: the direction in which the support holds it.
-    shear = points["tangential_traction"][:, 0]
-    if np.any(shear):
-        size = np.abs(shear)
-        axes.plot(
-            x[near], size[near], "-", color=_COLOURS["tangential"], label="|tangential traction|"
-        )
-        for state, marker, name in (
-            (Status.STICK, "o", "sticking"),
-            (Status.SLIP, "x", "slipping"),
-        ):
-            mask = near & (status == state)
-            axes.plot(
-                x[mask],
-                size[mask],
-                marker,
-                color=_COLOURS["tangential"],
-                markersize=4,
-                label=f"{name} points",
-            )
+    shear = np.abs(points["tangential_traction"][:, 0])
+    _draw_tractions(axes, x, points["pressure"], shear, status, [near])
     styles = ("--", ":", "-.")
     for i, (label, (xs, ys)) in enumerate((curves or {}).items()):
         axes.plot(xs, ys, styles[i % 3], color="black", linewidth=1.2, label=label)
@@ -237,7 +240,94 @@ def plot_tractions(
     axes.set_ylim(bottom=0.0)
     axes.grid(alpha=0.25)
     axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
-    _save(figure, path)
+    drawing.save(figure, path)
+
+
+def plot_along(
+    path: str | os.PathLike[str],
+    contact: Contact,
+    *,
+    length: str = "mm",
+    stress: str = "MPa",
+    title: str = "",
+) -> None:
+    """Draw tractions, gap and slip at the points of Γc in the plane. Collective.
+
+    Over the coordinate along which the contact reaches farthest, on the undeformed Γc; each side of
+    a Γc that turns back, a hole's for instance, has a curve of its own.
+
+    Args:
+        path: PNG or PDF to write.
+        contact: Evaluated, of a plane body.
+        length: Unit of length, for the axes.
+        stress: Unit of stress, for the axes.
+        title: Title.
+
+    Raises:
+        ValueError: The body is none of the plane. On all ranks.
+        OSError: The file cannot be written; it is as before. On all ranks.
+    """
+    if contact.points.shape[1] != 2:
+        raise ValueError(
+            f"{contact.name}: curves along Γc are drawn in the plane; in space use plot_field"
+        )
+    points, comm = contact.gather(), contact.surface.mesh.comm
+    with collective_errors(comm):
+        if comm.rank != 0:
+            return
+        status = points["status"]
+        closed = status != Status.OPEN
+        if not closed.any():
+            closed = np.ones_like(closed)
+        axis = int(np.argmax(np.ptp(points["x"][closed], axis=0)))
+        x, normal = points["x"][:, axis], points["normal"][:, 1 - axis]
+        # Somewhat beyond the contact.
+        low, high = x[closed].min(), x[closed].max()
+        margin = 0.25 * (high - low) or 1.0
+        near = (x >= low - margin) & (x <= high + margin)
+        sides = [near & side for side in (normal < 0, normal >= 0) if np.any(near & side)]
+        plt = drawing.pyplot()
+        figure, (upper, lower) = plt.subplots(
+            2, 1, sharex=True, figsize=(7.6, 6.0), layout="constrained"
+        )
+        size = np.linalg.norm(points["tangential_traction"], axis=1)
+        _draw_tractions(upper, x, points["pressure"], size, status, sides)
+        for name, colour in (("gap", "pressure"), ("slip", "tangential")):
+            for i, side in enumerate(sides):
+                label = {"gap": "gap", "slip": "accumulated slip"}[name] if i == 0 else None
+                values = points[name]
+                if name == "gap" or np.any(values):
+                    style = {"color": drawing.COLOURS[colour], "label": label}
+                    lower.plot(x[side], values[side], ".-", **style)
+        upper.set(ylabel=f"traction [{stress}]", title=title)
+        lower.set(xlabel=f"{'xy'[axis]} [{length}]", ylabel=f"gap, slip [{length}]")
+        for axes in (upper, lower):
+            axes.axhline(0.0, color="#555555", linewidth=0.6)  # lest round-off fill the picture
+            axes.grid(alpha=0.25)
+            axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
+        drawing.save(figure, path)
+
+
+def _draw_tractions(
+    axes: Any, x: Array, pressure: Array, shear: Array, status: Array, sides: Sequence[Mask]
+) -> None:
+    """Curves of pressure and shear, with what sticks and slips; of several sides of Γc."""
+    blue, red = drawing.COLOURS["pressure"], drawing.COLOURS["tangential"]
+    labels = True
+    for side in sides:
+        curves = [(pressure, ".-", blue, "pressure", side)]
+        if np.any(shear):
+            curves.append((shear, "-", red, "|tangential traction|", side))
+            for state, marker, name in (
+                (Status.STICK, "o", "sticking points"),
+                (Status.SLIP, "x", "slipping points"),
+            ):
+                curves.append((shear, marker, red, name, side & (status == state)))
+        for values, style, colour, label, mask in curves:
+            told = label if labels else None
+            size = 4 if values is shear else 6
+            axes.plot(x[mask], values[mask], style, color=colour, markersize=size, label=told)
+        labels = False
 
 
 @contextmanager
@@ -254,165 +344,12 @@ def figure(
     Yields:
         The axes, or an array of them if there are several.
     """
-    plt = _pyplot()
+    plt = drawing.pyplot()
     drawn, axes = plt.subplots(
         1, columns, figsize=(columns * size[0], size[1]), layout="constrained"
     )
     try:
         yield axes
-        _save(drawn, path)
+        drawing.save(drawn, path)
     finally:
         plt.close(drawn)
-
-
-@dataclass(frozen=True)
-class _Surface:
-    """Γc and the body about it, of all ranks.
-
-    Attributes:
-        body: Corners of cells, or facets of the boundary, (n, n_corners, d).
-        facets: Those of the facets of Γc.
-        values: Of the facets.
-        outward: Sum of their normals.
-    """
-
-    body: Array
-    facets: Array
-    values: npt.NDArray[Any]
-    outward: Array
-
-    def axes(self, unit: str, title: str, view: tuple[float, float] | None) -> tuple[Any, Any]:
-        """A figure with the body in it, seen so that Γc is in front unless a view is given."""
-        if view is None and self.body.shape[2] == 3:
-            view = _towards(self.outward)
-        figure, axes = _axes(self.body, unit, title, view)
-        axes.add_collection(_polygons(self.body, "#9a9a9a10", "#9a9a9a60", 0.4))
-        return figure, axes
-
-
-def _surface(contact: Contact, values: npt.NDArray[Any], magnification: float) -> _Surface | None:
-    """Γc with a value for every facet, on the first rank; None on the others. Collective."""
-    contact.displacement.follow()
-    u, mesh = contact.displacement.u, contact.surface.mesh
-    facets = FacetSet(u.function_space, contact.surface.facets)
-    outward = global_sum(mesh.comm, facets.mean_normals().sum(axis=0))
-    _, body = _shapes(u, magnification)
-    gathered = mesh.comm.gather((_moved(facets, u, magnification), values))
-    if gathered is None or body is None:
-        return None
-    at, values = (np.concatenate(part) for part in zip(*gathered, strict=True))
-    return _Surface(body, at, values, outward)
-
-
-def _towards(outward: Array) -> tuple[float, float]:
-    """Elevation and azimuth from which a surface with this normal is seen, somewhat aslant."""
-    x, y, z = outward / (np.linalg.norm(outward) or 1.0)
-    elevation = float(np.degrees(np.arcsin(np.clip(z, -1, 1))))
-    flat = np.hypot(x, y) < 0.1
-    azimuth = -60.0 if flat else float(np.degrees(np.arctan2(y, x))) + 25.0
-    return float(np.clip(elevation, -55.0, 55.0)) + (
-        20.0 if abs(elevation) < 20.0 else 0.0
-    ), azimuth
-
-
-def _moved(facets: FacetSet, u: fem.Function, magnification: float) -> Array:
-    """Corners of facets in the order of their rings, displaced, (n_facets, n_corners, d)."""
-    original = facets.moved_corners(None)
-    return original + magnification * (facets.moved_corners(u) - original)
-
-
-def _shapes(u: fem.Function, magnification: float) -> tuple[Array | None, Array | None]:
-    """Corners of all cells, in space of the boundary's facets, as they were and as they are.
-
-    Collective.
-
-    Returns:
-        (n, n_corners, d) each on the first rank, None on the others.
-    """
-    mesh = u.function_space.mesh
-    d = mesh.topology.dim
-    if d == 3:
-        mesh.topology.create_connectivity(2, 3)
-        exterior = exterior_facet_indices(mesh.topology)
-        facets = FacetSet(u.function_space, exterior)
-        shapes = facets.moved_corners(None), _moved(facets, u, magnification)
-    else:
-        corners = fem.functionspace(mesh, ("Lagrange", 1, (d,)))
-        at_corners = fem.Function(corners)
-        at_corners.interpolate(u)
-        order = [0, 1, 3, 2] if mesh.topology.cell_type == CellType.quadrilateral else [0, 1, 2]
-        cells = corners.dofmap.list[: mesh.topology.index_map(d).size_local][:, order]
-        original = corners.tabulate_dof_coordinates()[:, :d][cells]
-        moved = at_corners.x.array.reshape(-1, d)[cells]
-        shapes = original, original + magnification * moved
-    gathered = mesh.comm.gather(shapes)
-    if gathered is None:
-        return None, None
-    original, deformed = (np.concatenate(part) for part in zip(*gathered, strict=True))
-    return original, deformed
-
-
-def _axes(
-    places: Array, unit: str, title: str, view: tuple[float, float] | None
-) -> tuple[Any, Any]:
-    """A figure and axes of equal scale that hold all places, (n, m, d)."""
-    plt, d = _pyplot(), places.shape[2]
-    places = places.reshape(-1, d)
-    low, high = places.min(axis=0), places.max(axis=0)
-    margin = 0.03 * (high - low).max()
-    low, high = low - margin, high + margin
-    labels = dict(
-        zip(("xlabel", "ylabel", "zlabel"), (f"{a} [{unit}]" for a in "xyz"), strict=True)
-    )
-    limits = zip(("xlim", "ylim", "zlim"), zip(low, high, strict=True), strict=False)
-    if d == 2:
-        del labels["zlabel"]
-        height = np.clip(6.0 * (high - low)[1] / (high - low)[0], 1.0, 8.0)
-        figure, axes = plt.subplots(figsize=(6.8, height + 1.4), layout="constrained")
-        axes.set(**labels, **dict(limits), title=title, aspect="equal")
-        return figure, axes
-    figure = plt.figure(figsize=(7.2, 6.0), layout="constrained")
-    axes = figure.add_subplot(projection="3d")
-    axes.set(**labels, **dict(limits), title=title)
-    axes.set_box_aspect(high - low, zoom=0.85)
-    axes.locator_params(nbins=4)
-    elevation, azimuth = (25.0, -60.0) if view is None else view
-    axes.view_init(elevation, azimuth)
-    return figure, axes
-
-
-def _polygons(corners: Array, faces: Any, edges: str, width: float) -> Any:
-    """Cells in the plane or facets in space."""
-    from matplotlib.collections import PolyCollection
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-
-    kind = PolyCollection if corners.shape[2] == 2 else Poly3DCollection
-    return kind(list(corners), facecolors=faces, edgecolors=edges, linewidths=width)
-
-
-def _on_surface(facets: Array, colours: Any) -> Any:
-    """Facets of Γc with a colour each: lines in the plane."""
-    from matplotlib.collections import LineCollection
-
-    if facets.shape[2] == 3:
-        return _polygons(facets, colours, "#555555", 0.3)
-    return LineCollection(list(facets), colors=colours, linewidths=5.0)
-
-
-def _save(figure: Any, path: str | os.PathLike[str]) -> None:
-    """Write a figure; the file is complete or as before."""
-    try:
-        with files.replacing(path) as temporary:
-            figure.savefig(temporary, dpi=150)
-    finally:
-        _pyplot().close(figure)
-
-
-def _pyplot() -> Any:
-    """Import pyplot when a picture is drawn: importing the package stays cheap."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot
-
-    return matplotlib.pyplot

@@ -23,6 +23,7 @@ from fenics_contact.contact.values import Status
 from fenics_contact.parallel import collective_errors
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.results import files, vtu
+from fenics_contact.results.drawing import von_mises
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.types import Array, Mask
 
@@ -210,9 +211,7 @@ class _Body:
             stress = np.einsum("np,cpij->cnij", self._basis, inside)
             fields["stress"] = stress
             if self._shape == (3, 3):
-                mean = np.trace(stress, axis1=2, axis2=3)[:, :, None, None] / 3
-                deviator = stress - mean * np.eye(3)
-                fields["von_mises"] = np.sqrt(1.5 * np.sum(deviator**2, axis=(2, 3)))
+                fields["von_mises"] = von_mises(stress)
         return vtu.Grid(self._number, places[:, :, :d], fields)
 
 
