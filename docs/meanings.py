@@ -133,6 +133,7 @@ GROUPS: list[tuple[str, list[str], str]] = [
             "results.writer",
             "results.drawing",
             "results.plotting",
+            "results.animation",
         ],
         "Files of another program are never overwritten.",
     ),

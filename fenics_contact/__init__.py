@@ -20,6 +20,7 @@ from fenics_contact.laws.unilateral import Foundation, Frictionless
 from fenics_contact.meshes import model_to_mesh
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.results import output, plotting
+from fenics_contact.results.animation import Animation
 from fenics_contact.results.writer import Writer
 from fenics_contact.supports.base import (
     Motion,
@@ -38,6 +39,7 @@ from fenics_contact.systems.operator import ContactOperator
 
 __all__ = [
     "Accuracy",
+    "Animation",
     "Balance",
     "Ball",
     "Contact",

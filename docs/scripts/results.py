@@ -32,10 +32,13 @@ problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
 
 # begin results
 writer = fc.Writer("output", problem, stress=steel.stress)
+film = fc.Animation("output/film.gif", problem, stress=steel.stress, magnification=1000)
 kept = {"checkpoint": "output/state.npz", "history": "output/history.csv"}
 for step in fc.increments(problem, push, 0, 1e-4, steps=5, **kept):
     print(step.summary())
     writer.write(step)
+    film.add(step)
+film.save()
 fc.plotting.plot_pressure("output/pressure.png", contact)
 fc.plotting.plot_status("output/status.png", contact)
 fc.plotting.plot_deformation("output/deformation.png", u, magnification=1000)

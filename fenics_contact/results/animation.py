@@ -1,0 +1,198 @@
+"""A history as a film: the deforming body, state by state, in a GIF. Needs matplotlib."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.contact.values import Status
+from fenics_contact.parallel import collective_errors
+from fenics_contact.problem import ContactProblem, Step
+from fenics_contact.results import drawing, files
+from fenics_contact.results.writer import facet_status
+from fenics_contact.types import Array
+
+__all__ = ["Animation"]
+
+_STATUS = {Status.OPEN: "open", Status.STICK: "pressure", Status.SLIP: "tangential"}
+
+
+class Animation:
+    """A film of a problem's states, one frame a call of `add`, written by `save`.
+
+    The body is drawn as it is deformed, coloured by its von Mises stress where one is given; in the
+    plane Γc, too: grey where it is open, blue where it sticks, red where it slips. All frames have
+    the same axes and the same colours, those of all states together. So they are drawn at the end;
+    until then what is to be drawn is in temporary files beside the film, and in memory nothing of
+    it. While they are drawn a frame takes one byte for each of its pixels.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        problem: ContactProblem,
+        *,
+        stress: Any = None,
+        magnification: float = 1.0,
+        unit: str = "mm",
+        stress_unit: str = "MPa",
+        title: str = "",
+        view: tuple[float, float] | None = None,
+        rate: float = 5.0,
+    ) -> None:
+        """See that the file can be written, and compile. Collective.
+
+        Args:
+            path: GIF to write; its folder is made.
+            problem: Whose states.
+            stress: UFL tensor (3, 3) on the body.
+            magnification: Factor by which the displacement is drawn.
+            unit: Unit of length, for the axes.
+            stress_unit: Unit of stress, for the colours.
+            title: Above every frame, before what the frame is of.
+            view: In space where to look from: elevation and azimuth in degrees.
+            rate: Frames a second.
+
+        Raises:
+            ValueError: An argument has no sense. On all ranks.
+            OSError: The folder cannot be made or written to. On all ranks.
+        """
+        check_instance("problem", problem, ContactProblem)
+        if not isinstance(path, str | os.PathLike) or Path(path).suffix.lower() != ".gif":
+            raise ValueError(f"path is {path!r}; it must be the name of a file that ends with .gif")
+        for name, value in (("magnification", magnification), ("rate", rate)):
+            if not (is_number(value) and np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value!r}; it must be a positive number")
+        drawing.check_view(view)
+        self.path, self._problem = Path(path), problem
+        self._magnification, self._rate = float(magnification), float(rate)
+        self._words = unit, stress_unit, title
+        self._view = view
+        self._comm = problem.u.function_space.mesh.comm
+        self._shape = drawing.ShapeOf(problem.displacement.u, stress)
+        self._n_frames = 0
+        self._folder = Path()  # of what is to be drawn, on the first rank
+        with collective_errors(self._comm):
+            if self._comm.rank == 0:
+                drawing.pyplot()  # whether it is there
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                # Where there is room for the film; /tmp may be memory.
+                folder, prefix = self.path.parent, f".{self.path.stem}."
+                self._folder = Path(tempfile.mkdtemp(dir=folder, prefix=prefix))
+                weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+
+    def add(self, state: Step | str) -> None:
+        """Take the present state as the next frame. Collective.
+
+        If u is behind it is completed first (`ContactProblem.complete`).
+
+        Args:
+            state: The step that was made: increment and load are told above the frame. Or what is
+                to stand there.
+
+        Raises:
+            ValueError: It is neither.
+            OSError: The disk is full; the frame is left out. On all ranks.
+        """
+        if isinstance(state, Step):
+            words = f"increment {state.increment}"
+            words += "" if state.load is None else f", load {state.load:.4g}"
+        elif isinstance(state, str):
+            words = state
+        else:
+            raise ValueError(f"state is {state!r}; it must be a Step, or words for the title")
+        self._problem.complete()
+        self._problem.displacement.follow()
+        shape, ends, status = self._shape(), [], []
+        if self._problem.displacement.u.function_space.mesh.topology.dim == 2:
+            for contact in self._problem.contacts:
+                found = drawing.facets_of(contact, facet_status(contact))
+                if found is not None:
+                    ends.append(found[0] + self._magnification * found[1])
+                    status.append(found[2])
+        with collective_errors(self._comm):
+            if shape is not None:
+                frame = {"body": shape.deformed(self._magnification), "words": np.array(words)}
+                if shape.stress is not None:
+                    frame["stress"] = shape.stress
+                if ends:
+                    frame |= {"ends": np.concatenate(ends), "status": np.concatenate(status)}
+                np.savez(self._frame(self._n_frames), **frame)  # type: ignore[arg-type]
+        self._n_frames += 1
+
+    def save(self) -> None:
+        """Write the film of all states so far; more may be added and saved after it. Collective.
+
+        Raises:
+            ValueError: There is none.
+            OSError: It cannot be written; the file is as before. On all ranks.
+        """
+        if not self._n_frames:
+            raise ValueError(f"{self.path} would have no frame; call add(step) first")
+        with collective_errors(self._comm):
+            if self._comm.rank == 0:
+                frames = self._drawn()
+                first = next(frames)
+                with files.replacing(self.path) as temporary:
+                    first.save(
+                        temporary,
+                        save_all=True,
+                        append_images=frames,
+                        duration=round(1000 / self._rate),
+                        loop=0,
+                    )
+
+    def _frame(self, number: int) -> Path:
+        return self._folder / f"{number:06d}.npz"
+
+    def _frames(self) -> Iterator[dict[str, Array]]:
+        """What is to be drawn, state by state."""
+        for number in range(self._n_frames):
+            with np.load(self._frame(number)) as frame:
+                yield dict(frame)
+
+    def _drawn(self) -> Iterator[Any]:
+        """The frames as images of Pillow, one at a time."""
+        from PIL import Image
+
+        # Axes and colours of all of them.
+        corners, largest = [], 0.0
+        for frame in self._frames():
+            flat = frame["body"].reshape(-1, frame["body"].shape[2])
+            corners.append(np.array([flat.min(axis=0), flat.max(axis=0)]))
+            largest = max(largest, frame.get("stress", np.zeros(0)).max(initial=0.0))
+        unit, stress_unit, title = self._words
+        figure, axes = drawing.made_axes(np.array(corners), unit, title, self._view)
+        colours = drawing.scale_of(0.0, largest)
+        plane = axes.name != "3d"
+        try:
+            for number, frame in enumerate(self._frames()):
+                faces: Any = "#e3ebf5"
+                if "stress" in frame:
+                    faces = colours.to_rgba(frame["stress"])
+                    if number == 0:
+                        bar = {"label": f"von Mises stress [{stress_unit}]", "shrink": 0.8}
+                        figure.colorbar(colours, ax=axes, **bar)
+                body = drawing.polygons(frame["body"], faces, "#11111180", 0.2)
+                drawn = [axes.add_collection(body)]
+                if plane and "ends" in frame:
+                    names = [_STATUS[Status(state)] for state in frame["status"]]
+                    line = drawing.on_surface(frame["ends"], [drawing.COLOURS[n] for n in names])
+                    line.set_linewidth(3.0)
+                    drawn.append(axes.add_collection(line))
+                axes.set_title(f"{title}: {frame['words']}" if title else str(frame["words"]))
+                figure.canvas.draw()
+                image = Image.fromarray(np.array(figure.canvas.buffer_rgba())).convert("RGB")
+                yield image.quantize()
+                for each in drawn:
+                    each.remove()
+        finally:
+            drawing.pyplot().close(figure)

@@ -1,0 +1,135 @@
+"""Films: frames, their colours and axes, and that none is left half written."""
+
+import gc
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.results import drawing
+from scenes.blocks import dimension
+from scenes.comparing import close, raised_everywhere, shared_folder
+from scenes.elasticity import stress
+from scenes.rubbing import Rub
+
+pytest.importorskip("matplotlib")
+Image = pytest.importorskip("PIL.Image")
+COMM = MPI.COMM_WORLD
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+
+
+def rubbed(cell):
+    """A block to be pressed and rubbed, and its stress."""
+    made = Rub(cell=cell)
+    made.problem.kinematics = np.inf
+    scene = made.scene
+    if dimension(cell) == 3:
+        return made, stress(scene.u, scene.E, scene.nu)
+    return made, fc.elasticity.LinearElastic(scene.u, scene.E, scene.nu, "plane strain").stress
+
+
+def on_first(check):
+    """Run it on the first rank, fail on all of them."""
+    error = None
+    if COMM.rank == 0:
+        try:
+            check()
+        except AssertionError as caught:
+            error = str(caught) or repr(caught)
+    assert COMM.bcast(error) is None
+
+
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
+def test_a_frame_is_a_state(cell, tmp_path, monkeypatch):
+    """Every body once, where it was then; one scale of colours and one of axes for all."""
+    folder = shared_folder(tmp_path)
+    made, sigma = rubbed(cell)
+    bodies, colours, axes = [], [], []
+    polygons, made_axes, scale_of = drawing.polygons, drawing.made_axes, drawing.scale_of
+
+    def drawn(corners, faces, *rest):
+        bodies.append(corners)
+        colours.append(faces)
+        return polygons(corners, faces, *rest)
+
+    def framed(places, *rest):
+        axes.append(places.reshape(-1, places.shape[-1]))
+        return made_axes(places, *rest)
+
+    monkeypatch.setattr(drawing, "polygons", drawn)
+    monkeypatch.setattr(drawing, "made_axes", framed)
+    film = fc.Animation(
+        folder / "new" / "film.gif", made.problem, stress=sigma, magnification=2.0, rate=4.0
+    )
+    shape_of, shapes = drawing.ShapeOf(made.scene.u, sigma), []
+    for step in fc.increments(made.problem, made.load, 0, 2, steps=4):
+        film.add(step)
+        shapes.append(shape_of())
+    film.save()
+
+    def check():
+        with Image.open(folder / "new" / "film.gif") as image:
+            assert image.n_frames == 4 and image.info["duration"] == 250
+        assert len(bodies) == 4
+        largest = max(shape.stress.max() for shape in shapes)
+        scale = scale_of(0.0, largest)
+        for shape, body, faces in zip(shapes, bodies, colours, strict=True):
+            assert close(body, shape.original + 2 * shape.moved, 1e-14)
+            assert close(faces, scale.to_rgba(shape.stress), 1e-14)
+        assert shapes[0].stress.max() < 0.9 * largest
+        (places,) = axes
+        everything = np.concatenate([body.reshape(-1, body.shape[2]) for body in bodies])
+        assert np.array_equal(places.min(axis=0), everything.min(axis=0))
+        assert np.array_equal(places.max(axis=0), everything.max(axis=0))
+
+    on_first(check)
+    del film
+    gc.collect()
+    COMM.barrier()
+    assert [p.name for p in (folder / "new").iterdir()] == ["film.gif"]  # and nothing beside it
+
+
+def test_bad_input(tmp_path):
+    """On all ranks, before any work; and nothing is written."""
+    folder = shared_folder(tmp_path)
+    made, sigma = rubbed("triangle")
+    problem, path = made.problem, folder / "film.gif"
+    for call, *words in (
+        (lambda: fc.Animation(folder / "film.mp4", problem), "film.mp4", ".gif"),
+        (lambda: fc.Animation(path, made.contact), "problem", "Contact"),
+        (lambda: fc.Animation(path, problem, magnification=0), "magnification is 0"),
+        (lambda: fc.Animation(path, problem, rate="fast"), "rate is 'fast'"),
+        (lambda: fc.Animation(path, problem, view=3.0), "view is 3.0"),
+        (lambda: fc.Animation(path, problem, stress=sigma[0, 0]), "shape ()", "(3, 3)"),
+        (lambda: fc.Animation(path, problem).save(), "add(step)"),
+        (lambda: fc.Animation(path, problem).add(3), "state is 3"),
+    ):
+        raised_everywhere(call, ValueError, *words)
+    COMM.barrier()
+    assert not path.exists()
+
+
+def test_a_failure_leaves_the_film_before(tmp_path, monkeypatch):
+    """A frame that cannot be drawn: the error on all ranks, the file as it was."""
+    folder = shared_folder(tmp_path)
+    made, _ = rubbed("triangle")
+    film = fc.Animation(folder / "film.gif", made.problem)
+    film.add("at rest")
+    film.save()
+    COMM.barrier()
+    before = (folder / "film.gif").read_bytes()
+    film.add("again")
+
+    def failing(*arguments):
+        raise OSError("no more ink")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(drawing, "polygons", failing)
+        raised_everywhere(film.save, OSError, "no more ink")
+    COMM.barrier()
+    assert (folder / "film.gif").read_bytes() == before
+    assert [p for p in folder.iterdir() if p.suffix == ".gif"] == [folder / "film.gif"]
+    COMM.barrier()
+    film.save()
