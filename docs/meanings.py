@@ -134,6 +134,7 @@ GROUPS: list[tuple[str, list[str], str]] = [
             "results.drawing",
             "results.plotting",
             "results.animation",
+            "histories.report",
         ],
         "Files of another program are never overwritten.",
     ),

@@ -12,6 +12,7 @@ from fenics_contact.estimates.adaptation import Level, adapt
 from fenics_contact.estimates.errors import ErrorBudget, estimate_errors
 from fenics_contact.histories import checkpoint
 from fenics_contact.histories.increments import increments
+from fenics_contact.histories.report import report
 from fenics_contact.joining import Joined, join_meshes
 from fenics_contact.laws.base import Kinematics, Law, Response
 from fenics_contact.laws.friction import Coulomb, FrictionLaw, Tresca
@@ -89,4 +90,5 @@ __all__ = [
     "model_to_mesh",
     "output",
     "plotting",
+    "report",
 ]

@@ -248,7 +248,7 @@ def test_scripts_run(path: Path, tmp_path: Path) -> None:
         return
     written = {each.name for each in (tmp_path / "output").iterdir()}
     assert written >= {"body.pvd", "contact.pvd", "contact_points.pvd", "state.npz", "history.csv"}
-    assert written >= {"pressure.png", "status.png", "deformation.png", "film.gif"}
+    assert written >= {"pressure.png", "status.png", "deformation.png", "film.gif", "report.html"}
     assert len((tmp_path / "output" / "history.csv").read_text().splitlines()) >= 1 + 5
     assert "INFO:fenics_contact:condensed onto" in done.stderr
     assert done.stdout.count("increment ") == 5

@@ -12,6 +12,7 @@ from petsc4py import PETSc
 
 import fenics_contact as fc
 from fenics_contact import __main__ as program
+from fenics_contact.installation import information
 from scenes.comparing import raised_everywhere
 
 COMM = MPI.COMM_WORLD
@@ -21,7 +22,7 @@ pytestmark = pytest.mark.mpi
 
 def test_what_is_there():
     """Versions of what is imported; numbers of this run."""
-    found = program.information()
+    found = information()
     assert found["fenics_contact"] == fc.__version__
     assert found["DOLFINx"] == dolfinx.__version__ and found["numpy"] == np.__version__
     assert found["Python"] == ".".join(map(str, sys.version_info[:3]))
@@ -38,7 +39,7 @@ def test_what_is_there():
 
 def test_orderings_are_tried():
     """AMD and QAMD are parts of MUMPS itself; one that does not exist is not taken for one."""
-    found = program.information()["direct solver"]
+    found = information()["direct solver"]
     words = found.split(";")[0].removeprefix("MUMPS, orderings ").split(", ")
     assert {"AMD", "AMF", "QAMD"} <= set(words) <= {"AMD", "AMF", "QAMD", "PORD", "SCOTCH", "METIS"}
 
@@ -53,7 +54,7 @@ def test_what_is_missing_and_what_it_costs(monkeypatch):
         return real(name, *rest)
 
     monkeypatch.setattr(importlib, "import_module", without)
-    found = program.information()["gmsh"]
+    found = information()["gmsh"]
     assert found.startswith("missing (libGLU.so.1") and "model_to_mesh" in found
 
 

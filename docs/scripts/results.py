@@ -1,4 +1,4 @@
-"""A block is pressed and pushed on a floor: results for ParaView, a table and pictures."""
+"""A block is pressed and pushed on a floor: results for ParaView, a table, pictures and a page."""
 
 import logging
 
@@ -39,6 +39,7 @@ for step in fc.increments(problem, push, 0, 1e-4, steps=5, **kept):
     writer.write(step)
     film.add(step)
 film.save()
+fc.report(problem, step, "output", history="output/history.csv", stress=steel.stress)
 fc.plotting.plot_pressure("output/pressure.png", contact)
 fc.plotting.plot_status("output/status.png", contact)
 fc.plotting.plot_deformation("output/deformation.png", u, magnification=1000)

@@ -16,11 +16,11 @@ from fenics_contact.parallel import collective_errors
 from fenics_contact.problem import ContactProblem, Step
 from fenics_contact.results import files
 
-__all__ = ["Table"]
+__all__ = ["AXES", "ENERGIES", "STATES", "Table", "columns", "read", "values"]
 
-_AXES = "xyz"
-_STATES = ("contact", "stick", "slip")
-_ENERGIES = ("work", "elastic", "springs", "dissipation", "remainder")
+AXES = "xyz"
+STATES = ("contact", "stick", "slip")
+ENERGIES = ("work", "elastic", "springs", "dissipation", "remainder")
 # How every table begins: a file that begins otherwise is not overwritten.
 _FIRST = ("increment", "load")
 
@@ -47,11 +47,7 @@ class Table:
         """
         self._path, self._problem, self._errors = path, problem, tuple(errors)
         self._comm = problem.u.function_space.mesh.comm
-        names = [*_FIRST]
-        for contact in problem.contacts:
-            names += [f"{contact.name}: {column}" for column in _columns(contact)]
-        names += [f"{name} (force length)" for name in _ENERGIES]
-        names += ["residual (share of the forces)", "method", "iterations", "cuts"]
+        names = columns(problem)
         names += [f"error of {name} by the increments ({_unit(name)})" for name in self._errors]
         self._header = _line(names)
         with collective_errors(self._comm):
@@ -118,12 +114,7 @@ class Table:
         Raises:
             OSError: It cannot be written; the file is as before. On all ranks.
         """
-        row: list[object] = [step.increment, "" if step.load is None else step.load]
-        for contact in self._problem.contacts:
-            row += _values(step.contacts[contact.name])
-        row += [getattr(step.energy, name) for name in _ENERGIES]
-        row += [step.verdict.relative_residual, step.method, step.iterations]
-        row.append(sum(attempt.method == "cut" for attempt in step.attempts))
+        row = values(self._problem, step)
         found = step.increment_error or {}
         row += [found.get(name, "") for name in self._errors]
         with collective_errors(self._comm):
@@ -142,21 +133,64 @@ class Table:
             raise
 
 
+def columns(problem: ContactProblem) -> list[str]:
+    """Names and units of what a row has of every step."""
+    names = [*_FIRST]
+    for contact in problem.contacts:
+        names += [f"{contact.name}: {column}" for column in _columns(contact)]
+    names += [f"{name} (force length)" for name in ENERGIES]
+    return [*names, "residual (share of the forces)", "method", "iterations", "cuts"]
+
+
+def values(problem: ContactProblem, step: Step) -> list[object]:
+    """The same in numbers; empty where there is none."""
+    row: list[object] = [step.increment, "" if step.load is None else step.load]
+    for contact in problem.contacts:
+        row += _values(step.contacts[contact.name])
+    row += [getattr(step.energy, name) for name in ENERGIES]
+    row += [step.verdict.relative_residual, step.method, step.iterations]
+    return [*row, sum(attempt.method == "cut" for attempt in step.attempts)]
+
+
+def read(path: Path, problem: ContactProblem) -> list[dict[str, str]]:
+    """The rows of a table by column. On the calling rank only.
+
+    Raises:
+        ValueError: It is no table of a history of these contacts.
+        OSError: It cannot be read.
+    """
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except UnicodeDecodeError:
+        rows = []
+    missing = [name for name in columns(problem) if not rows or rows[0].get(name) is None]
+    if missing:
+        raise ValueError(
+            f"history is {path}, and that is no table of a history of these contacts, or has no "
+            f"row: there is no column {missing[0]!r}; give the file that increments(history=...) "
+            "wrote"
+        )
+    if None in rows[-1].values():
+        rows.pop()  # what ended the run ended it in the middle
+    return rows
+
+
 def _columns(contact: Contact) -> list[str]:
     """Names and units of what a contact has in a row."""
     d = contact.surface.mesh.geometry.dim
-    turns = _AXES if d == 3 else "z"
+    turns = AXES if d == 3 else "z"
     return [
-        *(f"force {axis} (force)" for axis in _AXES[:d]),
+        *(f"force {axis} (force)" for axis in AXES[:d]),
         "normal force (force)",
         "friction as the sum of sizes (force)",
         *(f"moment {axis} about the origin (force length)" for axis in turns),
-        *(f"area in {state} (area)" for state in _STATES),
+        *(f"area in {state} (area)" for state in STATES),
         *(
             f"{state} {end} {axis} (length)"
-            for state in _STATES
+            for state in STATES
             for end in ("from", "to")
-            for axis in _AXES[:d]
+            for axis in AXES[:d]
         ),
         "largest pressure (stress)",
         "largest penetration (length)",
@@ -166,7 +200,7 @@ def _columns(contact: Contact) -> list[str]:
 
 def _values(r: Resultants) -> list[object]:
     """The same in numbers; empty where no point is of a state."""
-    extents = [r.extents[state] for state in _STATES]
+    extents = [r.extents[state] for state in STATES]
     ends = np.concatenate([end for e in extents for end in (e.low, e.high)])
     return [
         *(float(value) for value in r.force),

@@ -1,0 +1,489 @@
+"""A history and its last state as one page of HTML, for the screen and for paper."""
+
+from __future__ import annotations
+
+import base64
+import datetime
+import os
+import tempfile
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+
+from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.contact.contact import Contact
+from fenics_contact.estimates.errors import ErrorBudget
+from fenics_contact.histories import table
+from fenics_contact.installation import information
+from fenics_contact.laws.stiffness import Scaled, Springs
+from fenics_contact.markup import shown
+from fenics_contact.parallel import collective_errors, global_max
+from fenics_contact.problem import ContactProblem, Step
+from fenics_contact.results import drawing, files, plotting
+from fenics_contact.types import Array
+
+__all__ = ["report"]
+
+# Of the mesh's size, how far displacements are drawn at least.
+_VISIBLE = 0.05
+_STYLE = """
+body { font: 15px/1.5 sans-serif; color: #1a1a1a; max-width: 72rem; margin: 2rem auto;
+  padding: 0 1rem; }
+h1, h2, h3 { line-height: 1.2; } h2 { border-bottom: 1px solid #bbb; margin-top: 2.2rem; }
+table { border-collapse: collapse; margin: 1rem 0; font-variant-numeric: tabular-nums; }
+caption { text-align: left; font-weight: bold; padding: .2rem 0; white-space: nowrap; }
+th, td { border-bottom: 1px solid #ddd; padding: .2rem .7rem; text-align: right; }
+th:first-child { text-align: left; font-weight: normal; }
+thead th, thead th:first-child { font-weight: bold; border-bottom: 1px solid #666; }
+.words td, .words th { text-align: left; }
+.words td { overflow-wrap: anywhere; }
+.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(24rem, 1fr));
+  gap: 1rem; }
+figure { margin: 0; } figure img { max-width: 100%; }
+.pictures figure:only-child { max-width: 42rem; }
+figcaption { color: #444; font-size: .9em; }
+.holds { border-left: 5px solid #2a8a3a; padding-left: .8rem; }
+.fails { border-left: 5px solid #b02020; padding-left: .8rem; }
+@media print {
+  @page { margin: 16mm; }
+  body { font-size: 10pt; max-width: none; margin: 0; padding: 0; }
+  .pictures { grid-template-columns: 1fr 1fr; }
+  h2, h3, caption, thead { break-after: avoid; } figure, tr { break-inside: avoid; }
+}
+"""
+
+
+def report(
+    problem: ContactProblem,
+    steps: Step | Sequence[Step],
+    folder: str | os.PathLike[str],
+    *,
+    history: str | os.PathLike[str] | None = None,
+    stress: Any = None,
+    budget: ErrorBudget | None = None,
+    title: str = "Contact",
+    units: tuple[str, str, str] = ("mm", "N", "MPa"),
+    magnification: float | None = None,
+    view: tuple[float, float] | None = None,
+) -> Path:
+    """Write ``report.html``, which needs no other file. Collective.
+
+    It has the verdict in words, the deformed body, of every contact the tractions, gap, slip and
+    status with their extents, curves of forces, moments, areas and energies over the history, the
+    iterations of every increment, the error budget, what was chosen, and the versions of all that
+    computed it. The file is complete or as before.
+
+    Args:
+        problem: In the state of the last step, whether it is committed or not.
+        steps: What `increments` or `ContactProblem.solve` gave: the steps of the history in their
+            order, or the last one alone.
+        folder: Where to; it is made.
+        history: Table that `increments` wrote for the same history: the curves are of its rows,
+            those of the runs before this one, too. By default they are of the steps.
+        stress: UFL tensor (3, 3) on the body, for the colours of the deformed body.
+        budget: What `estimate_errors` found of this state.
+        title: Heading.
+        units: Of length, force and stress, for what is shown; moments and energies are in force
+            times length. In the plane forces are per thickness unless the contacts' weight has it.
+        magnification: Factor by which displacements are drawn; by default 1 with finite kinematics,
+            and else so that they can be seen.
+        view: In space where to look from: elevation and azimuth in degrees.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        ValueError: An argument has no sense, the steps or the table are of another history. On all
+            ranks.
+        OSError: The folder cannot be made or written to, or the table cannot be read. On all ranks.
+    """
+    check_instance("problem", problem, ContactProblem)
+    steps = [steps] if isinstance(steps, Step) else steps
+    _check(problem, steps, folder, history, budget, title, units, magnification)
+    drawing.check_view(view)
+    comm, path = problem.u.function_space.mesh.comm, Path(folder) / "report.html"
+    shape = drawing.ShapeOf(problem.displacement.u, stress)  # refuses stresses of other shapes
+    rows: list[dict[str, str]] = []
+    with ExitStack() as stack:
+        scratch = Path()
+        with collective_errors(comm):
+            if comm.rank == 0:
+                drawing.pyplot()  # whether it is there
+                path.parent.mkdir(parents=True, exist_ok=True)
+                tempfile.TemporaryFile(dir=path.parent).close()  # whether it can be written to
+                scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+                rows = _rows(problem, steps, history)
+        problem.complete()
+        problem.displacement.follow()
+        page = _Page(scratch, units, view)
+        if magnification is None:
+            magnification = _visible(problem)
+        _state(page, problem, steps[-1], shape, magnification)
+        for contact in problem.contacts:
+            _contact(page, contact, steps[-1], magnification)
+        with collective_errors(comm):
+            if comm.rank == 0:
+                _history(page, problem, rows)
+        _errors(page, budget)
+        _choices(page, problem, steps[-1])
+        words = information(comm).items()
+        page.words("Versions", ("what", "version"), words)
+        with collective_errors(comm):
+            if comm.rank == 0:
+                with files.replacing(path) as temporary:
+                    temporary.write_text(page.text(title), encoding="utf-8")
+    return path
+
+
+def _check(
+    problem: ContactProblem,
+    steps: Any,
+    folder: Any,
+    history: Any,
+    budget: Any,
+    title: Any,
+    units: Any,
+    magnification: Any,
+) -> None:
+    """Refuse arguments without sense, on every rank alike.
+
+    Raises:
+        ValueError: It says what was given, and what is expected.
+    """
+    if not isinstance(steps, Sequence) or not all(isinstance(step, Step) for step in steps):
+        raise ValueError(
+            f"steps is a {type(steps).__name__}; it must be a Step, or a list of them, such as "
+            "list(increments(...))"
+        )
+    if not steps:
+        raise ValueError(
+            "steps is empty: nothing was solved, and the problem has no state to report; where a "
+            "checkpoint says that all is done, remove it or lead the history further"
+        )
+    names = [contact.name for contact in problem.contacts]
+    numbers = [step.increment for step in steps]
+    now = (problem.increment, problem.increment + 1)  # committed, or solved alone
+    if (
+        list(steps[-1].contacts) != names
+        or numbers[-1] not in now
+        or min(np.diff(numbers), default=1) < 1
+    ):
+        raise ValueError(
+            f"steps are of the increments {numbers} and of contacts {list(steps[-1].contacts)}, "
+            f"and the problem, of contacts {names}, is at increment {problem.increment}; give its "
+            "steps in their order, the last one at the end"
+        )
+    for name, value in (("folder", folder), ("history", history)):
+        if not (isinstance(value, str | os.PathLike) or (name == "history" and value is None)):
+            what = {"folder": "folder", "history": "file"}[name]
+            raise ValueError(f"{name} is {value!r}; it must be the name of a {what}")
+    if budget is not None:
+        check_instance("budget", budget, ErrorBudget)
+    check_instance("title", title, str)
+    if not (
+        isinstance(units, tuple | list)
+        and len(units) == 3
+        and all(isinstance(unit, str) for unit in units)
+    ):
+        raise ValueError(f'units is {units!r}; it must be three words, such as ("mm", "N", "MPa")')
+    if magnification is not None and not (
+        is_number(magnification) and np.isfinite(magnification) and magnification > 0
+    ):
+        raise ValueError(f"magnification is {magnification!r}; it must be a positive number")
+
+
+class _Page:
+    """Parts of the page one after another. What a rank but the first adds is dropped.
+
+    Attributes:
+        length, force, stress: Units.
+        view: Where to look from in space.
+    """
+
+    def __init__(
+        self, scratch: Path, units: tuple[str, str, str], view: tuple[float, float] | None
+    ) -> None:
+        self.length, self.force, self.stress = units
+        self.view = view
+        self._scratch, self._parts = scratch, [""]
+        self._pictures = 0
+
+    def add(self, *parts: str) -> None:
+        """HTML as it is."""
+        self._parts += parts
+
+    def heading(self, text: str, level: int = 2) -> None:
+        """A heading, escaped."""
+        self.add(f"<h{level}>{escape(text)}</h{level}>")
+
+    def words(self, title: str, header: Sequence[str], rows: Iterable[tuple[str, ...]]) -> None:
+        """A table of words."""
+        self.add('<div class="words">', shown(title, header, rows), "</div>")
+
+    def path(self) -> Path:
+        """Where the next picture is to be drawn."""
+        self._pictures += 1
+        return self._scratch / f"{self._pictures}.png"
+
+    def picture(self, path: Path, caption: str) -> str:
+        """A picture that was drawn there, within the page."""
+        if not path.exists():  # on the other ranks
+            return ""
+        data = base64.b64encode(path.read_bytes()).decode()
+        told = escape(caption)
+        return (
+            f'<figure><img alt="{told}" src="data:image/png;base64,{data}">'
+            f"<figcaption>{told}</figcaption></figure>"
+        )
+
+    def pictures(self, *figures: str) -> None:
+        """Beside each other, where there is room."""
+        self.add('<div class="pictures">', *figures, "</div>")
+
+    def text(self, title: str) -> str:
+        """All of it."""
+        head = (
+            f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}'
+            '</title><meta name="viewport" content="width=device-width, initial-scale=1">'
+            f"<style>{_STYLE}</style></head><body><h1>{escape(title)}</h1>"
+        )
+        now = datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+        units = f"Lengths in {self.length}, forces in {self.force}, stresses in {self.stress}."
+        foot = f"<p>{escape(units)} Written {now}.</p></body></html>"
+        return "\n".join([head, *self._parts, foot, ""])
+
+
+def _rows(
+    problem: ContactProblem, steps: Sequence[Step], history: str | os.PathLike[str] | None
+) -> list[dict[str, str]]:
+    """Those of the table, or of the steps. On the first rank."""
+    if history is None:
+        names = table.columns(problem)
+        return [
+            dict(zip(names, map(str, table.values(problem, step)), strict=True)) for step in steps
+        ]
+    rows = table.read(Path(history), problem)
+    if int(rows[-1]["increment"]) != steps[-1].increment:
+        raise ValueError(
+            f"history is {history}, whose last increment is {rows[-1]['increment']}, and the last "
+            f"step is of increment {steps[-1].increment}; give the table of the same history"
+        )
+    return rows
+
+
+def _visible(problem: ContactProblem) -> float:
+    """A magnification, 1, 2 or 5 by a power of ten, with which displacements show. Collective."""
+    u, comm = problem.displacement.u, problem.u.function_space.mesh.comm
+    largest = global_max(comm, np.abs(u.x.array))
+    if any(contact.finite for contact in problem.contacts) or not largest > 0:
+        return 1.0
+    wanted = _VISIBLE * problem.motions.size / largest
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(max(1.0, power * max(n for n in (1, 2, 5) if n * power <= wanted)))
+
+
+def _state(
+    page: _Page, problem: ContactProblem, step: Step, shape: drawing.ShapeOf, magnification: float
+) -> None:
+    """Verdict in words, resultants, the deformed body. Collective."""
+    failures = step.verdict.failures
+    where = f"Increment {step.increment}" + (
+        "" if step.load is None else f", at load {step.load:.6g}"
+    )
+    if failures:
+        page.add(f'<p class="fails">{escape(where)}: the state does not hold.</p>')
+    else:
+        checked = ["the equations", "the balance of forces and moments"]
+        checked += ["the laws at every point"] if step.verdict.laws else []
+        checked += ["what the multipliers leave"] if step.verdict.enforcement else []
+        checked += ["the rigid supports"] if step.verdict.obstacles else []
+        small = [c.name for c in problem.contacts if not c.finite]
+        known = step.verdict.kinematics
+        checked += ["that displacements are small"] if any(n in known for n in small) else []
+        page.add(
+            f'<p class="holds">{escape(where)}: the state holds. Checked apart from the solver: '
+            f"{', '.join(checked)}. The residual is {step.verdict.relative_residual:.1e} of the "
+            "forces.</p>"
+        )
+    page.add(step._repr_html_())
+    page.heading("Deformed body")
+    path = page.path()
+    drawn = shape()
+    with collective_errors(problem.u.function_space.mesh.comm):
+        if drawn is not None:
+            units = page.length, page.stress
+            figure = drawing.deformed(drawn, units, "", magnification, None, page.view)
+            drawing.save(figure, path)
+    told = "" if magnification == 1 else f", displacements × {magnification:g}"
+    page.pictures(page.picture(path, f"Original and deformed mesh{told}"))
+
+
+def _contact(page: _Page, contact: Contact, step: Step, magnification: float) -> None:
+    """Tractions, gap, slip, status and extents. Collective."""
+    page.heading(f"Contact: {contact.name}")
+    units = {"length": page.length, "stress": page.stress}
+    drawn = []
+    if contact.points.shape[1] == 2:
+        path = page.path()
+        plotting.plot_along(path, contact, **units)
+        drawn.append(page.picture(path, "Pressure, friction, gap and slip at the points"))
+    else:
+        for field, caption in (
+            ("pressure", "Pressure"),
+            ("friction", "Tangential traction"),
+            ("gap", "Gap"),
+            ("slip", "Slip"),
+        ):
+            path = page.path()
+            shown_as = {"magnification": magnification, "view": page.view}
+            plotting.plot_field(path, contact, field, **units, **shown_as)  # type: ignore[arg-type]
+            drawn.append(page.picture(path, f"{caption}, means of the facets"))
+    path = page.path()
+    plotting.plot_status(
+        path, contact, length=page.length, magnification=magnification, view=page.view
+    )
+    drawn.append(page.picture(path, "Status of most points of each facet"))
+    page.pictures(*drawn)
+    extents = step.contacts[contact.name].extents
+    rows = [
+        (
+            state,
+            f"{extents[state].area:.6g}",
+            _place(extents[state].low),
+            _place(extents[state].high),
+        )
+        for state in table.STATES
+    ]
+    page.add(shown("Extents on the undeformed surface", ("state", "area", "from", "to"), rows))
+
+
+def _place(x: Array) -> str:
+    return "–" if np.isnan(x).any() else "(" + ", ".join(f"{value:.6g}" for value in x) + ")"
+
+
+def _history(page: _Page, problem: ContactProblem, rows: list[dict[str, str]]) -> None:
+    """Curves over the load, or where it is not known over the increments. On the first rank."""
+    page.heading("History")
+    first, last = rows[0]["increment"], rows[-1]["increment"]
+    page.add(f"<p>Increments {first} to {last}, {_total(rows, 'iterations'):.0f} iterations, ")
+    page.add(f"{_total(rows, 'cuts'):.0f} cuts.</p>")
+    increments = _column(rows, "increment")
+    over, abscissa = _column(rows, "load"), "load"
+    if np.isnan(over).any():
+        over, abscissa = increments, "increment"
+    drawn = []
+    for contact in problem.contacts:
+        path, d = page.path(), contact.surface.mesh.geometry.dim
+        with plotting.figure(path, columns=3, size=(4.6, 3.6)) as (forces, moments, areas):
+            for axis in table.AXES[:d]:
+                values = _column(rows, f"{contact.name}: force {axis} (force)")
+                forces.plot(over, values, ".-", label=f"force {axis}")
+            friction = _column(rows, f"{contact.name}: friction as the sum of sizes (force)")
+            forces.plot(over, friction, "k:", label="friction ∫|τ|")
+            for axis in table.AXES if d == 3 else "z":
+                name = f"{contact.name}: moment {axis} about the origin (force length)"
+                moments.plot(over, _column(rows, name), ".-", label=f"moment {axis}")
+            for state in table.STATES:
+                values = _column(rows, f"{contact.name}: area in {state} (area)")
+                areas.plot(over, values, ".-", label=state)
+            forces.set(ylabel=f"force on the body [{page.force}]")
+            moments.set(ylabel=f"moment about the origin [{page.force} {page.length}]")
+            areas.set(ylabel=f"area [{page.length}{'²' if d == 3 else ''}]")
+            for axes in (forces, moments, areas):
+                axes.set(xlabel=abscissa)
+                axes.locator_params(axis="x", nbins=6)
+                axes.ticklabel_format(scilimits=(-3, 4))
+                axes.grid(alpha=0.25)
+                axes.legend(fontsize="small")
+        drawn.append(page.picture(path, f"{contact.name}: forces, moments and areas"))
+    page.add(*drawn)  # each as wide as the page
+    path = page.path()
+    with plotting.figure(path, columns=2, size=(6.4, 3.6)) as (solver, energy):
+        solver.bar(increments, _column(rows, "iterations"), color=drawing.COLOURS["pressure"])
+        cuts = _column(rows, "cuts")
+        for number, times in zip(increments[cuts > 0], cuts[cuts > 0], strict=True):
+            solver.annotate(f"cut {times:.0f}×", (number, 0.0), rotation=90, ha="center")
+        solver.set(xlabel="increment", ylabel="iterations")
+        for name in table.ENERGIES:
+            sums = np.cumsum(_column(rows, f"{name} (force length)"))
+            energy.plot(increments, sums, ".-", label=name)
+        energy.set(xlabel="increment", ylabel=f"sum so far [{page.force} {page.length}]")
+        energy.legend(fontsize="small")
+        for axes in (solver, energy):
+            axes.grid(alpha=0.25)
+            axes.locator_params(axis="x", integer=True)
+    page.add(page.picture(path, "Iterations of the increments; work, and what became of it"))
+
+
+def _column(rows: list[dict[str, str]], name: str) -> Array:
+    """Numbers; NaN where there is none."""
+    return np.array([float(row[name] or "nan") for row in rows])
+
+
+def _total(rows: list[dict[str, str]], name: str) -> float:
+    return float(_column(rows, name).sum())
+
+
+def _errors(page: _Page, budget: ErrorBudget | None) -> None:
+    """The budget, where there is one."""
+    page.heading("Errors")
+    if budget is None:
+        page.add("<p>Not estimated: report(budget=estimate_errors(...)) has them.</p>")
+    else:
+        page.add(budget._repr_html_())
+
+
+def _choices(page: _Page, problem: ContactProblem, step: Step) -> None:
+    """Verdict in numbers, what was tried, and what was chosen. Collective."""
+    page.heading("Checks")
+    page.add(step.verdict._repr_html_())
+    page.heading("What was chosen")
+    space = problem.u.function_space
+    mesh = space.mesh
+    kind = mesh.topology.cell_name()
+    rows = [
+        ("cells", f"{mesh.topology.index_map(mesh.topology.dim).size_global} of kind {kind}"),
+        ("unknowns", str(space.dofmap.index_map.size_global * space.dofmap.index_map_bs)),
+        ("ranks", str(mesh.comm.size)),
+        ("method of the last increment", step.method),
+        ("tried in it", "; ".join(map(str, step.attempts))),
+        ("accuracy", "none said" if problem.accuracy is None else str(problem.accuracy)),
+    ]
+    if not all(contact.finite for contact in problem.contacts):
+        rows.append(("share that small displacements may change", f"{problem.kinematics:g}"))
+    page.words("Problem", ("what", "choice"), rows)
+    for contact in problem.contacts:
+        count = contact.surface.submesh.topology
+        facets = count.index_map(count.dim).size_global
+        rows = [
+            ("law", type(contact.law).__name__),
+            ("support", type(contact.support).__name__),
+            ("kinematics", "finite" if contact.finite else "small"),
+            ("enforcement", _enforcement(contact)),
+            ("facets", str(facets)),
+        ]
+        given = contact.law.parameters()
+        for name in {**given, **contact.parameters}:
+            rows.append((name, _parameter(given.get(name), contact.parameters.get(name))))
+        page.words(f"Contact: {contact.name}", ("what", "choice"), rows)
+
+
+def _enforcement(contact: Contact) -> str:
+    if contact.multipliers is None:
+        return "penalty"
+    return f"augmented, to {contact.tolerance:g} of the largest traction"
+
+
+def _parameter(given: Any, constant: fem.Constant | None) -> str:
+    """Of a law or support: how it was given, and its number as it is now, if it has one."""
+    if isinstance(given, Springs):
+        return f"{given.k:g} for each node"
+    if constant is None:
+        return "given by an expression"
+    number = ", ".join(f"{x:g}" for x in np.ravel(constant.value))
+    return f"{number} E/h" if isinstance(given, Scaled) else number

@@ -1,0 +1,293 @@
+"""The page of a history: well formed, whole without other files, and of the right numbers."""
+
+import base64
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.results import drawing
+from scenes.comparing import close, raised_everywhere, shared_folder
+from scenes.elasticity import stress
+from scenes.histories import Press, Ramp
+from scenes.rubber import Tool
+from scenes.rubbing import Rub
+
+pytest.importorskip("matplotlib")
+COMM = MPI.COMM_WORLD
+PNG = b"\x89PNG\r\n\x1a\n"
+EMPTY = {"meta", "img"}  # elements without an end
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+
+
+class Page(HTMLParser):
+    """What a browser would find.
+
+    Attributes:
+        tables: Rows of cells by caption.
+        pictures: Captions and bytes.
+        text: All that is written.
+        outside: Addresses of anything that is not in the file.
+    """
+
+    def __init__(self, path):
+        """Read the file, on all ranks."""
+        super().__init__()
+        COMM.barrier()
+        self.tables, self.pictures, self.text, self.outside = {}, {}, "", []
+        self._open, self._rows, self._caption = [], [], ""
+        self.feed(path.read_text(encoding="utf-8"))
+        COMM.barrier()
+        assert self._open == []
+
+    def handle_starttag(self, tag, attrs):
+        """See `HTMLParser`."""
+        found = dict(attrs)
+        for name in ("src", "href"):
+            address = found.get(name)
+            if address is not None and not address.startswith("data:image/png;base64,"):
+                self.outside.append(address)
+            elif address is not None:
+                self.pictures[found["alt"]] = base64.b64decode(address.split(",")[1], validate=True)
+        if tag == "tr":
+            self._rows.append([])
+        if tag in ("th", "td"):
+            self._rows[-1].append("")
+        if tag not in EMPTY:
+            self._open.append(tag)
+
+    def handle_endtag(self, tag):
+        """See `HTMLParser`."""
+        assert self._open.pop() == tag
+        if tag == "table":
+            self.tables.setdefault(self._caption, self._rows)
+            self._rows, self._caption = [], ""
+
+    def handle_data(self, data):
+        """See `HTMLParser`."""
+        if "style" in self._open:
+            assert "url(" not in data and "@import" not in data
+            return
+        self.text += data
+        if self._open and self._open[-1] == "caption":
+            self._caption += data
+        elif self._open and self._open[-1] in ("th", "td"):
+            self._rows[-1][-1] += data
+
+    def check(self, problem, steps):
+        """What every page must have."""
+        assert self.outside == []
+        assert all(picture.startswith(PNG) for picture in self.pictures.values())
+        plane = problem.u.function_space.mesh.geometry.dim == 2
+        # Deformed body, history of each contact and of all; of each contact (the same captions).
+        assert len(self.pictures) == 2 + len(problem.contacts) + (2 if plane else 5)
+        assert "the state holds" in self.text and "not hold" not in self.text
+        small = any(not contact.finite for contact in problem.contacts)
+        assert ("that displacements are small" in self.text) == small
+        assert {"Verdict: holds", "Problem", "Versions"} <= self.tables.keys()
+        assert ["fenics_contact", fc.__version__] in self.tables["Versions"]
+        for contact in problem.contacts:
+            chosen = dict(self.tables[f"Contact: {contact.name}"])
+            assert chosen["law"] == type(contact.law).__name__
+            assert chosen["support"] == type(contact.support).__name__
+            assert chosen["kinematics"] == ("finite" if contact.finite else "small")
+            for name, constant in contact.parameters.items():
+                told = ", ".join(f"{x:g}" for x in np.ravel(constant.value))
+                scaled = isinstance(getattr(contact.law, name, None), fc.Scaled)
+                assert chosen[name] == told + (" E/h" if scaled else "")
+        extents = self.tables["Extents on the undeformed surface"]  # of the first contact
+        found = steps[-1].contacts[problem.contacts[0].name].extents
+        for (name, area, *_), (state, extent) in zip(extents[1:], found.items(), strict=True):
+            assert name == state and area == f"{extent.area:.6g}"
+        residual = f"{steps[-1].verdict.relative_residual:.1e}"
+        assert f"The residual is {residual} of the forces" in self.text
+
+
+@pytest.fixture
+def curves(monkeypatch):
+    """What was drawn on the first rank: x and y of the curves by the label of the y axis."""
+    found, save = {}, drawing.save
+
+    def keep(figure, path):
+        for axes in figure.axes:
+            for line in axes.get_lines():
+                key = axes.get_ylabel(), line.get_label()
+                found.setdefault(key, []).append(np.array(line.get_data()))
+        save(figure, path)
+
+    monkeypatch.setattr(drawing, "save", keep)
+    return found
+
+
+def drawn(curves, key, n=0):
+    """Of the first rank, on all."""
+    return COMM.bcast(curves[key][n] if COMM.rank == 0 else None)
+
+
+def test_a_resumed_history(tmp_path, curves):
+    """Two contacts, multipliers, there and back; broken off, and the curves are of all increments.
+
+    References: the steps of both runs.
+    """
+    folder = shared_folder(tmp_path)
+    kept = {"checkpoint": folder / "state.npz", "history": folder / "history.csv"}
+
+    def press():
+        return Press(wall=True, contact={"enforcement": "augmented"})
+
+    steps = []
+    for step in press().increments(3.0, **kept):
+        steps.append(step)
+        if step.increment == 3:
+            break
+    made = press()
+    steps += list(made.increments(3.0, **kept))
+    scene = made.scene
+    body = fc.elasticity.LinearElastic(scene.u, scene.E, scene.nu, "plane strain")
+    budget = fc.estimate_errors(made.problem, stress(scene.u, scene.E, scene.nu))
+    path = fc.report(
+        made.problem,
+        steps[-1],
+        folder / "new" / "folder",
+        history=kept["history"],
+        stress=body.stress,
+        budget=budget,
+        title="<b>one & two</b>",
+        units=("m", "kN", "kPa"),
+    )
+    assert path == folder / "new" / "folder" / "report.html"
+    page = Page(path)
+    page.check(made.problem, steps)
+    assert "<b>one & two</b>" in page.text and "Increments 1 to 6" in page.text
+    assert page.tables["Error budget"][0][1:] == list(budget.values)
+    assert "augmented" in dict(page.tables["Contact: floor"])["enforcement"]
+    assert dict(page.tables["Contact: wall"])["enforcement"] == "penalty"
+    loads = [step.load for step in steps]
+    for n, name in enumerate(("floor", "wall")):
+        for i, axis in enumerate("xy"):
+            x, y = drawn(curves, ("force on the body [kN]", f"force {axis}"), n)
+            assert close(x, loads, 1e-14)
+            assert close(y, [step.contacts[name].force[i] for step in steps], 1e-14)
+        x, y = drawn(curves, ("moment about the origin [kN m]", "moment z"), n)
+        assert close(y, [step.contacts[name].moment[0] for step in steps], 1e-14)
+        x, y = drawn(curves, ("area [m]", "stick"), n)
+        assert close(y, [step.contacts[name].extents["stick"].area for step in steps], 1e-14)
+    x, y = drawn(curves, ("sum so far [kN m]", "dissipation"))
+    assert close(y, np.cumsum([step.energy.dissipation for step in steps]), 1e-14)
+    # At the points: what `gather` has, of those near the contact.
+    points = made.problem.contacts[0].gather()
+    x, y = drawn(curves, ("traction [kPa]", "pressure"))
+    assert close([y.max()], [points["pressure"].max()], 1e-14)
+    assert set(x) <= set(points["x"][:, 0])
+
+
+def space():
+    """A block in space, and its stress."""
+    made = Rub(cell="tetrahedron")
+    made.problem.kinematics = np.inf
+    steps = list(fc.increments(made.problem, made.load, 0, 2, steps=2))
+    return made.problem, steps, stress(made.scene.u, made.scene.E, made.scene.nu)
+
+
+def bodies():
+    """Two bodies, pairs found anew."""
+    made = Ramp()
+    return made.problem, list(made.increments(1.0)), None
+
+
+def finite():
+    """Rubber under a disc that moves far."""
+    made = Tool()
+    return made.problem, list(made.increments(1.0)), None
+
+
+def alone():
+    """One increment without a load parameter, not committed."""
+    made = Rub(fc.Coulomb(0.3))
+    made.problem.kinematics = np.inf
+    made.move(0.01, 0.03)
+    return made.problem, made.problem.solve(), None
+
+
+@pytest.mark.parametrize("scene", [space, bodies, finite, alone], ids=lambda f: f.__name__)
+def test_all_kinds(scene, tmp_path, curves):
+    """In space, between bodies, at large displacements, and for a step that is not committed."""
+    problem, steps, sigma = scene()
+    path = fc.report(problem, steps, shared_folder(tmp_path), stress=sigma)
+    steps = [steps] if isinstance(steps, fc.Step) else steps
+    Page(path).check(problem, steps)
+    force = drawn(curves, ("force on the body [N]", "force y"))
+    name = problem.contacts[0].name
+    assert close(force[1], [step.contacts[name].force[1] for step in steps], 1e-14)
+    loads = [step.increment if step.load is None else step.load for step in steps]
+    assert close(force[0], loads, 1e-14)
+
+
+def test_bad_input(tmp_path):
+    """On all ranks, before any work; there is no page."""
+    folder = shared_folder(tmp_path)
+    made = Rub()
+    made.problem.kinematics = np.inf
+    first, step = fc.increments(
+        made.problem, made.load, 0, 1, steps=2, history=folder / "history.csv"
+    )
+    problem, page = made.problem, folder / "page"
+    if COMM.rank == 0:
+        lines = (folder / "history.csv").read_text().splitlines(keepends=True)
+        (folder / "short.csv").write_text("".join(lines[:2]))
+        (folder / "other.csv").write_text("a,b\n1,2\n")
+        (folder / "empty.csv").write_text(lines[0])
+    COMM.barrier()
+    several = (each for each in [step])
+    for words, arguments, options in (
+        (("problem",), (made.contact, step, page), {}),
+        (
+            ("steps is a generator", "list(increments"),
+            (problem, several, page),
+            {},
+        ),
+        (("steps is empty",), (problem, [], page), {}),
+        (("increments [1]", "at increment 2"), (problem, first, page), {}),
+        (("increments [2, 2]",), (problem, [step, step], page), {}),
+        (("folder is 3",), (problem, step, 3), {}),
+        (("history is 3",), (problem, step, page), {"history": 3}),
+        (("last increment is 1",), (problem, step, page), {"history": folder / "short.csv"}),
+        (("no column 'increment'",), (problem, step, page), {"history": folder / "other.csv"}),
+        (("has no row",), (problem, step, page), {"history": folder / "empty.csv"}),
+        (("shape ()", "(3, 3)"), (problem, step, page), {"stress": made.scene.E}),
+        (("budget is a float",), (problem, step, page), {"budget": 0.1}),
+        (("title",), (problem, step, page), {"title": 1}),
+        (("units is 'mm'",), (problem, step, page), {"units": "mm"}),
+        (("magnification is -1",), (problem, step, page), {"magnification": -1}),
+        (("view is (1, 2, 3)",), (problem, step, page), {"view": (1, 2, 3)}),
+    ):
+        raised_everywhere(lambda a=arguments, o=options: fc.report(*a, **o), ValueError, *words)
+    missing = folder / "missing.csv"
+    raised_everywhere(
+        lambda: fc.report(problem, step, page, history=missing), OSError, "missing.csv"
+    )
+    raised_everywhere(lambda: fc.report(problem, step, folder / "other.csv"), OSError, "other.csv")
+    COMM.barrier()
+    assert not (page / "report.html").exists()
+
+
+def test_a_failure_leaves_the_page_before(tmp_path, monkeypatch):
+    """A picture that cannot be drawn: the error on all ranks, the page as it was."""
+    folder = shared_folder(tmp_path)
+    made = Rub()
+    made.problem.kinematics = np.inf
+    (step,) = fc.increments(made.problem, made.load, 0, 1)
+    path = fc.report(made.problem, step, folder)
+    COMM.barrier()
+    before = path.read_bytes()
+
+    def failing(figure, path):
+        raise OSError("no more ink")
+
+    monkeypatch.setattr(drawing, "save", failing)
+    raised_everywhere(lambda: fc.report(made.problem, step, folder), OSError, "no more ink")
+    COMM.barrier()
+    assert path.read_bytes() == before and [p.name for p in folder.iterdir()] == ["report.html"]
