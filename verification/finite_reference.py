@@ -27,7 +27,16 @@ from verification import finite_scenes, fuzz_judge, fuzz_scenes
 from verification import reference_solver as reference
 from verification.reference_solver import Failed
 
-__all__ = ["FiniteContact", "FiniteJudge", "FiniteProblem", "model", "shape_of"]
+__all__ = [
+    "FiniteContact",
+    "FiniteJudge",
+    "FiniteProblem",
+    "bulk_of",
+    "loads_of",
+    "model",
+    "rubber",
+    "shape_of",
+]
 
 Array = np.ndarray
 # Of a shape: signed distance, (n,), and minus its gradient, (n, d), at places (n, d).
@@ -321,10 +330,12 @@ class FiniteProblem(reference.Problem):
         bulk: Function of u: internal forces (N,), their derivative (N, N), and whether no cell is
             turned inside out.
         before: Load of the last solution.
+        parts: Into how many an increment is cut, tried in turn.
     """
 
     bulk: Any = None
     before: Any = None
+    parts: tuple[int, ...] = _PARTS
 
     def stiffness(self, u: Array) -> Array:
         """K at a displacement."""
@@ -348,7 +359,7 @@ class FiniteProblem(reference.Problem):
         self, u: Array, motion: Array, load: Any, old: list[Any], *, rtol: float = 1e-12
     ) -> tuple[Array, Array, list[Any]]:
         """One increment, in parts; see `reference.Problem.solve`."""
-        for parts in _PARTS:
+        for parts in self.parts:
             with contextlib.suppress(Failed, np.linalg.LinAlgError):
                 v, m = u, motion
                 for share in np.arange(1, parts + 1) / parts:
@@ -416,12 +427,10 @@ class FiniteProblem(reference.Problem):
         self, u: Array, motion: Array, load: Any, old: list[Any], rtol: float
     ) -> tuple[Array, Array]:
         """Newton's method with a line search."""
-        d, free = self.body.d, self.motions()
+        free = self.motions()
         fixed = np.zeros(len(u), dtype=bool)
         fixed[load.fixed] = True
         kept = np.flatnonzero(~fixed)
-        maps = [np.kron(c.interpolation, np.eye(d))[:, kept] for c in self.contacts]
-        reach = _DIFFERENCE * np.ptp(self.body.places, axis=0).max()
 
         def evaluate(v: Array, m: Array) -> tuple[Array, float, Array, bool]:
             inside, stiff, whole = self.bulk(v)
@@ -441,42 +450,7 @@ class FiniteProblem(reference.Problem):
             return np.concatenate([total[kept], rest]), size, floor, whole
 
         def tangent(v: Array, m: Array, *, closed: bool) -> Array:
-            matrix = np.zeros((len(kept) + len(free),) * 2)
-            matrix[: len(kept), : len(kept)] = self.bulk(v)[1][np.ix_(kept, kept)]
-            shifts = self.shifts(load, m)
-            for c, model in enumerate(self.contacts):
-                left = np.zeros((model.x.size, len(matrix)))
-                left[:, : len(kept)] = maps[c]
-                for k, (o, i) in enumerate(free):
-                    if o == c:
-                        left[i::d, len(kept) + k] = -1.0
-                jump = model.jump(v)
-                blocks = np.zeros((len(jump), d, d))
-                if closed:
-                    blocks[:] = -np.eye(d) * np.maximum(model.k_n, model.k_t)[:, None, None]
-                else:
-                    for i in range(d):
-                        way = reach * np.eye(d)[i]
-                        ends = [
-                            model.respond(jump + s * way, shifts[c], old[c])["traction"]
-                            for s in (1, -1)
-                        ]
-                        blocks[:, :, i] = (ends[0] - ends[1]) / (2 * reach)
-                blocks *= model.weights[:, None, None]
-                felt = np.einsum("qij,qjn->qin", blocks, left.reshape(len(jump), d, -1))
-                matrix -= left.T @ felt.reshape(left.shape)
-                for k, (o, i) in enumerate(free):  # the history moves along with the support
-                    if o == c and not closed:
-                        ends = []
-                        for s in (1, -1):
-                            moved = replace(
-                                shifts[c], shift=shifts[c].shift + s * reach * np.eye(d)[i]
-                            )
-                            there = model.respond(jump, moved, old[c])["traction"]
-                            ends.append((model.weights[:, None] * there).ravel())
-                        by = (ends[0] - ends[1]) / (2 * reach)
-                        matrix[:, len(kept) + k] = -left.T @ by
-            return matrix
+            return self._tangent(v, m, load, old, kept, closed=closed)
 
         u, motion = u.copy(), motion.copy()
         u[load.fixed] = load.values
@@ -530,8 +504,49 @@ class FiniteProblem(reference.Problem):
             raise Failed(f"residual {norm / max(size, 1e-300):.1e} of the forces")
         return u, motion
 
+    def _tangent(
+        self, v: Array, m: Array, load: Any, old: list[Any], kept: Array, *, closed: bool
+    ) -> Array:
+        """Derivative of what is free; ``closed``: as if springs held all points every way."""
+        d, free = self.body.d, self.motions()
+        reach = _DIFFERENCE * np.ptp(self.body.places, axis=0).max()
+        matrix = np.zeros((len(kept) + len(free),) * 2)
+        matrix[: len(kept), : len(kept)] = self.bulk(v)[1][np.ix_(kept, kept)]
+        shifts = self.shifts(load, m)
+        for c, model in enumerate(self.contacts):
+            left = np.zeros((model.x.size, len(matrix)))
+            left[:, : len(kept)] = np.kron(model.interpolation, np.eye(d))[:, kept]
+            for k, (o, i) in enumerate(free):
+                if o == c:
+                    left[i::d, len(kept) + k] = -1.0
+            jump = model.jump(v)
+            blocks = np.zeros((len(jump), d, d))
+            if closed:
+                blocks[:] = -np.eye(d) * np.maximum(model.k_n, model.k_t)[:, None, None]
+            else:
+                for i in range(d):
+                    way = reach * np.eye(d)[i]
+                    ends = [
+                        model.respond(jump + s * way, shifts[c], old[c])["traction"]
+                        for s in (1, -1)
+                    ]
+                    blocks[:, :, i] = (ends[0] - ends[1]) / (2 * reach)
+            blocks *= model.weights[:, None, None]
+            felt = np.einsum("qij,qjn->qin", blocks, left.reshape(len(jump), d, -1))
+            matrix -= left.T @ felt.reshape(left.shape)
+            for k, (o, i) in enumerate(free):  # the history moves along with the support
+                if o == c and not closed:
+                    ends = []
+                    for s in (1, -1):
+                        moved = replace(shifts[c], shift=shifts[c].shift + s * reach * np.eye(d)[i])
+                        there = model.respond(jump, moved, old[c])["traction"]
+                        ends.append((model.weights[:, None] * there).ravel())
+                    by = (ends[0] - ends[1]) / (2 * reach)
+                    matrix[:, len(kept) + k] = -left.T @ by
+        return matrix
 
-def _rubber(u: Any, v: Any, E: Any, nu: Any) -> Any:
+
+def rubber(u: Any, v: Any, E: Any, nu: Any) -> Any:
     """Virtual work of neo-Hookean rubber by its first Piola-Kirchhoff stress (UFL)."""
     d = len(u)
     F = ufl.Identity(d) + ufl.grad(u)
@@ -544,8 +559,7 @@ def model(
     scene: dict[str, Any],
 ) -> tuple[FiniteProblem, Any, Callable[[int, float], FiniteLoad]]:
     """The second problem, and its loads by stage and load parameter. On one rank."""
-    made = finite_scenes.FiniteMade(scene, MPI.COMM_SELF, bulk=_rubber)
-    d, V = made.d, made.V
+    made = finite_scenes.FiniteMade(scene, MPI.COMM_SELF, bulk=rubber)
     body, surface = fuzz_scenes.body_of(made)
     contacts = []
     for i, contact in enumerate(scene["contacts"]):
@@ -559,9 +573,14 @@ def model(
                 None if turn[1] is None else np.array(turn[1], dtype=float),
             )
         contacts.append(made_contact)
-    rubber = scene["bulk"] == "rubber"
-    zero = fem.Function(V)
-    minus = fem.form(-ufl.replace(made.F, {made.u: zero}))
+    return FiniteProblem(body, contacts, bulk=bulk_of(made, body)), made, loads_of(made)
+
+
+def bulk_of(made: Any, body: reference.Body) -> Callable[[Array], tuple[Array, Array, bool]]:
+    """Of u: internal forces, their derivative, and whether no cell is turned inside out."""
+    d, V = made.d, made.V
+    nonlinear = made.scene["bulk"] == "rubber"
+    minus = fem.form(-ufl.replace(made.F, {made.u: fem.Function(V)}))
     tangent = ufl.derivative(made.F, made.u, ufl.TrialFunction(V))
     inner, outer = fem.form(made.F), fem.form(tangent)
     volume = ufl.det(ufl.Identity(d) + ufl.grad(made.u))
@@ -570,7 +589,7 @@ def model(
     memory: dict[bytes, Any] = {}
 
     def bulk(u: Array) -> tuple[Array, Array, bool]:
-        if not rubber:
+        if not nonlinear:
             return body.stiffness @ u, body.stiffness, True
         key = u.tobytes()
         if key not in memory:
@@ -581,6 +600,14 @@ def model(
             memory.clear()
             memory[key] = force.copy(), stiff, fem.assemble_scalar(inverted) == 0.0
         return memory[key]
+
+    return bulk
+
+
+def loads_of(made: Any) -> Callable[[int, float], FiniteLoad]:
+    """What drives the bodies, by stage and load parameter."""
+    d, V, scene = made.d, made.V, made.scene
+    minus = fem.form(-ufl.replace(made.F, {made.u: fem.Function(V)}))
 
     def load(stage: int, t: float) -> FiniteLoad:
         made.apply(stage, t)
@@ -604,7 +631,7 @@ def model(
         angle = float(made.angle.value)
         return FiniteLoad(force, dofs, values[dofs], shifts, pushes, angle)
 
-    return FiniteProblem(body, contacts, bulk=bulk), made, load
+    return load
 
 
 # ---- the judge -----------------------------------------------------------------------------------

@@ -172,6 +172,10 @@ def play(
         from verification import finite_reference, finite_scenes
 
         make_scene, make_judge = finite_scenes.FiniteMade, finite_reference.FiniteJudge
+    elif scene.get("kinematics") == "present":
+        from verification import present_reference, present_scenes
+
+        make_scene, make_judge = present_scenes.PresentMade, present_reference.PresentJudge
     comm = comm or MPI.COMM_SELF
     records: list[dict[str, Any]] = []
     start, outcome, kind, detail = time.perf_counter(), "right", "", []
@@ -268,10 +272,12 @@ def features(scene: Scene) -> list[str]:
 
 def _drawn(seed: int, arguments: argparse.Namespace, ranks: int) -> Scene:
     """The scene of a seed, in a family with the other seeds next to it, if so asked."""
-    from verification import finite_scenes, fuzz_scenes
+    from verification import finite_scenes, fuzz_scenes, present_scenes
 
     family = seed // arguments.alike if arguments.alike > 1 else None
     draw = finite_scenes.draw if arguments.finite else fuzz_scenes.draw
+    if arguments.bodies:
+        draw = present_scenes.draw
     return draw(seed, without=tuple(arguments.without), ranks=ranks, family=family)
 
 
@@ -302,6 +308,7 @@ def _batch(seeds: list[int], arguments: argparse.Namespace) -> Iterator[dict[str
     """Results of scenes solved in one process; ends early where it hangs or dies."""
     words = ["--work", ",".join(map(str, seeds)), "--limit", arguments.limit]
     words += ["--alike", arguments.alike] + ["--finite"] * arguments.finite
+    words += ["--bodies"] * arguments.bodies
     words += [v for name in arguments.without for v in ("--without", name)]
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
@@ -574,6 +581,9 @@ def main() -> int:
     )
     parser.add_argument(
         "--finite", action="store_true", help="scenes with finite kinematics; seeds of their own"
+    )
+    parser.add_argument(
+        "--bodies", action="store_true", help="of two bodies with finite kinematics; likewise"
     )
     parser.add_argument("--table", nargs="+", help="print the table of files of results")
     parser.add_argument("--verbose", action="store_true", help="a line for every scene")

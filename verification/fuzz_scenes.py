@@ -481,9 +481,7 @@ class Made:
         self.bcs: list[fem.DirichletBC] = []
         self.moved: list[fem.Constant] = []
         for body, side, components, how in scene["holds"]:
-            facets = self.tags.find(_tag(scene, body, side))
-            if side == "top":  # tops share a tag
-                facets = facets[np.isin(self._cell_of(facets), np.flatnonzero(self.box == body))]
+            facets = self.facets_of(body, side)
             for i in components:
                 value = fem.Constant(self.mesh, 0.0)
                 space = self.V.sub(i)
@@ -495,6 +493,11 @@ class Made:
         self.shift = fem.Constant(self.mesh, np.zeros(d))
         self.push = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
         self.pull = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
+
+    def facets_of(self, body: int, side: str) -> Array:
+        """Facets of a side of a body; tops share a tag."""
+        facets = self.tags.find(_tag(self.scene, body, side))
+        return facets[np.isin(self._cell_of(facets), np.flatnonzero(self.box == body))]
 
     def _bend(self) -> None:
         """Move the nodes of bodies up by a parabola over x."""
@@ -762,7 +765,7 @@ def _record(
             columns.append(contact.multipliers.fields.values("pressure"))
             if contact.law.has_friction:
                 columns.append(contact.multipliers.fields.values("traction"))
-                if contact.finite:
+                if "normal" in contact.multipliers.fields:
                     columns.append(contact.multipliers.fields.values("normal"))
         rows = gathered(comm, np.column_stack(columns))
         r = step.contacts[contact.name]

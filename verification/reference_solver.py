@@ -111,7 +111,10 @@ class Surface:
         return self._origin[facet] + np.einsum("pk,pkd->pd", xi, self._axes[facet])
 
     def place(self, facet: Array, xi: Array, u: Array | None = None) -> tuple[Array, Array]:
-        """Coordinates, (n, d), and tangents, (n, d - 1, d), of places, displaced by u."""
+        """Coordinates, (n, d), and tangents, (n, d - 1, d), of places, displaced by u.
+
+        That is of all dofs, or has the displacements of the cells' nodes, (n, m, d).
+        """
         inside = self._in_cell(facet, xi)
         table = _tabulate(self._map, 1, inside)
         corners = self.body.x[self.body.vertices[self.cells[facet]]]
@@ -119,10 +122,18 @@ class Surface:
         slope = np.einsum("jpk,pkd->pjd", table[1:], corners)
         if u is not None:
             table = _tabulate(self._element, 1, inside)
-            moved = u.reshape(-1, self.d)[self.body.nodes[self.cells[facet]]]
+            moved = u if u.ndim == 3 else self.local(facet, u)
             x = x + np.einsum("pk,pkd->pd", table[0], moved)
             slope = slope + np.einsum("jpk,pkd->pjd", table[1:], moved)
         return x, np.einsum("pkj,pjd->pkd", self._axes[facet], slope)
+
+    def local(self, facet: Array, u: Array) -> Array:
+        """Displacements of the nodes of the facets' cells, (n, m, d)."""
+        return u.reshape(-1, self.d)[self.body.nodes[self.cells[facet]]]
+
+    def shapes(self, facet: Array, xi: Array) -> Array:
+        """Values of the shape functions of these nodes at places, (n, m)."""
+        return _tabulate(self._element, 0, self._in_cell(facet, xi))[0]
 
     def _across(self, facet: Array, xi: Array, u: Array | None = None) -> Array:
         tangents = self.place(facet, xi, u)[1]
@@ -137,7 +148,7 @@ class Surface:
 
     def interpolation(self, facet: Array, xi: Array) -> Array:
         """From values at the nodes to those at places: (n, n_nodes)."""
-        table = _tabulate(self._element, 0, self._in_cell(facet, xi))[0]
+        table = self.shapes(facet, xi)
         matrix = np.zeros((len(facet), len(self.body.places)))
         for row, (f, values) in enumerate(zip(facet, table, strict=False)):
             matrix[row, self.body.nodes[self.cells[f]]] += values
@@ -185,17 +196,24 @@ class Surface:
         """Where rays meet facets, pair by pair: coordinates, signed distance, whether they do."""
         xi = self.middles()[1][facet]
         distance, bad = np.zeros(len(facet)), np.zeros(len(facet), dtype=bool)
+        moving = np.arange(len(facet))
         for _ in range(30):
-            x, tangents = self.place(facet, xi, u)
-            system = np.concatenate([np.swapaxes(tangents, 1, 2), -ray[:, :, None]], axis=2)
-            rest = x - start - distance[:, None] * ray
+            moved = u if u is None or u.ndim < 3 else u[moving]
+            x, tangents = self.place(facet[moving], xi[moving], moved)
+            way = ray[moving]
+            system = np.concatenate([np.swapaxes(tangents, 1, 2), -way[:, :, None]], axis=2)
+            rest = x - start[moving] - distance[moving, None] * way
             size = np.prod(np.linalg.norm(system, axis=1), axis=1)
-            bad |= np.abs(np.linalg.det(system)) < 1e-12 * size
-            system[bad], rest[bad] = np.eye(self.d), 0.0
+            flat = np.abs(np.linalg.det(system)) < 1e-12 * size
+            bad[moving[flat]] = True
+            system[flat], rest[flat] = np.eye(self.d), 0.0
             step = np.linalg.solve(system, -rest[..., None])[..., 0]
-            xi = np.clip(xi + step[:, :-1], -3, 4)
-            distance = distance + step[:, -1]
-            if np.abs(step[:, :-1]).max(initial=0.0) < 1e-14:
+            now = np.clip(xi[moving] + step[:, :-1], -3, 4)
+            change = np.abs(now - xi[moving]).max(axis=1, initial=0.0)
+            xi[moving] = now
+            distance[moving] += step[:, -1]
+            moving = moving[(change >= 1e-14) & ~flat]
+            if not len(moving):
                 break
         x, tangents = self.place(facet, xi, u)
         size = np.linalg.norm(tangents, axis=2).max(axis=1)

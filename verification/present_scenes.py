@@ -1,0 +1,232 @@
+"""Random scenes of two bodies with finite kinematics: a block on a slab, pressed, dragged, turned.
+
+As in `fuzz_scenes`, whose mesh and history they share, a scene is a dictionary of numbers that is
+played again as it is. It says ``"kinematics": "present"``. The slab is held at its bottom, the
+block at its top, by amounts that are prescribed or pressed by a force; the block may rock, and both
+may be turned together.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+
+from verification.finite_scenes import FiniteMade
+from verification.fuzz_scenes import Made, Scene, dice
+
+__all__ = ["PresentMade", "draw"]
+
+Array = np.ndarray
+
+
+def draw(
+    seed: int, *, without: tuple[str, ...] = (), ranks: int = 1, family: int | None = None
+) -> Scene:
+    """A random scene.
+
+    Args:
+        seed: The same gives the same.
+        without: Features to leave out: "space", "rubber", "bend", "spin", "rock", "multipliers",
+            "units", "restart", "method", "ration", "edge", "stiff", "fine".
+        ranks: Kept in the scene.
+        family: See `fuzz_scenes.draw`.
+    """
+    rng = np.random.default_rng([seed, 40])
+    built = rng if family is None else np.random.default_rng([family, 41])
+
+    chance, pick, log = dice(rng, built, without)
+
+    def within(low: float, high: float) -> float:
+        return float(f"{rng.uniform(low, high):.3g}")
+
+    space = chance(0.2, "space")
+    d = 3 if space else 2
+    cell = pick("tetrahedron", "hexahedron") if space else pick("triangle", "quadrilateral")
+    degree = 1 if chance(0.55) else 2
+    strain = log(-3, -0.9)
+
+    # The slab, and on it the block; either may be the finer or the stiffer one.
+    most = 2 if space else (8 if degree == 1 else 5)
+    coarse = int(rng.integers(1, 3))
+    fine = int(rng.integers(2, most + 1))
+    if not space and chance(0.15, "fine", of=rng):
+        coarse, fine = 1, 20
+    counts = [coarse, fine] if chance(0.5, of=rng) else [fine, coarse]
+    size = [within(1.2, 2.0) for _ in range(d)]
+    size[-1] = within(0.6, 1.2)
+    slab = {"origin": [0.0] * d, "size": size, "n": [counts[0]] * (d - 1) + [2]}
+    width = within(0.25, 0.6) * size[0]
+    room = size[0] - width
+    block = {"origin": [0.0] * d, "size": [width] * d, "n": [counts[1]] * (d - 1) + [2]}
+    block["origin"] = [within(0.1, 0.9) * room] + [0.5 * (s - width) for s in size[1:]]
+    clearance = within(-0.2, 1.0) * strain * width if chance(0.3, of=rng) else 0.0
+    block["origin"][-1] = float(f"{size[-1] + clearance:.6g}")
+    stiff = log(0, 3.5) if chance(0.3, "stiff", of=rng) else log(-0.5, 0.5)
+    moduli = [1.0, stiff] if chance(0.5, of=rng) else [stiff, 1.0]
+    for body, modulus in zip((slab, block), moduli, strict=True):
+        body |= {"E": 100.0 * modulus, "jitter": 0}
+        if chance(0.4, of=rng):
+            body["jitter"] = int(rng.integers(1, 1000))
+
+    law: Scene = {"kind": pick("frictionless", "coulomb", "coulomb", "coulomb", "tresca")}
+    law["k_n"] = pick(["scaled", log(-0.5, 1.5)], ["number", log(-0.5, 2)])
+    if law["kind"] != "frictionless":
+        law["friction"] = pick(0.1, 0.3, 0.3, 0.6, of=rng)
+        law["k_t"] = pick(["scaled", log(-0.5, 1.5)], ["number", log(-0.5, 2)])
+    if law["kind"] == "tresca":
+        law["pressure"] = float(f"{rng.uniform(0.1, 2) * strain:.3g}")
+    upper = {"body": 1, "side": "bottom"}
+    lower = {"body": 0, "side": "top"}
+    own, other = (upper, lower) if chance(0.6) else (lower, upper)
+    contact: Scene = own | {"support": {"kind": "body", "update": "never"} | other, "law": law}
+    if chance(0.2):
+        contact["quadrature"] = pick(1, 3, 5)
+    if chance(0.2, "multipliers"):
+        contact["enforcement"] = "augmented"
+
+    drive = "force" if chance(0.2) else "prescribed"
+    whole = list(range(d))
+    holds: list[list[Any]] = [[0, "bottom", whole, "still"]]
+    holds.append([1, "top", whole[:-1] if drive == "force" else whole, "moved"])
+    scene: Scene = {
+        "seed": seed,
+        "kinematics": "present",
+        "bulk": "rubber" if chance(0.6, "rubber") else "linear",
+        "layout": "two",
+        "cell": cell,
+        "degree": degree,
+        "nu": within(0.0, 0.45),
+        "bodies": [slab, block],
+        "ranks": ranks,
+        "units": [1.0, 1.0],
+        "drive": drive,
+        "contacts": [contact],
+        "holds": holds,
+        "strain": strain,
+        "share": 1.0,
+        "cuts": pick(1, 3, 5, of=rng),
+    }
+    if chance(0.4, "bend") and cell != "hexahedron":
+        scene["bend"] = [within(-0.05, 0.05), within(0.0, 0.15)]
+
+    # Stages: strain of the block, ways aside in its widths, and angles (radians) at their end.
+    far = pick(strain, 0.1, 0.5, of=rng)
+    if chance(0.2, "edge", of=rng):
+        far = 1.5
+    rocks, spins = (
+        chance(share, feature, of=rng) and drive == "prescribed"
+        for share, feature in ((0.3, "rock"), (0.3, "spin"))
+    )
+    stages, rock, spin = [], 0.0, 0.0
+    for name in pick(
+        ["press"],
+        ["press", "shear"],
+        ["press", "shear", "reverse"],
+        ["press", "turn"],
+        ["press", "shear", "turn"],
+        ["press", "lift", "press"],
+        ["press", "shear", "lift", "press"],
+        ["both", "ease", "both"],
+        of=rng,
+    ):
+        normal, side = {
+            "press": (1.0, 0.0),
+            "shear": (1.0, rng.uniform(0.2, 1.0)),
+            "reverse": (1.0, -rng.uniform(0.2, 1.0)),
+            "turn": (1.0, rng.uniform(-0.2, 0.2)),
+            "lift": (-0.3 if drive != "force" else 0.3, 0.0),
+            "ease": (0.4, rng.uniform(0, 0.3)),
+            "both": (1.0, rng.uniform(-1, 1)),
+        }[name]
+        if name in ("turn", "both"):
+            rock += strain * rng.uniform(-1, 1) * rocks
+            spin += rng.uniform(-1.5, 1.5) * spins
+        stages.append(
+            {
+                "steps": int(rng.integers(2, 6)),
+                "normal": normal,
+                "side": float(f"{side * far:.3g}"),
+                "across": float(f"{side * far * rng.uniform(-1, 1):.3g}") if space else 0.0,
+                "turn": float(f"{rock:.3g}"),
+                "spin": float(f"{spin:.3g}"),
+            }
+        )
+    scene["stages"] = stages
+    total = sum(s["steps"] for s in stages)
+    if chance(0.3, "restart", of=rng):
+        scene["restart"] = int(rng.integers(1, total))
+    if chance(0.25, "units", of=rng):
+        scene["units"] = [log(-4, 4), log(-6, 6)]
+    if chance(0.2, "method", of=rng):
+        scene["method"] = pick("newton", "lbfgs", "continuation", of=rng)
+    if chance(0.1):
+        scene["thickness"] = log(-2, 2)
+    if chance(0.05, "ration", of=rng):
+        scene["ration"] = int(rng.integers(4, 12))
+    return scene
+
+
+def _turn(d: int, angle: float) -> Array:
+    """About the axis out of the plane of x and the height."""
+    c, s = np.cos(angle), np.sin(angle)
+    found = np.eye(d)
+    found[0, 0], found[0, -1], found[-1, 0], found[-1, -1] = c, -s, s, c
+    return found
+
+
+class PresentMade(FiniteMade):
+    """A scene as mesh, forms and constants."""
+
+    def __init__(self, scene: Scene, comm: MPI.Comm, *, bulk: Any = None) -> None:
+        """Make it; see `FiniteMade`. Collective."""
+        super().__init__(scene, comm, bulk=bulk)
+        self._held: list[tuple[int, Any]] = []
+        if scene["drive"] == "prescribed":  # places by turns take functions
+            self.bcs = []
+            for body, side, *_ in scene["holds"]:
+                value = fem.Function(self.V)
+                facets = self.facets_of(body, side)
+                dofs = fem.locate_dofs_topological(self.V, self.d - 1, facets)
+                self.bcs.append(fem.dirichletbc(value, dofs))
+                self._held.append((body, value))
+
+    def drives(self, stage: int, t: float) -> dict[str, float]:
+        """See `FiniteMade`; the turn of the block, and that of both as well."""
+        stages = self.scene["stages"]
+        now = super().drives(stage, t)
+        before = stages[stage - 1]["spin"] if stage else 0.0
+        return now | {"spin": before + t * (stages[stage]["spin"] - before)}
+
+    def apply(self, stage: int, t: float) -> None:
+        """Set all loads."""
+        scene, d, now = self.scene, self.d, self.drives(stage, t)
+        slab, block = scene["bodies"]
+        way = np.zeros(d)
+        way[0] = now["side"] * block["size"][0]
+        if d == 3:
+            way[1] = now["across"] * block["size"][1]
+        down = now["normal"] * scene["strain"]
+        if scene["drive"] == "force":
+            rows = self.traction.x.array.reshape(-1, d)
+            rows[self._cells] = -down * min(self.moduli) * np.eye(d)[-1]
+            for _, i, value in self.moved:
+                value.value = way[i] * self.length
+            return
+        way[-1] = -down * block["size"][-1]
+        middle = 0.5 * np.array(slab["size"]) * self.length
+        pivot = (np.array(block["origin"]) + 0.5 * np.array(block["size"])) * self.length
+        whole, own = _turn(d, now["spin"]), _turn(d, now["turn"])
+        x = self.V.tabulate_dof_coordinates()[:, :d]
+        for body, value in self._held:
+            place = x
+            if body == 1:
+                place = pivot + (x - pivot) @ own.T + way * self.length
+            moved = middle + (place - middle) @ whole.T - x
+            value.x.array[:] = moved.ravel()
+
+    def support(self, contact: Scene) -> Any:
+        """The package's support."""
+        return Made.support(self, contact)
