@@ -269,5 +269,13 @@ class PresentJudge(finite_reference.FiniteJudge):
         traction = record["lambda_t"][row] if contact.law.slips else old.traction
         return PresentState(old.jump, traction, record["lambda_n"][row], None, old.u)
 
+    def _forces(self, u: Array, load: Any, found: list[dict]) -> dict[str, Any]:
+        """A body has the round-off of what it touches, too, where that has gone far."""
+        forces = super()._forces(u, load, found)
+        most = max(body["rounding"] for body in forces["bodies"])
+        for body in forces["bodies"]:
+            body["rounding"] = most
+        return forces
+
     def _unique(self) -> bool:
         return False

@@ -15,7 +15,7 @@ from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.contact.contact import Contact
 from fenics_contact.joining import Joined
 from fenics_contact.laws.base import Law
-from fenics_contact.parallel import agreed, collective_errors
+from fenics_contact.parallel import agreed, collective_errors, warn
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.displacement import Displacement
@@ -88,7 +88,7 @@ def contact_pairs(
 
     Returns:
         The contacts in the order of the bodies, named by them, such as "1-2": empty if none are so
-        near.
+        near, which gives a warning.
 
     Raises:
         ValueError: An argument is none of these, a cell has no tag, or facets are no part of the
@@ -111,8 +111,12 @@ def contact_pairs(
         facets = tagged_facets(mesh, facet_tags, tags)
     label = of_cell[facet_cells(mesh, facets)]
     found = find_neighbours(space, facets, label, distance, itself=itself)
-    if not found and comm.rank == 0:
-        logger.info("contact_pairs: no two of the bodies %s are within %g", names, distance)
+    if not found:
+        warn(
+            comm,
+            f"contact_pairs: no two of the bodies {names} are within {distance:g}. Check the "
+            "distance; bodies that overlap by more than half a cell are not found either",
+        )
 
     on = [agreed(comm, _side_of_surface(pair, names, surface_on)) for pair in found]
     roles = [pair.facets[side] for pair, side in zip(found, on, strict=True)]
