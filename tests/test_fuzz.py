@@ -14,7 +14,7 @@ import pytest
 from mpi4py import MPI
 
 from scenes.processes import ROOT, environment
-from verification import finite_reference, finite_scenes, fuzz, fuzz_scenes
+from verification import finite_reference, finite_scenes, fuzz, fuzz_scenes, present_scenes
 from verification import reference_solver as reference
 
 COMM = MPI.COMM_WORLD
@@ -53,16 +53,19 @@ def test_scenes_are_not_wrong(part):
         assert outcome.outcome in FINE, f"{outcome}\n{json.dumps(scene)}"
 
 
+FINITE = [*SCENES["finite"], *SCENES["bodies"]]
+
+
 @pytest.mark.mpi
-@pytest.mark.parametrize("number", range(len(SCENES["finite"])))
+@pytest.mark.parametrize("number", range(len(FINITE)))
 def test_scenes_of_finite_kinematics_are_right(number):
-    """Supports that move and turn, linear bodies and rubber; on several ranks some of them.
+    """Supports that move and turn, linear bodies and rubber, two bodies; on several ranks some.
 
     On one rank they are solved, too, and most are the solution found apart.
     """
     if COMM.size > 1 and number % 4:
         pytest.skip("takes longer on several ranks")
-    scene = SCENES["finite"][number]
+    scene = FINITE[number]
     outcome = played(scene)
     assert outcome.outcome in FINE, f"{outcome}\n{json.dumps(scene)}"
     if COMM.size == 1:
@@ -205,9 +208,34 @@ TURNING["contacts"][0]["support"] = {
 }
 
 
+# A block pressed on a slab, dragged along it, and turned together with it; half of the points slip.
+TWO = copy.deepcopy(TURNING) | {
+    "kinematics": "present",
+    "bulk": "rubber",
+    "layout": "two",
+    "drive": "prescribed",
+    "bodies": [
+        {"origin": [0.0, 0.0], "size": [2.0, 0.8], "n": [4, 2], "E": 100.0, "jitter": 3},
+        {"origin": [0.7, 0.8], "size": [0.6, 0.6], "n": [3, 2], "E": 100.0, "jitter": 0},
+    ],
+    "holds": [[0, "bottom", [0, 1], "still"], [1, "top", [0, 1], "moved"]],
+    "strain": 0.1,
+    "stages": [
+        {"steps": 2, "normal": 1.0, "side": 0.0, "across": 0.0, "turn": 0.0, "spin": 0.0},
+        {"steps": 2, "normal": 1.0, "side": 0.05, "across": 0.0, "turn": 0.02, "spin": 0.7},
+    ],
+}
+TWO["contacts"][0] |= {
+    "body": 1,
+    "support": {"kind": "body", "update": "never", "body": 0, "side": "top"},
+}
+FAR = pytest.mark.parametrize("scene", [TURNING, TWO], ids=["support", "bodies"])
+
+
 @serial
-def test_a_good_scene_of_finite_kinematics_is_right():
-    assert played(TURNING).outcome == "right"
+@FAR
+def test_a_good_scene_of_finite_kinematics_is_right(scene):
+    assert played(scene).outcome == "right"
 
 
 def _forget_a_turn(history):
@@ -219,8 +247,9 @@ def _slip_from_elsewhere(history):
 
 
 @serial
+@FAR
 @pytest.mark.parametrize("spoil", [_forget_a_turn, _slip_from_elsewhere])
-def test_a_spoiled_history_of_finite_kinematics_is_found(spoil):
+def test_a_spoiled_history_of_finite_kinematics_is_found(spoil, scene):
     """The traction with its components exchanged; slip counted from 1e-6 aside."""
 
     def changed(made, problem):
@@ -233,7 +262,20 @@ def test_a_spoiled_history_of_finite_kinematics_is_found(spoil):
 
         problem.commit = spoiled
 
-    outcome = played(TURNING, changed=changed)
+    outcome = played(scene, changed=changed)
+    assert outcome.outcome == "wrong"
+    assert "equations" in outcome.kind
+
+
+@serial
+def test_slip_of_bodies_that_is_not_turned_is_found():
+    """The committed traction stays in space while both bodies turn."""
+
+    def changed(made, problem):
+        present = problem.contacts[0].pairs
+        present.turned = lambda vectors: vectors
+
+    outcome = played(TWO, changed=changed)
     assert outcome.outcome == "wrong"
     assert "equations" in outcome.kind
 
@@ -305,9 +347,9 @@ def test_seeds_reproduce_and_features_can_be_left_out():
     one = [fuzz_scenes.draw(s) for s in range(30)]
     assert one == [json.loads(json.dumps(fuzz_scenes.draw(s))) for s in range(30)]
     assert any(s["units"] != [1.0, 1.0] for s in one)
-    assert [finite_scenes.draw(s) for s in range(30)] == [
-        json.loads(json.dumps(finite_scenes.draw(s))) for s in range(30)
-    ]
+    for scenes in (finite_scenes, present_scenes):
+        drawn = [scenes.draw(s) for s in range(30)]
+        assert drawn == [json.loads(json.dumps(scenes.draw(s))) for s in range(30)]
     plain = [fuzz_scenes.draw(s, without=("units", "restart")) for s in range(30)]
     assert all(s["units"] == [1.0, 1.0] and "restart" not in s for s in plain)
 

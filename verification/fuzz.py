@@ -5,6 +5,7 @@
     docker/run python verification/fuzz.py --scenes 200 --ranks 2 --resume results2.csv
     docker/run python verification/fuzz.py --scenes 9000 --alike 12 --resume more.csv  # faster
     docker/run python verification/fuzz.py --finite --scenes 300 --alike 12 --resume finite.csv
+    docker/run python verification/fuzz.py --bodies --scenes 300 --alike 24 --resume bodies.csv
     docker/run python verification/fuzz.py --replay scene.json --minimise
     docker/run python verification/fuzz.py --table results.csv        # Markdown
 

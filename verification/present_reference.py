@@ -26,6 +26,8 @@ Array = np.ndarray
 _DIFFERENCE = 1e-7
 # Parts into which an increment is cut, tried in turn: that of the package is long enough, mostly.
 _PARTS = (1, 8)
+# Round-off of places, by the diagonal of K: differences of them are gaps, and strains.
+_PLACES = 100 * np.finfo(float).eps
 
 
 @dataclass(eq=False)
@@ -270,9 +272,12 @@ class PresentJudge(finite_reference.FiniteJudge):
         return PresentState(old.jump, traction, record["lambda_n"][row], None, old.u)
 
     def _forces(self, u: Array, load: Any, found: list[dict]) -> dict[str, Any]:
-        """A body has the round-off of what it touches, too, where that has gone far."""
+        """Round-off is that of places, too; of what a body touches; of where it began."""
         forces = super()._forces(u, load, found)
-        most = max(body["rounding"] for body in forces["bodies"])
+        before = [] if self._before is None else self._before["bodies"]
+        most = max(body["rounding"] for body in [*forces["bodies"], *before])
+        places = np.abs(self.problem.body.places.ravel()) + np.abs(u)
+        most += _PLACES * float(np.linalg.norm(np.diag(self.problem.stiffness(u)) * places))
         for body in forces["bodies"]:
             body["rounding"] = most
         return forces
