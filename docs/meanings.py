@@ -295,9 +295,13 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "An interference that is meant belongs in `Contact(gap=...)`; else the place of the "
             "support.",
         ),
+        "no two of the bodies": (
+            "`contact_pairs` found nothing: bodies are farther apart, or overlap by more than "
+            "half a cell.",
+            "A larger `distance`; bodies that do not overlap.",
+        ),
     },
     "log": {
-        "no two of the bodies": ("`contact_pairs` found nothing.", "A larger `distance`."),
         "are done": ("The checkpoint has all increments of this call.", "Nothing."),
         "going on from": ("A history goes on behind its checkpoint.", "Nothing."),
         "accuracy": ("What `accuracy=` has chosen.", "Nothing."),

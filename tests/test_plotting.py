@@ -83,7 +83,11 @@ def test_pictures_of_any_body(cell, tmp_path, drawn):
         assert close(before.max(axis=0)[: d - 1], np.ones(d - 1), 1e-12)
         assert close([after[:, 0].max()], [1.2], 1e-9)
         assert close([after[:, -1].max()], [1 - 0.06], 1e-9)
-        assert len(shapes(deformed.axes[0].collections[0])[0]) in (CORNERS[cell], CORNERS[cell] + 1)
+        outline = shapes(deformed.axes[0].collections[0])
+        if d == 2:
+            assert len(outline[0]) in (CORNERS[cell], CORNERS[cell] + 1)
+        else:  # the twelve edges of the cube, of four facets each
+            assert len(outline) == 48 and all(len(ends) == 2 for ends in outline)
         for name in ("p.png", "s.png", "d.png"):
             assert (folder / name).read_bytes()[:4] == b"\x89PNG"
 
@@ -150,6 +154,8 @@ def test_fields_and_stress(cell, tmp_path, drawn):
 
 def shapes(collection):
     """Corners of what is in a collection, as given."""
+    if hasattr(collection, "_segments3d"):
+        return [np.asarray(ends) for ends in collection._segments3d]
     if hasattr(collection, "_vec"):  # in space: rows x, y, z, 1 of all corners one after another
         if hasattr(collection, "_faces"):
             return [np.asarray(face) for face in collection._faces]
@@ -188,3 +194,38 @@ def test_what_is_no_displacement(tmp_path):
         lambda: plotting.plot_deformation(path, scalar), ValueError, "shape ()", "contact.u"
     )
     raised_everywhere(lambda: plotting.plot_deformation(path, "u"), ValueError, "u is a str")
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_only_what_is_near_the_contact(cell, tmp_path, drawn):
+    """All facets that bear are drawn, and none farther from them than asked for; or all of them."""
+    folder, d = shared_folder(tmp_path), dimension(cell)
+    made = Rub(cell=cell, mesh={"n": 8 if d == 2 else 4})
+    made.problem.kinematics = np.inf
+    list(fc.increments(made.problem, made.load, 0, 1, steps=1))
+    points = made.contact.gather()
+    reach, count = 0.05, np.count_nonzero(per_facet(points, cell) > 0)
+    for near in (reach, None):
+        plotting.plot_pressure(folder / "p.png", made.contact, near=near)
+        plotting.plot_status(folder / "s.png", made.contact, near=near)
+    for near in (0.0, -1.0, np.nan, "near"):
+        raised_everywhere(
+            lambda near=near: plotting.plot_status(folder / "a.png", made.contact, near=near),
+            ValueError,
+            "length greater than zero",
+        )
+
+    def check():
+        close_up, _, whole, _ = drawn
+        (some, every) = (shapes(figure.axes[0].collections[-1]) for figure in (close_up, whole))
+        assert count <= len(some) < len(every)
+        for figure in drawn[:2]:
+            body, surface = figure.axes[0].collections
+            bearing = np.concatenate(shapes(surface))
+            n = CORNERS[cell]  # of a closed path the first comes twice
+            middles = np.array([np.mean(shape[:n], axis=0) for shape in shapes(body)])
+            middles = middles.reshape(-1, d)
+            low, high = bearing.min(axis=0) - reach, bearing.max(axis=0) + reach
+            assert np.all((middles >= low - 1e-12) & (middles <= high + 1e-12))
+
+    on_first(check)

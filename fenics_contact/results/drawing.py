@@ -19,13 +19,14 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_sum
 from fenics_contact.results import files
 from fenics_contact.surface.facets import FacetSet
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Mask
 
 __all__ = [
     "COLOURS",
     "Shape",
     "ShapeOf",
     "Surface",
+    "check_near",
     "check_view",
     "deformed",
     "facets_of",
@@ -46,6 +47,16 @@ COLOURS = {
     "mesh": "#9a9a9a",
     "open": "#d8d8d8",
 }
+
+
+def check_near(near: Any) -> None:
+    """Refuse what is no distance.
+
+    Raises:
+        ValueError: It says what was given.
+    """
+    if near is not None and not (is_number(near) and near > 0):
+        raise ValueError(f"near is {near!r}; it must be a length greater than zero")
 
 
 def check_view(view: Any) -> None:
@@ -169,11 +180,28 @@ class Surface:
     values: npt.NDArray[Any]
     outward: Array
 
+    def around(self, bearing: Mask, reach: float | None) -> Surface:
+        """What of it is no farther than that from the facets that bear; None: all of it."""
+        if reach is None or not bearing.any():
+            return self
+        places = self.facets[bearing]
+        low, high = places.min(axis=(0, 1)) - reach, places.max(axis=(0, 1)) + reach
+
+        def near(corners: Array) -> Mask:
+            middle = corners.mean(axis=1)
+            return np.all((middle >= low) & (middle <= high), axis=1)
+
+        kept = near(self.facets) | bearing
+        body = self.body[near(self.body)]
+        return Surface(body, self.facets[kept], self.values[kept], self.outward)
+
     def axes(self, unit: str, title: str, view: tuple[float, float] | None) -> tuple[Any, Any]:
         """A figure with the body in it, seen so that Γc is in front unless a view is given."""
-        if view is None and self.body.shape[2] == 3:
+        d = self.body.shape[2]
+        if view is None and d == 3:
             view = _towards(self.outward)
-        figure, axes = made_axes(self.body, unit, title, view)
+        places = np.concatenate([self.body.reshape(-1, d), self.facets.reshape(-1, d)])
+        figure, axes = made_axes(places[None], unit, title, view)
         axes.add_collection(polygons(self.body, "#9a9a9a10", "#9a9a9a60", 0.4))
         return figure, axes
 
@@ -240,8 +268,13 @@ def deformed(
     places = np.concatenate([original, moved])
     figure, axes = made_axes(places, units[0], title, view)
     plane = original.shape[2] == 2  # in space what is behind is hidden
-    outline = polygons(original, "#ffffff00", COLOURS["mesh"], 0.4)
-    axes.add_collection(outline)
+    if plane:
+        axes.add_collection(polygons(original, "#ffffff00", COLOURS["mesh"], 0.4))
+    else:
+        from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+        lines = Line3DCollection(list(_ridges(original)), colors=COLOURS["mesh"], linewidths=0.8)
+        axes.add_collection(lines)
     edges, width = COLOURS["pressure"], 0.5 if plane else 0.3
     faces: Any = "#1f5fa818" if plane else "#e3ebf5e8"
     if shape.stress is not None:
@@ -264,6 +297,27 @@ def deformed(
         axes.margins(0.03)
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
+
+
+def _ridges(facets: Array) -> Array:
+    """Ends of the edges at which facets in space, (n, n_corners, 3), meet at more than 30°."""
+    corners = facets.reshape(-1, 3)
+    size = float(np.ptp(corners, axis=0).max()) or 1.0
+    _, first, number = np.unique(
+        np.round(corners / size, 9), axis=0, return_index=True, return_inverse=True
+    )
+    number = number.reshape(facets.shape[:2])
+    ends = np.sort(np.stack([number, np.roll(number, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    edges, edge = np.unique(ends, axis=0, return_inverse=True)
+    across = np.cross(facets[:, 1] - facets[:, 0], facets[:, 2] - facets[:, 0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    normal = np.repeat(across, facets.shape[1], axis=0)
+    # Two facets of any orientation: n n^T of both differ by their angle alone.
+    spread = np.zeros((len(edges), 3, 3))
+    np.add.at(spread, edge.ravel(), normal[:, :, None] * normal[:, None, :])
+    # The largest eigenvalue is 1 + |cos| of the angle; 1 of an edge with one facet.
+    largest = np.linalg.eigvalsh(spread)[:, -1]
+    return corners[first[edges[largest < 1 + np.cos(np.pi / 6)]]]
 
 
 def made_axes(
@@ -290,6 +344,9 @@ def made_axes(
     axes.set(**labels, **dict(limits), title=title)
     axes.set_box_aspect(high - low, zoom=0.85)
     axes.locator_params(nbins=4)
+    for axis, start, end in zip((axes.xaxis, axes.yaxis, axes.zaxis), low, high, strict=True):
+        if end - start < 0.2 * (high - low).max():  # no room for more than one number
+            axis.set_ticks([float(f"{(start + end) / 2:.3g}")])
     elevation, azimuth = (25.0, -60.0) if view is None else view
     axes.view_init(elevation, azimuth)
     return figure, axes

@@ -86,6 +86,7 @@ def plot_field(
     stress: str = "MPa",
     title: str = "",
     magnification: float = 1.0,
+    near: float | None = None,
     view: tuple[float, float] | None = None,
 ) -> None:
     """Draw values on the facets of Γc, and the deformed body about it. Collective.
@@ -102,15 +103,18 @@ def plot_field(
         stress: Unit of stress, for the colours.
         title: Title.
         magnification: Factor by which the displacement is drawn.
+        near: Draw no more than what is within this distance (length) of the facets that bear; by
+            default all of the body.
         view: In space where to look from, elevation and azimuth in degrees; by default so that Γc
             is in front.
 
     Raises:
-        ValueError: There is no such field. On all ranks.
+        ValueError: There is no such field, or `near` is no distance. On all ranks.
         OSError: The file cannot be written; it is as before. On all ranks.
     """
     if field not in _FIELDS:
         raise ValueError(f"field is {field!r}; use one of {list(_FIELDS)}")
+    drawing.check_near(near)
     at_points = _field(contact, field)
     rows = contact.quadrature.point_rows()
     values, weights = at_points[rows], contact.quadrature.weights[rows]
@@ -118,14 +122,15 @@ def plot_field(
     total = np.sum(weights * known, axis=1)
     means = np.sum(weights * np.where(known, values, 0.0), axis=1)
     means = np.divide(means, total, out=np.full_like(total, np.nan), where=total > 0)
-    drawn = drawing.surface_of(contact, means, magnification)
+    drawn = drawing.surface_of(contact, np.column_stack([means, _bears(contact)]), magnification)
     with collective_errors(contact.surface.mesh.comm):
         if drawn is None:
             return
+        drawn = drawn.around(drawn.values[:, 1] > 0, near)
         figure, axes = drawn.axes(length, title, view)
         from matplotlib.colors import to_rgba
 
-        means = drawn.values
+        means = drawn.values[:, 0]
         low, high = (end(means, initial=0.0) for end in (np.nanmin, np.nanmax))
         colours = drawing.scale_of(low, high)
         faces = colours.to_rgba(means)
@@ -137,6 +142,12 @@ def plot_field(
         unit = {"stress": stress, "length": length}[kind]
         figure.colorbar(colours, ax=axes, label=f"{name} [{unit}]", shrink=0.8)
         drawing.save(figure, path)
+
+
+def _bears(contact: Contact) -> Mask:
+    """Which of this rank's facets have a point that is not open."""
+    status = contact.status[contact.quadrature.point_rows()]
+    return np.asarray(np.any(status != Status.OPEN, axis=1))
 
 
 def _field(contact: Contact, name: str) -> Array:
@@ -166,6 +177,7 @@ def plot_status(
     length: str = "mm",
     title: str = "",
     magnification: float = 1.0,
+    near: float | None = None,
     view: tuple[float, float] | None = None,
 ) -> None:
     """Draw where Γc is open, sticks and slips, and the deformed body about it. Collective.
@@ -178,12 +190,18 @@ def plot_status(
         length: Unit of length, for the axes.
         title: Title.
         magnification: Factor by which the displacement is drawn.
-        view: As for `plot_pressure`.
+        near: As for `plot_field`.
+        view: As for `plot_field`.
+
+    Raises:
+        ValueError: `near` is no distance. On all ranks.
     """
+    drawing.check_near(near)
     drawn = drawing.surface_of(contact, facet_status(contact), magnification)
     with collective_errors(contact.surface.mesh.comm):
         if drawn is None:
             return
+        drawn = drawn.around(drawn.values != Status.OPEN, near)
         figure, axes = drawn.axes(length, title, view)
         from matplotlib.patches import Patch
 
