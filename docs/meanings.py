@@ -302,6 +302,11 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         ),
     },
     "log": {
+        "compiling forms": (
+            "A program waits for the compiler where it has forms that none had before.",
+            "Nothing: the next run starts at once. Numbers that are `fem.Constant`s leave the form "
+            "as it is when they change.",
+        ),
         "are done": ("The checkpoint has all increments of this call.", "Nothing."),
         "going on from": ("A history goes on behind its checkpoint.", "Nothing."),
         "accuracy": ("What `accuracy=` has chosen.", "Nothing."),

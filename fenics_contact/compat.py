@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import logging
+import sys
+import time
 from typing import Any
 
 import basix
@@ -11,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact.types import Array
@@ -19,6 +23,7 @@ __all__ = [
     "LEAST_RESIDUAL",
     "LONGEST_STEP",
     "NOT_FINITE",
+    "Waiting",
     "cell_partitioner",
     "collapsed",
     "compile_form",
@@ -28,6 +33,7 @@ __all__ = [
     "gmsh_data",
     "interpolation_points",
     "option_was_read",
+    "waiting",
 ]
 
 if tuple(map(int, dolfinx.__version__.split(".")[:2])) < (0, 9):
@@ -36,6 +42,9 @@ if tuple(map(int, dolfinx.__version__.split(".")[:2])) < (0, 9):
         "later one, or use the container (docker/run)"
     )
 
+logger = logging.getLogger("fenics_contact")
+# Seconds: what takes less was in the cache; when a user wonders.
+_FROM_CACHE, _LONG = 0.1, 3.0
 # PETSc's line search for the least residual, renamed in 3.24; bound to Python since 3.23.
 _line_searches = getattr(getattr(PETSc, "SNESLineSearch", None), "Type", None)
 LEAST_RESIDUAL = getattr(_line_searches, "SECANT", "l2")
@@ -107,8 +116,42 @@ def collapsed(space: fem.FunctionSpace) -> tuple[fem.FunctionSpace, npt.NDArray[
 
 
 def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:
-    """Compile a UFL form with the entity maps of its submeshes. Collective."""
-    return fem.form(form, entity_maps=entity_maps or None)
+    """Compile a UFL form with the entity maps of its submeshes. Collective.
+
+    What has been compiled before, in any run, is in DOLFINx's cache. If all that is not takes more
+    than some seconds, it is said once what the program is doing: at level INFO, or to a terminal.
+    """
+    start = time.perf_counter()
+    compiled = fem.form(form, entity_maps=entity_maps or None)
+    waiting.add(time.perf_counter() - start)
+    return compiled
+
+
+class Waiting:
+    """Time that went into compilation in this process."""
+
+    def __init__(self) -> None:
+        """None so far."""
+        self._seconds, self._said = 0.0, False
+
+    def add(self, seconds: float) -> None:
+        """Count it, and say so if it was not from the cache and has become long."""
+        if seconds > _FROM_CACHE:
+            self._seconds += seconds
+        if self._said or self._seconds < _LONG or MPI.COMM_WORLD.rank:
+            return
+        self._said = True
+        text = (
+            "compiling forms, as every first run with new ones does; later runs find them in "
+            f"{dolfinx.jit.get_options()['cache_dir']}"
+        )
+        if logger.isEnabledFor(logging.INFO):
+            logger.info(text)
+        elif sys.stderr.isatty():
+            print(text, file=sys.stderr)
+
+
+waiting = Waiting()
 
 
 def geometry_element(mesh: dolfinx.mesh.Mesh) -> Any:

@@ -1,17 +1,22 @@
 """What the installation tells of itself, beside what is known by another way."""
 
 import importlib
+import itertools
+import logging
 import sys
 from pathlib import Path
 
 import dolfinx
 import numpy as np
 import pytest
+import ufl
+from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
 from fenics_contact import __main__ as program
+from fenics_contact import compat
 from fenics_contact.installation import information
 from scenes.comparing import raised_everywhere
 
@@ -73,3 +78,28 @@ def exits(words):
         program.main(words)
     except SystemExit as error:
         raise RuntimeError(f"exit {error.code}") from None
+
+
+def test_what_a_first_run_waits_for_is_said_once(monkeypatch, caplog, capsys):
+    """In the log, or to a terminal; nothing where neither looks, nor of forms from the cache."""
+    mesh = dolfinx.mesh.create_unit_square(MPI.COMM_WORLD, 1, 1)
+    form = fem.Constant(mesh, 1.0) * ufl.dx
+    first = MPI.COMM_WORLD.rank == 0
+
+    def said(level, *, terminal, seconds):
+        """How often two forms that take so long are told of, in the log and on the terminal."""
+        caplog.clear()
+        times = itertools.count(0.0, seconds)
+        monkeypatch.setattr(compat.time, "perf_counter", lambda: next(times))
+        monkeypatch.setattr(compat, "waiting", compat.Waiting())
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
+        with caplog.at_level(level, "fenics_contact"):
+            for _ in range(2):
+                compat.compile_form(form)
+        printed = capsys.readouterr().err
+        return caplog.text.count("compiling forms"), printed.count("compiling forms")
+
+    assert said(logging.INFO, terminal=True, seconds=4.0) == (first, 0)
+    assert said(logging.WARNING, terminal=True, seconds=4.0) == (0, first)
+    assert said(logging.WARNING, terminal=False, seconds=4.0) == (0, 0)
+    assert said(logging.INFO, terminal=True, seconds=0.01) == (0, 0)
