@@ -38,9 +38,11 @@ class PresentState(reference.State):
         jump: What of the slip has not been taken back by friction, with multipliers (length).
         traction: τ, or with multipliers λ_t.
         u: The displacement committed.
+        depth: In the opposite then, (n,) (length); None before the first commit.
     """
 
     u: Array | None = None
+    depth: Array | None = None
 
 
 @dataclass(eq=False)
@@ -50,7 +52,8 @@ class PresentContact(reference.ContactModel):
     Attributes:
         here, there: The surfaces.
         facet, xi: Of the points on ``here``.
-        reach: How far behind a point its partner may be, by pairs of facets (length).
+        reach: How far behind a point its partner may be, by pairs of facets (length); or twice as
+            deep as points of its facet have been.
     """
 
     here: Any = None
@@ -87,8 +90,11 @@ class PresentContact(reference.ContactModel):
             turn = 0.5 * (turn + np.swapaxes(np.linalg.inv(turn), 1, 2))
         return n_new, turn, n_old
 
-    def partners(self, u: Array) -> Array:
+    def partners(self, u: Array, old: PresentState) -> Array:
         """The facet that every point looks at, -1 without."""
+        deep = np.zeros(len(self.here.facets))
+        if old.depth is not None:
+            np.maximum.at(deep, self.facet, old.depth)
         x, _ = self.here.place(self.facet, self.xi, u)
         n = self.here.normal(self.facet, self.xi, u)
         count, m = len(x), len(self.there.facets)
@@ -96,14 +102,15 @@ class PresentContact(reference.ContactModel):
         rows = np.repeat(np.arange(count), m)
         xi, far, met = self.there.meet(every, x[rows], n[rows], u)
         met &= np.sum(self.there.normal_moved(every, xi, u) * n[rows], axis=1) < 0
-        met &= far >= -self.reach[self.facet[rows], every]
+        reach = np.maximum(self.reach[self.facet[rows], every], 2 * deep[self.facet[rows]])
+        met &= far >= -reach
         distance = np.where(met, np.abs(far), np.inf).reshape(count, m)
         best = distance.argmin(axis=1)
         return np.where(np.isfinite(distance[np.arange(count), best]), best, -1)
 
     def respond_at(self, u: Array, old: Any) -> dict[str, Array]:
         """Tractions, and what they follow from, at a displacement."""
-        hit = self.partners(u)
+        hit = self.partners(u, old)
         own, other = self.here.local(self.facet, u), self.there.local(np.maximum(hit, 0), u)
         return self._respond(np.arange(len(hit)), hit, own, other, old) | {"u": u}
 
@@ -187,18 +194,19 @@ class PresentContact(reference.ContactModel):
         """One round: the multipliers that the tractions found make."""
         pressure = self.project @ -found["r_n"] if self.law.has_normal else 0 * found["r_n"]
         traction = self.project @ found["framed"] if self.law.slips else old.traction
-        return PresentState(old.jump, traction, pressure, None, old.u)
+        return PresentState(old.jump, traction, pressure, None, old.u, old.depth)
 
     def next_state(self, found: dict[str, Array], old: Any) -> PresentState:
         """History of the next increment; ``old`` with the multipliers it was found with."""
         zero, u = np.zeros_like(self.x), found["u"].copy()
+        depth = np.where(found["hit"] >= 0, np.maximum(found["closing"], 0.0), 0.0)
         if self.project is None:
-            return PresentState(zero, found["tau"].copy(), None, None, u)
+            return PresentState(zero, found["tau"].copy(), None, None, u, depth)
         left = zero
         if self.law.slips:
             left = -self.law.stretch(self.k_t, found["normal"], found["before"] - found["tau"])
         traction = np.einsum("qij,qj->qi", found["turn"], old.traction)
-        return PresentState(left, traction, old.pressure, None, u)
+        return PresentState(left, traction, old.pressure, None, u, depth)
 
 
 class PresentProblem(finite_reference.FiniteProblem):
@@ -269,7 +277,7 @@ class PresentJudge(finite_reference.FiniteJudge):
             return old
         row = self._rows(contact, record)
         traction = record["lambda_t"][row] if contact.law.slips else old.traction
-        return PresentState(old.jump, traction, record["lambda_n"][row], None, old.u)
+        return PresentState(old.jump, traction, record["lambda_n"][row], None, old.u, old.depth)
 
     def _forces(self, u: Array, load: Any, found: list[dict]) -> dict[str, Any]:
         """Round-off is that of places, too; of what a body touches; of where it began."""

@@ -143,7 +143,8 @@ def draw(
         }[name]
         if name in ("turn", "both"):
             rock += strain * rng.uniform(-1, 1) * rocks
-            spin += rng.uniform(-1.5, 1.5) * spins
+            # Turned farther, a linear body swells.
+            spin += rng.uniform(-1.5, 1.5) * spins * (1.0 if scene["bulk"] == "rubber" else 0.2)
         stages.append(
             {
                 "steps": int(rng.integers(2, 6)),

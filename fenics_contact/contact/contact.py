@@ -837,6 +837,11 @@ class Contact(PointResults):
         """Whether the pairs follow the bodies wherever they go."""
         return self._present is not None
 
+    @property
+    def flat(self) -> bool:
+        """Whether Γc has lost its tangent plane somewhere, with pairs that follow the bodies."""
+        return self._present is not None and self._present.flat
+
     def turned(self, vectors: Array) -> Array:
         """Directions in the frame of the support, as they are in space: (n_points, gdim)."""
         if self._present is not None:

@@ -44,6 +44,8 @@ __all__ = ["PresentKinematics", "PresentPairs"]
 
 # A weight below this is the round-off of one that is zero.
 _NO_WEIGHT = 1e-14
+# Determinant of the metric of unit vectors below which they span nothing.
+_FLAT = 1e-20
 # Parts of an increment, in each of which a point is seen to go through at most one surface.
 _PARTS = 8
 
@@ -97,6 +99,7 @@ class PresentPairs(Pairs):
         told: "jump", the displacement relative to the partner since the last commit (length);
             "foot", nothing; "turn I", rows of R; "committed", R times the committed traction
             (stress).
+        flat: Whether Γc has no tangent plane at some point of any rank: a trial state gone astray.
     """
 
     def __init__(
@@ -111,6 +114,7 @@ class PresentPairs(Pairs):
         self.felt = PointFields(quadrature, {"gap": 0, "normal": d, "slip": d, "traction": d})
         turns = {f"turn {i}": d for i in range(d)}
         self.told = PointFields(quadrature, {"jump": d, "foot": d, "committed": d} | turns)
+        self.flat = False
         self._where: tuple[Array, Array] | None = None
         self._committed: _Committed | None = None
         self._present: _Present | None = None
@@ -146,6 +150,7 @@ class PresentPairs(Pairs):
             self._committed = _Committed(x, normal, _reciprocal(tangents))
         before = self._committed
         _, tangents = here.positions(facet, place, self._u)
+        self.flat = bool(self._mesh.comm.allreduce(int(not _metric(tangents)[1].all())))
         normal = here.normals(facet, place, self._u)
         deep = np.maximum(self.search.largest(history.values("penetration")), 0.0)
         hits = self._rays.follow(
@@ -341,7 +346,7 @@ class PresentPairs(Pairs):
         right[:, :, own] += np.eye(d)
         right[:, :, other] -= np.eye(d)
         system = np.concatenate([partner.tangents, -now.normal[:, :, None]], axis=2)
-        system[now.hits.facet < 0] = np.eye(d)
+        system[(now.hits.facet < 0) | ~_metric(system)[1]] = np.eye(d)
         solved = np.linalg.solve(system, right)
         slide, gap = solved[:, :-1], solved[:, -1]
         way = np.einsum("qia,qam->qim", partner.tangents_before, slide)
@@ -435,14 +440,29 @@ class PresentKinematics:
         return combined(vector, [self._told.ufl(f"turn {i}") for i in range(len(vector))])
 
 
+def _metric(vectors: Array) -> tuple[Array, Mask]:
+    """That of unit vectors along vectors (n, d, m), and where these span a space: (n,)."""
+    with np.errstate(all="ignore"):
+        unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+        metric = np.einsum("qia,qib->qab", unit, unit)
+        return metric, np.atleast_1d(np.linalg.det(metric) > _FLAT)
+
+
 def _reciprocal(tangents: Array) -> Array:
-    """Vectors a^α with a^α·a_β = δ_αβ, in the tangent plane: (n, d, d - 1)."""
-    metric = np.einsum("qia,qib->qab", tangents, tangents)
-    return np.asarray(np.swapaxes(np.linalg.solve(metric, np.swapaxes(tangents, 1, 2)), 1, 2))
+    """Vectors a^α with a^α·a_β = δ_αβ, in the tangent plane: (n, d, d - 1); or 0 of no plane."""
+    metric, spans = _metric(tangents)
+    metric[~spans] = np.eye(metric.shape[1])
+    size = np.linalg.norm(tangents, axis=1, keepdims=True)
+    unit = np.zeros_like(tangents)
+    np.divide(tangents, size, out=unit, where=spans[:, None, None])
+    found = np.swapaxes(np.linalg.solve(metric, np.swapaxes(unit, 1, 2)), 1, 2)
+    return np.divide(found, size, out=np.zeros_like(found), where=spans[:, None, None])
 
 
 def _polar(gradient: Array) -> Array:
-    """The rotations in gradients, (n, d, d)."""
+    """The rotations in gradients, (n, d, d); none in what is not finite."""
+    finite = np.atleast_1d(np.isfinite(gradient).all(axis=(1, 2)))
+    gradient = np.where(finite[:, None, None], gradient, np.eye(gradient.shape[1]))
     left, _, right = np.linalg.svd(gradient)
     return np.asarray(left @ right)
 

@@ -96,7 +96,8 @@ class Equations:
     def residual(self, x: PETSc.Vec, f: PETSc.Vec) -> Norms:
         """Compute the residual at ``x`` into ``f``, and its norms, kept too. Collective.
 
-        It is not a number where cells are turned inside out, or supports have turned too far.
+        It is not a number where cells are turned inside out, supports have turned too far, or Γc
+        has no tangent plane.
         """
         self.set_state(x)
         contacts = self.system.contact_forces()

@@ -204,12 +204,13 @@ class System(ABC):
             motion.set_value(value)
 
     def is_twisted(self) -> bool:
-        """Whether a support that turns freely has turned too far in this increment.
+        """Whether a support that turns freely has turned too far, or Γc is flat.
 
         A turn further its points are where they were: to a solution there are others.
         """
         turning = (c for c in self.contacts if c.free_angle is not None)
-        return any(not abs(contact.turned_by()) < _TURN for contact in turning)
+        far = any(not abs(contact.turned_by()) < _TURN for contact in turning)
+        return far or any(contact.flat for contact in self.contacts)
 
     def rolled(self, state: Array) -> Array:
         """A state with supports that turn freely turned to where they slip least. Collective.
