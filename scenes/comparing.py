@@ -124,6 +124,17 @@ def identical(a: Iterable[Array], b: Iterable[Array]) -> bool:
     return bool(np.all(MPI.COMM_WORLD.allgather(same)))
 
 
+def on_first(check: Callable[[], None]) -> None:
+    """Run it on the first rank, fail on all of them. Collective."""
+    error, comm = None, MPI.COMM_WORLD
+    if comm.rank == 0:
+        try:
+            check()
+        except AssertionError as caught:
+            error = str(caught) or repr(caught)
+    assert comm.bcast(error) is None
+
+
 def raised_everywhere(
     call: Callable[[], Any],
     kind: type[Exception] | tuple[type[Exception], ...],

@@ -9,7 +9,7 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.results import drawing
 from scenes.blocks import dimension
-from scenes.comparing import close, raised_everywhere, shared_folder
+from scenes.comparing import close, on_first, raised_everywhere, shared_folder
 from scenes.elasticity import stress
 from scenes.rubbing import Rub
 
@@ -28,17 +28,6 @@ def rubbed(cell):
     if dimension(cell) == 3:
         return made, stress(scene.u, scene.E, scene.nu)
     return made, fc.elasticity.LinearElastic(scene.u, scene.E, scene.nu, "plane strain").stress
-
-
-def on_first(check):
-    """Run it on the first rank, fail on all of them."""
-    error = None
-    if COMM.rank == 0:
-        try:
-            check()
-        except AssertionError as caught:
-            error = str(caught) or repr(caught)
-    assert COMM.bcast(error) is None
 
 
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])

@@ -159,19 +159,29 @@ def test_a_spoiled_result_is_found(spoiled, check):
     assert check in outcome.kind
 
 
-@serial
-def test_a_spoiled_history_is_found():
+def spoiling(spoil):
+    """A change by which every commit leaves the history with what ``spoil`` makes of it."""
+
     def changed(made, problem):
         commit, history = problem.commit, problem.contacts[0].history
 
-        def forgetful():
+        def spoiled():
             commit()
             values = {n: history.values(n) for n in history.names}
-            history.commit(values | {"traction": 0.999 * values["traction"]})
+            history.commit(values | spoil(history))
 
-        problem.commit = forgetful
+        problem.commit = spoiled
 
-    outcome = played(ONE, changed=changed)
+    return changed
+
+
+def _forget_some_traction(history):
+    return {"traction": 0.999 * history.values("traction")}
+
+
+@serial
+def test_a_spoiled_history_is_found():
+    outcome = played(ONE, changed=spoiling(_forget_some_traction))
     assert outcome.outcome == "wrong"
     assert "equations" in outcome.kind
 
@@ -251,18 +261,7 @@ def _slip_from_elsewhere(history):
 @pytest.mark.parametrize("spoil", [_forget_a_turn, _slip_from_elsewhere])
 def test_a_spoiled_history_of_finite_kinematics_is_found(spoil, scene):
     """The traction with its components exchanged; slip counted from 1e-6 aside."""
-
-    def changed(made, problem):
-        commit, history = problem.commit, problem.contacts[0].history
-
-        def spoiled():
-            commit()
-            values = {n: history.values(n) for n in history.names}
-            history.commit(values | spoil(history))
-
-        problem.commit = spoiled
-
-    outcome = played(scene, changed=changed)
+    outcome = played(scene, changed=spoiling(spoil))
     assert outcome.outcome == "wrong"
     assert "equations" in outcome.kind
 

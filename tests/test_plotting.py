@@ -10,7 +10,7 @@ import fenics_contact as fc
 from fenics_contact import plotting
 from fenics_contact.results import drawing
 from scenes.blocks import CELLS, dimension
-from scenes.comparing import close, raised_everywhere, shared_folder
+from scenes.comparing import close, on_first, raised_everywhere, shared_folder
 from scenes.rubbing import Rub
 
 matplotlib = pytest.importorskip("matplotlib")
@@ -32,17 +32,6 @@ def drawn(monkeypatch):
 
     monkeypatch.setattr(drawing, "save", keep)
     return figures
-
-
-def on_first(check):
-    """Run it on the first rank, fail on all of them."""
-    error = None
-    if COMM.rank == 0:
-        try:
-            check()
-        except AssertionError as caught:
-            error = str(caught) or repr(caught)
-    assert COMM.bcast(error) is None
 
 
 @pytest.mark.parametrize("cell", CELLS)

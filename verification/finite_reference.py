@@ -580,7 +580,7 @@ def bulk_of(made: Any, body: reference.Body) -> Callable[[Array], tuple[Array, A
     """Of u: internal forces, their derivative, and whether no cell is turned inside out."""
     d, V = made.d, made.V
     nonlinear = made.scene["bulk"] == "rubber"
-    minus = fem.form(-ufl.replace(made.F, {made.u: fem.Function(V)}))
+    outside = made.outside()
     tangent = ufl.derivative(made.F, made.u, ufl.TrialFunction(V))
     inner, outer = fem.form(made.F), fem.form(tangent)
     volume = ufl.det(ufl.Identity(d) + ufl.grad(made.u))
@@ -595,7 +595,7 @@ def bulk_of(made: Any, body: reference.Body) -> Callable[[Array], tuple[Array, A
         if key not in memory:
             # F less the loads: their part of it is assembled with them at u = 0.
             made.u.x.array[:] = u
-            force = fem.assemble_vector(inner).array + fem.assemble_vector(minus).array
+            force = fem.assemble_vector(inner).array + fem.assemble_vector(outside).array
             stiff = fem.assemble_matrix(outer).to_scipy().toarray()
             memory.clear()
             memory[key] = force.copy(), stiff, fem.assemble_scalar(inverted) == 0.0
@@ -607,7 +607,7 @@ def bulk_of(made: Any, body: reference.Body) -> Callable[[Array], tuple[Array, A
 def loads_of(made: Any) -> Callable[[int, float], FiniteLoad]:
     """What drives the bodies, by stage and load parameter."""
     d, V, scene = made.d, made.V, made.scene
-    minus = fem.form(-ufl.replace(made.F, {made.u: fem.Function(V)}))
+    outside = made.outside()
 
     def load(stage: int, t: float) -> FiniteLoad:
         made.apply(stage, t)
@@ -627,7 +627,7 @@ def loads_of(made: Any) -> Callable[[int, float], FiniteLoad]:
                     shift[i] = 0.0 if i in free else float(made.pull[i].value)
             shifts.append(shift)
             pushes.append(push)
-        force = fem.assemble_vector(minus).array.copy()
+        force = fem.assemble_vector(outside).array.copy()
         angle = float(made.angle.value)
         return FiniteLoad(force, dofs, values[dofs], shifts, pushes, angle)
 

@@ -17,7 +17,7 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.elasticity import NeoHookean
 from scenes.surfaces import ball, box, ring
-from verification.fuzz_scenes import TOP, Made, Scene, dice, frictions
+from verification.fuzz_scenes import TOP, Made, Scene, dice, element, frictions
 
 __all__ = ["DEGREE", "KINDS", "FiniteMade", "draw", "pieces", "place_of"]
 
@@ -48,15 +48,9 @@ def draw(
     rng = np.random.default_rng([seed, 30])
     built = rng if family is None else np.random.default_rng([family, 31])
 
-    chance, pick, log = dice(rng, built, without)
-
-    def within(low: float, high: float) -> float:
-        return float(f"{rng.uniform(low, high):.3g}")
-
-    space = chance(0.3, "space")
+    chance, pick, log, within = dice(rng, built, without)
+    space, cell, degree = element(chance, pick, 0.3)
     d = 3 if space else 2
-    cell = pick("tetrahedron", "hexahedron") if space else pick("triangle", "quadrilateral")
-    degree = 1 if chance(0.55) else 2
     most = (2 if degree == 1 else 1) if space else (6 if degree == 1 else 4)
     kinds = [k for k in KINDS if (space or k not in ("torus", "turned profile"))]
     kind = pick("halfspace", *kinds)

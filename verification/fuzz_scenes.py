@@ -26,7 +26,18 @@ import fenics_contact as fc
 from fenics_contact import compat
 from verification import reference_solver as reference
 
-__all__ = ["LAWS", "SUPPORTS", "Made", "dice", "draw", "frictions", "history", "model", "path"]
+__all__ = [
+    "LAWS",
+    "SUPPORTS",
+    "Made",
+    "dice",
+    "draw",
+    "element",
+    "frictions",
+    "history",
+    "model",
+    "path",
+]
 
 Array = np.ndarray
 Scene = dict[str, Any]
@@ -52,7 +63,12 @@ NU_MAX = 0.45
 
 def dice(
     rng: np.random.Generator, built: np.random.Generator, without: tuple[str, ...]
-) -> tuple[Callable[..., bool], Callable[..., Any], Callable[[float, float], float]]:
+) -> tuple[
+    Callable[..., bool],
+    Callable[..., Any],
+    Callable[[float, float], float],
+    Callable[[float, float], float],
+]:
     """What scenes are drawn by.
 
     Args:
@@ -62,7 +78,7 @@ def dice(
 
     Returns:
         Whether something of a probability, with a feature's name, is so; one of some values; a
-        number between two powers of ten, to three digits.
+        number between two powers of ten, and one between two numbers, to three digits.
     """
 
     def chance(p: float, feature: str = "", of: np.random.Generator = built) -> bool:
@@ -74,7 +90,19 @@ def dice(
     def log(low: float, high: float) -> float:
         return float(f"{10 ** rng.uniform(low, high):.3g}")
 
-    return chance, pick, log
+    def within(low: float, high: float) -> float:
+        return float(f"{rng.uniform(low, high):.3g}")
+
+    return chance, pick, log, within
+
+
+def element(
+    chance: Callable[..., bool], pick: Callable[..., Any], in_space: float
+) -> tuple[bool, str, int]:
+    """Whether a scene is in space, with this probability; its cells, and their degree."""
+    space = chance(in_space, "space")
+    cell = pick("tetrahedron", "hexahedron") if space else pick("triangle", "quadrilateral")
+    return space, cell, 1 if chance(0.55) else 2
 
 
 def draw(
@@ -95,11 +123,9 @@ def draw(
     rng = np.random.default_rng([seed, 20])
     built = rng if family is None else np.random.default_rng([family, 21])
 
-    chance, pick, log = dice(rng, built, without)
-    space = chance(0.35, "space")
-    cell = pick("tetrahedron", "hexahedron") if space else pick("triangle", "quadrilateral")
+    chance, pick, log, within = dice(rng, built, without)
+    space, cell, degree = element(chance, pick, 0.35)
     d = 3 if space else 2
-    degree = 1 if chance(0.55) else 2
     layout = pick("floor", "floor", "floor", "corner", "pair", "pair", "pair", "tower", "apart")
     if layout == "apart" and "apart" in without:
         layout = "floor"
@@ -121,7 +147,7 @@ def draw(
         below = bodies[-1]
         top = below["origin"][-1] + below["size"][-1]
         above = box([0.0] * d)
-        side = float(f"{rng.uniform(-0.3, 0.3):.3g}") if chance(0.5, of=rng) else 0.0
+        side = within(-0.3, 0.3) if chance(0.5, of=rng) else 0.0
         above["origin"] = [below["origin"][0] + side, *below["origin"][1:-1], top]
         if chance(0.5, of=rng):
             above["size"][:-1] = below["size"][:-1]
@@ -131,7 +157,7 @@ def draw(
         "layout": layout,
         "cell": cell,
         "degree": degree,
-        "nu": float(f"{rng.uniform(0, NU_MAX):.3g}"),
+        "nu": within(0, NU_MAX),
         "bodies": bodies,
         "ranks": ranks,
         "units": [1.0, 1.0],
@@ -313,7 +339,7 @@ def draw(
             }[kind]
             if drive == "force" and not any(h[1] == "left" for h in holds):
                 side *= 0.6
-            across = float(f"{rng.uniform(-1, 1):.3g}") if space else 0.0
+            across = within(-1, 1) if space else 0.0
             side = float(f"{side * grip * level:.3g}")
             stages.append(
                 {
@@ -493,6 +519,10 @@ class Made:
         self.shift = fem.Constant(self.mesh, np.zeros(d))
         self.push = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
         self.pull = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
+
+    def outside(self) -> fem.Form:
+        """Forces of the loads: what of -F is left without displacements."""
+        return fem.form(-ufl.replace(self.F, {self.u: fem.Function(self.V)}))
 
     def facets_of(self, body: int, side: str) -> Array:
         """Facets of a side of a body; tops share a tag."""
@@ -907,8 +937,7 @@ def body_of(made: Made) -> tuple[reference.Body, Callable[[int], reference.Surfa
 def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float], reference.Load]]:
     """The reference's problem, and its loads by stage and load parameter. On one rank."""
     made = Made(scene, MPI.COMM_SELF)
-    d, V = made.d, made.V
-    minus = fem.form(-ufl.replace(made.F, {made.u: fem.Function(V)}))
+    d, outside = made.d, made.outside()
     body, surface = body_of(made)
     contacts = [
         _contact(
@@ -942,7 +971,7 @@ def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float],
             shifts.append(shift)
             pushes.append(push)
         return reference.Load(
-            fem.assemble_vector(minus).array.copy(), dofs, values[dofs], shifts, pushes
+            fem.assemble_vector(outside).array.copy(), dofs, values[dofs], shifts, pushes
         )
 
     return reference.Problem(body, contacts), made, load

@@ -15,7 +15,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from verification.finite_scenes import FiniteMade
-from verification.fuzz_scenes import Made, Scene, dice
+from verification.fuzz_scenes import Made, Scene, dice, element
 
 __all__ = ["PresentMade", "draw"]
 
@@ -37,15 +37,9 @@ def draw(
     rng = np.random.default_rng([seed, 40])
     built = rng if family is None else np.random.default_rng([family, 41])
 
-    chance, pick, log = dice(rng, built, without)
-
-    def within(low: float, high: float) -> float:
-        return float(f"{rng.uniform(low, high):.3g}")
-
-    space = chance(0.2, "space")
+    chance, pick, log, within = dice(rng, built, without)
+    space, cell, degree = element(chance, pick, 0.2)
     d = 3 if space else 2
-    cell = pick("tetrahedron", "hexahedron") if space else pick("triangle", "quadrilateral")
-    degree = 1 if chance(0.55) else 2
     strain = log(-3, -0.9)
 
     # The slab, and on it the block; either may be the finer or the stiffer one.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import basix
@@ -16,6 +16,7 @@ from dolfinx.mesh import CellType, exterior_facet_indices
 
 from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_sum
 from fenics_contact.results import files
 from fenics_contact.surface.facets import FacetSet
@@ -172,28 +173,35 @@ class Surface:
         body: Corners of cells, or facets of the boundary, (n, n_corners, d).
         facets: Those of the facets of Γc.
         values: Of the facets.
+        bears: Which of them have a point that is not open.
         outward: Sum of their normals.
     """
 
     body: Array
     facets: Array
     values: npt.NDArray[Any]
+    bears: Mask
     outward: Array
 
-    def around(self, bearing: Mask, reach: float | None) -> Surface:
+    def around(self, reach: float | None) -> Surface:
         """What of it is no farther than that from the facets that bear; None: all of it."""
-        if reach is None or not bearing.any():
+        if reach is None or not self.bears.any():
             return self
-        places = self.facets[bearing]
+        places = self.facets[self.bears]
         low, high = places.min(axis=(0, 1)) - reach, places.max(axis=(0, 1)) + reach
 
         def near(corners: Array) -> Mask:
             middle = corners.mean(axis=1)
             return np.all((middle >= low) & (middle <= high), axis=1)
 
-        kept = near(self.facets) | bearing
-        body = self.body[near(self.body)]
-        return Surface(body, self.facets[kept], self.values[kept], self.outward)
+        kept = near(self.facets) | self.bears
+        return replace(
+            self,
+            body=self.body[near(self.body)],
+            facets=self.facets[kept],
+            values=self.values[kept],
+            bears=self.bears[kept],
+        )
 
     def axes(self, unit: str, title: str, view: tuple[float, float] | None) -> tuple[Any, Any]:
         """A figure with the body in it, seen so that Γc is in front unless a view is given."""
@@ -214,12 +222,14 @@ def surface_of(contact: Contact, values: npt.NDArray[Any], magnification: float)
         mesh.comm, FacetSet(u.function_space, contact.surface.facets).mean_normals().sum(axis=0)
     )
     shape = ShapeOf(u)()
+    status = contact.status[contact.quadrature.point_rows()]
+    bearing = mesh.comm.gather(np.any(status != Status.OPEN, axis=1))
     gathered = facets_of(contact, values)
-    if gathered is None or shape is None:
+    if gathered is None or bearing is None or shape is None:
         return None
     original, moved, values = gathered
     at = original + magnification * moved
-    return Surface(shape.deformed(magnification), at, values, outward)
+    return Surface(shape.deformed(magnification), at, values, np.concatenate(bearing), outward)
 
 
 def facets_of(

@@ -122,15 +122,15 @@ def plot_field(
     total = np.sum(weights * known, axis=1)
     means = np.sum(weights * np.where(known, values, 0.0), axis=1)
     means = np.divide(means, total, out=np.full_like(total, np.nan), where=total > 0)
-    drawn = drawing.surface_of(contact, np.column_stack([means, _bears(contact)]), magnification)
+    drawn = drawing.surface_of(contact, means, magnification)
     with collective_errors(contact.surface.mesh.comm):
         if drawn is None:
             return
-        drawn = drawn.around(drawn.values[:, 1] > 0, near)
+        drawn = drawn.around(near)
         figure, axes = drawn.axes(length, title, view)
         from matplotlib.colors import to_rgba
 
-        means = drawn.values[:, 0]
+        means = drawn.values
         low, high = (end(means, initial=0.0) for end in (np.nanmin, np.nanmax))
         colours = drawing.scale_of(low, high)
         faces = colours.to_rgba(means)
@@ -142,12 +142,6 @@ def plot_field(
         unit = {"stress": stress, "length": length}[kind]
         figure.colorbar(colours, ax=axes, label=f"{name} [{unit}]", shrink=0.8)
         drawing.save(figure, path)
-
-
-def _bears(contact: Contact) -> Mask:
-    """Which of this rank's facets have a point that is not open."""
-    status = contact.status[contact.quadrature.point_rows()]
-    return np.asarray(np.any(status != Status.OPEN, axis=1))
 
 
 def _field(contact: Contact, name: str) -> Array:
@@ -201,7 +195,7 @@ def plot_status(
     with collective_errors(contact.surface.mesh.comm):
         if drawn is None:
             return
-        drawn = drawn.around(drawn.values != Status.OPEN, near)
+        drawn = drawn.around(near)
         figure, axes = drawn.axes(length, title, view)
         from matplotlib.patches import Patch
 
