@@ -414,7 +414,7 @@ class ContactProblem:
         worst = 0.0
         for contact in self.contacts:
             contact.check_input()
-            contact.check_side()
+            contact.inputs.check_side(contact.values, gap_prescribed=contact.gap_prescribed)
             gap = global_min(self._comm, contact.values.initial_gap)
             if gap < -_TOUCHING * self.motions.size and not contact.gap_prescribed:
                 worst = max(worst, -gap)
@@ -648,7 +648,7 @@ class ContactProblem:
         """Whether u can stay behind: energies and pairs must be found without it. Collective."""
         if not (self.solver.condensed and self.bulk.symmetric):
             return False
-        if any(contact.pairs_anew for contact in self.contacts):
+        if any(contact.opposite.pairs_anew for contact in self.contacts):
             return False
         moved = self._comm.allreduce(int(self._committed.any()))
         at_rest = self.increment == 0 and not moved
@@ -814,7 +814,8 @@ class ContactProblem:
         self._rate = state - self._committed
         self._committed = state
         self._committed_lag = self._pending_field, self._load
-        self._committed_energy = self._energy.between([c.committed_jump for c in self.contacts])
+        jumps = [contact.opposite.committed_jump for contact in self.contacts]
+        self._committed_energy = self._energy.between(jumps)
         self.increment += 1
 
     def restore(self) -> None:
@@ -913,7 +914,7 @@ class ContactProblem:
             contact.take_up(history, values)
         forces: dict[object, Forces] = {self.full.mark: Forces(state, internal, external)}
         energy = EnergyState.at(forces, self.contacts)
-        self._energy = energy.between([c.committed_jump for c in self.contacts])
+        self._energy = energy.between([c.opposite.committed_jump for c in self.contacts])
         self._committed_energy = self._energy
         self.restart_solver()
 

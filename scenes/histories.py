@@ -156,7 +156,7 @@ def picture(made: History) -> dict[str, Array]:
         found["kept"] = problem.solver.system.unknowns.kept
     for c, ways in zip(problem.contacts, energy.contacts, strict=True):
         found[f"{c.name} history"] = at_points(c, c.history.rows())
-        found[f"{c.name} jump"] = at_points(c, c.committed_jump)
+        found[f"{c.name} jump"] = at_points(c, c.opposite.committed_jump)
         found[f"{c.name} ways"] = at_points(c, np.hstack(ways))
         if c.multipliers is not None:
             found[f"{c.name} multipliers"] = at_points(c, c.multipliers.fields.rows())

@@ -101,7 +101,7 @@ def test_the_residual_is_the_gradient_of_the_energy(cell, condensation):
     scene, problem, contact = pressed(cell, law, "newton", side=0.03, condensation=condensation)
     problem.solve()
     problem.commit()
-    contact.freeze(contact.pressure)
+    contact.acting.freeze(contact.pressure)
     space = problem.solver.system
     equations = problem.solver.equations
     x = equations.solution.copy()
@@ -119,7 +119,7 @@ def test_the_residual_is_the_gradient_of_the_energy(cell, condensation):
         energies.append(equations.energy(z))
     assert slope != 0.0
     assert close((energies[0] - energies[1]) / (2 * step), slope, 1e-6)
-    contact.thaw()
+    contact.acting.thaw()
 
 
 @pytest.mark.parametrize(("factor", "friction"), [(1e6, 0.0), (1e8, 0.0), (1e4, 0.3)])

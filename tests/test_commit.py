@@ -95,11 +95,11 @@ def test_a_second_commit_finds_no_other_pairs():
         slide.value = way
         problem.solve()
         problem.commit()
-    pairings, rows = contact.pairings, contact.history.rows()
+    pairings, rows = contact.pairs.number, contact.history.rows()
     before = contact.resultants()
     slide.value = 0.2
     problem.commit()
-    assert (contact.pairings, problem.increment) == (pairings, 2)
+    assert (contact.pairs.number, problem.increment) == (pairings, 2)
     assert close(contact.history.rows(), rows, 0.0)
     assert close(contact.resultants().force, before.force, 0.0)
     step = problem.solve()

@@ -92,7 +92,7 @@ class Pair:
 
     def force(self) -> np.ndarray:
         """Contact's part of the residual at this rank's unknowns. Collective."""
-        self.contact.follow()
+        self.contact.opposite.update()
         operator = ContactOperator(self.contact)
         vector = operator.unknowns.vector()
         vector.set(0.0)
@@ -332,7 +332,7 @@ def test_points_that_go_through_a_body_are_seen(cell, ways, through):
         pair.contact.commit()
         pair.place(pair.pressed(pair.nodes, down, along) @ turn(pair.d, 0.4).T)
         pair.contact.evaluate()
-    passed = np.flatnonzero(pair.contact.passed_through())
+    passed = np.flatnonzero(pair.contact.opposite.passed_through(pair.contact.values))
     n = MPI.COMM_WORLD.allreduce(len(passed))
     points = MPI.COMM_WORLD.allreduce(len(pair.contact.points))
     assert n == (points if through else 0)

@@ -114,7 +114,7 @@ class EnergyState:
         for contact, there, here in zip(contacts, before.contacts, self.contacts, strict=True):
             mean = contact.measure[:, None] * 0.5 * (there[0] + here[0])
             relative, carried = here[1] - there[1], here[2] - there[2]
-            if contact.turns:
+            if contact.opposite.turns:
                 # Half-way between both ends, else a normal pressure works on what turns beneath it.
                 d = here.shape[2]
                 axes = 0.5 * (there[3 : 3 + d] + here[3 : 3 + d])
@@ -149,9 +149,10 @@ class EnergyState:
 def _ways(contact: Contact, traction: Array) -> Array:
     """A contact's part of `EnergyState.contacts`."""
     jump = contact.values.jump
-    if not contact.turns:
+    if not contact.opposite.turns:
         return np.stack([traction, jump, contact.values.shift])
-    axes = [contact.turned(np.broadcast_to(unit, jump.shape)) for unit in np.eye(jump.shape[1])]
+    units = np.eye(jump.shape[1])
+    axes = [contact.opposite.turned(np.broadcast_to(unit, jump.shape)) for unit in units]
     # The work of forces that move the support is that of the loads.
     own = contact.own_displacement()
     for component, motion in contact.free_motion.items():
@@ -159,7 +160,7 @@ def _ways(contact: Contact, traction: Array) -> Array:
     ways = [traction, jump, own, *axes]
     if contact.free_angle is not None:
         angle = float(contact.free_angle.value)
-        ways += [contact.turning_rate(), np.full_like(jump, angle)]
+        ways += [contact.opposite.turning_rate(), np.full_like(jump, angle)]
     return np.stack(ways)
 
 

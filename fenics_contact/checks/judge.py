@@ -8,9 +8,10 @@ import numpy as np
 
 from fenics_contact.checks.kinematics import Linearisation, linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
+from fenics_contact.checks.passing import passing
 from fenics_contact.checks.rigid_motions import RigidMotions
+from fenics_contact.checks.second_route import SecondRoute
 from fenics_contact.checks.verdict import Balance, Verdict, check_laws
-from fenics_contact.contact.contact import passing
 from fenics_contact.parallel import global_max, global_sum, warn
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.system import System
@@ -27,8 +28,6 @@ _NOTABLE = 0.01
 # Displacements beyond this many sizes of the mesh excuse no round-off: a body that nothing loads
 # may go anywhere, and then anything would pass.
 _FARTHEST = 10.0
-# Round-off of displacements that two routes add up in different orders, by their size.
-_ROUND_OFF = 100 * np.finfo(float).eps
 
 
 class Judge:
@@ -50,7 +49,8 @@ class Judge:
             second_route: Likewise.
         """
         self.kinematics = kinematics
-        self._full, self._motions, self._second_route = full, motions, second_route
+        self._full, self._motions = full, motions
+        self._second_route = SecondRoute(full.contacts) if second_route else None
         self._contacts, self._comm = full.contacts, full.unknowns.comm
         self._imposed = motions.size
         self._told: set[str] = set()
@@ -116,14 +116,14 @@ class Judge:
             obstacles={
                 c.name: ObstacleCheck.of(c)
                 for c in self._contacts
-                if laws and (c.rigid or c.follows)
+                if laws and (c.rigid or c.opposite.follows)
             },
             kinematics=self._linearisation(respond) if respond else {},
             kinematics_allowed=self.kinematics,
             displacement=global_max(self._comm, np.abs(self._full.displacement.u.x.array))
             / self._imposed,
             inverted=self._full.bulk.is_inverted(),
-            routes=self._compare_routes() if self._second_route and laws else {},
+            routes=self._second_route.compare() if self._second_route and laws else {},
         )
         return verdict, reaction
 
@@ -180,22 +180,3 @@ class Judge:
         rotations = sums[self._full.gdim : -2]
         rotations[np.isnan(rotations)] = 0.0
         return sums[:-2].T, sums[-2:]
-
-    def _compare_routes(self) -> dict[str, Balance]:
-        """Nodal forces on Γc as the solver has them against those of the boundary form. Collective.
-
-        Both have the round-off of the displacement, by as much as the springs are stiff.
-        """
-        found = {}
-        for contact in self._contacts:
-            mine, assembled = contact.own_forces()
-            values = contact.values
-            across = np.abs(values.tangential_stiffness).max(axis=(1, 2))
-            stiffness = values.normal_stiffness + across
-            terms = contact.moved() + np.abs(values.initial_gap)
-            blur = float(global_sum(self._comm, contact.measure @ (stiffness * terms)))
-            sizes = (global_max(self._comm, np.abs(f)) for f in (mine - assembled, mine))
-            residual, force = (float(size) for size in sizes)
-            allowed = 1e-10 * force + _ROUND_OFF * blur
-            found[contact.name] = Balance(residual, force, allowed)
-        return found

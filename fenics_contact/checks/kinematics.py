@@ -50,7 +50,7 @@ class LinearSprings:
         d = normal.shape[1]
         stiffness = np.zeros((len(normal), d, d))
         stretch = np.zeros_like(normal)
-        borne = contact.borne_by_springs()
+        borne = _borne_by_springs(contact)
         if law.has_normal_stiffness:
             # A slipping point's friction follows the pressure as its limit does.
             follows = (status == Status.SLIP) & (pressure > 0) & (values.limit > 0)
@@ -125,7 +125,11 @@ class Deviation:
         flat = contact.finite or contact.support.is_flat
         if flat or not (contact.rigid or _moves(contact)):
             return none
-        change, normal = contact.gap_deviation()
+        change, normal = contact.opposite.deviation(values)
+        if not contact.rigid:
+            # It jumps from point to point; what is answered to is a function on Γc.
+            smooth = contact.traces(np.nan_to_num(change))
+            change = np.where(np.isnan(change), np.nan, smooth)
         told = closed & np.isfinite(normal).all(axis=1)
         turn = np.where(told[:, None], normal - values.normal, 0.0)
         if contact.gap_prescribed:
@@ -143,6 +147,25 @@ class Deviation:
         return contact.values.normal_traction[:, None] * self.turn
 
 
+def _borne_by_springs(contact: Contact) -> Array:
+    """What of the traction the springs bear in place of rigid contact: (n_points, gdim) (stress).
+
+    As far as displacements of Γc can answer it. Zero where the stiffness is physical. Collective.
+    """
+    law, values = contact.law, contact.values
+    if not contact.regularised:
+        return np.zeros_like(values.x)
+    pressure: Array = np.zeros(len(values.x))
+    if law.has_normal_stiffness:
+        pressure = contact.traces(contact.pressure)
+    side = contact.traces(contact.tangential_traction)
+    if contact.multipliers is not None:
+        pressure = pressure - contact.multipliers.fields.values("pressure")
+        if law.has_friction:
+            side = side - contact.multipliers.fields.values("traction")
+    return np.asarray(side - pressure[:, None] * values.normal)
+
+
 def _moves(contact: Contact) -> bool:
     """Whether bodies slide or turn by enough for a search anew to find anything. Collective."""
     comm, values = contact.surface.mesh.comm, contact.values
@@ -150,7 +173,7 @@ def _moves(contact: Contact) -> bool:
     d = values.normal.shape[1]
     facets = contact.quadrature.weights[rows].sum(axis=1) ** (1 / (d - 1))
     smallest = global_min(comm, facets, empty=np.inf)
-    slid = global_max(comm, np.linalg.norm(contact.relative_slide(), axis=1))
+    slid = global_max(comm, np.linalg.norm(values.slide, axis=1))
     x, u = values.x, contact.own_displacement()
     spread = np.zeros((2, d))
     for i in range(d):

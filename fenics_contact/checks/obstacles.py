@@ -46,12 +46,12 @@ class ObstacleCheck:
         comm, closed = contact.surface.mesh.comm, contact.status != Status.OPEN
         if not contact.rigid:
             return cls(1.0, 0.0, _passed(contact))
-        slopes = contact.distance_slope()[closed]
+        slopes = contact.opposite.slope(contact.values)[closed]
         ends = global_min(comm, slopes, empty=1.0), global_max(comm, slopes, empty=1.0)
         slope = max(ends, key=lambda value: abs(value - 1.0))
         depth, passed = 0.0, None
         if contact.finite and not contact.support.is_flat:
-            curvature = contact.support_curvature()[closed]
+            curvature = contact.opposite.curvature()[closed]
             sunk = contact.values.penetration[closed]
             # At a centre of curvature there is none, and no eigenvalues to look for.
             known = np.isfinite(curvature).all(axis=(1, 2))
@@ -60,7 +60,7 @@ class ObstacleCheck:
             depth = global_max(comm, sunk * bend)
             passed = _passed(contact)
         rubs = contact.law.has_friction and comm.allreduce(int(closed.any())) > 0
-        turn = abs(contact.turned_by()) if rubs else 0.0
+        turn = abs(contact.opposite.turned_by(contact.values)) if rubs else 0.0
         return cls(slope, depth, passed, turn)
 
     def failures(self, contact: str) -> list[str]:
@@ -94,5 +94,6 @@ class ObstacleCheck:
 
 def _passed(contact: Contact) -> list[float] | None:
     """A place of the undeformed Γc that has gone through the support. Collective."""
-    gone = contact.surface.mesh.comm.allgather(contact.points[contact.passed_through()].tolist())
+    passed = contact.opposite.passed_through(contact.values)
+    gone = contact.surface.mesh.comm.allgather(contact.points[passed].tolist())
     return next((places[0] for places in gone if places), None)

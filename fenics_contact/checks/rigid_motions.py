@@ -338,7 +338,7 @@ class RigidMotions:
         data = [resultant / np.abs(resultant).max()]
         for contact in contacts:
             data += [contact.values.normal, contact.values.grip]
-            data += [np.array([contact.pairings])]
+            data += [np.array([contact.pairs.number])]
         known = len(data) == len(self._balanced) and all(map(_alike, data, self._balanced))
         if self._comm.allreduce(not known) == 0:
             return

@@ -72,7 +72,7 @@ class Verdict:
         enforcement: `Contact.enforcement_error` of the contacts with multipliers, by name.
         enforcement_tolerance: What passes, by name.
         unseen: How deep the opposite body passes through Γc between its points (length), and where,
-            by the names of the contacts where it does; see `Contact.unseen_penetration`.
+            by the names of the contacts where it does; see `unseen_penetration`.
         obstacles: What is found of supports that are rigid or go far, by contact.
         kinematics: What taking displacements as small changes, relative, by contact.
         kinematics_allowed: What passes; where it is finite no displacement passes that is more than

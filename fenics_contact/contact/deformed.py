@@ -34,7 +34,7 @@ class DeformedPlaces:
         self._evaluate: PointEvaluator | None = None
 
     def __call__(self) -> tuple[Array, Array]:
-        """See `Contact.true_placement`. Collective."""
+        """See `Opposite.true_placement`. Collective."""
         if self._evaluate is None:
             x = ufl.SpatialCoordinate(self._quadrature.surface.mesh)
             moved = ufl.variable(x + self._displacement)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -26,8 +27,14 @@ from fenics_contact.types import Array
 __all__ = ["FreeMotion", "Inputs"]
 
 
+logger = logging.getLogger("fenics_contact")
+
 # What a contact itself is given by these names, among which a law's parameters stand.
 _OWN = ("angle", "displacement", "gap", "moment", "support", "weight")
+# Normal times outward normal of the body above minus which Γc faces its support.
+_FACING = 1e-6
+# The size of the mesh times this is a penetration that no mesh has.
+_DEEP = 0.1
 # A direction with no more than this share across the normal counts as parallel to it.
 _PARALLEL = 1e-6
 
@@ -345,6 +352,31 @@ class Inputs:
             raise ValueError(f"{self._name}: weight is negative at a point of Γc")
         if "direction" in parameters:
             self._check_direction(parameters, values)
+
+    def check_side(self, values: PointValues, *, gap_prescribed: bool) -> None:
+        """Refuse, or warn of, a support that all of Γc looks away from. Collective.
+
+        Args:
+            values: Evaluated with the data as they are.
+            gap_prescribed: Whether the gap was given apart from the geometry.
+
+        Raises:
+            ValueError: The body is deep inside of it, too.
+        """
+        comm = self._surface.mesh.comm
+        if global_max(comm, values.facing) > -_FACING:  # NaN has its own errors
+            return
+        x, depth = self._surface.mesh.geometry.x, -global_min(comm, values.initial_gap)
+        text = (
+            f"{self._name}: the normal from the body to the support points into the body at every "
+            "point of Γc: turn it round (a HalfSpace's points out of it, to the body: up for a "
+            "floor; a Ball or Cylinder around the body has inside=True)"
+        )
+        size = global_max(comm, x) - global_min(comm, x)
+        if depth > _DEEP * size and not gap_prescribed:
+            raise ValueError(f"{text}; the body is inside of the support, by up to {depth:g}")
+        if comm.rank == 0:
+            logger.warning(text)
 
     def _check_direction(self, parameters: Mapping[str, Array], values: PointValues) -> None:
         given = parameters["direction"]

@@ -158,7 +158,7 @@ class Pairs:
         return values
 
     def true_gap(self, values: PointValues) -> tuple[Array, Array]:
-        """See `Contact.true_gap`. Collective."""
+        """See `Opposite.true_placement`. Collective."""
         assert self.search is not None
         depth = self.depth(values.normal_displacement)
         return self.search.true_gap(values.x, values.normal, self._u, depth)
@@ -207,7 +207,7 @@ class Pairs:
         gap_prescribed: bool,
         stiffness: float,
     ) -> tuple[float, Array]:
-        """See `Contact.unseen_penetration`. Collective.
+        """See `unseen_penetration`. Collective.
 
         Args:
             values: At the points.

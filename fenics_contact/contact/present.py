@@ -233,7 +233,7 @@ class PresentPairs(Pairs):
         self._forget()
 
     def true_gap(self, values: PointValues) -> tuple[Array, Array]:
-        """See `Contact.true_gap`: it is that of the pairs themselves."""
+        """See `Opposite.true_placement`: it is that of the pairs themselves."""
         return np.where(self.paired, values.gap, np.nan), values.normal.copy()
 
     def linear_gap(self, values: PointValues) -> Array:

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+import ufl
 
 from fenics_contact.contact.values import Extent, PointValues, Resultants, Status
 from fenics_contact.laws.base import Law
 from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_sum
+from fenics_contact.supports.base import as_vector
+from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.fields import PointFields
-from fenics_contact.surface.surface import ContactSurface, SurfaceQuadrature
+from fenics_contact.surface.surface import ContactSurface, PointEvaluator, SurfaceQuadrature
 from fenics_contact.types import Array
 
 __all__ = ["PointResults"]
@@ -30,12 +34,16 @@ class PointResults(ABC):
     of them evaluates the present displacement, which is collective.
 
     Attributes:
+        name: In messages and files.
         surface, law: What was given.
+        displacement: What u is in the function that is solved for.
         quadrature: The points of Γc.
         history: The committed state.
     """
 
+    name: str
     surface: ContactSurface
+    displacement: Displacement
     law: Law
     quadrature: SurfaceQuadrature
     history: PointFields
@@ -126,8 +134,49 @@ class PointResults(ABC):
         return self.quadrature.weights * self.values.weight
 
     @abstractmethod
+    def places(self) -> Array:
+        """Where tractions act, (n_points, gdim) (length): X, or X + u with finite kinematics.
+
+        Collective.
+        """
+
     def moment(self, about: Sequence[float]) -> Array:
-        """Moment of the contact forces on the body about a point. Collective."""
+        """Moment of the contact forces on the body about a point. Collective.
+
+        They act on the undeformed Γc, or with finite kinematics at X + u. That on a rigid support
+        is the opposite.
+
+        Args:
+            about: The point, gdim numbers (length).
+
+        Returns:
+            Its component out of the plane, (1,), or in space (3,) (force times length).
+        """
+        places = self.places()
+        arm = places - as_vector(f"{self.name}: about", about, places.shape[1])
+        force = self.measure[:, None] * self.traction
+        if places.shape[1] == 3:
+            turn = np.cross(arm, force)
+        else:
+            turn = (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0])[:, None]
+        return global_sum(self.surface.mesh.comm, turn.sum(axis=0))
+
+    def area_stretch(self) -> Array:
+        """Deformed area by undeformed, |J F⁻ᵀ N| with F = I + grad u, (n_points,). Collective.
+
+        Tractions divided by it are true ones (Cauchy's), per deformed area; those of the contact
+        are nominal. Of axisymmetric bodies, whose hoops stretch too, by 1 + u_r/r more.
+        """
+        self.displacement.follow()
+        return self._stretch()["area"]
+
+    @cached_property
+    def _stretch(self) -> PointEvaluator:
+        u, normal = self.displacement.u, ufl.FacetNormal(self.surface.mesh)
+        gradient = ufl.Identity(len(u)) + ufl.grad(u)
+        normal = ufl.det(gradient) * ufl.dot(ufl.transpose(ufl.inv(gradient)), normal)
+        area = ufl.sqrt(ufl.dot(normal, normal))
+        return PointEvaluator(self.quadrature, {"area": area})
 
     def resultants(self) -> Resultants:
         """Forces, moment, counts and extents. Collective."""

@@ -118,7 +118,7 @@ class Alternation:
             for cycle in range(_MAX_CYCLES):
                 ends = np.cumsum([c.quadrature.n_points for c in equations.contacts])[:-1]
                 for contact, part in zip(equations.contacts, np.split(pressure, ends), strict=True):
-                    contact.freeze(part)
+                    contact.acting.freeze(part)
                 share = 0.0 if equations.has_potential else _INNER
                 self._goal = share * residual
                 iterations += self._minimise()
@@ -139,14 +139,14 @@ class Alternation:
         finally:
             equations.h0_is_made = False
             for contact in equations.contacts:
-                contact.thaw()
+                contact.acting.thaw()
 
     def possible(self) -> bool:
         """Whether there are minimum problems, all of which the line search asks for energies."""
         contacts, full = self._equations.contacts, self._equations.full
         if full.displacement.mixed:  # a saddle point, whatever the laws
             return False
-        return bool(contacts) and all(contact.freezes for contact in contacts)
+        return bool(contacts) and all(contact.acting.freezes for contact in contacts)
 
     def _pressure(self) -> Array:
         """Of all contacts at this rank's points."""
@@ -159,7 +159,7 @@ class Alternation:
         """That of the whole law."""
         equations = self._equations
         for contact in equations.contacts:
-            contact.thaw()
+            contact.acting.thaw()
         return float(equations.residual(equations.solution, equations.function).total)
 
     def _minimise(self) -> int:

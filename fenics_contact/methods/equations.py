@@ -138,7 +138,7 @@ class Equations:
     @property
     def has_potential(self) -> bool:
         """Whether every contact law has one."""
-        return all(c.has_potential for c in self.contacts)
+        return all(c.acting.has_potential for c in self.contacts)
 
     def symmetric(self, consistent: bool) -> bool:
         """Whether the matrix of H₀, or of the consistent tangent, is."""
@@ -171,7 +171,7 @@ class Equations:
             contacts: Contact's part, used up.
         """
         self.factorisations += self.system.fill(matrix, contacts)
-        if any(contact.follows for contact in self.contacts):
+        if any(contact.opposite.follows for contact in self.contacts):
             # A factorisation of another pattern is no start, whatever the matrix says.
             for consistent, mine in self._matrices.items():
                 if mine.handle == matrix.handle:

@@ -245,7 +245,7 @@ class Solver:
         inside = newton_solver(equations.symmetric(False))
         alternation = Alternation(equations, options, prefix, inside)
         if settings.method == "alternating" and self._full.contacts and not alternation.possible():
-            none = [c for c in self._full.contacts if not c.freezes]
+            none = [c for c in self._full.contacts if not c.acting.freezes]
             laws = ", ".join(type(c.law).__name__ for c in none)
             why = "not even under a given pressure"
             if all(c.finite for c in none):
@@ -323,7 +323,7 @@ class Solver:
 
     def _present_pairings(self) -> list[int]:
         # Matrices of pairs that follow the bodies are made for each anew, and no one is kept.
-        return [0 if c.follows else c.pairings for c in self._full.contacts]
+        return [0 if c.opposite.follows else c.pairs.number for c in self._full.contacts]
 
     def is_current(self) -> bool:
         """Whether bulk and pairs are those of the last solution. Collective."""

@@ -175,7 +175,7 @@ class FullSystem(System):
         """Bulk tangent plus contact, conditions applied, dimensionless; see `System.fill`."""
         assert self.stiffness is not None
         subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
-        if any(c.follows for c in self.contacts):  # and so does the pattern
+        if any(c.opposite.follows for c in self.contacts):  # and so does the pattern
             subset = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
         if not any(c.couples for c in self.contacts):
             self.stiffness.copy(matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)

@@ -57,7 +57,7 @@ class ContactOperator:
         self.unknowns = unknowns or Unknowns(displacement.whole.function_space)
         self._gdim = contact.surface.mesh.geometry.dim
         self._first = self.unknowns.first_motion + first_motion
-        self._of_bodies = self.unknowns.widened(displacement.lifted(contact.jump_map))
+        self._of_bodies = self.unknowns.widened(displacement.lifted(contact.pairs.jump_map))
         self.within = self._find_within()
         self._motions: PETSc.Mat | None = None
         self._map = self._of_bodies
@@ -80,7 +80,7 @@ class ContactOperator:
         """See the attribute. Collective."""
         if not isinstance(self.unknowns, Selection):
             return None
-        pointers, columns, values = self.contact.jump_map.getValuesCSR()
+        pointers, columns, values = self.contact.pairs.jump_map.getValuesCSR()
         row = np.repeat(np.arange(pointers.size - 1), np.diff(pointers))
         lost = (values != 0.0) & ~self.unknowns.has(columns)
         within = np.ones(self.contact.quadrature.n_points, dtype=np.bool_)
@@ -155,7 +155,7 @@ class ContactOperator:
                 ``u``: then `Contact.form` is added, assembled.
         """
         if traction is None:
-            traction = self.contact.acting_traction()
+            traction = self.contact.acting.traction()
         force = self.contact.area[:, None] * traction
         self._at_points.array[:] = -force.ravel()
         self._map.multTransposeAdd(self._at_points, residual, residual)
@@ -192,9 +192,9 @@ class ContactOperator:
         Returns:
             A new matrix over the unknowns (force/length).
         """
-        tangent = tangent or self.contact.acting_tangent()
-        if self.contact.local_map is not None:
-            return self._local_tangent(tangent.by_jump, self.contact.local_map)
+        tangent = tangent or self.contact.acting.tangent()
+        if self.contact.opposite.local_map is not None:
+            return self._local_tangent(tangent.by_jump, self.contact.opposite.local_map)
         if tangent.spun is not None and self._turn is not None:
             product = self.springs(-tangent.by_jump)
             self._add_spin(product, tangent.spun, self._turn)
@@ -230,7 +230,7 @@ class ContactOperator:
         Returns:
             (n_points, gdim); zero where a point is not within.
         """
-        arms = np.asarray(self.contact.turning_rate() / self._length, dtype=np.float64)
+        arms = np.asarray(self.contact.opposite.turning_rate() / self._length, dtype=np.float64)
         return arms if self.within is None else np.where(self.within[:, None], arms, 0.0)
 
     def steadied(self, tangent: PETSc.Mat) -> PETSc.Mat:

@@ -92,8 +92,9 @@ class System(ABC):
     def operators(self) -> list[ContactOperator]:
         """What the contacts are over these unknowns, with the pairs as they are. Collective."""
         for contact in self.contacts:
-            contact.follow()
-        pairings = [c.pairings for c in self.contacts]
+            if contact.opposite.follows:
+                contact.opposite.update()
+        pairings = [c.pairs.number for c in self.contacts]
         if self._operators is None or self._operators[0] != pairings:
             self._operators = pairings, contact_operators(self.contacts, self.unknowns)
         return self._operators[1]
@@ -101,7 +102,7 @@ class System(ABC):
     @property
     def parts(self) -> Parts:
         """What has to be in balance, for the present pairs. Collective."""
-        pairings = [c.pairings for c in self.contacts]
+        pairings = [c.pairs.number for c in self.contacts]
         if self._parts is None or self._parts[0] != pairings:
             moving = [(n, m.way) for n, c in enumerate(self.contacts) for m in c.motions]
             n = self.n_bodies - len(moving)
@@ -208,9 +209,13 @@ class System(ABC):
 
         A turn further its points are where they were: to a solution there are others.
         """
-        turning = (c for c in self.contacts if c.free_angle is not None)
-        far = any(not abs(contact.turned_by()) < _TURN for contact in turning)
-        return far or any(contact.flat for contact in self.contacts)
+        turns = (
+            float(contact.free_angle.value) - contact.opposite.committed_angle
+            for contact in self.contacts
+            if contact.free_angle is not None
+        )
+        far = any(not abs(turn) < _TURN for turn in turns)
+        return far or any(contact.opposite.flat for contact in self.contacts)
 
     def rolled(self, state: Array) -> Array:
         """A state with supports that turn freely turned to where they slip least. Collective.

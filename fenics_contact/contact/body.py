@@ -1,0 +1,179 @@
+"""What lies opposite Γc where it is another body."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from fenics_contact.contact.opposite import Opposite, Parts
+from fenics_contact.contact.pairs import Pairs
+from fenics_contact.contact.point_law import PointLaw, PointTangent
+from fenics_contact.contact.present import PresentKinematics, PresentPairs
+from fenics_contact.contact.values import PointValues
+from fenics_contact.supports.base import Placement
+from fenics_contact.supports.deformable import DeformableBody
+from fenics_contact.types import Array, Mask
+
+__all__ = ["BodyOpposite", "FollowedOpposite"]
+
+
+class BodyOpposite(Opposite):
+    """Another body, paired with the points on the undeformed bodies or at every commit."""
+
+    is_rigid = False
+
+    def __init__(self, parts: Parts, pairs: Pairs | None = None) -> None:
+        """Collect both surfaces. Collective.
+
+        Args:
+            parts: Of the contact.
+            pairs: Of the points; by default such as stay.
+        """
+        pairs = pairs or parts.new_pairs()
+        assert pairs.distance is not None
+        normal = ufl.FacetNormal(parts.quadrature.surface.mesh)
+        super().__init__(parts, pairs, parts.new_jump(), Placement(pairs.distance, normal))
+
+    def told(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
+        """See `Opposite`."""
+        since = 0.0 if self.pairs.found_at is None else self.committed_jump
+        slide, normal = arrays["jump"] - since, arrays["normal"]
+        slide = slide - np.sum(slide * normal, axis=1)[:, None] * normal
+        return self._told_of_pairs(arrays) | {"slide": slide}
+
+    def _told_of_pairs(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
+        """Which points have an opposite, and how deep they are in it."""
+        depth = self.pairs.depth(arrays["normal_displacement"])
+        return {"paired": self.pairs.paired.astype(np.float64), "depth": depth}
+
+    def true_placement(self, values: PointValues) -> tuple[Array, Array]:
+        """See `Opposite`."""
+        return self.pairs.true_gap(values)
+
+    def deviation(self, values: PointValues) -> tuple[Array, Array]:
+        """See `Opposite`."""
+        gap, normal = self.true_placement(values)
+        return gap - self.pairs.linear_gap(values), normal
+
+    @property
+    def pairs_anew(self) -> bool:
+        """See `Opposite`."""
+        support = self._parts.support
+        return isinstance(support, DeformableBody) and support.update == "increment"
+
+    def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
+        """See `Opposite`."""
+        self.update_data()
+        self.pairs.find(self.data.values["x"], self.data.values["normal"], depth, u)
+
+    def resume(self, depth: Array, evaluate: Callable[[], PointValues]) -> None:
+        """See `Opposite`: the pairs by which points were as deep as that are gone."""
+        if self.pairs_anew:
+            self.find_pairs(self._parts.displacement.u, depth)
+        super().resume(depth, evaluate)
+        if self.pairs_anew:  # to the last digit as `commit` has it
+            self.committed_jump = self.present_jump()
+
+    def commit(self, values: PointValues) -> Array | None:
+        """See `Opposite`."""
+        super().commit(values)
+        if not self.pairs_anew:
+            return None
+        # The traction stays with the points of Γc; what they slip over has moved on.
+        self.find_pairs(self._parts.displacement.u, values.depth)
+        self.committed_jump = self.present_jump()
+        return self.committed_jump - values.jump
+
+
+class FollowedOpposite(BodyOpposite):
+    """Another body, wherever both go: pairs of the present places."""
+
+    is_finite = True
+    follows = True
+
+    def __init__(self, parts: Parts) -> None:
+        """Collect both surfaces. Collective."""
+        support = parts.support
+        assert isinstance(support, DeformableBody)
+        pairs = PresentPairs(parts.name, parts.displacement.u, parts.quadrature, support)
+        super().__init__(parts, pairs)
+        self._present = pairs
+        self.felt = pairs.felt.function
+        self.in_form = self.at_points = PresentKinematics(pairs, parts.multipliers)
+
+    def update(self) -> None:
+        """See `Opposite`."""
+        self.update_data()
+        data, history = self.data.values, self._parts.history
+        self._parts.displacement.follow()
+        self._present.follow(data["x"], data["normal"], history, self._parts.multipliers or history)
+        self._update_jump()
+
+    def told(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
+        """See `Opposite`."""
+        return self._told_of_pairs(arrays)
+
+    def tangent(self, law: PointLaw) -> PointTangent:
+        """See `Opposite`."""
+        by_felt = law.evaluate_tangent({}).by_jump
+        traction = law.evaluate_traction()
+        return PointTangent(self._present.tangent(by_felt, traction, self._parts.history))
+
+    def turned(self, vectors: Array) -> Array:
+        """See `Opposite`: of the committed bodies."""
+        return self._present.turned(vectors)
+
+    def passed_through(self, values: PointValues) -> Mask:
+        """See `Opposite`."""
+        return self._present.passed_through()
+
+    @property
+    def pairs_anew(self) -> bool:
+        """See `Opposite`."""
+        return False
+
+    @property
+    def flat(self) -> bool:
+        """See `Opposite`."""
+        return self._present.flat
+
+    @property
+    def local_map(self) -> PETSc.Mat | None:
+        """See `Opposite`."""
+        return self._present.local_map
+
+    def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
+        """See `Opposite`: they are found wherever points are updated."""
+        self.update()
+
+    def begins_anew(self) -> bool:
+        """See `Opposite`."""
+        if self._present.is_begun():
+            return False
+        self._present.commit()
+        return True
+
+    def start(self) -> dict[str, Array]:
+        """See `Opposite`: all is counted from the committed bodies."""
+        return {}
+
+    def committed_fields(self, fields: Mapping[str, Array]) -> dict[str, Array]:
+        """See `Opposite`: vectors turned with the surface."""
+        turned = {n: self.turned(fields[n]) for n in ("traction", "jump") if n in fields}
+        return dict(fields) | turned
+
+    def resume(self, depth: Array, evaluate: Callable[[], PointValues]) -> None:
+        """See `Opposite`."""
+        self._present.commit()
+        super().resume(depth, evaluate)
+
+    def commit(self, values: PointValues) -> Array | None:
+        """See `Opposite`."""
+        super().commit(values)
+        self._present.commit()
+        self.committed_jump = np.zeros_like(values.jump)
+        return None

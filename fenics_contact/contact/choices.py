@@ -1,0 +1,115 @@
+"""How a contact is taken: kinematics and enforcement, asked for or by what else is given."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fenics_contact.arguments import is_number
+from fenics_contact.contact.accuracy import Accuracy
+from fenics_contact.contact.body import BodyOpposite, FollowedOpposite
+from fenics_contact.contact.opposite import Opposite, Parts
+from fenics_contact.contact.rigid import MovingOpposite, RigidOpposite
+from fenics_contact.laws.base import Law
+from fenics_contact.laws.stiffness import Springs
+from fenics_contact.supports.base import Support
+from fenics_contact.supports.deformable import DeformableBody
+
+__all__ = ["is_augmented", "is_finite", "is_regularised", "opposite_of"]
+
+
+_ENFORCEMENTS = ("penalty", "augmented")
+_KINEMATICS = ("small", "finite")
+# Of augmented enforcement, where nothing is said.
+_TOLERANCE = 1e-5
+
+
+def is_finite(name: str, kinematics: str, support: Support, law: Law, gap: Any) -> bool:
+    """Whether displacements may be of any size.
+
+    Args:
+        name: Of the contact, in messages.
+        kinematics: As given to `Contact`.
+        support: Likewise.
+        law: Likewise.
+        gap: Likewise.
+
+    Raises:
+        ValueError: It is no word for any, or something was given that has no sense with it.
+    """
+    if kinematics not in _KINEMATICS:
+        raise ValueError(
+            f"{name}: kinematics is {kinematics!r}; use one of {_KINEMATICS} (the share that "
+            "passes in a verdict is the kinematics of the ContactProblem)"
+        )
+    if kinematics == "small":
+        if support.rotation is not None:
+            raise ValueError(
+                f'{name}: a support that turns needs Contact(kinematics="finite"); for small '
+                "turns give its displacement as a UFL vector"
+            )
+        return False
+    if gap is not None:
+        raise ValueError(
+            f"{name}: a gap is prescribed, and finite kinematics take it from the places of "
+            "body and support; leave the gap out, and move the support by its displacement"
+        )
+    if law.has_tangential and not law.has_friction:
+        raise ValueError(
+            f"{name}: {type(law).__name__} bonds points to places of the support, and finite "
+            "kinematics know no such law; use one with friction, or leave k_t out"
+        )
+    return True
+
+
+def is_regularised(law: Law) -> bool:
+    """Whether the stiffness stands for none at all, and is not that of physical springs."""
+    springs = (isinstance(v, Springs) for v in law.parameters().values())
+    return not law.is_physical and not any(springs)
+
+
+def is_augmented(
+    name: str, enforcement: str | None, tolerance: float | None, law: Law, chosen: Accuracy | None
+) -> tuple[bool, float]:
+    """Whether there are multipliers, and the tolerance.
+
+    Args:
+        name: Of the contact, in messages.
+        enforcement: As given to `Contact`.
+        tolerance: Likewise.
+        law: Likewise.
+        chosen: For the accuracy wanted; None: none was said.
+
+    Raises:
+        ValueError: The law has no use for them, or the tolerance is none.
+    """
+    if enforcement is None:
+        enforcement = chosen.enforcement if chosen and is_regularised(law) else "penalty"
+    if tolerance is None:
+        tolerance = chosen.tolerance if chosen else _TOLERANCE
+    if enforcement not in _ENFORCEMENTS:
+        raise ValueError(f"{name}: enforcement is {enforcement!r}; use one of {_ENFORCEMENTS}")
+    if not (is_number(tolerance) and 0.0 < tolerance < 1.0):
+        raise ValueError(f"{name}: tolerance is {tolerance!r}; it must be a number between 0 and 1")
+    if enforcement == "penalty":
+        return False, tolerance
+    if not is_regularised(law):
+        springs = [n for n, v in law.parameters().items() if isinstance(v, Springs)]
+        what = f"{springs[0]} by Springs" if springs else type(law).__name__
+        raise ValueError(
+            f"{name}: {what} has the stiffness of something that is there; multipliers "
+            'would take it away; use enforcement="penalty", or a law and stiffness that stand '
+            "for rigid contact"
+        )
+    return True, tolerance
+
+
+def opposite_of(parts: Parts, *, finite: bool) -> Opposite:
+    """What lies opposite, by support and kinematics. Collective.
+
+    Args:
+        parts: Of the contact.
+        finite: Whether displacements may be of any size.
+    """
+    if isinstance(parts.support, DeformableBody):
+        return FollowedOpposite(parts) if finite else BodyOpposite(parts)
+    return MovingOpposite(parts) if finite else RigidOpposite(parts)

@@ -1,0 +1,422 @@
+"""What lies opposite Γc: where it is, and what the points feel of it.
+
+|                     | a rigid support (`rigid`) | another body (`body`) |
+|---------------------|---------------------------|-----------------------|
+| small displacements | `RigidOpposite`           | `BodyOpposite`        |
+| finite ones         | `MovingOpposite`          | `FollowedOpposite`    |
+
+Each samples at the points of Γc what laws are functions of there, and keeps what was committed of
+it: the jump, the angle, the pairs.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from fenics_contact.contact.finite import (
+    FiniteKinematics,
+)
+from fenics_contact.contact.inputs import Inputs
+from fenics_contact.contact.kinematics import Seen, SmallKinematics
+from fenics_contact.contact.pairs import Pairs, PairsState
+from fenics_contact.contact.point_data import PointData
+from fenics_contact.contact.point_law import PointLaw, PointTangent
+from fenics_contact.contact.present import PresentKinematics
+from fenics_contact.contact.sampled import SampledPlaces
+from fenics_contact.contact.values import PointValues
+from fenics_contact.laws.base import Law
+from fenics_contact.parallel import global_max
+from fenics_contact.supports.base import Placement, Support
+from fenics_contact.surface.displacement import Displacement
+from fenics_contact.surface.fields import PointFields
+from fenics_contact.surface.surface import SurfaceQuadrature
+from fenics_contact.types import Array, Mask
+
+__all__ = ["Opposite", "OppositeState", "Parts"]
+
+
+AnyKinematics: TypeAlias = SmallKinematics | FiniteKinematics | PresentKinematics
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a contact consists of; see there."""
+
+    name: str
+    displacement: Displacement
+    quadrature: SurfaceQuadrature
+    support: Support
+    law: Law
+    inputs: Inputs
+    gap: Any
+    history: PointFields
+    multipliers: PointFields | None
+
+    def new_pairs(self) -> Pairs:
+        """Pairs that stay as they are found. Collective."""
+        return Pairs(self.name, self.displacement.u, self.quadrature, self.support)
+
+    def new_jump(self) -> fem.Function:
+        """A function at the points, for the displacement there."""
+        gdim = self.quadrature.surface.mesh.geometry.dim
+        return fem.Function(self.quadrature.space(gdim), name="jump")
+
+
+@dataclass(frozen=True)
+class OppositeState:
+    """What was committed of an `Opposite`; see its attributes."""
+
+    jump: Array
+    angle: float
+    pairs: PairsState
+
+
+class Opposite(ABC):
+    """What lies opposite Γc, under one kinematics.
+
+    Attributes:
+        pairs: What lies opposite each of the points.
+        data: What was given, sampled at the points.
+        jump: Displacement at the points relative to what lies opposite, less its pure motion.
+        felt: What laws are functions of there: the jump, or what follows from it.
+        given, sampled: What else laws see, as expressions on Γc, and as numbers at the points.
+        in_form, at_points: Kinematics of laws in the form on Γc, and at numbers at the points.
+        committed_jump: The jump at the last commit, that of the support taken away, (n_points,
+            gdim), between the places that are opposite each other from then on; zero before the
+            first.
+        committed_angle: By which the support had turned then (radians).
+        is_finite: Whether displacements may be of any size.
+        is_rigid: Whether it is a rigid support, whose reactions are external to the mesh.
+        follows: Whether the pairs follow the bodies wherever they go.
+        pairs_anew: Whether pairs are found anew, on the deformed bodies, at every commit.
+        flat: Whether Γc has lost its tangent plane somewhere, with pairs that follow the bodies.
+        local_map: Sparse map from ``u`` to what derivatives at the points are by, where that is
+            another than ``pairs.jump_map``; None: there is none.
+    """
+
+    is_finite = False
+    is_rigid = True
+    follows = False
+
+    def __init__(
+        self,
+        parts: Parts,
+        pairs: Pairs,
+        jump: fem.Function,
+        placement: Placement,
+        at_rest: SampledPlaces | None = None,
+    ) -> None:
+        """Compile what samples the points. Collective.
+
+        Args:
+            parts: Of the contact.
+            pairs: Of the points.
+            jump: A function at the points, for the displacement there.
+            placement: Where the opposite is, seen from the undeformed Γc.
+            at_rest: Of a support known in numbers, what has to be sampled for that.
+        """
+        self.pairs, self.jump = pairs, jump
+        self._parts, self._at_rest = parts, at_rest
+        self._mesh = parts.quadrature.surface.mesh
+        self._gdim = self._mesh.geometry.dim
+        self.given = self._see(placement)
+        self.data, self.sampled = self._sample(placement)
+        self.felt = jump
+        small = SmallKinematics(parts.history, parts.multipliers)
+        self.in_form: AnyKinematics = small
+        self.at_points: AnyKinematics = small
+        self.committed_jump: Array = np.zeros((parts.quadrature.n_points, self._gdim))
+        self.committed_angle = 0.0
+
+    # ---- construction ----------------------------------------------------------------------------
+
+    def _see(self, placement: Placement) -> Seen:
+        """What laws see, as expressions on Γc."""
+        inputs, gap = self._parts.inputs, self._parts.gap
+        open_gap = placement.gap
+        if gap is not None:
+            open_gap = inputs.scalar("gap", gap)
+            if inputs.shift is not None:
+                open_gap = open_gap + ufl.dot(inputs.shift, placement.normal)
+        return Seen(open_gap, placement.normal, inputs.shift, inputs.law)
+
+    def _sample(self, placement: Placement) -> tuple[PointData, Seen]:
+        """The same at the points, and more that is known there."""
+        inputs, direction, given = self._parts.inputs, placement.direction, self.given
+        expressions = {
+            "x": ufl.SpatialCoordinate(self._mesh),
+            "normal": given.normal,
+            "direction_length": ufl.sqrt(ufl.dot(direction, direction)),
+            "facing": ufl.dot(given.normal, ufl.FacetNormal(self._mesh)),
+            "weight": inputs.weight,
+            "initial_gap": given.gap,
+            "shift": inputs.prescribed_shift(),
+        } | {f"parameter {n}": v for n, v in given.parameters.items()}
+        if inputs.rotation is not None:
+            d, matrix = self._gdim, inputs.rotation[0]
+            expressions["about"] = inputs.rotation[1]
+            if d == 3:
+                expressions["axis"] = inputs.axis
+            if inputs.free_angle is None:
+                rows = [matrix[i, j] for i in range(d) for j in range(d)]
+                expressions |= {"angle": inputs.angle, "turn": ufl.as_vector(rows)}
+        seen = ["initial_gap", "normal", *(f"parameter {n}" for n in given.parameters)]
+        if given.shift is not None:
+            expressions["support"] = given.shift
+            seen.append("support")
+        for i, free in inputs.free_shift.items():
+            expressions |= {f"gap by {i}": ufl.diff(given.gap, free)}
+            expressions |= {f"normal by {i}": ufl.diff(given.normal, free)}
+        data = PointData(self._parts.quadrature, expressions, seen)
+        sampled = Seen(
+            data.ufl("initial_gap"),
+            data.ufl("normal"),
+            None if given.shift is None else data.ufl("support"),
+            {n: data.ufl(f"parameter {n}") for n in given.parameters},
+        )
+        return data, sampled
+
+    def laws(self, within: fem.Function) -> tuple[PointLaw, PointLaw]:
+        """The law in the form on Γc, and at numbers at the points.
+
+        Args:
+            within: 1 at the points that the latter is confined to, 0 at others.
+        """
+        law, quadrature, free = self._parts.law, self._parts.quadrature, self._free
+        felt, paired = self.felt, self.pairs.acts
+        acts = within if paired is None else paired * within
+        return (
+            PointLaw(law, self.given, self.in_form, quadrature, felt, acts=paired, free=free),
+            PointLaw(law, self.sampled, self.at_points, quadrature, felt, acts=acts, free=free),
+        )
+
+    @property
+    def _free(self) -> list[int]:
+        """Unknown components of the support's displacement that laws are differentiated by."""
+        return list(self._parts.inputs.free_motion)
+
+    # ---- the points ------------------------------------------------------------------------------
+
+    def update(self) -> None:
+        """Let the points be at the present ``u`` and data. Collective."""
+        self.update_data()
+        self._update_jump()
+
+    def update_data(self) -> None:
+        """Let what does not follow from ``u`` be as it was given last. Collective."""
+        if self._at_rest is not None:
+            self._at_rest.update()
+        self.data.update()
+
+    def _update_jump(self) -> None:
+        """Let the displacement at the points be the present one. Collective."""
+        displacement = self._parts.displacement
+        displacement.follow()
+        self.pairs.jump_map.mult(displacement.u.x.petsc_vec, self.jump.x.petsc_vec)
+        self.jump.x.scatter_forward()
+
+    def present_jump(self) -> Array:
+        """Displacement relative to what lies opposite, or of the body alone. Collective."""
+        self._update_jump()
+        rows = self.jump.x.array.reshape(-1, self._gdim)
+        return np.array(rows[: self._parts.quadrature.n_points])
+
+    def told(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
+        """What else is known at the points, beside what a law told; see `PointValues`."""
+        return {}
+
+    def tangent(self, law: PointLaw) -> PointTangent:
+        """Derivatives of a law's tractions where the points are. Collective."""
+        data = self.data.values
+        turns = {i: (data[f"gap by {i}"], data[f"normal by {i}"]) for i in self._free}
+        return law.evaluate_tangent(turns)
+
+    # ---- where it is -----------------------------------------------------------------------------
+
+    @abstractmethod
+    def true_placement(self, values: PointValues) -> tuple[Array, Array]:
+        """Gap and normal where the body has moved to: at X + u instead of X. Collective.
+
+        With finite kinematics these are the gap and normal of the contact itself. Opposite another
+        body they are by a search anew, in which the pairs stay as they are.
+
+        Args:
+            values: Of the last evaluation.
+
+        Returns:
+            Gap, (n_points,) (length): NaN where there is no opposite, and infinite where an
+            `Obstacle` says no distance that could be told at other places; and unit normals from
+            body to support, (n_points, gdim).
+        """
+
+    def deviation(self, values: PointValues) -> tuple[Array, Array]:
+        """True gap less the linearised one, and the true normal; see `true_placement`. Collective.
+
+        Between facets that do not match it jumps from point to point. Nothing deviates where the
+        true gap is not known.
+        """
+        gap, normal = self.true_placement(values)
+        return np.where(np.isinf(gap), 0.0, gap - values.gap), normal
+
+    @property
+    def turns(self) -> bool:
+        """Whether the support turns."""
+        return self._parts.inputs.rotation is not None
+
+    def turned(self, vectors: Array) -> Array:
+        """Directions in the frame of the history, as they are in space: (n_points, gdim)."""
+        return vectors
+
+    def angle(self, values: PointValues) -> float:
+        """By which the support has turned since it began, 0 where it cannot (radians). Collective.
+
+        Args:
+            values: Of the last evaluation.
+        """
+        inputs = self._parts.inputs
+        if inputs.free_angle is not None:
+            return float(inputs.free_angle.value)
+        if inputs.angle is None:
+            return 0.0
+        # The same at all points.
+        return global_max(self._mesh.comm, values.arrays["angle"])
+
+    def turned_by(self, values: PointValues) -> float:
+        """By which the support has turned since the last commit (radians). Collective."""
+        return self.angle(values) - self.committed_angle
+
+    def turning_rate(self) -> Array:
+        """Way by a unit angle of the support's points where those of Γc are now. Collective.
+
+        Returns:
+            ω × r, with r from the axis as it is now, (n_points, gdim) (length).
+
+        Raises:
+            ValueError: The support does not turn.
+        """
+        rotation = self._parts.support.rotation
+        if rotation is None:
+            raise ValueError(f"{self._parts.name}: the support does not turn")
+        jump = self.present_jump()
+        self.update_data()
+        data = self.data.values
+        return rotation.rate(data["x"] + jump - data["about"] - data.get("support", 0.0))
+
+    def slope(self, values: PointValues) -> Array:
+        """Length of the gradient of the gap where points are, (n_points,): 1 of a distance.
+
+        At X with small displacements, at X + u with finite ones.
+        """
+        if self._parts.support.is_distance:
+            return self.data.values["direction_length"].copy()
+        return np.ones(len(values.x))
+
+    def curvature(self) -> Array:
+        """Second derivatives of the distance at X + u, (n_points, gdim, gdim) (1/length).
+
+        Raises:
+            ValueError: Displacements are taken as small, or it is no rigid support.
+        """
+        raise ValueError(
+            f'{self._parts.name}: there is none without kinematics="finite" and a rigid support'
+        )
+
+    def passed_through(self, values: PointValues) -> Mask:
+        """Points that have gone through what lies opposite since the last commit, (n_points,).
+
+        Of points that go straight on, and a support that turns evenly, with finite kinematics.
+        Collective.
+
+        Raises:
+            ValueError: Displacements are taken as small.
+        """
+        raise ValueError(f'{self._parts.name}: there is none without kinematics="finite"')
+
+    # ---- pairs -----------------------------------------------------------------------------------
+
+    @property
+    def pairs_anew(self) -> bool:
+        """See the class."""
+        return False
+
+    @property
+    def flat(self) -> bool:
+        """See the class."""
+        return False
+
+    @property
+    def local_map(self) -> PETSc.Mat | None:
+        """See the class."""
+        return None
+
+    def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
+        """Find what lies opposite the points; see `Contact.pair`. Collective.
+
+        On a rigid support there is nothing to find.
+
+        Args:
+            u: Displacement in which to find it; None: the undeformed bodies.
+            depth: Of the points in the opposite in ``u``, (n_points,) (length).
+        """
+        self.update()
+
+    # ---- history ---------------------------------------------------------------------------------
+
+    def begins_anew(self) -> bool:
+        """Let ways be counted from the present ``u``; whether that is not where they were from.
+
+        Collective.
+        """
+        jump = self.present_jump()
+        differs = global_max(self._mesh.comm, np.abs(jump - self.committed_jump)) > 0
+        self.committed_jump = jump
+        return differs
+
+    def start(self) -> dict[str, Array]:
+        """What the history has of displacements at `committed_jump`, by name. Collective."""
+        return {"jump": self.committed_jump}
+
+    def committed_fields(self, fields: Mapping[str, Array]) -> dict[str, Array]:
+        """What is found of a solution, as the history has it."""
+        return dict(fields)
+
+    def commit(self, values: PointValues) -> Array | None:
+        """Make an evaluated state the committed one. Collective.
+
+        Returns:
+            By how much the jump is another as pairs were found anew, (n_points, gdim) (length);
+            None: they were not.
+        """
+        self.count_from(values)
+        return None
+
+    def count_from(self, values: PointValues) -> None:
+        """Let ways and angles be counted from an evaluated state. Collective."""
+        self.committed_jump = values.jump
+        self.committed_angle = self.angle(values)
+
+    def resume(self, depth: Array, evaluate: Callable[[], PointValues]) -> None:
+        """Take the present ``u`` for the committed one, of another run. Collective.
+
+        Args:
+            depth: Of the points in the opposite then, (n_points,) (length).
+            evaluate: Gives what is at the points now.
+        """
+        self.count_from(evaluate())
+
+    def state(self) -> OppositeState:
+        """What was committed, for `set_state`."""
+        return OppositeState(self.committed_jump, self.committed_angle, self.pairs.state())
+
+    def set_state(self, state: OppositeState) -> None:
+        """Make a state the committed one again. Collective."""
+        self.committed_jump, self.committed_angle = state.jump, state.angle
+        self.pairs.set_state(state.pairs)

@@ -1,0 +1,193 @@
+"""What lies opposite Γc where it is a rigid support."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+from fenics_contact.contact.deformed import DeformedPlaces
+from fenics_contact.contact.finite import (
+    ExactView,
+    FiniteKinematics,
+    Frame,
+    SampledView,
+    check_places,
+    check_rigid,
+)
+from fenics_contact.contact.opposite import Opposite, Parts
+from fenics_contact.contact.passage import Passage
+from fenics_contact.contact.point_law import PointLaw, PointTangent
+from fenics_contact.contact.sampled import SampledPlaces
+from fenics_contact.contact.values import PointValues
+from fenics_contact.supports.base import Placement, SampledSupport
+from fenics_contact.types import Array, Mask
+
+__all__ = ["MovingOpposite", "RigidOpposite"]
+
+
+class RigidOpposite(Opposite):
+    """A rigid support, seen from the undeformed Γc."""
+
+    def __init__(self, parts: Parts) -> None:
+        """Place it. Collective.
+
+        Raises:
+            ValueError: Data of a `SampledSupport` do not fit.
+        """
+        support, shift = parts.support, parts.inputs.shift
+        x = ufl.SpatialCoordinate(parts.quadrature.surface.mesh)
+        jump = parts.new_jump()
+        at_rest: SampledPlaces | None = None
+        self._moved: SampledPlaces | None = None
+        if isinstance(support, SampledSupport):
+            frame = Frame(shift, None)
+            at_rest, self._moved = _sampled_places(parts, support, frame, jump)
+            placement = at_rest.at(frame.into(x))
+        else:
+            placement = _placed(parts, x, shift)
+        super().__init__(parts, parts.new_pairs(), jump, placement, at_rest)
+        self._deformed = DeformedPlaces(parts.quadrature, jump, placement)
+
+    def true_placement(self, values: PointValues) -> tuple[Array, Array]:
+        """See `Opposite`."""
+        self.update()
+        if self._moved is not None:
+            self._moved.update()
+            return self._moved.values("distance"), self._moved.values("normal")
+        return self._deformed()
+
+
+class MovingOpposite(Opposite):
+    """A rigid support that may move and turn by any amount, seen from where Γc is now."""
+
+    is_finite = True
+
+    def __init__(self, parts: Parts) -> None:
+        """Place it, and see it from moving points. Collective.
+
+        Raises:
+            ValueError: Its place is not known everywhere, or it is not rigid.
+        """
+        inputs, support, quadrature = parts.inputs, parts.support, parts.quadrature
+        mesh = quadrature.surface.mesh
+        frame, jump = Frame(inputs.shift, inputs.rotation), parts.new_jump()
+        at_rest: SampledPlaces | None = None
+        self._moved: SampledPlaces | None = None
+        if isinstance(support, SampledSupport):
+            at_rest, self._moved = _sampled_places(parts, support, frame, jump)
+        check_rigid(parts.name, inputs.shift, inputs.rotation)
+
+        def place(z: Any) -> Placement:
+            return _placed(parts, z, None)
+
+        x = ufl.SpatialCoordinate(mesh)
+        if at_rest is None:
+            check_places(parts.name, place, mesh)
+        here = (place if at_rest is None else at_rest.at)(frame.into(x))
+        placement = Placement(here.gap, frame.turned(here.direction))
+        super().__init__(parts, parts.new_pairs(), jump, placement, at_rest)
+        exact = ExactView(
+            x,
+            frame,
+            place if self._moved is None else self._moved.at,
+            parts.history,
+            parts.multipliers,
+        )
+        turns, friction = frame.rotation is not None, parts.law.has_friction
+        self._view = SampledView(exact, quadrature, jump, turns=turns, friction=friction)
+        self.in_form = FiniteKinematics(exact, parts.multipliers)
+        self.at_points = FiniteKinematics(self._view, parts.multipliers)
+        numbers = support if isinstance(support, SampledSupport) else None
+        self._passage = Passage(quadrature, numbers or place)
+
+    @property
+    def _free(self) -> list[int]:
+        """None: where all follows from X + u less the motion of the support, so do derivatives."""
+        return []
+
+    def update(self) -> None:
+        """See `Opposite`."""
+        super().update()
+        if self._moved is not None:
+            self._moved.update()
+        self._view.update()
+
+    def tangent(self, law: PointLaw) -> PointTangent:
+        """See `Opposite`."""
+        tangent = super().tangent(law)
+        rotation = self._parts.support.rotation
+        if self._parts.inputs.free_angle is None or rotation is None:
+            return tangent
+        return replace(tangent, spun=rotation.rate(law.evaluate_traction()))
+
+    def true_placement(self, values: PointValues) -> tuple[Array, Array]:
+        """See `Opposite`."""
+        self.update()
+        return self._view.values("gap"), self._view.values("normal")
+
+    def turned(self, vectors: Array) -> Array:
+        """See `Opposite`: of the frame of the support."""
+        return self._view.turned(vectors)
+
+    def slope(self, values: PointValues) -> Array:
+        """See `Opposite`."""
+        return np.asarray(np.linalg.norm(self._view.values("slope"), axis=1))
+
+    def curvature(self) -> Array:
+        """See `Opposite`."""
+        turns = [self._view.values(f"turn {i}") for i in range(self._gdim)]
+        by_place = -np.stack(turns, axis=1)
+        return np.asarray(by_place + by_place.swapaxes(1, 2)) / 2
+
+    def passed_through(self, values: PointValues) -> Mask:
+        """See `Opposite`."""
+        x, rotation, angle = values.x, self._parts.support.rotation, self.turned_by(values)
+
+        def turned(places: Array, share: float) -> Array:
+            if rotation is None:
+                return places
+            about = values.arrays["about"]
+            return about + rotation.turned(places - about, share * angle)
+
+        return self._passage.through(x + self.committed_jump, x + values.jump, turned)
+
+    def start(self) -> dict[str, Array]:
+        """See `Opposite`: the foot, minus X, and the normal there."""
+        self.update_data()
+        gap, normal = self._passage.sample(self.data.values["x"] + self.committed_jump)
+        return {"jump": self.committed_jump + gap[:, None] * normal, "normal": normal}
+
+
+def _placed(parts: Parts, x: Any, shift: Any) -> Placement:
+    """Where a rigid support is, seen from x (UFL)."""
+    return parts.support.place(x, shift, lambda v: parts.inputs.to_ufl("support", v))
+
+
+def _sampled_places(
+    parts: Parts, support: SampledSupport, frame: Frame, jump: fem.Function
+) -> tuple[SampledPlaces, SampledPlaces]:
+    """A support known in numbers, from X, and from X + u, in its frame. Collective.
+
+    Raises:
+        ValueError: Its data are of another dimension, or not the same on every rank.
+    """
+    mesh, kind = parts.quadrature.surface.mesh, type(support).__name__
+    d = mesh.geometry.dim
+    if support.gdim != d:
+        raise ValueError(
+            f"{parts.name}: the {kind} is given in {support.gdim} dimensions, and the mesh has "
+            f"{d}; give it {d} coordinates a point"
+        )
+    if len(set(mesh.comm.allgather(support.fingerprint))) > 1:
+        raise ValueError(
+            f"{parts.name}: the data of the {kind} differ from rank to rank; give every rank "
+            "the same (read the file on all of them, or broadcast its arrays)"
+        )
+    x = ufl.SpatialCoordinate(mesh)
+    places = (frame.into(x), frame.into(x + jump))
+    rest, moved = (SampledPlaces(parts.quadrature, support, place) for place in places)
+    return rest, moved
