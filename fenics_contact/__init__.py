@@ -3,6 +3,7 @@
 import fenics_contact.compat  # noqa: F401  # first: it refuses releases that are too old
 from fenics_contact import elasticity
 from fenics_contact._version import __version__
+from fenics_contact.checks.step import Step
 from fenics_contact.checks.verdict import Balance, NotConverged, Verdict
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.contact import Contact
@@ -19,7 +20,7 @@ from fenics_contact.laws.friction import Coulomb, FrictionLaw, Tresca
 from fenics_contact.laws.stiffness import Scaled, Springs
 from fenics_contact.laws.unilateral import Foundation, Frictionless
 from fenics_contact.meshes import model_to_mesh
-from fenics_contact.problem import ContactProblem, Step
+from fenics_contact.problem import ContactProblem
 from fenics_contact.results import output, plotting
 from fenics_contact.results.animation import Animation
 from fenics_contact.results.writer import Writer

@@ -15,18 +15,23 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.arguments import check_instance, is_number, listed
-from fenics_contact.checks.energy import Energy, EnergyState
+from fenics_contact.checks.energy import EnergyState
+from fenics_contact.checks.given import (
+    check_contacts,
+    check_start,
+    check_values,
+    constrained_unknowns,
+    find_displacement,
+)
 from fenics_contact.checks.judge import Judge
 from fenics_contact.checks.rigid_motions import RigidMotions
+from fenics_contact.checks.step import Step
 from fenics_contact.checks.verdict import Attempt, NotConverged, Verdict
 from fenics_contact.contact.contact import Contact, Found
-from fenics_contact.contact.values import Resultants, Status
-from fenics_contact.markup import shown
+from fenics_contact.contact.values import Status
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
 from fenics_contact.methods.solver import METHODS, Settings, Solver
-from fenics_contact.parallel import fail_together, global_max, global_min
-from fenics_contact.surface.displacement import Displacement
-from fenics_contact.surface.facets import facet_nodes
+from fenics_contact.parallel import fail_together, global_max
 from fenics_contact.surface.modulus import cell_modulus
 from fenics_contact.systems import linear
 from fenics_contact.systems.bulk import Bulk
@@ -35,114 +40,16 @@ from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Unknowns
-from fenics_contact.types import Array, Mask
+from fenics_contact.types import Array
 
-__all__ = ["ContactProblem", "Step"]
+__all__ = ["ContactProblem"]
 
 logger = logging.getLogger("fenics_contact")
 
-# Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
-_TOUCHING = 1e-12
 # Contact that bears less than this share of the load on a free motion bears nothing yet.
 _IDLE = 1e-3
-# Of a vector's largest component, what of another is the solver's tolerance.
-_NOTHING = 1e-9
-# How parts of a mixed function are prescribed.
-_OF_A_PART = (
-    "; on a part of a mixed one it is dirichletbc(value, dofs, W.sub(0)), where dofs are those of "
-    "locate_dofs_topological((W.sub(0), V), ...) and V, _ = W.sub(0).collapse()"
-)
 # What became of an attempt on too few unknowns.
 _SPREADS = "contact spreads beyond the unknowns kept"
-
-
-@dataclass(frozen=True)
-class Step:
-    """What one solve did.
-
-    Attributes:
-        increment: Number of the increment, from 1.
-        reason: SNES reason of the last solve (positive: converged).
-        iterations: SNES iterations in all, those on too few unknowns included.
-        rounds: Solutions one after another, with multipliers between them.
-        method: The method that found the solution; see `ContactProblem`.
-        factorisations: Sparse matrices factored; dense ones of a condensed problem do not count.
-        verdict: The independent check.
-        contacts: Resultants of every contact, by name.
-        energy: Works and energies of the increment.
-        attempts: Everything that was tried, in its order; the last is what found the solution.
-        wall_seconds: Time of the solve on this rank.
-        load: Load parameter, where `increments` set one.
-        increment_error: Errors by the size of the increments so far, by quantity, where
-            `increments` estimates them; see `ErrorBudget`.
-        complete: Whether all of u is that of the increment; else `ContactProblem.complete` makes
-            it so.
-    """
-
-    increment: int
-    reason: int
-    iterations: int
-    rounds: int
-    method: str
-    factorisations: int
-    verdict: Verdict
-    contacts: dict[str, Resultants]
-    energy: Energy
-    attempts: tuple[Attempt, ...]
-    wall_seconds: float
-    load: float | None = None
-    increment_error: dict[str, float] | None = None
-    complete: bool = True
-
-    def summary(self) -> str:
-        """One line for people.
-
-        Of every contact "force" is ∫ -r_n, "friction ∫|τ|" the sum of the sizes over the points,
-        and "resultant" the force on the body, in which tractions of opposite ways cancel.
-        """
-        parts = [f"increment {self.increment}"]
-        if self.load is not None:
-            parts.append(f"load {self.load:.6g}")
-        made = f"{self.iterations} iterations" if self.iterations else "solved by its first guess"
-        parts.append(f"{self.method}: {made}")
-        residual, force = self.verdict.relative_residual, self.verdict.force
-        parts.append(f"residual {residual:.1e} of the forces" if force > 0 else "no forces")
-        for name, r in self.contacts.items():
-            parts.append(
-                f"{name}: force {r.normal_force:.6g}, friction ∫|τ| "
-                f"{r.tangential_force:.6g}, resultant {_components(r.force)}, "
-                f"area {r.area:.4g}, {r.stick} stick {r.slip} slip {r.open} open"
-            )
-        return "; ".join(parts)
-
-    def _repr_html_(self) -> str:
-        """The same as a table, for notebooks."""
-        title = f"Increment {self.increment}"
-        if self.load is not None:
-            title += f", load {self.load:.6g}"
-        header = ("contact", "∫ pressure", "friction ∫|τ|", "resultant on the body", "area")
-        rows = [
-            (
-                name,
-                f"{r.normal_force:.6g}",
-                f"{r.tangential_force:.6g}",
-                _components(r.force),
-                f"{r.area:.4g}",
-                *(str(number) for number in (r.stick, r.slip, r.open)),
-            )
-            for name, r in self.contacts.items()
-        ]
-        remarks = [
-            f"{self.method}: {self.iterations} iterations; residual "
-            f"{self.verdict.relative_residual:.1e} of the forces"
-        ]
-        return shown(title, (*header, "stick", "slip", "open"), rows, remarks)
-
-
-def _components(vector: Array) -> str:
-    """In words; what is next to nothing beside the largest is 0."""
-    size = np.abs(vector).max(initial=0.0)
-    return "(" + ", ".join(f"{v if abs(v) > _NOTHING * size else 0:.6g}" for v in vector) + ")"
 
 
 @dataclass(frozen=True)
@@ -263,7 +170,7 @@ class ContactProblem:
         self.contacts = listed("contacts", contacts, Contact)
         self._bcs = listed("bcs", bcs, fem.DirichletBC)
         linear.warn_of_slow_blas()
-        self.displacement = self._find_displacement(u)
+        self.displacement = find_displacement(u, self.contacts)
         self.u = u
         self.bulk = Bulk(F, self.displacement)
         said = [c.accuracy for c in self.contacts if c.accuracy is not None]
@@ -275,8 +182,10 @@ class ContactProblem:
         n_motions = sum(len(contact.motions) for contact in self.contacts)
         self.unknowns = Unknowns(u.function_space, n_motions)
         self._n_owned = self.unknowns.n_dofs
-        self.constrained = self._constrained_unknowns()
-        self._check_contacts()
+        self.constrained = constrained_unknowns(
+            self._bcs, u, self.unknowns, mixed=self.displacement.mixed
+        )
+        check_contacts(self.contacts, self.displacement, self.constrained)
         self.full = FullSystem(
             self.displacement, self.unknowns, self.bulk, self.contacts, self.constrained
         )
@@ -295,7 +204,7 @@ class ContactProblem:
             [f"{m.kind} {m.way} of the support of {name}" for name, m in supports],
             turning=[motion.turns for _, motion in supports],
         )
-        self.initial_penetration = self._check_start()
+        self.initial_penetration = check_start(self.contacts, self.motions.size)
         self.motions.find_free(self.full.stiffness, self.constrained)
         self.motions.check_held(self.operators)
         self._judge = Judge(
@@ -348,83 +257,6 @@ class ContactProblem:
     @kinematics.setter
     def kinematics(self, share: float) -> None:
         self._judge.kinematics = share
-
-    # ---- construction ----------------------------------------------------------------------------
-
-    def _find_displacement(self, u: fem.Function) -> Displacement:
-        """That of the contacts, which must be of ``u`` and the same for all. Collective."""
-        if isinstance(u, ufl.core.expr.Expr) and not isinstance(u, fem.Function):
-            raise ValueError(
-                "problem: u is a part of a function, or another expression; give the function that "
-                "is solved for, the w of ufl.split(w)"
-            )
-        for contact in self.contacts:
-            found, first = contact.displacement, self.contacts[0].displacement
-            if found.whole is not u:
-                raise ValueError(f"{contact.name}: its u is not the u of the problem")
-            if not found.same_part(first):
-                raise ValueError(
-                    f"{contact.name}: its u is another part of the mixed function than that of "
-                    f"{self.contacts[0].name}; give all contacts the same"
-                )
-        if self.contacts:
-            return self.contacts[0].displacement
-        if not isinstance(u, fem.Function):
-            return Displacement(u, None, "problem")  # refuses it
-        return Displacement.only(u, "problem")
-
-    def _constrained_unknowns(self) -> Mask:
-        mask = np.zeros(self.unknowns.n_local, dtype=np.bool_)
-        for bc in self._bcs:
-            dofs, _ = bc.dof_indices()
-            # A collapsed part of a mixed space has numbers of its own.
-            own, all_of_u = (s.dofmap.index_map for s in (bc.function_space, self.u.function_space))
-            other = own.size_global != all_of_u.size_global
-            if self._comm.allreduce(
-                int(other or (dofs.size and dofs.max() >= self.u.x.array.size))
-            ):
-                advice = _OF_A_PART if self.displacement.mixed else ""
-                raise ValueError(
-                    f"a Dirichlet condition is on another function space than u{advice}"
-                )
-            # Their number of owned dofs, which comes with them, is wrong for blocked conditions.
-            mask[dofs[dofs < self._n_owned]] = True
-        return mask
-
-    def _check_contacts(self) -> None:
-        names = [c.name for c in self.contacts]
-        if len(set(names)) != len(names):
-            raise ValueError(f"contacts are named {names}; give every Contact a name of its own")
-        constrained = fem.Function(self.u.function_space)
-        constrained.x.array[: self._n_owned] = self.constrained[: self._n_owned]
-        constrained.x.scatter_forward()
-        dofs = self.displacement.dofs
-        mask = constrained.x.array if dofs is None else constrained.x.array[dofs]
-        for contact in self.contacts:
-            held = _facets_held(contact, mask)
-            n_held = self._comm.allreduce(held)
-            if n_held:
-                raise ValueError(
-                    f"{contact.name}: all displacements of {n_held} facets of Γc are prescribed by "
-                    "Dirichlet conditions; contact has nothing to decide there: take these facets "
-                    "out of Γc or out of the condition"
-                )
-
-    def _check_start(self) -> float:
-        worst = 0.0
-        for contact in self.contacts:
-            contact.check_input()
-            contact.inputs.check_side(contact.values, gap_prescribed=contact.gap_prescribed)
-            gap = global_min(self._comm, contact.values.initial_gap)
-            if gap < -_TOUCHING * self.motions.size and not contact.gap_prescribed:
-                worst = max(worst, -gap)
-                if self._comm.rank == 0:
-                    logger.warning(
-                        "%s: the undeformed body penetrates its support by up to %g",
-                        contact.name,
-                        -gap,
-                    )
-        return worst
 
     def expect(self, increments: int) -> None:
         """Say how many increments will be solved: the choice of the solver needs it. Collective.
@@ -713,13 +545,7 @@ class ContactProblem:
         size = global_max(self._comm, np.abs(self._load))
         if not np.isfinite(size):
             raise ValueError("the external load is not finite (NaN or inf) at some dof")
-        for number, bc in enumerate(self._bcs):
-            values = np.zeros_like(self.u.x.array)
-            bc.set(values)
-            if not np.isfinite(global_max(self._comm, np.abs(values))):
-                raise ValueError(
-                    f"Dirichlet condition number {number} has values that are not finite"
-                )
+        check_values(self._bcs, self.u)
         if self.bulk.linear:
             self.motions.check_balance(self._load, self.operators)
 
@@ -923,10 +749,3 @@ class ContactProblem:
         self.solver.restart()
         for mark in set(self._committed_energy.forces) - {self.full.mark}:
             del self._committed_energy.forces[mark]
-
-
-def _facets_held(contact: Contact, constrained: Array) -> int:
-    """Number of this rank's facets of Γc all of whose displacements are prescribed."""
-    space, facets = contact.u.function_space, contact.surface.facets
-    held: Mask = np.all(constrained.reshape(-1, space.dofmap.bs), axis=1)
-    return int(np.count_nonzero(held[facet_nodes(space, facets)].all(axis=1)))

@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 from dolfinx import fem
 
+from fenics_contact.checks.step import Step
 from fenics_contact.checks.verdict import Attempt, NotConverged
 from fenics_contact.estimates.errors import quantities
 from fenics_contact.histories import checkpoint as states
 from fenics_contact.histories.table import Table
 from fenics_contact.parallel import collective_errors
-from fenics_contact.problem import ContactProblem, Step
+from fenics_contact.problem import ContactProblem
 from fenics_contact.types import Array
 
 __all__ = ["increments"]

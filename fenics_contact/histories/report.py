@@ -16,6 +16,7 @@ import numpy as np
 from dolfinx import fem
 
 from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.checks.step import Step
 from fenics_contact.contact.contact import Contact
 from fenics_contact.estimates.errors import ErrorBudget
 from fenics_contact.histories import table
@@ -23,7 +24,7 @@ from fenics_contact.installation import information
 from fenics_contact.laws.stiffness import Scaled, Springs
 from fenics_contact.markup import shown
 from fenics_contact.parallel import collective_errors, global_max
-from fenics_contact.problem import ContactProblem, Step
+from fenics_contact.problem import ContactProblem
 from fenics_contact.results import drawing, files, plotting
 from fenics_contact.types import Array
 

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from fenics_contact.checks.step import Step
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Resultants
 from fenics_contact.parallel import collective_errors
-from fenics_contact.problem import ContactProblem, Step
+from fenics_contact.problem import ContactProblem
 from fenics_contact.results import files
 
 __all__ = ["AXES", "ENERGIES", "STATES", "Table", "columns", "read", "values"]

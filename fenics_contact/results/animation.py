@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.checks.step import Step
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import collective_errors
-from fenics_contact.problem import ContactProblem, Step
+from fenics_contact.problem import ContactProblem
 from fenics_contact.results import drawing, files
 from fenics_contact.results.writer import facet_status
 from fenics_contact.types import Array

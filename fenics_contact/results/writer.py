@@ -18,10 +18,11 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.checks.step import Step
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import collective_errors
-from fenics_contact.problem import ContactProblem, Step
+from fenics_contact.problem import ContactProblem
 from fenics_contact.results import files, vtu
 from fenics_contact.results.drawing import von_mises
 from fenics_contact.surface.facets import FacetSet

@@ -1,0 +1,174 @@
+"""Whether displacement, Dirichlet conditions and contacts of a problem go together."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+from fenics_contact.contact.contact import Contact
+from fenics_contact.parallel import global_max, global_min
+from fenics_contact.surface.displacement import Displacement
+from fenics_contact.surface.facets import facet_nodes
+from fenics_contact.systems.unknowns import Unknowns
+from fenics_contact.types import Array, Mask
+
+__all__ = [
+    "check_contacts",
+    "check_start",
+    "check_values",
+    "constrained_unknowns",
+    "find_displacement",
+]
+
+
+logger = logging.getLogger("fenics_contact")
+
+# Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
+_TOUCHING = 1e-12
+# How parts of a mixed function are prescribed.
+_OF_A_PART = (
+    "; on a part of a mixed one it is dirichletbc(value, dofs, W.sub(0)), where dofs are those of "
+    "locate_dofs_topological((W.sub(0), V), ...) and V, _ = W.sub(0).collapse()"
+)
+
+
+def find_displacement(u: fem.Function, contacts: Sequence[Contact]) -> Displacement:
+    """That of the contacts, which must be of ``u`` and the same for all. Collective.
+
+    Raises:
+        ValueError: It is not.
+    """
+    if isinstance(u, ufl.core.expr.Expr) and not isinstance(u, fem.Function):
+        raise ValueError(
+            "problem: u is a part of a function, or another expression; give the function that "
+            "is solved for, the w of ufl.split(w)"
+        )
+    for contact in contacts:
+        found, first = contact.displacement, contacts[0].displacement
+        if found.whole is not u:
+            raise ValueError(f"{contact.name}: its u is not the u of the problem")
+        if not found.same_part(first):
+            raise ValueError(
+                f"{contact.name}: its u is another part of the mixed function than that of "
+                f"{contacts[0].name}; give all contacts the same"
+            )
+    if contacts:
+        return contacts[0].displacement
+    if not isinstance(u, fem.Function):
+        return Displacement(u, None, "problem")  # refuses it
+    return Displacement.only(u, "problem")
+
+
+def constrained_unknowns(
+    bcs: Sequence[fem.DirichletBC], u: fem.Function, unknowns: Unknowns, *, mixed: bool
+) -> Mask:
+    """This rank's unknowns with Dirichlet conditions, (n_local,). Collective.
+
+    Args:
+        bcs: The conditions.
+        u: What is solved for.
+        unknowns: Of the problem.
+        mixed: Whether the displacement is a part of ``u``.
+
+    Raises:
+        ValueError: A condition is of another function.
+    """
+    mask = np.zeros(unknowns.n_local, dtype=np.bool_)
+    for bc in bcs:
+        dofs, _ = bc.dof_indices()
+        # A collapsed part of a mixed space has numbers of its own.
+        own, all_of_u = (s.dofmap.index_map for s in (bc.function_space, u.function_space))
+        other = own.size_global != all_of_u.size_global
+        if unknowns.comm.allreduce(int(other or (dofs.size and dofs.max() >= u.x.array.size))):
+            advice = _OF_A_PART if mixed else ""
+            raise ValueError(f"a Dirichlet condition is on another function space than u{advice}")
+        # Their number of owned dofs, which comes with them, is wrong for blocked conditions.
+        mask[dofs[dofs < unknowns.n_dofs]] = True
+    return mask
+
+
+def check_values(bcs: Sequence[fem.DirichletBC], u: fem.Function) -> None:
+    """Refuse prescribed values that are no numbers. Collective.
+
+    Raises:
+        ValueError: On all ranks.
+    """
+    for number, bc in enumerate(bcs):
+        values = np.zeros_like(u.x.array)
+        bc.set(values)
+        if not np.isfinite(global_max(u.function_space.mesh.comm, np.abs(values))):
+            raise ValueError(f"Dirichlet condition number {number} has values that are not finite")
+
+
+def check_contacts(
+    contacts: Sequence[Contact], displacement: Displacement, constrained: Mask
+) -> None:
+    """Refuse contacts of one name, and Γc where all is prescribed. Collective.
+
+    Args:
+        contacts: Of a problem.
+        displacement: Likewise.
+        constrained: What `constrained_unknowns` gave.
+
+    Raises:
+        ValueError: On all ranks.
+    """
+    names = [c.name for c in contacts]
+    if len(set(names)) != len(names):
+        raise ValueError(f"contacts are named {names}; give every Contact a name of its own")
+    space = displacement.whole.function_space
+    held = fem.Function(space)
+    n_owned = space.dofmap.index_map.size_local * space.dofmap.index_map_bs
+    held.x.array[:n_owned] = constrained[:n_owned]
+    held.x.scatter_forward()
+    mask = held.x.array if displacement.dofs is None else held.x.array[displacement.dofs]
+    for contact in contacts:
+        n_held = space.mesh.comm.allreduce(_facets_held(contact, mask))
+        if n_held:
+            raise ValueError(
+                f"{contact.name}: all displacements of {n_held} facets of Γc are prescribed by "
+                "Dirichlet conditions; contact has nothing to decide there: take these facets "
+                "out of Γc or out of the condition"
+            )
+
+
+def _facets_held(contact: Contact, constrained: Array) -> int:
+    """Number of this rank's facets of Γc all of whose displacements are prescribed."""
+    space, facets = contact.u.function_space, contact.surface.facets
+    held: Mask = np.all(constrained.reshape(-1, space.dofmap.bs), axis=1)
+    return int(np.count_nonzero(held[facet_nodes(space, facets)].all(axis=1)))
+
+
+def check_start(contacts: Sequence[Contact], size: float) -> float:
+    """Refuse input out of range, and warn of bodies that are in their supports. Collective.
+
+    Args:
+        contacts: Of a problem.
+        size: Of the mesh (length).
+
+    Returns:
+        Largest penetration of the undeformed body (length), 0 if none; an interference by a
+        prescribed gap is none.
+
+    Raises:
+        ValueError: On all ranks.
+    """
+    worst = 0.0
+    for contact in contacts:
+        comm = contact.surface.mesh.comm
+        contact.check_input()
+        contact.inputs.check_side(contact.values, gap_prescribed=contact.gap_prescribed)
+        gap = global_min(comm, contact.values.initial_gap)
+        if gap < -_TOUCHING * size and not contact.gap_prescribed:
+            worst = max(worst, -gap)
+            if comm.rank == 0:
+                logger.warning(
+                    "%s: the undeformed body penetrates its support by up to %g",
+                    contact.name,
+                    -gap,
+                )
+    return worst

@@ -1,0 +1,108 @@
+"""What one increment came to, in numbers and in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fenics_contact.checks.energy import Energy
+from fenics_contact.checks.verdict import Attempt, Verdict
+from fenics_contact.contact.values import Resultants
+from fenics_contact.markup import shown
+from fenics_contact.types import Array
+
+__all__ = ["Step"]
+
+
+# Of a vector's largest component, what of another is the solver's tolerance.
+_NOTHING = 1e-9
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one solve did.
+
+    Attributes:
+        increment: Number of the increment, from 1.
+        reason: SNES reason of the last solve (positive: converged).
+        iterations: SNES iterations in all, those on too few unknowns included.
+        rounds: Solutions one after another, with multipliers between them.
+        method: The method that found the solution; see `ContactProblem`.
+        factorisations: Sparse matrices factored; dense ones of a condensed problem do not count.
+        verdict: The independent check.
+        contacts: Resultants of every contact, by name.
+        energy: Works and energies of the increment.
+        attempts: Everything that was tried, in its order; the last is what found the solution.
+        wall_seconds: Time of the solve on this rank.
+        load: Load parameter, where `increments` set one.
+        increment_error: Errors by the size of the increments so far, by quantity, where
+            `increments` estimates them; see `ErrorBudget`.
+        complete: Whether all of u is that of the increment; else `ContactProblem.complete` makes
+            it so.
+    """
+
+    increment: int
+    reason: int
+    iterations: int
+    rounds: int
+    method: str
+    factorisations: int
+    verdict: Verdict
+    contacts: dict[str, Resultants]
+    energy: Energy
+    attempts: tuple[Attempt, ...]
+    wall_seconds: float
+    load: float | None = None
+    increment_error: dict[str, float] | None = None
+    complete: bool = True
+
+    def summary(self) -> str:
+        """One line for people.
+
+        Of every contact "force" is ∫ -r_n, "friction ∫|τ|" the sum of the sizes over the points,
+        and "resultant" the force on the body, in which tractions of opposite ways cancel.
+        """
+        parts = [f"increment {self.increment}"]
+        if self.load is not None:
+            parts.append(f"load {self.load:.6g}")
+        made = f"{self.iterations} iterations" if self.iterations else "solved by its first guess"
+        parts.append(f"{self.method}: {made}")
+        residual, force = self.verdict.relative_residual, self.verdict.force
+        parts.append(f"residual {residual:.1e} of the forces" if force > 0 else "no forces")
+        for name, r in self.contacts.items():
+            parts.append(
+                f"{name}: force {r.normal_force:.6g}, friction ∫|τ| "
+                f"{r.tangential_force:.6g}, resultant {_components(r.force)}, "
+                f"area {r.area:.4g}, {r.stick} stick {r.slip} slip {r.open} open"
+            )
+        return "; ".join(parts)
+
+    def _repr_html_(self) -> str:
+        """The same as a table, for notebooks."""
+        title = f"Increment {self.increment}"
+        if self.load is not None:
+            title += f", load {self.load:.6g}"
+        header = ("contact", "∫ pressure", "friction ∫|τ|", "resultant on the body", "area")
+        rows = [
+            (
+                name,
+                f"{r.normal_force:.6g}",
+                f"{r.tangential_force:.6g}",
+                _components(r.force),
+                f"{r.area:.4g}",
+                *(str(number) for number in (r.stick, r.slip, r.open)),
+            )
+            for name, r in self.contacts.items()
+        ]
+        remarks = [
+            f"{self.method}: {self.iterations} iterations; residual "
+            f"{self.verdict.relative_residual:.1e} of the forces"
+        ]
+        return shown(title, (*header, "stick", "slip", "open"), rows, remarks)
+
+
+def _components(vector: Array) -> str:
+    """In words; what is next to nothing beside the largest is 0."""
+    size = np.abs(vector).max(initial=0.0)
+    return "(" + ", ".join(f"{v if abs(v) > _NOTHING * size else 0:.6g}" for v in vector) + ")"
