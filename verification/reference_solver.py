@@ -37,6 +37,8 @@ _STEP = 1e-60
 # Facets are covered if no more than this share of them is not.
 _COVERED = 1e-6
 _OVERLAP = 1e-6
+# Systems whose condition is better than its inverse are solved by elimination.
+_WELL = 1e-8
 
 
 # ---- geometry ------------------------------------------------------------------------------------
@@ -494,7 +496,7 @@ class Law:
             along = (np.abs(n[:, 0].real) < 0.9)[:, None]
             direction = np.where(along, np.array([1.0, 0, 0]), np.array([0.0, 1, 0]))
         else:
-            direction = np.tile(np.asarray(self.direction, dtype=float), (len(n), 1))
+            direction = np.asarray(self.direction, dtype=float)
         first = direction - np.sum(direction * n, axis=1)[:, None] * n
         first = first / np.sqrt(np.sum(first * first, axis=1))[:, None]
         return first, np.cross(n, first)
@@ -510,10 +512,13 @@ class Law:
         closing: Array,
         given: Array | None,
     ) -> Array:
-        """τ from Δu_t, the old τ and u_t, all (n, d); ``given``: limit of friction."""
+        """τ from Δu_t, the old τ and u_t, all (n, d); ``given``: limit of friction.
+
+        Δu_t, u_t, r_n and the closing may have one more axis, the first.
+        """
         if self.kind == "foundation":
             tau = -k_t[:, None] * total
-            return tau if self.tension else np.where((closing.real > 0)[:, None], tau, 0)
+            return tau if self.tension else np.where((closing.real > 0)[..., None], tau, 0)
         if not self.slips:
             return np.zeros_like(step)
         limit = (
@@ -524,25 +529,26 @@ class Law:
         if given is not None:
             limit = 0 * r_n + given
         if n.shape[1] == 2:
-            tangent = np.column_stack([-n[:, 1], n[:, 0]])
-            trial = np.sum((old - k_t[:, None] * step) * tangent, axis=1)
+            tangent = np.stack([-n[:, 1], n[:, 0]], axis=1)
+            trial = _dot(old - k_t[:, None] * step, tangent)
             value = np.where(trial.real > limit.real, limit, trial)
             value = np.where(trial.real < -limit.real, -limit, value)
-            return value[:, None] * tangent
+            return value[..., None] * tangent
         first, second = self.frame(n)
         ratio = 1.0 if self.transverse is None else self.transverse / self.friction
         # The limit is a circle or polygon in σ = (τ₁, τ₂/r), and K_t is k_t diag(1, r²).
         trial = np.stack(
             [
-                np.sum(old * first, axis=1) - k_t * np.sum(step * first, axis=1),
-                np.sum(old * second, axis=1) / ratio - k_t * ratio * np.sum(step * second, axis=1),
+                _dot(old, first) - k_t * _dot(step, first),
+                _dot(old, second) / ratio - k_t * ratio * _dot(step, second),
             ],
-            axis=1,
+            axis=-1,
         )
-        sigma = _nearest_in_circle(trial, limit)
         if self.modes is not None:
             sigma = nearest_in_polygon(trial, limit, self.modes)
-        return sigma[:, :1] * first + ratio * sigma[:, 1:] * second
+        else:
+            sigma = _nearest_in_circle(trial, limit)
+        return sigma[..., :1] * first + ratio * sigma[..., 1:] * second
 
     def stiffness(self, k_t: Array, n: Array) -> Array:
         """K_t, (n, d, d)."""
@@ -562,18 +568,22 @@ class Law:
         return np.linalg.solve(self.stiffness(k_t, n) + along, tau[..., None])[..., 0]
 
 
+def _dot(one: Array, other: Array) -> Array:
+    """Scalar products of vectors, which are the last axis; complex ones are not conjugated."""
+    return np.einsum("...i,...i->...", one, other)
+
+
 def _nearest_in_circle(trial: Array, limit: Array) -> Array:
-    size = np.sqrt(np.sum(trial * trial, axis=1) + 0j)
-    size = size if np.iscomplexobj(trial) or np.iscomplexobj(limit) else size.real
+    size = np.sqrt(_dot(trial, trial))
     out = size.real > limit.real
-    return np.where(out[:, None], (limit / np.where(out, size, 1.0))[:, None] * trial, trial)
+    return np.where(out[..., None], (limit / np.where(out, size, 1.0))[..., None] * trial, trial)
 
 
 def nearest_in_polygon(trial: Array, limit: Array, modes: int) -> Array:
     """The nearest point of the polygon: of all its sides' nearest points the nearest one."""
     half = np.tan(np.pi / modes)
-    inside = np.ones(len(trial), dtype=bool)
-    best, found = np.full(len(trial), np.inf), trial.copy() + 0 * limit[:, None]
+    inside = np.ones(trial.shape[:-1], dtype=bool)
+    best, found = np.full(inside.shape, np.inf), trial + 0 * limit[..., None]
     for j in range(modes):
         angle = 2 * np.pi * j / modes
         a, b = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
@@ -581,12 +591,12 @@ def nearest_in_polygon(trial: Array, limit: Array, modes: int) -> Array:
         inside &= x.real <= limit.real
         y = np.where(y.real > half * limit.real, half * limit, y)
         y = np.where(y.real < -half * limit.real, -half * limit, y)
-        place = limit[:, None] * a + y[:, None] * b
-        far = np.linalg.norm((place - trial).real, axis=1)
+        place = limit[..., None] * a + y[..., None] * b
+        far = np.linalg.norm((place - trial).real, axis=-1)
         nearer = far < best
         best = np.where(nearer, far, best)
-        found = np.where(nearer[:, None], place, found)
-    return np.where(inside[:, None], trial, found)
+        found = np.where(nearer[..., None], place, found)
+    return np.where(inside[..., None], trial, found)
 
 
 # ---- a contact -----------------------------------------------------------------------------------
@@ -656,21 +666,20 @@ class ContactModel:
         return self.interpolation @ u.reshape(-1, self.d)
 
     def respond(self, jump: Array, shift: Array, old: State) -> dict[str, Array]:
-        """Tractions and what they follow from."""
+        """Tractions and what they follow from; of one jump (n, d), or of several, (m, n, d)."""
         gap, n = self.place(shift)
-        closing = np.sum(jump * n, axis=1) - gap
         relative = jump - shift
 
         def across(vector: Array) -> Array:
-            return vector - np.sum(vector * n, axis=1)[:, None] * n
+            return vector - _dot(vector, n)[..., None] * n
 
+        closing = _dot(jump, n) - gap
         step, before = across(relative - old.jump), across(old.traction)
+        total = across(relative) if self.law.kind == "foundation" else relative
         r_n = self.law.normal(self.k_n, closing, old.pressure)
-        tau = self.law.tangential(
-            self.k_t, n, step, before, across(relative), r_n, closing, old.limit
-        )
+        tau = self.law.tangential(self.k_t, n, step, before, total, r_n, closing, old.limit)
         r_n, tau = np.where(self.paired, r_n, 0), np.where(self.paired[:, None], tau, 0)
-        traction = r_n[:, None] * n + tau
+        traction = r_n[..., None] * n + tau
         return {
             "normal": n,
             "closing": closing,
@@ -682,14 +691,21 @@ class ContactModel:
             "traction": traction,
         }
 
-    def derivatives(self, jump: Array, shift: Array, old: State) -> tuple[Array, Array]:
-        """∂t/∂jump, (n, d, d), and ∂t/∂shift, (n, d, d); the last index is the component."""
-        by_jump, by_shift = [], []
-        for i in range(self.d):
-            turn = 1j * _STEP * np.eye(self.d)[i]
-            by_jump.append(self.respond(jump + turn, shift + 0j, old)["traction"].imag / _STEP)
-            by_shift.append(self.respond(jump + 0j, shift + turn, old)["traction"].imag / _STEP)
-        return np.stack(by_jump, axis=2), np.stack(by_shift, axis=2)
+    def derivatives(
+        self, jump: Array, shift: Array, old: State, moves: Sequence[int] | None = None
+    ) -> tuple[Array, Array]:
+        """∂t/∂jump, (n, d, d), and ∂t/∂shift, (n, d, m); the last index is the component.
+
+        ``moves``: components of the shift that are asked for; by default all of them.
+        """
+        turns = 1j * _STEP * np.eye(self.d)
+        found = self.respond(jump + turns[:, None], shift, old)["traction"]
+        by_jump = np.moveaxis(found.imag, 0, 2) / _STEP
+        by_shift = np.zeros((len(jump), self.d, self.d if moves is None else len(moves)))
+        for k, i in enumerate(range(self.d) if moves is None else moves):
+            found = self.respond(jump + 0j, shift + turns[i], old)["traction"]
+            by_shift[:, :, k] = found.imag / _STEP
+        return by_jump, by_shift
 
     def augment(self, found: dict[str, Array], old: State) -> State:
         """One round: the multipliers that the tractions found make."""
@@ -760,13 +776,142 @@ class Failed(RuntimeError):
     """No solution was found here."""
 
 
+class Reduced:
+    """A linear problem on the unknowns of Γc and the free motions, the others eliminated.
+
+    It holds while the pairs and the prescribed unknowns are the same.
+
+    Attributes:
+        kept, inner: Numbers of the unknowns of Γc that are free, n, and of those eliminated.
+        stiffness: Of these n unknowns, then of m free motions, (n + m, n + m).
+        closed: With all of Γc closed and sticking, to hold what nothing holds yet.
+        scale: Root of the diagonal of that.
+        maps: Of every contact, from the n unknowns to jumps, (n_points d, n).
+        left: From all n + m unknowns to jumps less shifts, (n_points d, n + m).
+        moves: Of every contact the columns of its motions there, and their components.
+    """
+
+    def __init__(self, problem: Problem, fixed: Array) -> None:
+        """Eliminate what is neither on Γc nor prescribed."""
+        d, stiff = problem.body.d, problem.body.stiffness
+        self._fixed = fixed
+        self._pairs = [c.interpolation for c in problem.contacts]
+        felt, held = np.zeros(len(stiff), dtype=bool), np.zeros(len(stiff), dtype=bool)
+        for pairs in self._pairs:
+            felt |= np.repeat(np.any(pairs != 0, axis=0), d)
+        held[fixed] = True
+        self.kept, self.inner = np.flatnonzero(felt & ~held), np.flatnonzero(~felt & ~held)
+        self._dragged = stiff[:, fixed]
+        schur = stiff[np.ix_(self.kept, self.kept)]
+        if len(self.inner):
+            self._factor = scipy.linalg.cho_factor(stiff[np.ix_(self.inner, self.inner)])
+            self._across = stiff[np.ix_(self.inner, self.kept)]
+            self._recover = scipy.linalg.cho_solve(self._factor, self._across)
+            schur = schur - self._across.T @ self._recover
+        free = problem.motions()
+        self.stiffness = scipy.linalg.block_diag(schur, np.zeros((len(free),) * 2))
+        self.closed = self.stiffness.copy()
+        self.maps, self.left, self.moves, self._ties = [], [], [], []
+        for c, model in enumerate(problem.contacts):
+            whole = np.kron(model.interpolation, np.eye(d))
+            mine = [len(self.kept) + k for k, (o, _) in enumerate(free) if o == c]
+            axes = [i for o, i in free if o == c]
+            left = np.zeros((model.x.size, len(self.stiffness)))
+            left[:, : len(self.kept)] = whole[:, self.kept]
+            left[:, mine] = -np.tile(np.eye(d)[:, axes], (len(model.x), 1))
+            self.maps.append(whole[:, self.kept])
+            self.left.append(left)
+            self.moves.append((mine, axes))
+            self._ties.append(whole[:, fixed])
+            springs = np.where(model.k_t > 0, model.k_t, model.k_n)
+            springs = model.weights * np.maximum(model.k_n, springs)
+            self.closed += left.T @ (np.repeat(springs, d)[:, None] * left)
+        self.scale = np.sqrt(np.maximum(np.abs(np.diag(self.closed)), 1e-300))
+        self._sizes = np.abs(self.stiffness), [np.abs(left) for left in self.left]
+        self._load: Load | None = None
+
+    def holds(self, problem: Problem, fixed: Array) -> bool:
+        """Whether it is still this problem."""
+        pairs = zip(problem.contacts, self._pairs, strict=True)
+        return all(c.interpolation is p for c, p in pairs) and np.array_equal(fixed, self._fixed)
+
+    def take(self, load: Load) -> tuple[Array, list[Array]]:
+        """Forces on the n + m unknowns; jumps of what is prescribed alone, of every contact."""
+        if load is not self._load:
+            right = load.force - self._dragged @ load.values
+            force = right[self.kept]
+            if len(self.inner):
+                self._first = scipy.linalg.cho_solve(self._factor, right[self.inner])
+                force = force - self._across.T @ self._first
+            pushes = [load.pushes[c][i] for c, (_, axes) in enumerate(self.moves) for i in axes]
+            self._taken = np.concatenate([force, pushes]), [t @ load.values for t in self._ties]
+            self._load = load
+        return self._taken
+
+    def fill(self, u: Array, kept: Array) -> None:
+        """Set the kept unknowns, and those eliminated, of the load taken last."""
+        u[self.kept] = kept
+        if len(self.inner):
+            u[self.inner] = self._first - self._recover @ kept
+
+    def floor(self, z: Array, forces: list[Array]) -> float:
+        """Size of all that the residual is summed of: rounding is a share of this."""
+        stiff, left = self._sizes
+        total = stiff @ np.abs(z)
+        for across, force in zip(left, forces, strict=True):
+            total += np.abs(force) @ across
+        return float(np.linalg.norm(total))
+
+    def step(self, matrix: Array, rest: Array) -> Array:
+        """Newton's step; that of closed springs where nothing holds the bodies."""
+        system = matrix / self.scale[:, None] / self.scale
+        right = -rest / self.scale
+        size = np.abs(system).sum(axis=0).max(initial=0.0)
+        factor, order, singular = scipy.linalg.lapack.dgetrf(system)
+        if not singular and scipy.linalg.lapack.dgecon(factor, size)[0] > _WELL:
+            return scipy.linalg.lapack.dgetrs(factor, order, right)[0] / self.scale
+        if np.linalg.cond(system) > 1e13:
+            system = self.closed / self.scale[:, None] / self.scale
+        return np.linalg.lstsq(system, right, rcond=1e-15)[0] / self.scale
+
+
+@dataclass(eq=False)
+class Trial:
+    """A place of Newton's method.
+
+    Attributes:
+        z: The n + m unknowns of `Reduced`.
+        rest: Residual of these.
+        size: The largest force.
+        jumps, shifts, forces: Of every contact.
+    """
+
+    z: Array
+    rest: Array
+    size: float
+    jumps: list[Array]
+    shifts: list[Array]
+    forces: list[Array]
+
+
+def _change(new: list[State], old: list[State]) -> tuple[float, float]:
+    """Largest change of multipliers, and the largest of them (stress)."""
+    change = scale = 0.0
+    for a, b in zip(new, old, strict=True):
+        if a.pressure is not None:
+            change = max(change, np.abs(a.pressure - b.pressure).max())
+            change = max(change, np.abs(a.traction - b.traction).max())
+            scale = max(scale, np.abs(a.pressure).max(), np.abs(a.traction).max())
+    return change, scale
+
+
 @dataclass(eq=False)
 class Problem:
     """A linear bulk and contacts, dense."""
 
     body: Body
     contacts: list[ContactModel]
-    notes: list[str] = field(default_factory=list)
+    _reduced: Reduced | None = field(default=None, init=False, repr=False)
 
     def motions(self) -> list[tuple[int, int]]:
         """Contact and component of every free motion."""
@@ -833,15 +978,7 @@ class Problem:
                 c.augment(f, o) if c.project is not None else o
                 for c, f, o in zip(self.contacts, found, old, strict=True)
             ]
-            change = scale = 0.0
-            for a, b in zip(new, old, strict=True):
-                if a.pressure is not None:
-                    change = max(
-                        change,
-                        np.abs(a.pressure - b.pressure).max(),
-                        np.abs(a.traction - b.traction).max(),
-                    )
-                    scale = max(scale, np.abs(a.pressure).max(), np.abs(a.traction).max())
+            change, scale = _change(new, old)
             old = new
             if change <= 1e-9 * scale:
                 return u, motion, old
@@ -871,122 +1008,77 @@ class Problem:
                     return self._newton(u, motion, load, old, rtol)
         raise last
 
+    def _reduce(self, fixed: Array) -> Reduced:
+        if self._reduced is None or not self._reduced.holds(self, fixed):
+            self._reduced = Reduced(self, fixed)
+        return self._reduced
+
+    def _tangent(self, reduced: Reduced, at: Trial, old: list[State]) -> Array:
+        """Derivative of the residual."""
+        d, matrix = self.body.d, reduced.stiffness.copy()
+        for c, model in enumerate(self.contacts):
+            mine, axes = reduced.moves[c]
+            by_jump, by_shift = model.derivatives(at.jumps[c], at.shifts[c], old[c], axes)
+            w, maps = model.weights[:, None, None], reduced.maps[c]
+            felt = ((w * by_jump) @ maps.reshape(-1, d, maps.shape[1])).reshape(maps.shape)
+            matrix[:, : maps.shape[1]] -= reduced.left[c].T @ felt
+            if mine:
+                turned = (w * by_shift).reshape(-1, len(axes))
+                matrix[:, mine] -= reduced.left[c].T @ turned
+        return matrix
+
     def _newton(
         self, u: Array, motion: Array, load: Load, old: list[State], rtol: float
     ) -> tuple[Array, Array]:
         """Newton's method on the unknowns of Γc, the others eliminated."""
-        d, n = self.body.d, len(u)
-        felt = np.zeros(n, dtype=bool)
-        for c in self.contacts:
-            felt |= np.repeat(np.any(c.interpolation != 0, axis=0), d)
-        fixed = np.zeros(n, dtype=bool)
-        fixed[load.fixed] = True
-        kept, inner = np.flatnonzero(felt & ~fixed), np.flatnonzero(~felt & ~fixed)
-        stiff = self.body.stiffness
-        u = u.copy()
-        u[load.fixed] = load.values
-        right = load.force - stiff[:, load.fixed] @ load.values
-        if len(inner):
-            factor = scipy.linalg.cho_factor(stiff[np.ix_(inner, inner)])
-            across = stiff[np.ix_(inner, kept)]
-            first = scipy.linalg.cho_solve(factor, right[inner])
-            recover = scipy.linalg.cho_solve(factor, across)
-            schur = stiff[np.ix_(kept, kept)] - across.T @ recover
-            g = right[kept] - across.T @ first
-        else:
-            schur, g = stiff[np.ix_(kept, kept)], right[kept]
-        maps = [np.kron(c.interpolation, np.eye(d))[:, kept] for c in self.contacts]
-        rigid = [
-            np.kron(c.interpolation, np.eye(d))[:, load.fixed] @ load.values for c in self.contacts
-        ]
-        free = self.motions()
+        reduced = self._reduce(load.fixed)
+        outside, rigid = reduced.take(load)
+        d, n = self.body.d, len(reduced.kept)
+        given = np.linalg.norm(outside[:n])
 
-        def evaluate(z: Array, *, tangent: bool) -> tuple[Array, Array | None, float, Array]:
-            v, m = z[: len(kept)], z[len(kept) :]
-            shifts = self.shifts(load, m)
-            rest = np.concatenate([schur @ v - g, [-load.pushes[c][i] for c, i in free]])
-            floor = np.concatenate([np.abs(schur) @ np.abs(v), np.zeros(len(free))])
-            sizes = [np.linalg.norm(g), np.linalg.norm(schur @ v)]
-            matrix = np.zeros((len(z), len(z))) if tangent else None
-            if tangent:
-                matrix[: len(kept), : len(kept)] = schur
+        def evaluate(z: Array) -> Trial:
+            inside = reduced.stiffness @ z
+            rest, size = inside - outside, max(given, np.linalg.norm(inside))
+            shifts, jumps, forces = self.shifts(load, z[n:]), [], []
             for c, model in enumerate(self.contacts):
-                jump = (maps[c] @ v + rigid[c]).reshape(-1, d)
-                found = model.respond(jump, shifts[c], old[c])
-                force = (model.weights[:, None] * found["traction"]).ravel()
-                mine = [len(kept) + k for k, (o, _) in enumerate(free) if o == c]
-                axes = [i for o, i in free if o == c]
-                select = np.kron(np.ones((len(model.x), 1)), np.eye(d))[:, axes]
-                rest[: len(kept)] -= maps[c].T @ force
-                rest[mine] += select.T @ force
-                floor[: len(kept)] += np.abs(maps[c].T) @ np.abs(force)
-                floor[mine] += np.abs(select).T @ np.abs(force)
-                sizes.append(np.linalg.norm(maps[c].T @ force))
-                if tangent:
-                    by_jump, by_shift = model.derivatives(jump, shifts[c], old[c])
-                    w = model.weights[:, None, None]
-                    left = np.zeros((force.size, len(z)))
-                    left[:, : len(kept)] = maps[c]
-                    left[:, mine] -= select
-                    per_point = maps[c].reshape(len(maps[c]) // d, d, len(kept))
-                    felt_by = np.einsum("qij,qjn->qin", w * by_jump, per_point)
-                    right_side = np.zeros((force.size, len(z)))
-                    right_side[:, : len(kept)] = felt_by.reshape(force.size, -1)
-                    if mine:
-                        turned = scipy.linalg.block_diag(*(w * by_shift))
-                        right_side[:, mine] = turned @ select
-                    matrix -= left.T @ right_side
-            return rest, matrix, max(sizes), floor
+                jump = (reduced.maps[c] @ z[:n] + rigid[c]).reshape(-1, d)
+                traction = model.respond(jump, shifts[c], old[c])["traction"]
+                force = (model.weights[:, None] * traction).ravel()
+                total = force @ reduced.left[c]
+                rest -= total
+                size = max(size, np.linalg.norm(total[:n]))
+                jumps.append(jump)
+                forces.append(force)
+            return Trial(z, rest, float(size), jumps, shifts, forces)
 
-        def closed() -> Array:
-            """Tangent with all of Γc closed and sticking, to hold what nothing holds yet."""
-            matrix = np.zeros((len(kept) + len(free),) * 2)
-            matrix[: len(kept), : len(kept)] = schur
-            for c, model in enumerate(self.contacts):
-                left = np.zeros((model.x.size, len(matrix)))
-                left[:, : len(kept)] = maps[c]
-                for k, (o, i) in enumerate(free):
-                    if o == c:
-                        left[i::d, len(kept) + k] -= 1.0
-                stiffness = np.where(model.k_t > 0, model.k_t, model.k_n)
-                stiffness = model.weights * np.maximum(model.k_n, stiffness)
-                matrix += left.T @ (np.repeat(stiffness, d)[:, None] * left)
-            return matrix
-
-        convex = not free and all(
+        convex = not self.motions() and all(
             c.law.unique or (o.limit is not None and c.law.kind == "coulomb")
             for c, o in zip(self.contacts, old, strict=True)
         )
-        z = np.concatenate([u[kept], motion])
-        best, since = (np.inf, z), 0
+        now = evaluate(np.concatenate([u[reduced.kept], motion]))
+        best, since = (np.inf, now), 0
         for iteration in range(200):
-            rest, matrix, size, floor = evaluate(z, tangent=True)
-            norm = np.linalg.norm(rest)
+            norm = np.linalg.norm(now.rest)
             if norm < best[0]:
                 since = iteration if norm < 0.5 * best[0] else since
-                best = (norm, z.copy())
-            if norm <= rtol * size or norm <= 1e-14 * np.linalg.norm(floor):
+                best = (norm, now)
+            if norm <= rtol * now.size or norm <= 1e-14 * reduced.floor(now.z, now.forces):
                 break
             if iteration > since + 40:
                 break
-            scale = np.sqrt(np.maximum(np.abs(np.diag(closed())), 1e-300))
-            system = matrix / scale[:, None] / scale
-            if np.linalg.cond(system) > 1e13:
-                system = closed() / scale[:, None] / scale
-            step = -np.linalg.lstsq(system, rest / scale, rcond=1e-15)[0] / scale
-            share, slope = 1.0, rest @ step
+            step = reduced.step(self._tangent(reduced, now, old), now.rest)
+            share, slope = 1.0, now.rest @ step
             low, high = (0.0, slope), None
+            first = np.linalg.norm(now.rest / reduced.scale)
             # The paper's line search: the energy, of laws that have one, is least where its slope
             # along the step is zero. Nothing holds an open body: the share is doubled until
             # something does.
             for _ in range(60):
-                trial = evaluate(z + share * step, tangent=False)[0]
-                lower = np.linalg.norm(trial / scale) < (1 - 0.1 * share) * np.linalg.norm(
-                    rest / scale
-                )
+                trial, tried = evaluate(now.z + share * step), share
+                lower = np.linalg.norm(trial.rest / reduced.scale) < (1 - 0.1 * share) * first
                 if lower and not convex:
                     break
-                along = trial @ step
+                along = trial.rest @ step
                 if abs(along) <= 0.3 * abs(slope):
                     break
                 if along < 0:
@@ -1000,12 +1092,11 @@ class Problem:
                     share = low[0] + np.clip(part, 0.1, 0.9) * (high[0] - low[0])
             if iteration % 9 == 8 and not convex:
                 share = 1.0 if iteration % 18 == 8 else 0.37  # out of a cycle
-            z = z + share * step
-        norm, z = best
-        _, _, size, floor = evaluate(z, tangent=False)
-        if norm > 1e3 * rtol * size and norm > 1e-12 * np.linalg.norm(floor):
-            raise Failed(f"residual {norm / max(size, 1e-300):.1e} of the forces")
-        u[kept], motion = z[: len(kept)], z[len(kept) :]
-        if len(inner):
-            u[inner] = first - recover @ u[kept]
-        return u, motion
+            now = trial if share == tried else evaluate(now.z + share * step)
+        norm, now = best
+        if norm > 1e3 * rtol * now.size and norm > 1e-12 * reduced.floor(now.z, now.forces):
+            raise Failed(f"residual {norm / max(now.size, 1e-300):.1e} of the forces")
+        u = u.copy()
+        u[load.fixed] = load.values
+        reduced.fill(u, now.z[:n])
+        return u, now.z[n:].copy()
