@@ -12,6 +12,8 @@ Arrays are those of one rank. Numbers of nodes are those of the displacement ele
 from __future__ import annotations
 
 import contextlib
+import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -463,6 +465,7 @@ class Law:
     direction: Sequence[float] | None = None
     tension: bool = False
     unilateral: bool = True
+    _frame: tuple[Any, ...] = field(default=(None, ()), init=False, repr=False, compare=False)
 
     @property
     def slips(self) -> bool:
@@ -490,8 +493,15 @@ class Law:
             return -elastic
         return -np.where(elastic.real > 0, elastic, 0)
 
-    def frame(self, n: Array) -> tuple[Array, Array]:
-        """Unit tangents along the direction and across it, (n, 3) each."""
+    def frame(self, n: Array) -> tuple[Array, ...]:
+        """Unit tangents, (n, d) each: in space along the direction and across it."""
+        if n is not self._frame[0]:  # normals are the same ones until the support moves
+            self._frame = n, self._tangents(n)
+        return self._frame[1]
+
+    def _tangents(self, n: Array) -> tuple[Array, ...]:
+        if n.shape[1] == 2:
+            return (np.stack([-n[:, 1], n[:, 0]], axis=1),)
         if self.direction is None:
             along = (np.abs(n[:, 0].real) < 0.9)[:, None]
             direction = np.where(along, np.array([1.0, 0, 0]), np.array([0.0, 1, 0]))
@@ -529,7 +539,7 @@ class Law:
         if given is not None:
             limit = 0 * r_n + given
         if n.shape[1] == 2:
-            tangent = np.stack([-n[:, 1], n[:, 0]], axis=1)
+            (tangent,) = self.frame(n)
             trial = _dot(old - k_t[:, None] * step, tangent)
             value = np.where(trial.real > limit.real, limit, trial)
             value = np.where(trial.real < -limit.real, -limit, value)
@@ -568,6 +578,10 @@ class Law:
         return np.linalg.solve(self.stiffness(k_t, n) + along, tau[..., None])[..., 0]
 
 
+def _norm(vector: Array) -> float:
+    return math.sqrt(vector @ vector)
+
+
 def _dot(one: Array, other: Array) -> Array:
     """Scalar products of vectors, which are the last axis; complex ones are not conjugated."""
     return np.einsum("...i,...i->...", one, other)
@@ -579,23 +593,28 @@ def _nearest_in_circle(trial: Array, limit: Array) -> Array:
     return np.where(out[..., None], (limit / np.where(out, size, 1.0))[..., None] * trial, trial)
 
 
+@functools.cache
+def _sides(modes: int) -> tuple[Array, Array, float]:
+    """Of a regular polygon: normals and directions of the sides, (modes, 2); half of a side."""
+    angles = 2 * np.pi * np.arange(modes) / modes
+    normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return normals, np.stack([-normals[:, 1], normals[:, 0]], axis=1), float(np.tan(np.pi / modes))
+
+
 def nearest_in_polygon(trial: Array, limit: Array, modes: int) -> Array:
     """The nearest point of the polygon: of all its sides' nearest points the nearest one."""
-    half = np.tan(np.pi / modes)
-    inside = np.ones(trial.shape[:-1], dtype=bool)
-    best, found = np.full(inside.shape, np.inf), trial + 0 * limit[..., None]
-    for j in range(modes):
-        angle = 2 * np.pi * j / modes
-        a, b = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
-        x, y = trial @ a, trial @ b
-        inside &= x.real <= limit.real
-        y = np.where(y.real > half * limit.real, half * limit, y)
-        y = np.where(y.real < -half * limit.real, -half * limit, y)
-        place = limit[..., None] * a + y[..., None] * b
-        far = np.linalg.norm((place - trial).real, axis=-1)
-        nearer = far < best
-        best = np.where(nearer, far, best)
-        found = np.where(nearer[..., None], place, found)
+    normals, along, half = _sides(modes)
+    limit = limit[..., None]
+    inside = np.all((trial @ normals.T).real <= limit.real, axis=-1)
+    if np.all(inside):
+        return trial + 0 * limit
+    y, end = trial @ along.T, half * limit
+    y = np.where(y.real > end.real, end, y)
+    y = np.where(y.real < -end.real, -end, y)
+    places = limit[..., None] * normals + y[..., None] * along
+    way = (places - trial[..., None, :]).real
+    nearest = _dot(way, way).argmin(axis=-1)
+    found = np.take_along_axis(places, nearest[..., None, None], axis=-2)[..., 0, :]
     return np.where(inside[..., None], trial, found)
 
 
@@ -650,6 +669,7 @@ class ContactModel:
     project: Array | None = None
     repair: Any = None
     back: Any = None
+    _placed: tuple[Any, ...] = field(default=(None, b"", ()), init=False, repr=False)
 
     @property
     def d(self) -> int:
@@ -665,9 +685,17 @@ class ContactModel:
         """Displacement of the body, less that of the opposite one, (n, d)."""
         return self.interpolation @ u.reshape(-1, self.d)
 
+    def placed(self, shift: Array) -> tuple[Array, Array]:
+        """Gap and normal; the same arrays until the support moves or the pairs change."""
+        if np.iscomplexobj(shift):
+            return self.place(shift)
+        if self._placed[0] is not self.place or self._placed[1] != shift.tobytes():
+            self._placed = self.place, shift.tobytes(), self.place(shift)
+        return self._placed[2]
+
     def respond(self, jump: Array, shift: Array, old: State) -> dict[str, Array]:
         """Tractions and what they follow from; of one jump (n, d), or of several, (m, n, d)."""
-        gap, n = self.place(shift)
+        gap, n = self.placed(shift)
         relative = jump - shift
 
         def across(vector: Array) -> Array:
@@ -860,7 +888,7 @@ class Reduced:
         total = stiff @ np.abs(z)
         for across, force in zip(left, forces, strict=True):
             total += np.abs(force) @ across
-        return float(np.linalg.norm(total))
+        return _norm(total)
 
     def step(self, matrix: Array, rest: Array) -> Array:
         """Newton's step; that of closed springs where nothing holds the bodies."""
@@ -1034,11 +1062,11 @@ class Problem:
         reduced = self._reduce(load.fixed)
         outside, rigid = reduced.take(load)
         d, n = self.body.d, len(reduced.kept)
-        given = np.linalg.norm(outside[:n])
+        given = _norm(outside[:n])
 
         def evaluate(z: Array) -> Trial:
             inside = reduced.stiffness @ z
-            rest, size = inside - outside, max(given, np.linalg.norm(inside))
+            rest, size = inside - outside, max(given, _norm(inside))
             shifts, jumps, forces = self.shifts(load, z[n:]), [], []
             for c, model in enumerate(self.contacts):
                 jump = (reduced.maps[c] @ z[:n] + rigid[c]).reshape(-1, d)
@@ -1046,10 +1074,10 @@ class Problem:
                 force = (model.weights[:, None] * traction).ravel()
                 total = force @ reduced.left[c]
                 rest -= total
-                size = max(size, np.linalg.norm(total[:n]))
+                size = max(size, _norm(total[:n]))
                 jumps.append(jump)
                 forces.append(force)
-            return Trial(z, rest, float(size), jumps, shifts, forces)
+            return Trial(z, rest, size, jumps, shifts, forces)
 
         convex = not self.motions() and all(
             c.law.unique or (o.limit is not None and c.law.kind == "coulomb")
@@ -1058,7 +1086,7 @@ class Problem:
         now = evaluate(np.concatenate([u[reduced.kept], motion]))
         best, since = (np.inf, now), 0
         for iteration in range(200):
-            norm = np.linalg.norm(now.rest)
+            norm = _norm(now.rest)
             if norm < best[0]:
                 since = iteration if norm < 0.5 * best[0] else since
                 best = (norm, now)
@@ -1069,13 +1097,13 @@ class Problem:
             step = reduced.step(self._tangent(reduced, now, old), now.rest)
             share, slope = 1.0, now.rest @ step
             low, high = (0.0, slope), None
-            first = np.linalg.norm(now.rest / reduced.scale)
+            first = _norm(now.rest / reduced.scale)
             # The paper's line search: the energy, of laws that have one, is least where its slope
             # along the step is zero. Nothing holds an open body: the share is doubled until
             # something does.
             for _ in range(60):
                 trial, tried = evaluate(now.z + share * step), share
-                lower = np.linalg.norm(trial.rest / reduced.scale) < (1 - 0.1 * share) * first
+                lower = _norm(trial.rest / reduced.scale) < (1 - 0.1 * share) * first
                 if lower and not convex:
                     break
                 along = trial.rest @ step
