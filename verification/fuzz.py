@@ -282,12 +282,31 @@ def _drawn(seed: int, arguments: argparse.Namespace, ranks: int) -> Scene:
     return draw(seed, without=tuple(arguments.without), ranks=ranks, family=family)
 
 
+def _keep_forms() -> None:
+    """Load a compiled form once in this process: FFCx reads all of its folder every time."""
+    from ffcx.codegeneration import jit
+
+    look_up, found = jit.get_cached_module, {}
+
+    def kept(name: str, objects: Any, folder: Any, timeout: Any) -> Any:
+        key = (name, str(folder))
+        if key not in found:
+            compiled, module = look_up(name, objects, folder, timeout)
+            if module is None:  # to be compiled now
+                return None, None
+            found[key] = compiled, module
+        return found[key]
+
+    jit.get_cached_module = kept
+
+
 def _work(seeds: list[int], arguments: argparse.Namespace) -> None:
     """In a process of its own, on all its ranks: play scenes, a line for each on rank 0."""
     import gc
 
     from mpi4py import MPI
 
+    _keep_forms()
     comm = MPI.COMM_WORLD
     if comm.size > 1:
         gc.disable()  # destructors are collective: together, between scenes
