@@ -19,15 +19,15 @@ from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.methods.alternating import Alternation
 from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
+from fenics_contact.methods.kept import Kept
 from fenics_contact.methods.method import Method, Newton, SnesMethod
 from fenics_contact.methods.neighbourhood import linearised, respond
 from fenics_contact.methods.options import Defaults, take_command_line
 from fenics_contact.methods.quasi_newton import QuasiNewton
 from fenics_contact.methods.starts import Starts
 from fenics_contact.systems import linear
-from fenics_contact.systems.candidates import acting, distances, nearest, touched
 from fenics_contact.systems.choice import linear_kind, obstacle_to_condensation
-from fenics_contact.systems.condensed import CondensedSystem, all_kept, inexpensive, worthwhile
+from fenics_contact.systems.condensed import CondensedSystem
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Selection
@@ -46,10 +46,6 @@ _FIRST_ROUND, _INNER, _NEARLY = 1e-4, 1e-2, 10.0
 _ENOUGH = 15
 # Increments expected where nothing is said.
 _EXPECTED = 4
-# What is kept grows by this factor, lest it grows often.
-_GROWTH = 2
-# Distances of points that differ by less than this share of the size of the mesh are the same.
-_ROUND_OFF = 1e-9
 
 _REASONS = PETSc.SNES.ConvergedReason
 _OUTCOMES = {
@@ -151,13 +147,7 @@ class Solver:
         self._comm = full.unknowns.comm
         self._obstacle: str | None = None  # to condensation, as last said
         self._pairings = self._present_pairings()  # those of the system
-        # The unknowns that are kept when condensed, and whether they were chosen where the first
-        # increment starts.
-        self._kept = self._nearest()
-        self._chosen = False
-        # For `change`: those to be kept, or how far points of the last solution were from bearing.
-        self._next: Indices | None = None
-        self._away: list[Array] | None = None
+        self._kept = Kept(full, motions.size, all_that_pay=bool(settings.condensation))
         # What is chosen and made by `_configure`, for the increments that are expected.
         self.options = Defaults()
         self._named: list[str] = []  # options given that name a linear solver
@@ -284,7 +274,7 @@ class Solver:
             linear_solver=self._settings.linear_solver,
             named=self._named,
             increments=self.expected,
-            n_kept=self._count(self._kept),
+            n_kept=self._kept.count,
         )
         if obstacle and obstacle != self._obstacle and self._comm.rank == 0:
             logger.info("iterating on all unknowns: %s", obstacle)
@@ -312,7 +302,7 @@ class Solver:
         """Take the system to iterate on: all unknowns, or those to be kept. Collective."""
         system: System = self._full
         if self.condensed:
-            selection = Selection(self._full.unknowns, self._kept)
+            selection = Selection(self._full.unknowns, self._kept.indices)
             prefix = self._settings.prefix + "interior_"
             system = CondensedSystem(self._full, selection, prefix=prefix)
             if self._comm.rank == 0:
@@ -340,92 +330,21 @@ class Solver:
         if self._pairings != self._present_pairings():
             if not self.condensed:
                 self._set_system()
-            elif self._all_kept(everything := self._touched()):
-                # A body that slides comes back to places where it was: what is kept grows only.
-                before = self._kept
-                self._kept = np.union1d(before, everything).astype(np.int32)
-                if self._count(self._kept) > self._count(before):
-                    self._set_system()
+            elif self._kept.grows():
+                self._set_system()
             self._pairings = self._present_pairings()
             self.snes.reset()
             self._make_matrices()
 
     # ---- the unknowns that are kept --------------------------------------------------------------
 
-    def _touched(self) -> Indices:
-        return touched(self._full.operators, self._full.unknowns)
-
-    def _count(self, kept: Indices) -> int:
-        """On all ranks. Collective."""
-        return int(self._comm.allreduce(kept.size))
-
-    def _all_kept(self, everything: Indices) -> bool:
-        """Whether contact touches so little that all of it is kept. Collective."""
-        return all_kept(self._full.unknowns.n_global, self._count(everything), self._full.gdim)
-
-    def _nearest(self, at_least: int = 0, away: Sequence[Array] | None = None) -> Indices:
-        """Unknowns to keep: where bodies are nearest to each other. Collective.
-
-        Args:
-            at_least: About how many, if they are more than come for nothing.
-            away: How far points are from bearing; by default at the present state.
-        """
-        everything = self._touched()
-        if self._all_kept(everything):
-            return everything
-        if away is None:
-            for contact in self._full.contacts:
-                contact.evaluate()
-            away = [distances(contact) for contact in self._full.contacts]
-        for_nothing = inexpensive(self._full.unknowns.n_global, self._full.gdim)
-        return nearest(
-            self._full.operators,
-            self._full.unknowns,
-            away,
-            max(at_least, for_nothing),
-            _ROUND_OFF * self.equations.length,
-        )
-
-    def _grown(self, away: Sequence[Array] | None, *, anew: bool) -> Indices:
-        """More unknowns than are kept now. Collective.
-
-        Contact that travels comes back, and all that was kept is so for as long as it pays.
-
-        Args:
-            away: See `_nearest`.
-            anew: Whether those kept now may be dropped where they would be too many.
-        """
-        before, n = self._kept, self._count(self._kept)
-        kept = before
-        for at_least in (_GROWTH * n, 0):
-            kept = np.union1d(before, self._nearest(at_least, away)).astype(np.int32)
-            if self._count(kept) == n:
-                kept = self._touched()
-            if self._settings.condensation or self._worthwhile(kept):
-                return kept
-        return self._nearest(0, away) if anew else kept
-
-    def _worthwhile(self, kept: Indices) -> bool:
-        n, gdim = self._full.unknowns.n_global, self._full.gdim
-        return worthwhile(n, self._count(kept), gdim)
-
     def chooses(self) -> bool:
         """Whether an increment that starts here takes other unknowns; then `change`. Collective.
 
         That is so where the first one starts, and where those that bear have other opposites.
         """
-        self._next = None
-        if not self._chosen:
-            self._chosen, found = True, self._nearest()
-            if self._comm.allreduce(int(not np.array_equal(found, self._kept))):
-                self._next = found
-        elif self.condensed and self._pairings != self._present_pairings():
-            if not self._all_kept(self._touched()):
-                bearing = [acting(contact) for contact in self._full.contacts]
-                needed = touched(self._full.operators, self._full.unknowns, bearing)
-                if self._comm.allreduce(np.setdiff1d(needed, self._kept).size):
-                    self._next = self._grown(None, anew=True)
-        return self._next is not None
+        others = self.condensed and self._pairings != self._present_pairings()
+        return self._kept.chooses(other_pairs=others)
 
     def misses(self, *, found: bool) -> bool:
         """Whether contact takes more unknowns than are kept: then `change`. Collective.
@@ -435,13 +354,7 @@ class Solver:
         """
         if not self.system.confined:
             return False
-        outside = False
-        for operator in self.system.operators:
-            if operator.within is not None:
-                outside |= bool(np.any(acting(operator.contact) & ~operator.within))
-        misses = bool(self._comm.allreduce(int(outside)))
-        self._next = None
-        self._away = [distances(c) for c in self._full.contacts] if found else None
+        misses = self._kept.misses(self.system.operators, found=found)
         # A body that nothing else holds may find no rest on what is kept.
         return misses or (not found and len(self.equations.motions.free) > 0)
 
@@ -453,7 +366,7 @@ class Solver:
         Args:
             anew: Whether what is kept now may be dropped where all would be too much.
         """
-        self._kept = self._grown(self._away, anew=anew) if self._next is None else self._next
+        self._kept.change(anew=anew)
         if self._choose_condensation() != self.condensed:
             self._configure_anew()
         elif self.condensed:
@@ -463,16 +376,16 @@ class Solver:
 
     def keep(self, kept: Indices) -> None:
         """Iterate on the unknowns that another run had kept, on all if it had. Collective."""
-        self._chosen = True
-        some, everything = self._count(kept) > 0, self._touched()
+        some = self._comm.allreduce(kept.size) > 0
+        anew = some != self.condensed and self._settings.condensation is None
         if some and self.condensed:
-            self._kept = kept
+            self._kept.take(kept)
             self._set_system()
             self.snes.reset()
-        elif some != self.condensed and not self._all_kept(everything):
-            if self._settings.condensation is None:
-                self._kept = kept if some else everything
-                self._configure_anew()
+        elif anew and not self._kept.is_all:
+            self._kept.take(kept if some else self._kept.touched())
+            self._configure_anew()
+        self._kept.was_chosen()
 
     def follow(self, before: Array) -> None:
         """Take note of how far the values prescribed now have moved, for a start. Collective.
