@@ -27,6 +27,7 @@ __all__ = [
     "cell_partitioner",
     "collapsed",
     "compile_form",
+    "contains",
     "create_facet_submesh",
     "geometry_dofmap",
     "geometry_element",
@@ -166,6 +167,12 @@ def geometry_dofmap(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:
     """Geometry nodes of every local cell, shape (n_cells, n_nodes)."""
     geometry = mesh.geometry
     return geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
+
+
+def contains(space: fem.FunctionSpace, other: Any) -> bool:
+    """Whether the space of a Dirichlet condition, bare in some releases, is in another one."""
+    whole, part = (getattr(each, "_cpp_object", each) for each in (space, other))
+    return bool(whole.contains(part))
 
 
 def interpolation_points(element: Any) -> Array:

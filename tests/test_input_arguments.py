@@ -332,6 +332,19 @@ def test_condition_on_another_space():
     raised_everywhere(lambda: scene.problem(coulomb(), [bc]), ValueError, "Dirichlet", "space")
 
 
+def test_condition_on_a_scalar_space():
+    """One of as many nodes is another all the same: its numbers of dofs are other places of u."""
+    scene = pressed()
+    space = fem.functionspace(scene.mesh, ("Lagrange", 1))
+    component, _ = scene.u.function_space.sub(0).collapse()
+    for other in (space, component):
+        dofs = fem.locate_dofs_topological(other, 1, scene.tags.find(TOP))
+        bc = fem.dirichletbc(0.0, dofs, other)
+        raised_everywhere(
+            lambda bc=bc: scene.problem(coulomb(), [bc]), ValueError, "Dirichlet", "V.sub(i)"
+        )
+
+
 # ---- the problem ---------------------------------------------------------------------------------
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
+from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_max, global_min
 from fenics_contact.surface.displacement import Displacement
@@ -33,6 +34,9 @@ _TOUCHING = 1e-12
 _OF_A_PART = (
     "; on a part of a mixed one it is dirichletbc(value, dofs, W.sub(0)), where dofs are those of "
     "locate_dofs_topological((W.sub(0), V), ...) and V, _ = W.sub(0).collapse()"
+)
+_OF_U = (
+    "; take V = u.function_space itself, or V.sub(i) for a component: dirichletbc(value, dofs, V)"
 )
 
 
@@ -80,11 +84,10 @@ def constrained_unknowns(
     mask = np.zeros(unknowns.n_local, dtype=np.bool_)
     for bc in bcs:
         dofs, _ = bc.dof_indices()
-        # A collapsed part of a mixed space has numbers of its own.
-        own, all_of_u = (s.dofmap.index_map for s in (bc.function_space, u.function_space))
-        other = own.size_global != all_of_u.size_global
+        # A scalar space, or a collapsed part, may have as many nodes and other numbers of dofs.
+        other = not compat.contains(u.function_space, bc.function_space)
         if unknowns.comm.allreduce(int(other or (dofs.size and dofs.max() >= u.x.array.size))):
-            advice = _OF_A_PART if mixed else ""
+            advice = _OF_A_PART if mixed else _OF_U
             raise ValueError(f"a Dirichlet condition is on another function space than u{advice}")
         # Their number of owned dofs, which comes with them, is wrong for blocked conditions.
         mask[dofs[dofs < unknowns.n_dofs]] = True
