@@ -51,9 +51,10 @@ GROUPS: list[tuple[str, list[str], str]] = [
     ),
     (
         "Laws and stiffness",
-        ["laws.base", "laws.friction", "laws.unilateral", "laws.stiffness"],
+        ["laws.base", "laws.friction", "laws.unilateral", "laws.stiffness", "contact.point_law"],
         "k_n and k_t are stresses per length. A law of one's own says its `response`, and its "
-        "potential where it has no k_n: [](learn/own-law.md).",
+        "potential where it has no k_n: [](learn/own-law.md). All that it depends on are its "
+        "parameters.",
     ),
     (
         "Contacts",

@@ -356,3 +356,29 @@ def test_modulus_function_out_of_range(value):
     raised_everywhere(
         lambda: scene.contact(fc.Coulomb(0.3), modulus=modulus), ValueError, "modulus"
     )
+
+
+@pytest.mark.parametrize("what", ["friction", "gap", "weight", "displacement", "normal"])
+def test_data_that_depend_on_the_displacement(what):
+    """Data are numbers while an increment is solved: what follows from u is none, and is named."""
+    scene = pressed()
+    part = scene.u.sub(1)  # its array is that of u
+    grows = 0.3 + ufl.div(scene.u) ** 2
+    contact = {
+        "friction": {},
+        "gap": {"gap": abs(part)},
+        "weight": {"weight": 1 + grows},
+        "displacement": {"displacement": ufl.as_vector([0.0, 0.1 * scene.u[1]])},
+        "normal": {"support": fc.Obstacle(0.0, ufl.as_vector([scene.u[0], -1.0]))},
+    }[what]
+    law = coulomb(friction=grows if what == "friction" else 0.3)
+    raised_everywhere(lambda: scene.contact(law, **contact), ValueError, what, "solved for", "u")
+
+
+def test_data_of_another_mesh_or_form():
+    """A function on another mesh, or a test function, has no value at the points of Γc."""
+    scene, other = pressed(), pressed()
+    far = coulomb(friction=0.3 + other.u[0] ** 2)
+    raised_everywhere(lambda: scene.contact(far), ValueError, "friction", "another mesh")
+    v = ufl.TestFunction(scene.u.function_space)
+    raised_everywhere(lambda: scene.contact(coulomb(friction=v[0])), ValueError, "friction", "test")

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import ufl
 from mpi4py import MPI
 
 import fenics_contact as fc
@@ -243,3 +244,28 @@ def test_parameters_of_an_own_law(name, value):
     scene = block()
     law = replace(Overclosure(P0, H), **{name: value})
     raised_everywhere(lambda: scene.contact(law), ValueError, "contact", name)
+
+
+@dataclass(frozen=True)
+class Beside(fc.Frictionless):
+    """A law that takes what it depends on past its parameters."""
+
+    hidden: Any = None
+
+    def parameters(self) -> dict[str, Any]:
+        """The stiffness alone."""
+        return {"k_n": self.k_n}
+
+    def response(self, kinematics, parameters):
+        """More pressure than the parameters say."""
+        told = super().response(kinematics, parameters)
+        return replace(told, normal_traction=(1 + self.hidden) * told.normal_traction)
+
+
+def test_what_is_no_parameter_is_refused():
+    """A place, a function of the body or u in a response: a law is evaluated at numbers alone."""
+    scene = block("quadrilateral", E=E, nu=NU)
+    x = ufl.SpatialCoordinate(scene.mesh)
+    for hidden in (x[0], scene.u[0] ** 2):
+        law = Beside(k_n=1e3, hidden=hidden)
+        raised_everywhere(lambda law=law: scene.contact(law), ValueError, "Beside", "parameter")

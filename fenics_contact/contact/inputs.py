@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
+from ufl.corealg.traversal import traverse_unique_terminals
 
 from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.contact.accuracy import DEFAULT_FACTOR, Accuracy
@@ -20,11 +21,12 @@ from fenics_contact.laws.base import Law
 from fenics_contact.laws.stiffness import Scaled, Springs
 from fenics_contact.parallel import global_max, global_min
 from fenics_contact.supports.base import Motion, Rotation, Support, as_vector, nonzero_vector
+from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.modulus import modulus_over_height
-from fenics_contact.surface.surface import SurfaceQuadrature, VertexAreas
+from fenics_contact.surface.surface import ContactSurface, SurfaceQuadrature, VertexAreas
 from fenics_contact.types import Array
 
-__all__ = ["FreeMotion", "Inputs"]
+__all__ = ["FreeMotion", "Inputs", "check_given"]
 
 
 logger = logging.getLogger("fenics_contact")
@@ -391,6 +393,49 @@ class Inputs:
                 "the tangent plane everywhere: give another direction, or a UFL vector that "
                 "follows the surface"
             )
+
+
+def check_given(
+    name: str,
+    given: Mapping[str, Any],
+    surface: ContactSurface,
+    displacement: Displacement,
+) -> None:
+    """Refuse data that are none at the points of Γc while an increment is solved.
+
+    Args:
+        name: Of the contact.
+        given: Expressions by name.
+        surface: Γc.
+        displacement: What is solved for, on which data cannot depend: points see numbers.
+
+    Raises:
+        ValueError: It names what depends on what.
+    """
+    meshes = (surface.mesh, surface.submesh)
+    solved_for = displacement.whole.x.array, displacement.u.x.array
+    for what, expression in given.items():
+        for item in traverse_unique_terminals(ufl.as_ufl(expression)):
+            if isinstance(item, ufl.Argument):
+                raise ValueError(
+                    f"{name}: {what} has a test or trial function; give what has a value at every "
+                    "point of Γc"
+                )
+            if not isinstance(item, fem.Function):
+                continue
+            if not any(
+                item.function_space.mesh is m or item.function_space.mesh == m for m in meshes
+            ):
+                raise ValueError(
+                    f"{name}: {what} has a function, {item.name!r}, on another mesh than Γc"
+                )
+            if any(np.shares_memory(item.x.array, array) for array in solved_for):
+                raise ValueError(
+                    f"{name}: {what} depends on what is solved for, {item.name!r}; data are "
+                    "numbers while an increment is solved: give a function of its own, whose values you "
+                    "set between increments, or a law of your own, whose response is a function "
+                    "of gap and slip"
+                )
 
 
 def _range_error(contact: str, name: str, value: float, positive: bool) -> str:

@@ -24,7 +24,7 @@ from petsc4py import PETSc
 from fenics_contact.contact.finite import (
     FiniteKinematics,
 )
-from fenics_contact.contact.inputs import Inputs
+from fenics_contact.contact.inputs import Inputs, check_given
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
 from fenics_contact.contact.pairs import Pairs, PairsState
 from fenics_contact.contact.point_data import PointData
@@ -168,6 +168,12 @@ class Opposite(ABC):
             if inputs.free_angle is None:
                 rows = [matrix[i, j] for i in range(d) for j in range(d)]
                 expressions |= {"angle": inputs.angle, "turn": ufl.as_vector(rows)}
+        own = dict(given.parameters) | {"weight": inputs.weight}
+        own |= {"displacement of the support": expressions["shift"]}
+        own |= {n: expressions[n] for n in ("angle", "about") if n in expressions}
+        own |= {"gap": given.gap, "normal": direction}
+        parts = self._parts
+        check_given(parts.name, own, parts.quadrature.surface, parts.displacement)
         seen = ["initial_gap", "normal", *(f"parameter {n}" for n in given.parameters)]
         if given.shift is not None:
             expressions["support"] = given.shift

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
+from ufl.corealg.traversal import traverse_unique_terminals
+from ufl.domain import extract_unique_domain
 
 from fenics_contact.contact.finite import FiniteKinematics
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
@@ -273,4 +275,27 @@ class PointLaw:
         }
 
     def _evaluator(self, expressions: Mapping[str, Any]) -> PointEvaluator:
+        for expression in expressions.values():
+            self._check_own(expression)
         return PointEvaluator(self._quadrature, expressions, by_points=True)
+
+    def _check_own(self, expression: Any) -> None:
+        """Refuse a law that has functions, or places, by another way than its parameters.
+
+        Raises:
+            ValueError: It says what.
+        """
+        submesh = self._quadrature.surface.submesh
+        for item in traverse_unique_terminals(ufl.as_ufl(expression)):
+            there = True
+            if isinstance(item, fem.Function):
+                there = item.function_space.mesh is submesh or item.function_space.mesh == submesh
+            elif isinstance(item, ufl.classes.GeometricQuantity):
+                there = extract_unique_domain(item) == submesh.ufl_domain()
+            if not there:
+                what = getattr(item, "name", None) or type(item).__name__
+                raise ValueError(
+                    f"{type(self.law).__name__} uses {what} in its response or another method; a "
+                    "law knows of a point what its kinematics and parameters tell it: give it as a "
+                    'parameter, a field of the class, and take it from parameters["..."]'
+                )
