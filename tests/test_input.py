@@ -318,3 +318,18 @@ def test_reductions_over_ranks():
     assert np.isnan(parallel.global_min(COMM, bad))
     rows = parallel.gather_rows(COMM, np.full((COMM.rank + 1, 2), float(COMM.rank)))
     assert rows.shape == (COMM.size * (COMM.size + 1) // 2, 2)
+
+
+@pytest.mark.parametrize("field", [True, False])
+def test_nodes_that_are_moved(field):
+    """Points, gaps and the stiffness are of where nodes were: moved ones are refused, not mixed."""
+    scene = pressed()
+    problem, contact = scene.problem(coulomb(), scene.rollers())
+    problem.solve(field=field)
+    problem.commit()
+    before = contact.history.rows()
+    scene.mesh.geometry.x[:, 0] *= 1.3
+    raised_everywhere(lambda: problem.solve(field=field), ValueError, "moved", "0.3")
+    assert np.array_equal(contact.history.rows(), before) and problem.increment == 1
+    scene.mesh.geometry.x[:, 0] /= 1.3
+    fc.ContactSurface(scene.mesh, scene.tags, BOTTOM)  # of the mesh as it is now

@@ -393,6 +393,7 @@ class Contact(PointResults):
         Raises:
             ValueError: On all ranks.
         """
+        self.surface.check_places(self.name)
         self.inputs.update()
         self.evaluate()
         self.inputs.check(self.values)

@@ -16,7 +16,7 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.arguments import check_instance, is_number
-from fenics_contact.parallel import gather_rows, global_min
+from fenics_contact.parallel import gather_rows, global_max, global_min
 from fenics_contact.surface.mass import assembled
 from fenics_contact.types import Array
 
@@ -86,6 +86,7 @@ class ContactSurface:
             mesh, self.facets
         )
         self._facet_tags = facet_tags
+        self._places = mesh.geometry.x.copy()
         self._ids = tuple(int(tag) for tag in np.unique(np.atleast_1d(np.asarray(tags))))
 
     def quadrature(self, element_degree: int, *, nodal: bool = False) -> SurfaceQuadrature:
@@ -99,6 +100,25 @@ class ContactSurface:
         free = self.quadrature_degree is None and self.quadrature_scheme is None
         scheme = "vertex" if nodal and free else self.quadrature_scheme or "default"
         return SurfaceQuadrature(self, degree, scheme)
+
+    def check_places(self, name: str) -> None:
+        """Refuse a mesh whose nodes have moved since. Collective.
+
+        Points, weights, gaps and the tangent of a linear bulk are of where they were.
+
+        Args:
+            name: Of the contact, in messages.
+
+        Raises:
+            ValueError: They have, by how much. On all ranks.
+        """
+        way = global_max(self.mesh.comm, np.abs(self.mesh.geometry.x - self._places))
+        if not way == 0.0:
+            raise ValueError(
+                f"{name}: nodes of the mesh have been moved, by up to {way:g}, since its "
+                "ContactSurface was made; leave the mesh as it is, displacements are in u (with "
+                'kinematics="finite" of any size), or make surface, contacts and problem anew'
+            )
 
     def parent_facets(self) -> npt.NDArray[np.int32]:
         """The facet of the body that each of this rank's own cells of the submesh is."""
