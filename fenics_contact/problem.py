@@ -232,6 +232,9 @@ class ContactProblem:
             contact.evaluate()
         forces: dict[object, Forces] = {self.full.mark: Forces.none(self._committed)}
         self._energy = self._committed_energy = EnergyState.unloaded(forces, self.contacts)
+        self._commits = [contact.commits for contact in self.contacts]
+        if any(self._commits):
+            self._begin_loaded()
         # What the present and the committed state need to be completed, and their loads.
         self._pending_field: Array | None = None
         self._committed_lag: tuple[Array | None, Array] = None, self._load
@@ -239,6 +242,15 @@ class ContactProblem:
         self._solved: _Solved | None = None
         self._cold = True
         self._fresh = True  # nothing was solved yet
+
+    def _begin_loaded(self) -> None:
+        """Let energies be counted from the state that another problem has left. Collective."""
+        self._load = self.present_load()
+        self.full.begin(self._load)
+        bulk = self.full.with_supports(self.bulk.assemble_residual())
+        reaction = np.where(self.constrained, bulk + self.full.contact_force(), 0.0)
+        forces: dict[object, Forces] = {self.full.mark: self.full.forces(bulk, reaction)}
+        self._energy = self._committed_energy = EnergyState.at(forces, self.contacts)
 
     @property
     def snes(self) -> PETSc.SNES:
@@ -539,7 +551,13 @@ class ContactProblem:
 
     def _check_before(self) -> None:
         self.bulk.check_finite()
-        for contact in self.contacts:
+        for contact, commits in zip(self.contacts, self._commits, strict=True):
+            if contact.commits != commits:
+                raise ValueError(
+                    f"{contact.name}: its history was committed by another problem, or by a call "
+                    "of its own, since this problem's last commit, which is no more the state to "
+                    "go on from; make a new ContactProblem of these contacts, with u as it is"
+                )
             contact.check_input()
         self._load = -self.full.with_supports(self.bulk.update_load())
         size = global_max(self._comm, np.abs(self._load))
@@ -642,6 +660,7 @@ class ContactProblem:
         self._committed_lag = self._pending_field, self._load
         jumps = [contact.opposite.committed_jump for contact in self.contacts]
         self._committed_energy = self._energy.between(jumps)
+        self._commits = [contact.commits for contact in self.contacts]
         self.increment += 1
 
     def restore(self) -> None:
@@ -742,6 +761,7 @@ class ContactProblem:
         energy = EnergyState.at(forces, self.contacts)
         self._energy = energy.between([c.opposite.committed_jump for c in self.contacts])
         self._committed_energy = self._energy
+        self._commits = [contact.commits for contact in self.contacts]
         self.restart_solver()
 
     def restart_solver(self) -> None:

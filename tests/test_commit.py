@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.blocks import block
-from scenes.comparing import at_points, close, nodal
+from scenes.comparing import at_points, close, nodal, raised_everywhere
 from scenes.stacks import FLOOR, LOWER, ROOF, UPPER, stack
 
 COMM = MPI.COMM_WORLD
@@ -113,3 +113,55 @@ def test_a_commit_before_any_solution_changes_nothing():
     problem.commit()
     assert problem.increment == 0
     assert close(contact.history.rows(), before, 0.0)
+
+
+def pressed_and_drawn(late):
+    """A block pressed by one problem, then drawn aside, by another that is made then or by it."""
+    scene = block("quadrilateral", n=4, up=-5.0)
+    contact = scene.contact(fc.Coulomb(0.3), displacement=np.zeros(2))
+    bcs = scene.rollers()
+
+    def made():
+        return fc.ContactProblem(scene.F, scene.u, bcs=bcs, contacts=[contact])
+
+    problem = made()
+    for up in (-5.0, -10.0):
+        scene.load(up=up)
+        problem.solve()
+        problem.commit()
+    if late:
+        problem = made()
+    scene.load(up=-8.0)
+    contact.parameters["displacement"].value[:] = 1e-3, 0.0
+    step = problem.solve()
+    problem.commit()
+    return step, nodal(scene.u)
+
+
+def test_another_problem_goes_on_with_a_history():
+    """Forces, field and energies are those of the one problem: what it starts from is loaded.
+
+    To 1e-9, the solver's, which starts from elsewhere.
+    """
+    (one, u), (two, same) = pressed_and_drawn(late=False), pressed_and_drawn(late=True)
+    assert close(same, u, 1e-9)
+    scale = abs(one.energy.work)
+    for name in ("work", "elastic", "springs", "dissipation", "remainder"):
+        assert abs(getattr(two.energy, name) - getattr(one.energy, name)) < 1e-9 * scale, name
+
+
+def test_a_history_that_another_problem_has_led_on_is_refused():
+    """Its energies and starts would be of a state that is gone. The refusal changes nothing."""
+    scene = block("quadrilateral", n=4, up=-5.0)
+    contact = scene.contact(fc.Coulomb(0.3))
+    first, second = (
+        fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=[contact])
+        for _ in range(2)
+    )
+    first.solve()
+    first.commit()
+    rows = contact.history.rows()
+    raised_everywhere(second.solve, ValueError, "another problem", "new ContactProblem")
+    assert close(contact.history.rows(), rows, 0.0)
+    first.solve()
+    first.commit()

@@ -58,10 +58,12 @@ class Committed:
     Attributes:
         history: `PointFields.rows`.
         opposite: What was committed of what lies opposite.
+        commits: `Contact.commits`.
     """
 
     history: Array
     opposite: OppositeState
+    commits: int
 
 
 class Contact(PointResults):
@@ -93,6 +95,7 @@ class Contact(PointResults):
         finite: Whether gap, normal and slip are those of displacements of any size.
         opposite: What lies opposite the points, and what they feel of it.
         acting: The law at the points.
+        commits: Number of commits.
     """
 
     def __init__(
@@ -197,7 +200,7 @@ class Contact(PointResults):
         if self.multipliers is not None:
             fields |= {"multiplier": 0}
         self.history = PointFields(self.quadrature, fields)
-        self._has_begun = False
+        self.commits = 0
 
         # All of contact is a sparse map from u to the jump at the points, and the law there: as
         # expressions for the form on Γc, and sampled at the points for all else.
@@ -581,7 +584,7 @@ class Contact(PointResults):
         The support is where it was given, not displaced. `ContactProblem` calls it before its
         first increment; the constructor has done so for the ``u`` of then.
         """
-        if not self._has_begun and self.opposite.begins_anew():
+        if not self.commits and self.opposite.begins_anew():
             self._count_anew()
 
     def _count_anew(self) -> None:
@@ -601,7 +604,7 @@ class Contact(PointResults):
             self.evaluate()
             found = self.found()
         values = dict(found.history)
-        self._has_begun = True
+        self.commits += 1
         self.history.commit(values)
         self._values = found.points  # results stay those of the solution, whatever its pairs
         moved = self.opposite.commit(found.points)
@@ -612,13 +615,13 @@ class Contact(PointResults):
 
     def committed(self) -> Committed:
         """The committed state, for `set_committed`."""
-        return Committed(self.history.rows(), self.opposite.state())
+        return Committed(self.history.rows(), self.opposite.state(), self.commits)
 
     def set_committed(self, state: Committed) -> None:
         """Make a state the committed one again; `restore` drops what came after it. Collective."""
         self.history.set_rows(state.history)
         self.opposite.set_state(state.opposite)
-        self._has_begun = True
+        self.commits = state.commits
 
     def take_up(self, history: Array, values: Mapping[str, Array]) -> None:
         """Make a state of another run the committed one, at the u that it has. Collective.
@@ -635,7 +638,7 @@ class Contact(PointResults):
 
         unknown = np.zeros(self.quadrature.n_points)
         self.opposite.resume(values.get("depth", unknown), present)
-        self._has_begun = True
+        self.commits += 1
         mine = self.values.arrays
         if {n: v.shape for n, v in values.items()} == {n: v.shape for n, v in mine.items()}:
             self._values = PointValues.of(values)
