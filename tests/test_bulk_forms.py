@@ -298,3 +298,23 @@ def test_unsymmetric_bulk():
     assert force[1] == pytest.approx(1.0, abs=1e-8)
     assert force[0] == pytest.approx(bedding, abs=1e-8)
     assert abs(bedding) > 1e-4
+
+
+def test_a_load_that_steps_with_the_displacement():
+    """A force that falls once the body gives way has no derivative, and is not linear all the same.
+
+    It is 3 until the top has sunk by 1e-4 and 2 from there on, which it has: 2e-3. Tolerance 1e-8:
+    the solver's, with room for the tangent's condition.
+    """
+    E, k_n = 1000.0, 5e4
+    scene = block("quadrilateral", E=E, nu=0.0, n=2)
+    v = ufl.TestFunction(scene.u.function_space)
+    sunk = ufl.lt(scene.u[1], -1e-4)
+    scene.F += (
+        ufl.conditional(sunk, 2.0, 3.0) * v[1] * ufl.ds(scene.mesh, subdomain_data=scene.tags)(TOP)
+    )
+    problem, _ = scene.problem(fc.Frictionless(k_n=k_n), scene.rollers())
+    assert not problem.bulk.linear
+    step = problem.solve(field=False)
+    assert step.complete
+    assert step.contacts["contact"].normal_force == pytest.approx(2.0, rel=1e-8)

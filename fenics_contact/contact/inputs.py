@@ -432,9 +432,9 @@ def check_given(
             if any(np.shares_memory(item.x.array, array) for array in solved_for):
                 raise ValueError(
                     f"{name}: {what} depends on what is solved for, {item.name!r}; data are "
-                    "numbers while an increment is solved: give a function of its own, whose values you "
-                    "set between increments, or a law of your own, whose response is a function "
-                    "of gap and slip"
+                    "numbers while an increment is solved: give a function of its own, whose "
+                    "values you set between increments, or a law of your own, whose response is a "
+                    "function of gap and slip"
                 )
 
 

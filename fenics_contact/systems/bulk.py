@@ -16,6 +16,8 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from petsc4py import PETSc
+from ufl.algorithms import extract_coefficients
+from ufl.corealg.traversal import unique_pre_traversal
 
 from fenics_contact import compat
 from fenics_contact.parallel import collective_errors, global_max, global_min
@@ -99,7 +101,7 @@ class Bulk:
         self.form, self.space = form, u.function_space
         derivative = ufl.derivative(form, u, ufl.TrialFunction(u.function_space))
         self.tangent_form = ufl.algorithms.expand_derivatives(derivative)
-        self.linear = u not in self.tangent_form.coefficients()
+        self.linear = not (u in self.tangent_form.coefficients() or _branches_by(form, u))
         self._volumes = None if self.linear else _Volumes(displacement)
         kinds = dict.fromkeys(integral.integral_type() for integral in form.integrals())
         parts = (_Part(form, kind, u) for kind in kinds)
@@ -337,6 +339,19 @@ class _Volumes:
     def least(self) -> float:
         """At the present u, over all ranks; NaN where it is none. Collective."""
         return global_min(self._comm, assembled(self._form) / self._weights, empty=np.inf)
+
+
+def _branches_by(form: ufl.Form, u: fem.Function) -> bool:
+    """Whether there is a condition on ``u`` in a form, which its derivative need not show.
+
+    A load that steps from one constant to another has none.
+    """
+    expanded = ufl.algorithms.expand_derivatives(form)
+    return any(
+        isinstance(item, ufl.classes.Condition) and u in extract_coefficients(item)
+        for integral in expanded.integrals()
+        for item in unique_pre_traversal(integral.integrand())
+    )
 
 
 class _Part:
