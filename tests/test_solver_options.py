@@ -9,7 +9,7 @@ from petsc4py import PETSc
 
 import fenics_contact as fc
 from scenes.blocks import TOP
-from scenes.comparing import at_points, close, gathered, nodal
+from scenes.comparing import at_points, close, gathered, nodal, raised_everywhere
 from scenes.rubbing import PATH, Rub
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
@@ -173,3 +173,11 @@ def test_a_solver_of_ones_own(cell, degree):
     assert gathered(COMM, made.contact.slip).max() > 1e-3
     for thing in (own.matrix, own.vector, own.x, own.snes):
         thing.destroy()
+
+
+@pytest.mark.parametrize("kind", ["vinewtonrsls", "fas", "newton"])
+def test_types_of_snes_that_cannot_work(kind):
+    """Some want bounds or a hierarchy, and without them end the program: refused by name."""
+    raised_everywhere(
+        lambda: Rub(petsc_options={"snes_type": kind}), ValueError, "snes_type", kind, "newtonls"
+    )

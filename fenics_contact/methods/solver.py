@@ -47,6 +47,11 @@ _ENOUGH = 15
 # Increments expected where nothing is said.
 _EXPECTED = 4
 
+# Others want bounds, a hierarchy or a partition of the unknowns, and end the program without them.
+_SNES_TYPES = (
+    *("newtonls", "newtontr", "newtontrdc", "qn", "nrichardson"),
+    *("ngmres", "ncg", "anderson", "ksponly"),
+)
 _REASONS = PETSc.SNES.ConvergedReason
 _OUTCOMES = {
     int(_REASONS.DIVERGED_LINEAR_SOLVE): "the matrix is singular",
@@ -195,7 +200,13 @@ class Solver:
             )
         globalised = {} if self._full.bulk.linear else _NONLINEAR.get(self.method, {})
         options.set(_COMMON | METHODS[self.method] | globalised, prefix)
-        quasi_newton = options.get(prefix + "snes_type") == PETSc.SNES.Type.QN
+        kind = options.get(prefix + "snes_type")
+        if kind not in _SNES_TYPES:
+            raise ValueError(
+                f"the option -{prefix}snes_type is {kind!r}, which needs more than residual and "
+                f"tangent, or is none of PETSc's; use one of {', '.join(_SNES_TYPES)}"
+            )
+        quasi_newton = kind == PETSc.SNES.Type.QN
         newton = linear.newton_options(self.system.linear_kind)
         if not quasi_newton:
             options.set(newton, prefix)
