@@ -150,6 +150,43 @@ def test_axisymmetric_ring_on_a_mandrel() -> None:
     assert contact.resultants().normal_force == pytest.approx(force, rel=1e-4)
 
 
+@pytest.mark.parametrize("inner", [0.0, 1.0])
+def test_axisymmetric_disc_bears_uniformly(inner: float) -> None:
+    """A disc, or a ring, pressed by PRESSURE with multipliers: p = PRESSURE at every point.
+
+    The stress is uniaxial, which linear cells have exactly; the area at a vertex is not the share
+    of it in a uniform pressure, and none on the axis. Tolerance 1e-5: that of the multipliers.
+    """
+    corners = [(inner, 0.0), (inner + 2.0, 1.0)]
+    mesh = dolfinx.mesh.create_rectangle(MPI.COMM_WORLD, corners, (4, 3))
+    tags = ends(mesh, 1, 1.0)
+    V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    body = LinearElastic(u, fem.Constant(mesh, E), NU, "axisymmetric")
+    ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
+    F = body.residual(v) + body.weight * PRESSURE * v[1] * ds(TOP)
+    bcs = []
+    if not inner:
+        axis = dolfinx.mesh.locate_entities_boundary(mesh, 1, lambda x: np.isclose(x[0], 0))
+        dofs = fem.locate_dofs_topological(V.sub(0), 1, axis)
+        bcs = [fem.dirichletbc(dolfinx.default_scalar_type(0.0), dofs, V.sub(0))]
+    floor = fc.HalfSpace((0, 0), (0, 1))
+
+    def pressed(enforcement: str, **rule: str) -> fc.Contact:
+        surface = fc.ContactSurface(mesh, tags, BOTTOM, **rule)
+        made = fc.Contact(
+            u, surface, floor, fc.Frictionless(), weight=body.weight, enforcement=enforcement
+        )
+        fc.ContactProblem(F, u, bcs=bcs, contacts=[made]).solve()
+        return made
+
+    points = pressed("augmented").gather()
+    assert points["pressure"] == pytest.approx(np.full(len(points["pressure"]), PRESSURE), rel=1e-5)
+    if not inner:
+        with pytest.raises(ValueError, match="weight is 0 at a vertex"):
+            pressed("penalty", quadrature_scheme="vertex")
+
+
 def test_moduli_as_functions() -> None:
     """Two layers in a row shorten by the sum of their compliances; scaled stiffness finds E/h."""
     mesh = dolfinx.mesh.create_rectangle(MPI.COMM_WORLD, [(0.0, 0.0), (1.0, 2.0)], (2, 4))

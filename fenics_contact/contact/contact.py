@@ -21,7 +21,7 @@ from fenics_contact.contact.choices import (
     is_regularised,
     opposite_of,
 )
-from fenics_contact.contact.inputs import FreeMotion, Inputs
+from fenics_contact.contact.inputs import FreeMotion, Inputs, varies
 from fenics_contact.contact.multipliers import Multipliers, TraceProjection
 from fenics_contact.contact.opposite import OppositeState, Parts
 from fenics_contact.contact.pairs import Pairs
@@ -181,6 +181,8 @@ class Contact(PointResults):
         # two meshes, and on quadrilaterals of any shape, nodes carry no uniform pressure over.
         nodal = augments and degree == 1 and not isinstance(support, DeformableBody)
         nodal = nodal and surface.submesh.topology.cell_name() != "quadrilateral"
+        # Nor where the area of a vertex is not that of its share of a uniform pressure.
+        nodal = nodal and not varies(weight)
         self.quadrature = surface.quadrature(degree, nodal=nodal)
         moving = self.finite and not isinstance(support, DeformableBody)
         self.multipliers: Multipliers | None = None

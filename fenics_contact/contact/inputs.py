@@ -26,7 +26,7 @@ from fenics_contact.surface.modulus import modulus_over_height
 from fenics_contact.surface.surface import ContactSurface, SurfaceQuadrature, VertexAreas
 from fenics_contact.types import Array
 
-__all__ = ["FreeMotion", "Inputs", "check_given"]
+__all__ = ["FreeMotion", "Inputs", "check_given", "varies"]
 
 
 logger = logging.getLogger("fenics_contact")
@@ -39,6 +39,8 @@ _FACING = 1e-6
 _DEEP = 0.1
 # A direction with no more than this share across the normal counts as parallel to it.
 _PARALLEL = 1e-6
+# A weight with no more than this share of the largest counts as none.
+_NOTHING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -350,8 +352,15 @@ class Inputs:
             positive = name in self._law.positive
             if low < 0 or (low == 0 and positive):
                 raise ValueError(_range_error(self._name, name, low, positive))
-        if global_min(comm, values.weight) < 0:
+        least = global_min(comm, values.weight)
+        if least < 0:
             raise ValueError(f"{self._name}: weight is negative at a point of Γc")
+        if self._quadrature.at_vertices and least <= _NOTHING * global_max(comm, values.weight):
+            raise ValueError(
+                f"{self._name}: weight is {least:g} at a vertex of Γc, as 2πr is on the axis, and "
+                'with quadrature_scheme="vertex" that is its area: whatever its pressure, it bears '
+                "nothing; take the default rule, whose points lie inside of the facets"
+            )
         if "direction" in parameters:
             self._check_direction(parameters, values)
 
@@ -393,6 +402,14 @@ class Inputs:
                 "the tangent plane everywhere: give another direction, or a UFL vector that "
                 "follows the surface"
             )
+
+
+def varies(value: Any) -> bool:
+    """Whether a number or UFL may differ from place to place."""
+    if not isinstance(value, ufl.core.expr.Expr):
+        return False
+    places = (ufl.classes.Coefficient, ufl.classes.GeometricQuantity)
+    return any(isinstance(item, places) for item in traverse_unique_terminals(value))
 
 
 def check_given(

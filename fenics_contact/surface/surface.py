@@ -65,8 +65,8 @@ class ContactSurface:
                 displacement element (`SurfaceQuadrature.default_degree`).
             quadrature_scheme: "default" (Gauss) or "vertex" (one point per facet vertex, the
                 contact springs of the paper's section 4). By default Gauss, but the vertices for
-                multipliers of linear elements on a rigid support, if no degree is given either and
-                the facets are edges or triangles.
+                multipliers of linear elements on a rigid support, if no degree is given either, the
+                facets are edges or triangles and the contact's weight is the same everywhere.
 
         Raises:
             ValueError: Wrong dimension, a tag that no facet has, an interior facet with the tag.
@@ -194,6 +194,7 @@ class SurfaceQuadrature:
         surface: The `ContactSurface`.
         degree: Polynomial degree of the rule.
         ds: The measure of Γc with this rule.
+        at_vertices: Whether the points are those of the rule "vertex".
         n_points: Quadrature points that this rank owns.
         weights: Weight times surface Jacobian of the owned points, shape (n_points,), in
             length^(gdim-1).
@@ -208,7 +209,8 @@ class SurfaceQuadrature:
         self.degree = degree
         self.ds = surface.measure(degree, scheme)
         self._cell = surface.submesh.topology.cell_name()
-        self._points_and_weights = _vertex_rule(self._cell) if scheme == "vertex" else None
+        self.at_vertices = scheme == "vertex"
+        self._points_and_weights = _vertex_rule(self._cell) if self.at_vertices else None
         space = self.space()
         self.weights_with_ghosts = self._weigh(self.ds)
         self.n_points = space.dofmap.index_map.size_local
