@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable
 
 import basix.ufl
+import dolfinx
 import numpy as np
 import pytest
 import ufl
@@ -54,6 +55,21 @@ def test_displacement_of_crouzeix_raviart():
     scene = block("triangle", **MESH)
     u = fem.Function(fem.functionspace(scene.mesh, ("CR", 1, (2,))))
     raised_everywhere(contact_with(u, scene), ValueError, "u ", "Lagrange")
+
+
+def test_displacement_in_single_precision():
+    """Compiled forms and PETSc are in double precision."""
+    mesh = dolfinx.mesh.create_unit_square(COMM, 4, 4, dtype=np.float32)
+    mesh.topology.create_connectivity(1, 2)
+    facets = dolfinx.mesh.exterior_facet_indices(mesh.topology)
+    tags = dolfinx.mesh.meshtags(mesh, 1, facets, np.ones(len(facets), dtype=np.int32))
+    u = fem.Function(displacement_space(mesh, 1), dtype=np.float32)
+    floor = fc.HalfSpace((0, 0), (0, 1))
+
+    def call():
+        return fc.Contact(u, fc.ContactSurface(mesh, tags, 1), floor, fc.Frictionless())
+
+    raised_everywhere(call, ValueError, "float32", "float64")
 
 
 def test_displacement_on_another_mesh():

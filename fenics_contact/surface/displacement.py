@@ -254,6 +254,11 @@ def _degree(u: fem.Function, mesh: Any, name: str) -> int:
         )
     if u.function_space.mesh is not mesh and u.function_space.mesh != mesh:
         raise ValueError(f"{name}: u lives on another mesh than the contact surface")
+    if u.x.array.dtype != np.float64:
+        raise ValueError(
+            f"{name}: u has values of type {u.x.array.dtype}; the mesh, its functions and PETSc "
+            "must be in float64"
+        )
     element = u.function_space.ufl_element()
     if u.function_space.dofmap.bs != gdim or element.pullback != ufl.identity_pullback:
         raise ValueError(
