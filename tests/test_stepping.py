@@ -83,6 +83,23 @@ def test_wrong_histories(load, steps, word):
     raised_everywhere(call, ValueError, word)
 
 
+@pytest.mark.parametrize(("start", "end"), [(0.0, 5e-324), (1e16, 1e16 + 2), (-1e308, 1e308)])
+def test_increments_that_numbers_cannot_tell_apart(start, end):
+    """Three were asked for; fewer would be solved, by another way of the load."""
+    made = Rub()
+    call = lambda: fc.increments(made.problem, made.load, start, end, steps=3)  # noqa: E731
+    raised_everywhere(call, ValueError, "steps is 3", "told apart")
+
+
+def test_one_file_for_checkpoint_and_table(tmp_path):
+    """Each would overwrite the other; nothing is written."""
+    made, path = Rub(), shared_folder(tmp_path) / "state"
+    names = {"checkpoint": path, "history": path.parent / ".." / path.parent.name / "state"}
+    call = lambda: fc.increments(made.problem, made.load, **names)  # noqa: E731
+    raised_everywhere(call, ValueError, "checkpoint and history are both")
+    assert not path.exists()
+
+
 # ---- cutting -------------------------------------------------------------------------------------
 
 

@@ -95,7 +95,8 @@ def increments(
             contact, energies, iterations, cuts, and the errors that ``estimate`` tells; the header
             says the units in words. Rows that the file has of increments behind the last committed
             one (all, where a history starts; those behind the checkpoint, where it goes on) are
-            replaced, those before it stay, so that several calls may share a file.
+            replaced, those before it stay, so that several calls may share a file, which is not
+            that of the checkpoint.
 
     Yields:
         The step, after its commit; ``load`` is its load parameter, and ``attempts`` has what was
@@ -144,6 +145,11 @@ def increments(
     if not isinstance(history, str | Path | None):
         raise ValueError(f"history is {history!r}; it must be the name of a file")
     table = None
+    if history is not None and file is not None and Path(history).resolve() == file.resolve():
+        raise ValueError(
+            f"checkpoint and history are both {history}, and each would overwrite the other; give "
+            "two names"
+        )
     if history is not None:
         table = Table(Path(history), problem, tuple(quantities(problem)) if estimate else ())
     leg = _Leg(float(start), ends, float(start), estimate)
@@ -523,7 +529,16 @@ def _ends(start: float, end: float, steps: int | Sequence[float]) -> list[float]
     if isinstance(steps, int | np.integer):
         if steps < 1:
             raise ValueError(f"steps is {steps}; it must be at least 1")
-        return [start + (end - start) * (i / steps) for i in range(1, steps)] + [float(end)]
+        with np.errstate(all="ignore"):
+            ends = [start + (end - start) * (i / steps) for i in range(1, steps)] + [float(end)]
+            ways = np.diff([start, *ends])
+        if not (np.all(np.isfinite(ends)) and (np.all(ways > 0) or np.all(ways < 0))):
+            raise ValueError(
+                f"steps is {steps}; so many numbers from start = {start!r} to end = {end!r} "
+                "cannot be told apart, or their distance is no number: take fewer, or let the "
+                "load parameter run from 0 to 1 and scale it in a function load"
+            )
+        return ends
     if not np.ndim(steps):
         raise ValueError(f"steps is {steps!r}; it must be a whole number, or ends of increments")
     ends = [float(value) for value in steps]
