@@ -201,7 +201,7 @@ class Solver:
         globalised = {} if self._full.bulk.linear else _NONLINEAR.get(self.method, {})
         options.set(_COMMON | METHODS[self.method] | globalised, prefix)
         kind = options.get(prefix + "snes_type")
-        if kind not in _SNES_TYPES:
+        if kind is not None and kind not in _SNES_TYPES:
             raise ValueError(
                 f"the option -{prefix}snes_type is {kind!r}, which needs more than residual and "
                 f"tangent, or is none of PETSc's; use one of {', '.join(_SNES_TYPES)}"
