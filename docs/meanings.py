@@ -60,7 +60,10 @@ GROUPS: list[tuple[str, list[str], str]] = [
         "Contacts",
         [
             "contact.contact",
+            "contact.choices",
             "contact.inputs",
+            "contact.opposite",
+            "contact.rigid",
             "contact.finite",
             "contact.general",
             "contact.accuracy",
@@ -78,7 +81,7 @@ GROUPS: list[tuple[str, list[str], str]] = [
     ),
     (
         "Problem and choice of the method",
-        ["problem", "methods.solver", "systems.choice"],
+        ["problem", "checks.given", "methods.solver", "systems.choice"],
         "[](choose.md) says which method and linear solver are for what.",
     ),
     (
