@@ -74,6 +74,10 @@ _COMMON: dict[str, Any] = {
     # `cp` takes |F·y| below this for convergence of the whole; the residual itself is tested here.
     "snes_linesearch_atol": 1e-300,
 }
+# Without prefix: of the vectors. By default PETSc takes products with several of them by BLAS, as
+# matrices of as many as happen to lie evenly in memory: with PETSc 3.25 the last digits of L-BFGS
+# changed from a history to the same one again.
+_VECTORS: dict[str, Any] = {"vec_mdot_use_gemv": False}
 # Options that only make sense for the sparse matrices over all unknowns.
 _NAMES_A_SOLVER = ("ksp_type", "pc_type", "pc_factor_mat_solver_type")
 # The methods, and the options of the main SNES with each.
@@ -178,6 +182,7 @@ class Solver:
         """Set up SNES and its two linear solvers: for H₀, and for the consistent tangent."""
         settings, prefix, equations = self._settings, self._settings.prefix, self.equations
         options = self.options = Defaults()
+        options.set(_VECTORS, "")
         options.give(settings.petsc_options, prefix)
         if settings.accuracy is not None:
             # Residuals as large as what multipliers may miss would make rounds that change nothing.
@@ -320,7 +325,8 @@ class Solver:
                 n = self._full.unknowns.n_global
                 logger.info("condensed onto %d of %d unknowns", selection.n_global, n)
         self._pairings = self._present_pairings()
-        self.equations.take(system)
+        with self.options.present():
+            self.equations.take(system)
 
     def _present_pairings(self) -> list[int]:
         # Matrices of pairs that follow the bodies are made for each anew, and no one is kept.
