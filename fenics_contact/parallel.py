@@ -93,18 +93,20 @@ def collective_errors(comm: MPI.Comm) -> Iterator[None]:
     raise (kind(text) if kind in (ValueError, TypeError, MemoryError) else RuntimeError(text))
 
 
-def warn(comm: MPI.Comm, text: str) -> None:
-    """Warn: in the log of the first rank, and by a Python warning on every rank. Collective.
+def warn(comm: MPI.Comm, text: str, *, category: type[Warning] = UserWarning) -> None:
+    """Warn: in the log of the first rank, and by a Python warning on every rank.
 
-    On all of them, because a warning may have been made an error.
+    On all of them, because a warning may have been made an error. In the log, because FFCx leads
+    Python's warnings into one of its own, which nobody sees where logging has not been set up.
 
     Args:
-        comm: The ranks.
+        comm: The ranks; nothing is communicated.
         text: The same on every rank.
+        category: Of the Python warning.
     """
     if comm.rank == 0:
         logger.warning(text)
-    warnings.warn(text, UserWarning, stacklevel=3)
+    warnings.warn(text, category, stacklevel=3)
 
 
 def agreed(comm: MPI.Comm, value: Any) -> Any:

@@ -115,7 +115,7 @@ def test_plastic_strains_go_on(bulk, tmp_path):
     assert close(gathered(COMM, owned(after.plastic)), gathered(COMM, owned(whole.plastic)), 1e-7)
 
 
-def test_fields_that_are_forgotten(tmp_path):
+def test_fields_that_are_forgotten(tmp_path, caplog):
     """Changed by the loop and not in the file: a warning, once; going on is refused."""
     path = shared_folder(tmp_path) / "state.npz"
     made = Press(bulk="nonlinear")
@@ -125,6 +125,7 @@ def test_fields_that_are_forgotten(tmp_path):
             if step.increment == 4:
                 break
     assert len([w for w in warned if "plastic" in str(w.message)]) == 1
+    assert caplog.text.count("plastic in the bulk form") == (COMM.rank == 0)
     after = Press(bulk="nonlinear")
     raised_everywhere(lambda: next(after.increments(checkpoint=path)), ValueError, "bulk")
 

@@ -336,12 +336,16 @@ def test_a_load_that_fails_leaves_the_problem(saved):
 # ---- calls that are no use -----------------------------------------------------------------------
 
 
-def test_increments_that_are_never_asked_for():
-    """A warning says that nothing was solved; none where something was, or nothing was to be."""
+def test_increments_that_are_never_asked_for(caplog):
+    """A warning says that nothing was solved; none where something was, or nothing was to be.
+
+    It is in the log, too: FFCx hides Python's warnings where no logging has been set up.
+    """
     made = Press()
     with pytest.warns(RuntimeWarning, match="iterate over"):
         made.increments()
     assert made.problem.increment == 0
+    assert caplog.text.count("nothing was solved") == (COMM.rank == 0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*taken as small")

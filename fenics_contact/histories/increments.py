@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import warnings
 import weakref
 from collections.abc import Callable, Generator, Iterator, Sequence
 from numbers import Real
@@ -12,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 from dolfinx import fem
+from mpi4py import MPI
 
 from fenics_contact.checks.step import Step
 from fenics_contact.checks.verdict import Attempt, NotConverged
 from fenics_contact.estimates.errors import quantities
 from fenics_contact.histories import checkpoint as states
 from fenics_contact.histories.table import Table
-from fenics_contact.parallel import collective_errors
+from fenics_contact.parallel import collective_errors, warn
 from fenics_contact.problem import ContactProblem
 from fenics_contact.types import Array
 
@@ -154,14 +154,15 @@ def increments(
         table = Table(Path(history), problem, tuple(quantities(problem)) if estimate else ())
     leg = _Leg(float(start), ends, float(start), estimate)
     every = max_cuts, checkpoint_every, field
-    return _Started(_history(problem, apply, leg, file, every, list(fields), changed, table))
+    made = _history(problem, apply, leg, file, every, list(fields), changed, table)
+    return _Started(made, comm)
 
 
 class _Started(Iterator[Step]):
     """Increments that are solved as they are asked for; warns if none ever is."""
 
-    def __init__(self, steps: Generator[Step, None, None]) -> None:
-        self._steps, self._asked = steps, False
+    def __init__(self, steps: Generator[Step, None, None], comm: MPI.Comm) -> None:
+        self._steps, self._comm, self._asked = steps, comm, False
 
     def __next__(self) -> Step:
         self._asked = True
@@ -174,11 +175,11 @@ class _Started(Iterator[Step]):
 
     def __del__(self) -> None:
         if not self._asked:
-            warnings.warn(
+            warn(
+                self._comm,
                 "increments(...) was called, and nothing was solved: iterate over what it returns, "
                 "for step in increments(...)",
-                RuntimeWarning,
-                stacklevel=2,
+                category=RuntimeWarning,
             )
 
 
@@ -469,12 +470,11 @@ class _Watch:
                 f.name for f, is_changed in zip(self._functions, changed, strict=True) if is_changed
             ]
             self._functions = []
-            warnings.warn(
+            warn(
+                self._comm,
                 f"{', '.join(names)} in the bulk form is changed between increments, and is not in "
                 "the checkpoint: a history that goes on from it will not have the values; give "
                 "fields=[...]",
-                UserWarning,
-                stacklevel=3,
             )
 
 

@@ -173,7 +173,8 @@ class Law:
         if self.has_potential and not self.has_tangential:
             return self.normal_potential(kinematics, parameters)
         raise ValueError(
-            f"{type(self).__name__} has no potential: its slip is not associated (eq. 46)"
+            f"{type(self).__name__} has no potential: what friction takes depends on the way "
+            "there; the energies of an increment are in step.energy"
         )
 
     def at_pressure(self, pressure: Expr) -> Law:

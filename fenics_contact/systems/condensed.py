@@ -8,7 +8,6 @@ An iteration costs milliseconds, and one back-substitution at its end gives the 
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -24,8 +23,6 @@ from fenics_contact.systems.unknowns import Selection
 from fenics_contact.types import Array, Indices
 
 __all__ = ["CondensedSystem", "all_kept", "inexpensive", "worthwhile"]
-
-logger = logging.getLogger("fenics_contact")
 
 # Dense matrices of this many unknowns take 200 MB each, and there are five or so.
 _LARGEST = 5000
