@@ -229,6 +229,19 @@ def test_the_line_that_ends_all_ranks(tmp_path: Path) -> None:
 # ---- scripts -------------------------------------------------------------------------------------
 
 
+def _quoted(script: Path) -> list[str]:
+    """Lines of output that the page of a script shows."""
+    name = f"In full: `docs/scripts/{script.name}`"
+    pages = [page.read_text() for page in PAGES if name in page.read_text()]
+    blocks = [block for page in pages for block in re.findall(r"```text\n(.*?)```", page, re.S)]
+    return [line for block in blocks for line in block.splitlines()]
+
+
+def _words(line: str) -> str:
+    """How a line of output begins, without its numbers, which are other ones elsewhere."""
+    return re.sub(r"\d[\d.]*(e[-+]\d+)?", "#", re.split(r"[;(]", line)[0]).strip()
+
+
 @pytest.mark.demo
 @pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own")
 @pytest.mark.parametrize("path", SCRIPTS, ids=[path.stem for path in SCRIPTS])
@@ -243,6 +256,8 @@ def test_scripts_run(path: Path, tmp_path: Path) -> None:
         timeout=300,
     )
     assert done.returncode == 0, done.stdout + done.stderr
+    said = {_words(line) for line in done.stdout.splitlines()}
+    assert [line for line in _quoted(path) if _words(line) not in said] == []
     if path.stem != "results":
         assert "assert " in path.read_text()
         return

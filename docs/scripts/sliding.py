@@ -1,0 +1,72 @@
+"""A pad of plastic on a plate of steel that slides to and fro: the loop of friction over way."""
+
+from pathlib import Path
+
+import numpy as np
+import ufl
+from dolfinx import fem, mesh
+from mpi4py import MPI
+
+import fenics_contact as fc
+
+FRICTION, PRESSURE, WIDTH, WAY = 0.3, 10.0, 1.0, 8e-3  # MPa, mm; forces in N per mm of depth
+E, NU = {"plate": 2.1e5, "pad": 3e3}, 0.35
+BELOW, ABOVE = 1, 2
+
+
+# begin bodies
+def block(low, high, cells):
+    """A rectangle between two corners, its mesh and tags."""
+    msh = mesh.create_rectangle(MPI.COMM_WORLD, [low, high], cells)
+    facets = mesh.locate_entities_boundary(msh, 1, lambda x: np.isfinite(x[0]))
+    y = mesh.compute_midpoints(msh, 1, facets)[:, 1]
+    where = np.select([np.isclose(y, low[1]), np.isclose(y, high[1])], [BELOW, ABOVE])
+    return msh, None, mesh.meshtags(msh, 1, facets, where.astype(np.int32))
+
+
+plate = block((-1, -0.5), (1, 0), (20, 5))
+pad = block((-WIDTH / 2, 0), (WIDTH / 2, 0.3), (24, 8))
+joined = fc.join_meshes({"plate": plate, "pad": pad})
+V = fem.functionspace(joined.mesh, ("Lagrange", 2, (2,)))
+u, v = fem.Function(V), ufl.TestFunction(V)
+pressure, way = fem.Constant(joined.mesh, 0.0), fem.Constant(joined.mesh, 0.0)
+body = fc.elasticity.LinearElastic(u, joined.by_body(E), NU, kind="plane strain")
+ds = ufl.Measure("ds", domain=joined.mesh, subdomain_data=joined.facets)
+F = body.residual(v) + pressure * v[1] * ds(joined.facet("pad", ABOVE))
+held = [("pad", ABOVE, 0, 0.0), ("plate", BELOW, 0, way), ("plate", BELOW, 1, 0.0)]
+bcs = []
+for name, side, i, value in held:
+    facets = joined.facets.find(joined.facet(name, side))
+    dofs = fem.locate_dofs_topological(V.sub(i), 1, facets)
+    bcs.append(fem.dirichletbc(value, dofs, V.sub(i)))
+
+# begin contact
+surface = fc.ContactSurface(joined.mesh, joined.facets, joined.facet("pad", BELOW))
+support = fc.DeformableBody(joined.facets, joined.facet("plate", ABOVE))
+contact = fc.Contact(u, surface, support, fc.Coulomb(FRICTION))
+problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
+
+# begin history
+list(fc.increments(problem, pressure, 0, PRESSURE))
+ways, forces, taken = [0.0], [0.0], 0.0
+for start, end in ((0, WAY), (WAY, -WAY), (-WAY, WAY)):
+    for step in fc.increments(problem, way, start, end, steps=10 if start == 0 else 20):
+        ways.append(step.load)
+        forces.append(float(contact.resultants().force[0]))
+        taken += step.energy.dissipation if start != 0 else 0.0  # in the cycle
+
+# begin picture
+loop = slice(10, None)  # from the first turn on
+area = np.trapezoid(forces[loop], ways[loop])
+Path("output").mkdir(exist_ok=True)
+if joined.mesh.comm.rank == 0:
+    with fc.plotting.figure("output/hysteresis.png") as axes:
+        axes.plot(1e3 * np.array(ways), forces, ".-")
+        axes.set(xlabel="way of the plate [µm]", ylabel="friction on the pad [N/mm]")
+        axes.set(title=f"Friction takes {1e3 * taken:.3g} µJ/mm a cycle")
+        axes.grid(alpha=0.25)
+    print(f"loop {1e3 * area:.4g} µJ/mm, dissipation {1e3 * taken:.4g} µJ/mm")
+
+limit = FRICTION * PRESSURE * WIDTH
+assert np.isclose(forces[10], limit, rtol=1e-6) and np.isclose(forces[-1], limit, rtol=1e-6)
+assert np.isclose(area, taken, rtol=1e-2)  # trapezia
