@@ -156,6 +156,19 @@ def test_model_of_ranks() -> None:
     assert parallel.speed_up(c, rows, 1e12, 64, alone) == pytest.approx(64, rel=0.01)
 
 
+@pytest.mark.demo
+def test_first_runs_begin_with_empty_caches(tmp_path: Path) -> None:
+    """The README's script out of an empty folder: forms are compiled in its first run alone."""
+    command = [sys.executable, str(ROOT / "benchmarks" / "tasks.py"), "--short", "--repeat", "1"]
+    command += ["--output", str(tmp_path)]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    with open(tmp_path / "tasks.csv", newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert row["script"] == "`README.md`" and row["pictures"] == "0"
+    assert float(row["first run [s]"]) > float(row["again [s]"])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["half_cylinder", "ball", "tagged"])
 def test_short_benchmark(name: str, tmp_path: Path) -> None:

@@ -105,6 +105,16 @@ def test_files_that_are_named_exist(page: Path) -> None:
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 
+@pytest.mark.parametrize("picture", sorted(DOCS.glob("*.png")), ids=lambda path: path.stem)
+def test_every_picture_has_its_command(picture: Path) -> None:
+    """It is on a page, which names a script: that it draws the picture nobody can see here."""
+    pages = [page.read_text() for page in [*PAGES, ROOT / "README.md"]]
+    shown = [text for text in pages if picture.name in text]
+    assert shown
+    for text in shown:
+        assert re.search(r"(python (demos|benchmarks)|`docs/scripts)/\w+\.py", text)
+
+
 def documented() -> list[str]:
     """Names in the reference, with dots."""
     text = "".join(page.read_text() for page in PAGES if page.parent.name == "reference")
