@@ -340,7 +340,11 @@ SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: fc.RigidSurface(SQUARE, [[0, 1, 2], [0, 3, 2]]), "ordered against each other"),
+        (
+            lambda: fc.RigidSurface(SQUARE, [[0, 1, 2], [0, 3, 2]]),
+            "at (0.5, 0.5, 0), neighbours are ordered against each other",
+        ),
+        (lambda: fc.RigidSurface(SQUARE[:, :2], [[0, 1], [2, 1]]), "at (1, 0), neighbours"),
         (lambda: fc.RigidSurface(SQUARE, [[0, 1, 4]]), "from 0 to 4"),
         (lambda: fc.RigidSurface(SQUARE, [[0, 1]]), "(n_facets, 3)"),
         (lambda: fc.RigidSurface(SQUARE, [[0.0, 1.0, 2.0]]), "whole numbers"),

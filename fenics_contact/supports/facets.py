@@ -57,7 +57,7 @@ class Facets:
         self.points, self.facets = _welded(points, facets)
         if halvings:
             corners = self.points[self.facets]
-            beyond = _beyond(self.facets, len(self.points))
+            beyond = _beyond(self.facets, self.points)
             parts = refined(corners, _facet_normals(corners)[0], beyond, halvings, sharp)
             d = points.shape[1]
             self.points, self.facets = _welded(
@@ -91,7 +91,7 @@ class Facets:
                 np.add.at(at_corners, self.facets[:, k], normals)
             begins = np.bincount(self.facets[:, 0], minlength=len(self.points))
             ends = np.bincount(self.facets[:, 1], minlength=len(self.points))
-            _check_order(begins, ends)
+            _check_order(begins, ends, self.points)
             at_border = begins != ends
         else:
             for k in range(3):
@@ -99,7 +99,7 @@ class Facets:
                 across = np.linalg.norm(np.cross(one, other), axis=1)
                 angle = np.arctan2(across, np.einsum("ij,ij->i", one, other))
                 np.add.at(at_corners, self.facets[:, k], angle[:, None] * normals)
-            beyond = _beyond(self.facets, len(self.points))
+            beyond = _beyond(self.facets, self.points)
             neighbour = np.where(beyond < 0, -1, beyond // 3)
             beside = np.where((neighbour >= 0)[:, :, None], normals[neighbour], 0.0)
             whole = np.concatenate([whole, whole + beside], axis=1)
@@ -201,24 +201,29 @@ def _facet_normals(corners: Array) -> tuple[Array, Mask]:
     return normals / length[:, None], has
 
 
-def _beyond(facets: Numbers, n_points: int) -> Numbers:
+def _beyond(facets: Numbers, points: Array) -> Numbers:
     """Of every edge of triangles the number of its other side, -1 where there is none: (n, 3)."""
-    start, end = facets, np.roll(facets, -1, axis=1)
+    start, end, n_points = facets, np.roll(facets, -1, axis=1), len(points)
     forward = (start * n_points + end).ravel()
     backward = (end * n_points + start).ravel()
     keys, first, counts = np.unique(forward, return_index=True, return_counts=True)
-    _check_order(counts, np.ones_like(counts))
+    middles = (points[keys // n_points] + points[keys % n_points]) / 2
+    _check_order(counts, np.ones_like(counts), middles)
     place = np.minimum(np.searchsorted(keys, backward), len(keys) - 1)
     found = np.where(keys[place] == backward, first[place], -1)
     return np.asarray(found.reshape(-1, 3), dtype=np.intp)
 
 
-def _check_order(ways: npt.NDArray[np.integer], back: npt.NDArray[np.integer]) -> None:
-    bad = int(np.sum((ways > 1) | (back > 1)))
-    if bad:
+def _check_order(
+    ways: npt.NDArray[np.integer], back: npt.NDArray[np.integer], places: Array
+) -> None:
+    bad = np.flatnonzero((ways > 1) | (back > 1))
+    if len(bad):
+        first = ", ".join(f"{v:.4g}" for v in places[bad[0]])
         raise ValueError(
-            f"at {bad} edges or corners neighbours are ordered against each other, or more than "
-            "two facets meet: order all facets anticlockwise as seen from outside of the support "
-            "(in the plane: the support on the left of the way), each given once, and take bodies "
-            "that touch each other as supports of their own"
+            f"at {len(bad)} edges or corners, one of them at ({first}), neighbours are ordered "
+            "against each other, or more than two facets meet: order all facets "
+            "anticlockwise as seen from outside of the support (in the plane: the support on the "
+            "left of the way), each given once, and take bodies that touch each other as supports "
+            "of their own"
         )
