@@ -112,6 +112,8 @@ def test_failed_increment_leaves_no_trace(method):
     made, twin = Rub(method=method), Rub(method=method)
     scene, contact = made.scene, made.contact
     bcs = [scene.hold(TOP, i, c) for i, c in enumerate(made.push)]
+    for m in (made, twin):
+        walk(m, path=PATH[:2])
     limited = fc.ContactProblem(
         scene.F,
         scene.u,
@@ -121,8 +123,6 @@ def test_failed_increment_leaves_no_trace(method):
         petsc_options={"snes_max_it": 1},
         prefix="limited_",
     )
-    for m in (made, twin):
-        walk(m, path=PATH[:2])
     before = snapshot(made)
     made.move(*PATH[2])
     for _ in range(2):  # and a second time, from a solver that has failed
