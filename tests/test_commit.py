@@ -165,3 +165,24 @@ def test_a_history_that_another_problem_has_led_on_is_refused():
     assert close(contact.history.rows(), rows, 0.0)
     first.solve()
     first.commit()
+
+
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+def test_results_after_a_restore_are_those_of_the_commit(enforcement):
+    """Points that slipped in the committed increment do so still, whatever was tried since."""
+    scene = block("quadrilateral", n=4, up=-10.0)
+    contact = {"displacement": np.zeros(2), "enforcement": enforcement}
+    problem, contact = scene.problem(fc.Coulomb(0.3), scene.rollers(), contact=contact)
+    contact.parameters["displacement"].value[:] = 5e-3, 0.0
+    problem.solve()
+    problem.commit()
+    before, status = contact.resultants(), contact.status.copy()
+    assert before.slip > 0
+    scene.load(up=-11.0)
+    problem.solve()
+    problem.restore()
+    assert np.array_equal(contact.status, status)
+    assert contact.resultants().slip == before.slip
+    scene.load(up=np.nan)
+    raised_everywhere(problem.solve, ValueError, "finite")
+    assert np.array_equal(contact.status, status)

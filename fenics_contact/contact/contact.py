@@ -59,11 +59,13 @@ class Committed:
         history: `PointFields.rows`.
         opposite: What was committed of what lies opposite.
         commits: `Contact.commits`.
+        points: All fields at this rank's points; None: nothing was committed.
     """
 
     history: Array
     opposite: OppositeState
     commits: int
+    points: PointValues | None
 
 
 class Contact(PointResults):
@@ -220,6 +222,7 @@ class Contact(PointResults):
         self.opposite = opposite_of(parts, finite=self.finite)
         self.acting = ActingLaw(law, self.opposite, self.quadrature)
         self._values: PointValues | None = None
+        self._committed_values: PointValues | None = None
         if not self.rigid:
             self.pair()
         self.opposite.begins_anew()
@@ -511,10 +514,13 @@ class Contact(PointResults):
         self._values = None
 
     def restore(self) -> None:
-        """Multipliers as at the last commit; what was evaluated is dropped. Collective."""
+        """Multipliers and results as at the last commit; before one none are. Collective.
+
+        At that state the law would call points that have slipped to it sticking ones.
+        """
         if self.multipliers is not None:
             self.multipliers.restore(self.history)
-        self.forget()
+        self._values = self._committed_values
 
     def enforcement_error(self) -> float:
         """What the springs bear at the last evaluated state, relative: 0 if exact. Collective.
@@ -612,18 +618,20 @@ class Contact(PointResults):
         moved = self.opposite.commit(found.points)
         if moved is not None and self.law.has_friction:
             self.history.commit(values | {"jump": values["jump"] + moved})
+        self._committed_values = found.points
         if self.multipliers is not None:
             self.multipliers.restore(self.history)
 
     def committed(self) -> Committed:
         """The committed state, for `set_committed`."""
-        return Committed(self.history.rows(), self.opposite.state(), self.commits)
+        rows, state = self.history.rows(), self.opposite.state()
+        return Committed(rows, state, self.commits, self._committed_values)
 
     def set_committed(self, state: Committed) -> None:
         """Make a state the committed one again; `restore` drops what came after it. Collective."""
         self.history.set_rows(state.history)
         self.opposite.set_state(state.opposite)
-        self.commits = state.commits
+        self.commits, self._committed_values = state.commits, state.points
 
     def take_up(self, history: Array, values: Mapping[str, Array]) -> None:
         """Make a state of another run the committed one, at the u that it has. Collective.
@@ -633,6 +641,7 @@ class Contact(PointResults):
             values: The arrays of its `values`, for the results to be those of its solution.
         """
         self.history.set_rows(history)
+        self._committed_values = None
 
         def present() -> PointValues:
             self.restore()
@@ -644,6 +653,7 @@ class Contact(PointResults):
         mine = self.values.arrays
         if {n: v.shape for n, v in values.items()} == {n: v.shape for n, v in mine.items()}:
             self._values = PointValues.of(values)
+        self._committed_values = self._values
 
     @property
     def values(self) -> PointValues:
