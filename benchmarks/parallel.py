@@ -13,7 +13,10 @@ measured times, and a picture draws it for more ranks.
 
     OMP_NUM_THREADS=1 python benchmarks/parallel.py            # ten minutes
     OMP_NUM_THREADS=1 python benchmarks/parallel.py --short
+    python benchmarks/parallel.py --tables       # from what was measured last, anew
 
+Two tables go from 1 to 1,024 ranks and from 1e5 to 1e9 unknowns, on paper: contact by multigrid as
+the model has it, and what the interface of the ranks takes where a problem in space is condensed.
 Another table says where the time goes, operation by operation, and what limits two ranks.
 """
 
@@ -64,6 +67,13 @@ NETWORKS = {
     "fast network": Machine(2e-6, 10e9, 4e-6),
     "Ethernet": Machine(50e-6, 0.1e9, 100e-6),
 }
+
+
+# Of the tables on paper: unknowns, ranks, the memory of a rank (GiB), and how many unknowns a rank
+# needs to have, fewer of which nobody solves by multigrid; and what an interface may take (s).
+SIZES = (1e5, 1e6, 1e7, 1e8, 1e9)
+RANKS = (1, 4, 16, 64, 256, 1024)
+NODE, FEWEST, BEARABLE = 16.0, 5000, 600.0
 
 
 # ---- the machine ---------------------------------------------------------------------------------
@@ -251,6 +261,47 @@ def beyond(c: float, rows: Sequence[Row], here: Machine) -> list[Row]:
     return found
 
 
+def by_multigrid(rows: Sequence[Row], c: float, machine: Machine) -> list[Row]:
+    """Seconds of one increment of contact on many ranks, by the model.
+
+    Args:
+        rows: Contact by multigrid, measured on one rank and on two.
+        c: Time for an unknown in an iteration (s).
+        machine: What ranks cost each other.
+    """
+    iterations = max(row["iterations"] for row in rows)
+    memory = min(row["GiB"] / row["dofs"] for row in rows)  # of the largest: libraries weigh less
+    found = []
+    for dofs in SIZES:
+        row: Row = {"unknowns": f"{dofs:.0e}"}
+        for ranks in RANKS:
+            one = {"dofs": dofs, "ranks": 1, "iterations": 1}
+            each = on_many(rows, dofs, ranks) if ranks > 1 else one
+            name = f"{ranks} ranks [s]" if ranks > 1 else "1 rank [s]"
+            if memory * dofs / ranks > NODE:
+                row[name] = "memory"
+            elif dofs / ranks < FEWEST:
+                row[name] = "too few"
+            else:
+                row[name] = iterations * predicted(c, each, machine)
+        found.append(row)
+    return found
+
+
+def interfaces() -> list[Row]:
+    """What the interface of the ranks takes where a square or cube is merged on one rank."""
+    found = []
+    for d, body in ((2, "square"), (3, "cube")):
+        for dofs in SIZES:
+            for ranks in RANKS[1:]:
+                cuts = d * (ranks ** (1 / d) - 1)
+                shared = d * cuts * (dofs / d) ** (1 - 1 / d)
+                row: Row = {"body": body, "unknowns": f"{dofs:.0e}", "ranks": ranks}
+                row |= {"shared unknowns": shared, "dense matrix [GiB]": 8 * shared**2 / 2**30}
+                found.append(row | {"seconds at 20 Gflop/s": 2 / 3 * shared**3 / 20e9})
+    return [row for row in found if row["seconds at 20 Gflop/s"] < BEARABLE]
+
+
 def draw(path: Path, rows: Sequence[Row], machine: Machine) -> None:
     """Speed-up over ranks by the model, with what is measured."""
     mine = [row for row in rows if row["run"] == RUNS[1]]
@@ -269,6 +320,20 @@ def draw(path: Path, rows: Sequence[Row], machine: Machine) -> None:
         axes.set_ylabel("speed-up")
         axes.grid(alpha=0.25, which="both")
         axes.legend(fontsize=8)
+
+
+def measured(path: Path) -> list[Row]:
+    """Rows that were saved, numbers as such."""
+
+    def value(text: str) -> float | int | str:
+        for kind in (int, float):
+            try:
+                return kind(text)
+            except ValueError:
+                pass
+        return text
+
+    return [{k: value(v) for k, v in row.items() if v} for row in timing.read(path)]
 
 
 def launch_machine() -> Machine:
@@ -306,6 +371,23 @@ def report(folder: Path, rows: list[Row], machine: Machine) -> None:
     assumed = f"Assumed, {assumed}, one rank to a memory bus, {NEIGHBOURS} neighbours. Coarse "
     assumed += "levels that leave ranks without work, and imbalance, are not in it."
     timing.write(folder, "parallel_4", title, beyond(c[RUNS[1]], mine, machine), assumed)
+    iterations = max(row["iterations"] for row in mine)
+    title = "One increment of contact by L-BFGS and multigrid, on paper"
+    assumed = (
+        f"The model on the fast network, with c as measured here and {iterations} iterations, the "
+        "most that were measured, whatever the size: nothing was run beyond 332,000 unknowns. "
+        f'"memory": more than {NODE:g} GiB a rank; "too few": fewer than {FEWEST} unknowns a '
+        "rank. Coarse levels on one rank, and imbalance, are not in it."
+    )
+    on_paper = by_multigrid(mine, c[RUNS[1]], NETWORKS["fast network"])
+    timing.write(folder, "parallel_5", title, on_paper, assumed)
+    assumed = (
+        "A square or cube cut into as many as there are ranks: unknowns in the cuts, their dense "
+        "matrix on the first rank, and the 2/3 n³ operations to eliminate it. Left out is what "
+        f"takes more than {BEARABLE:g} s."
+    )
+    title = "The interface of the ranks where a problem is condensed, on paper"
+    timing.write(folder, "parallel_6", title, interfaces(), assumed)
     draw(folder / "speed_up.png", rows, machine)
 
 
@@ -314,7 +396,12 @@ def main() -> None:
     parser = timing.parser(__doc__, "parallel")
     parser.add_argument("--cells", type=int, nargs="*", default=list(CELLS))
     parser.add_argument("--machine", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--tables", action="store_true", help="from what was measured last")
     arguments = parser.parse_args()
+    if arguments.tables:
+        machine = Machine(**json.loads((arguments.output / "machine.json").read_text()))
+        report(arguments.output, measured(arguments.output / "parallel.csv"), machine)
+        return
     if arguments.machine:
         machine = measure_machine()
         if MPI.COMM_WORLD.rank == 0:

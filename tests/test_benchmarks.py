@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -154,6 +155,31 @@ def test_model_of_ranks() -> None:
     alone = parallel.Machine(1e-6, 1e9, 2e-6)
     assert parallel.speed_up(c, rows, 1000, 2, alone) == pytest.approx(0.05 / (time - 0.00625))
     assert parallel.speed_up(c, rows, 1e12, 64, alone) == pytest.approx(64, rel=0.01)
+
+
+def test_tables_on_paper(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cuts through a square and a cube counted by hand; memory and too few unknowns are said."""
+    monkeypatch.setattr(parallel, "SIZES", (2e6, 3e6))
+    monkeypatch.setattr(parallel, "RANKS", (1, 4, 64, 1024))
+    monkeypatch.setattr(parallel, "BEARABLE", math.inf)
+    shared = {(r["body"], r["unknowns"], r["ranks"]): r for r in parallel.interfaces()}
+    # Two lines of 1000 nodes; nine planes of 100² nodes.
+    assert shared["square", "2e+06", 4]["shared unknowns"] == pytest.approx(2 * 1000 * 2)
+    cube = shared["cube", "3e+06", 64]
+    assert cube["shared unknowns"] == pytest.approx(9 * 100**2 * 3)
+    assert cube["dense matrix [GiB]"] == pytest.approx(8 * 270e3**2 / 2**30)
+
+    counts = {"messages": 0.0, "MB sent": 0.0, "reductions": 0.0}
+    one = {"dofs": 1000, "ranks": 1, "iterations": 50, "seconds": 0.05, "GiB": 1.0}
+    rows = [one, one | {"ranks": 2} | counts]
+    bus = parallel.Machine(alpha=0.0, beta=1.0, gamma=0.0)
+    row = parallel.by_multigrid(rows, 1e-6, bus)[0]
+    assert row["1 rank [s]"] == row["64 ranks [s]"] == "memory"  # 1 MiB for an unknown
+    assert row["1024 ranks [s]"] == "too few"
+    monkeypatch.setattr(parallel, "NODE", math.inf)
+    row = parallel.by_multigrid(rows, 1e-6, bus)[0]
+    assert row["1 rank [s]"] == pytest.approx(50 * 2e6 * 1e-6)
+    assert row["64 ranks [s]"] == pytest.approx(50 * 2e6 * 1e-6 / 64)
 
 
 @pytest.mark.demo
