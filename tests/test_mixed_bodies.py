@@ -1,0 +1,191 @@
+"""Two bodies with a pressure of their own beside the displacement, pressed together and dragged."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+
+import fenics_contact as fc
+from fenics_contact.elasticity import NeoHookean
+from scenes.comparing import assemble_owned, close, compiled, owned, shared_folder
+from scenes.elasticity import strain
+from scenes.rubber import MIXED, TIGHT, mixed_space, split
+from scenes.tags import plane, sides
+from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, two_blocks
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
+E = 1000.0
+G = E / 3  # ν = 1/2
+
+
+class Blocks:
+    """A block of incompressible rubber on another, 1 by 1/2 each, in plane strain."""
+
+    def __init__(
+        self,
+        kinematics: str,
+        law: fc.Law,
+        *,
+        mixed: str = "Taylor-Hood",
+        smooth: bool = False,
+        n: tuple[int, int] = (4, 4),
+        widths: tuple[float, float] = (1.0, 1.0),
+        shift: float = 0.0,
+        contact: dict[str, Any] | None = None,
+        **options: Any,
+    ) -> None:
+        """Make it. Collective.
+
+        Args:
+            kinematics: "finite" with a neo-Hookean bulk, or "small" with a linear one.
+            law: Between the blocks.
+            mixed: Elements, of `MIXED`.
+            smooth: Whether bottom and top slide on planes, and the left sides, too; else they are
+                held and the top moves along.
+            n: Cells of the lower and the upper block along their sides.
+            widths: Of both.
+            shift: Of the upper one along the lower.
+            contact: Further arguments of the contact.
+            **options: Of the problem.
+        """
+        mesh, tags = two_blocks("triangle", n, widths, shift)
+        self.mesh, W = mesh, mixed_space(mesh, mixed)
+        self.w = fem.Function(W)
+        (u, p), (v, q) = split(ufl.split(self.w)), split(ufl.TestFunctions(W))
+        if kinematics == "finite":
+            dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4})
+            self.F = NeoHookean(u, E, 0.5, "plane strain", pressure=p).residual(v, dx, q=q)
+        else:
+            work = 2 * G * ufl.inner(strain(u), strain(v)) - p * ufl.div(v) - q * ufl.div(u)
+            self.F = work * ufl.dx(mesh)
+        self.along, self.down = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
+        nothing = fem.Constant(mesh, 0.0)
+        left = sides(mesh, {9: plane(0, 0.0)})
+        held = [(tags, BOTTOM, 1, nothing), (tags, TOP, 1, self.down)]
+        if smooth:
+            held += [(left, 9, 0, nothing)]
+        else:
+            held += [(tags, BOTTOM, 0, nothing), (tags, TOP, 0, self.along)]
+        bcs = []
+        for where, tag, i, value in held:
+            part = W.sub(0).sub(i)
+            dofs = fem.locate_dofs_topological(part, 1, where.find(tag))
+            bcs.append(fem.dirichletbc(value, dofs, part))
+        self.contact = fc.Contact(
+            u,
+            fc.ContactSurface(mesh, tags, UPPER),
+            fc.DeformableBody(tags, LOWER, update="never"),
+            law,
+            kinematics=kinematics,
+            **(contact or {}),
+        )
+        options = {"petsc_options": TIGHT} | options
+        if kinematics == "small":  # of any size, to compare with closed forms
+            options["kinematics"] = np.inf
+        self.problem = fc.ContactProblem(
+            self.F, self.w, bcs=bcs, contacts=[self.contact], **options
+        )
+
+    def load(self, t: float) -> None:
+        """Down in the first half, then along."""
+        self.down.value = -0.06 * min(1.0, 2 * t)
+        self.along.value = 0.2 * max(0.0, 2 * t - 1)
+
+    def reaction(self, height: float) -> np.ndarray:
+        """Of the nodes at a height, by assembly here, (2,). Collective."""
+        forces = assemble_owned(compiled(self.F), self.w.function_space)
+        part = self.problem.displacement
+        found = np.zeros(2)
+        for i in range(2):
+            chosen = fem.Function(part.u.function_space)
+            there = np.isclose(part.u.function_space.tabulate_dof_coordinates()[:, 1], height)
+            chosen.x.array[i::2] = there
+            found[i] = self.mesh.comm.allreduce(part.within(owned(chosen)) @ forces)
+        return found
+
+
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+@pytest.mark.parametrize("mixed", MIXED)
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+def test_uniform_compression(kinematics, mixed, enforcement):
+    """Between smooth planes, free on the right: the nominal stress G (λ - λ⁻³), or 4 G ε: 1e-6.
+
+    In plane strain at ν = 1/2. Both blocks widen as much, so that nothing slips. By penalty the
+    joint gives way by p/k_n; multipliers leave 1e-9 of that.
+    """
+    down, k_n = 0.2 if kinematics == "finite" else 0.01, 1e6
+    nominal = 0.0
+    for _ in range(30):  # until the joint is as deep as it is pressed
+        stretch = 1 - down - (nominal / k_n if enforcement == "penalty" else 0.0)
+        nominal = 4 * G * (stretch - 1) if kinematics == "small" else G * (stretch - stretch**-3)
+    options = {"enforcement": enforcement}
+    if enforcement == "augmented":
+        options["tolerance"] = 1e-9
+    made = Blocks(
+        kinematics,
+        fc.Coulomb(0.3, k_n, k_n),
+        mixed=mixed,
+        smooth=True,
+        contact=options,
+    )
+    for share in (0.5, 1.0):
+        made.down.value = -share * down
+        step = made.problem.solve()
+        made.problem.commit()
+    force = step.contacts["contact"]
+    assert force.normal_force == pytest.approx(-nominal, rel=1e-6)
+    assert force.slip == 0 and force.tangential_force < 1e-6 * force.normal_force
+    assert close(made.contact.pressure, np.full_like(made.contact.pressure, -nominal), 1e-6)
+
+
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+def test_dragged_along(kinematics, enforcement):
+    """A narrow block pressed on a wide one and dragged: it slips in the end, by μ of its force.
+
+    Reactions of the bottom and the top, by assembly here, balance the contact force: 1e-9.
+    """
+    made = Blocks(
+        kinematics,
+        fc.Coulomb(0.3),
+        n=(8, 4),
+        widths=(2.0, 1.0),
+        shift=0.25,
+        contact={"enforcement": enforcement},
+    )
+    for step in fc.increments(made.problem, made.load, 0, 1, steps=8):
+        assert not step.verdict.failures
+        force = step.contacts["contact"].force
+        assert close(made.reaction(1.0), -force, 1e-9)
+        assert close(made.reaction(0.0), force, 1e-9)
+    last = step.contacts["contact"]
+    assert last.slip > 0 and last.stick == 0
+    assert force[0] < 0 < force[1]
+    assert last.tangential_force == pytest.approx(0.3 * last.normal_force, rel=1e-9)
+
+
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+def test_a_history_goes_on(kinematics, tmp_path):
+    """Broken off while it is dragged, and taken up: the same to 1e-9 in force and displacement."""
+
+    def make() -> Blocks:
+        wide = {"n": (8, 4), "widths": (2.0, 1.0), "shift": 0.25}
+        return Blocks(kinematics, fc.Coulomb(0.3), **wide)
+
+    folder = shared_folder(tmp_path)
+    whole, first, second = make(), make(), make()
+    for _ in fc.increments(whole.problem, whole.load, 0, 1, steps=8):
+        pass
+    file = folder / "state.npz"
+    for step in fc.increments(first.problem, first.load, 0, 1, steps=8, checkpoint=file):
+        if step.increment == 6:
+            break
+    for _ in fc.increments(second.problem, second.load, 0, 1, steps=8, checkpoint=file):
+        pass
+    forces = [each.contact.resultants().force for each in (whole, second)]
+    assert close(forces[1], forces[0], 1e-9)
+    assert close(owned(second.w), owned(whole.w), 1e-9)
