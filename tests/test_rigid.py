@@ -34,9 +34,8 @@ def test_inside_and_outside_of_a_cone(m):
 @pytest.mark.parametrize("above", [0.9, 1.01])
 def test_a_block_beside_its_friction_angle(n, above):
     """Pushed along by less than μ times its weight a block can be held, by more it cannot."""
-    scene = block("quadrilateral", up=-1.0, side=0.3 * above, n=n)
     # A low block, so that it does not tip: the push acts at half its height.
-    scene.mesh.geometry.x[:, 1] *= 0.1
+    scene = block("quadrilateral", up=-1.0, side=0.3 * above, n=n, size=[1.0, 0.1])
     problem, _ = scene.problem(fc.Coulomb(0.3, k_n=1e5, k_t=1e5), [])
     if above < 1:
         problem.solve()
