@@ -14,7 +14,7 @@ from fenics_contact.laws.stiffness import Springs
 from fenics_contact.supports.base import Support
 from fenics_contact.supports.deformable import DeformableBody
 
-__all__ = ["is_augmented", "is_finite", "is_regularised", "opposite_of"]
+__all__ = ["enforcement_of", "is_finite", "is_regularised", "opposite_of"]
 
 
 _ENFORCEMENTS = ("penalty", "augmented")
@@ -67,7 +67,7 @@ def is_regularised(law: Law) -> bool:
     return not law.is_physical and not any(springs)
 
 
-def is_augmented(
+def enforcement_of(
     name: str, enforcement: str | None, tolerance: float | None, law: Law, chosen: Accuracy | None
 ) -> tuple[bool, float]:
     """Whether there are multipliers, and the tolerance.

@@ -16,7 +16,7 @@ from fenics_contact.arguments import check_instance
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.acting import ActingLaw
 from fenics_contact.contact.choices import (
-    is_augmented,
+    enforcement_of,
     is_finite,
     is_regularised,
     opposite_of,
@@ -178,7 +178,7 @@ class Contact(PointResults):
             raise ValueError(f"{name}: {error}") from None
         self.accuracy = None if accuracy is None else Accuracy.of(accuracy)
         self.finite = is_finite(name, kinematics, support, law, gap)
-        augments, self.tolerance = is_augmented(name, enforcement, tolerance, law, self.accuracy)
+        augments, self.tolerance = enforcement_of(name, enforcement, tolerance, law, self.accuracy)
         # Linear elements hold a curved gap at their nodes alone (docs/enforcement.md). But between
         # two meshes, and on quadrilaterals of any shape, nodes carry no uniform pressure over.
         nodal = augments and degree == 1 and not isinstance(support, DeformableBody)
