@@ -16,7 +16,7 @@ measured times, and a picture draws it for more ranks.
     python benchmarks/parallel.py --tables       # from what was measured last, anew
 
 Two tables go from 1 to 1,024 ranks and from 1e5 to 1e9 unknowns, on paper: contact by multigrid as
-the model has it, and what the interface of the ranks takes where a problem in space is condensed.
+the model has it, and what the interface of the ranks takes where a problem is condensed.
 Another table says where the time goes, operation by operation, and what limits two ranks.
 """
 

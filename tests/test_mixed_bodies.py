@@ -62,6 +62,7 @@ class Blocks:
         else:
             work = 2 * G * ufl.inner(strain(u), strain(v)) - p * ufl.div(v) - q * ufl.div(u)
             self.F = work * ufl.dx(mesh)
+        self.form = compiled(self.F)
         self.along, self.down = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
         nothing = fem.Constant(mesh, 0.0)
         left = sides(mesh, {9: plane(0, 0.0)})
@@ -97,7 +98,7 @@ class Blocks:
 
     def reaction(self, height: float) -> np.ndarray:
         """Of the nodes at a height, by assembly here, (2,). Collective."""
-        forces = assemble_owned(compiled(self.F), self.w.function_space)
+        forces = assemble_owned(self.form, self.w.function_space)
         part = self.problem.displacement
         found = np.zeros(2)
         for i in range(2):

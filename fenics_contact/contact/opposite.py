@@ -14,22 +14,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact.contact.finite import (
-    FiniteKinematics,
-)
 from fenics_contact.contact.inputs import Inputs, check_given
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
 from fenics_contact.contact.pairs import Pairs, PairsState
 from fenics_contact.contact.point_data import PointData
-from fenics_contact.contact.point_law import PointLaw, PointTangent
-from fenics_contact.contact.present import PresentKinematics
+from fenics_contact.contact.point_law import AnyKinematics, PointLaw, PointTangent
 from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law
@@ -41,9 +37,6 @@ from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.types import Array, Mask
 
 __all__ = ["Opposite", "OppositeState", "Parts"]
-
-
-AnyKinematics: TypeAlias = SmallKinematics | FiniteKinematics | PresentKinematics
 
 
 @dataclass(frozen=True)
@@ -85,7 +78,8 @@ class Opposite(ABC):
     Attributes:
         pairs: What lies opposite each of the points.
         data: What was given, sampled at the points.
-        jump: Displacement at the points relative to what lies opposite, less its pure motion.
+        jump: Displacement at the points relative to what lies opposite; that of a rigid support is
+            not in it.
         felt: What laws are functions of there: the jump, or what follows from it.
         given, sampled: What else laws see, as expressions on Γc, and as numbers at the points.
         in_form, at_points: Kinematics of laws in the form on Γc, and at numbers at the points.

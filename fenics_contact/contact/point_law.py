@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import ufl
@@ -21,7 +21,10 @@ from fenics_contact.parallel import global_max, global_min
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
 from fenics_contact.types import Array
 
-__all__ = ["PointLaw", "PointTangent"]
+__all__ = ["AnyKinematics", "PointLaw", "PointTangent"]
+
+
+AnyKinematics: TypeAlias = SmallKinematics | FiniteKinematics | PresentKinematics
 
 
 # The size of the mesh times this is a penetration that is next to none.
@@ -58,7 +61,7 @@ class PointLaw:
         self,
         law: Law,
         seen: Seen,
-        kinematics: SmallKinematics | FiniteKinematics | PresentKinematics,
+        kinematics: AnyKinematics,
         quadrature: SurfaceQuadrature,
         jump: fem.Function,
         *,

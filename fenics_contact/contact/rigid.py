@@ -38,17 +38,13 @@ class RigidOpposite(Opposite):
         Raises:
             ValueError: Data of a `SampledSupport` do not fit.
         """
-        support, shift = parts.support, parts.inputs.shift
-        x = ufl.SpatialCoordinate(parts.quadrature.surface.mesh)
-        jump = parts.new_jump()
-        at_rest: SampledPlaces | None = None
-        self._moved: SampledPlaces | None = None
-        if isinstance(support, SampledSupport):
-            frame = Frame(shift, None)
-            at_rest, self._moved = _sampled_places(parts, support, frame, jump)
-            placement = at_rest.at(frame.into(x))
+        x, jump = ufl.SpatialCoordinate(parts.quadrature.surface.mesh), parts.new_jump()
+        frame = Frame(parts.inputs.shift, None)
+        at_rest, self._moved = _sampled_places(parts, frame, jump)
+        if at_rest is None:
+            placement = _placed(parts, x, frame.shift)
         else:
-            placement = _placed(parts, x, shift)
+            placement = at_rest.at(frame.into(x))
         super().__init__(parts, parts.new_pairs(), jump, placement, at_rest)
         self._deformed = DeformedPlaces(parts.quadrature, jump, placement)
 
@@ -75,10 +71,7 @@ class MovingOpposite(Opposite):
         inputs, support, quadrature = parts.inputs, parts.support, parts.quadrature
         mesh = quadrature.surface.mesh
         frame, jump = Frame(inputs.shift, inputs.rotation), parts.new_jump()
-        at_rest: SampledPlaces | None = None
-        self._moved: SampledPlaces | None = None
-        if isinstance(support, SampledSupport):
-            at_rest, self._moved = _sampled_places(parts, support, frame, jump)
+        at_rest, self._moved = _sampled_places(parts, frame, jump)
         check_rigid(parts.name, inputs.shift, inputs.rotation)
 
         def place(z: Any) -> Placement:
@@ -168,14 +161,17 @@ def _placed(parts: Parts, x: Any, shift: Any) -> Placement:
 
 
 def _sampled_places(
-    parts: Parts, support: SampledSupport, frame: Frame, jump: fem.Function
-) -> tuple[SampledPlaces, SampledPlaces]:
-    """A support known in numbers, from X, and from X + u, in its frame. Collective.
+    parts: Parts, frame: Frame, jump: fem.Function
+) -> tuple[SampledPlaces | None, SampledPlaces | None]:
+    """A support known in numbers, from X, and from X + u, in its frame; else none. Collective.
 
     Raises:
         ValueError: Its data are of another dimension, or not the same on every rank.
     """
-    mesh, kind = parts.quadrature.surface.mesh, type(support).__name__
+    support, mesh = parts.support, parts.quadrature.surface.mesh
+    if not isinstance(support, SampledSupport):
+        return None, None
+    kind = type(support).__name__
     d = mesh.geometry.dim
     if support.gdim != d:
         raise ValueError(

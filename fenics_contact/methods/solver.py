@@ -74,9 +74,8 @@ _COMMON: dict[str, Any] = {
     # `cp` takes |F·y| below this for convergence of the whole; the residual itself is tested here.
     "snes_linesearch_atol": 1e-300,
 }
-# Without prefix: of the vectors. By default PETSc takes products with several of them by BLAS, as
-# matrices of as many as happen to lie evenly in memory: with PETSc 3.25 the last digits of L-BFGS
-# changed from a history to the same one again.
+# Without prefix: of the vectors. By default PETSc takes products with several of them by BLAS: with
+# PETSc 3.25 the last digits of L-BFGS changed so from a history to the same one again.
 _VECTORS: dict[str, Any] = {"vec_mdot_use_gemv": False}
 # Options that only make sense for the sparse matrices over all unknowns.
 _NAMES_A_SOLVER = ("ksp_type", "pc_type", "pc_factor_mat_solver_type")
