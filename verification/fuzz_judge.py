@@ -214,11 +214,12 @@ class Judge:
                 }
             )
         contacts = []
-        for c, f in zip(problem.contacts, found, strict=True):
+        for i, (c, f) in enumerate(zip(problem.contacts, found, strict=True)):
             w = c.weights * c.paired
             contacts.append(
                 {
                     "force": w @ f["traction"],
+                    "determined": self._determined(problem, i, found, load),
                     "normal": float(w @ -f["r_n"]),
                     "tangential": float(w @ np.linalg.norm(f["tau"], axis=1)),
                     "size": float(w @ np.linalg.norm(f["traction"], axis=1)),
@@ -463,14 +464,14 @@ class Judge:
         tolerance = self._tolerance(record, _APART)
         worst = 0.0
         rounding = max(b["rounding"] for b in now["bodies"])
-        for i, (c, f) in enumerate(zip(problem.contacts, found, strict=True)):
-            force = (c.weights * c.paired) @ f["traction"]
+        for i, contact in enumerate(now["contacts"]):
+            force, here = self._determined(problem, i, found, load), contact["determined"]
             size = max(self._size(now, "contacts", i), float(np.abs(force).max()))
-            error = np.abs(force - now["contacts"][i]["force"]).max()
+            error = np.abs(force - here).max()
             allowed = tolerance * size + 30 * rounding
             if allowed > 0:
                 worst = max(worst, error / allowed)
-            text = f"{name}, contact {i}: {now['contacts'][i]['force']} here, {force} apart"
+            text = f"{name}, contact {i}: {here} here, {force} apart"
             if error > allowed:
                 (self.wrong if self._unique() else self.another).append("apart: " + text)
         self.worst["apart"] = max(self.worst.get("apart", 0.0), worst)
@@ -481,6 +482,20 @@ class Judge:
         ]
         self._pair_anew(problem, self._own_old, u)
         self._own_u, self._own_motion = u, motion
+
+    def _determined(self, problem: Any, i: int, found: list[dict], load: Any) -> Array:
+        """Force of a contact, less what multipliers of friction leave open.
+
+        Where a displacement is prescribed and the point sticks, neither slip nor balance tells how
+        much of the reaction is friction: any multiplier within the limit is a solution.
+        """
+        contact = problem.contacts[i]
+        if contact.project is None or not contact.law.slips:
+            return (contact.weights * contact.paired) @ found[i]["traction"]
+        force = problem.contact_force(found)[i]
+        force[load.fixed] = 0.0
+        own = problem.body.parts == self.scene["contacts"][i]["body"]
+        return force.reshape(-1, contact.d)[own].sum(axis=0)
 
     @staticmethod
     def _pair_anew(problem: Any, states: list[Any], u: Array) -> None:

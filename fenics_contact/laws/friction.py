@@ -288,8 +288,9 @@ class Tresca(FrictionLaw):
         k_n: Normal stiffness (stress/length); see `Frictionless`.
         k_t: Tangential stiffness (stress/length).
         unilateral: True: the normal reaction is that of unilateral contact, and only the limit
-            of friction is prescribed. False: the normal traction on the body *is* -p, gap or not
-            (eq. 43); k_n is not used.
+            of friction is prescribed: it acts on all of Γc, whether a point touches or not (the
+            classical problem of given friction). False: the normal traction on the body *is* -p,
+            gap or not (eq. 43); k_n is not used.
         modes, transverse_friction, direction: See `Coulomb`.
     """
 
