@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import ufl
+from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
@@ -263,9 +264,9 @@ class Beside(fc.Frictionless):
 
 
 def test_what_is_no_parameter_is_refused():
-    """A place, a function of the body or u in a response: a law is evaluated at numbers alone."""
+    """A place, a function of the body, u, or a constant, which no checkpoint would tell apart."""
     scene = block("quadrilateral", E=E, nu=NU)
     x = ufl.SpatialCoordinate(scene.mesh)
-    for hidden in (x[0], scene.u[0] ** 2):
+    for hidden in (x[0], scene.u[0] ** 2, fem.Constant(scene.mesh, 0.1)):
         law = Beside(k_n=1e3, hidden=hidden)
         raised_everywhere(lambda law=law: scene.contact(law), ValueError, "Beside", "parameter")

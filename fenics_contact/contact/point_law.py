@@ -82,7 +82,12 @@ class PointLaw:
         self.law, self.seen = law, seen
         self._kinematics, self._quadrature, self._jump = kinematics, quadrature, jump
         self._acts, self._free = acts, list(free)
-        self._gdim = quadrature.surface.mesh.geometry.dim
+        surface = quadrature.surface
+        self._gdim = surface.mesh.geometry.dim
+        comm, x = surface.mesh.comm, surface.mesh.geometry.x
+        # A length that is nothing beside the mesh.
+        size = global_max(comm, x) - global_min(comm, x)
+        self._barely = fem.Constant(surface.submesh, _BARELY * size)
 
     def with_law(self, law: Law, parameters: Mapping[str, Any]) -> PointLaw:
         """Another law at the same points, with parameters of its own."""
@@ -263,14 +268,9 @@ class PointLaw:
         law, parameters = self.law, self.seen.parameters
         u_n = ufl.variable(felt.normal_displacement)
         at_variable = replace(felt, normal_displacement=u_n)
-        surface = self._quadrature.surface
-        comm, x = surface.mesh.comm, surface.mesh.geometry.x
-        barely = fem.Constant(
-            surface.submesh, _BARELY * (global_max(comm, x) - global_min(comm, x))
-        )
         # Where nothing acts the stiffness is that of a point that has just closed.
         acts = ufl.ne(response.normal_traction, 0)
-        closed = ufl.conditional(acts, felt.normal_displacement, felt.gap + barely)
+        closed = ufl.conditional(acts, felt.normal_displacement, felt.gap + self._barely)
         at_closed = replace(felt, normal_displacement=closed)
         return {
             "normal_reaction": -ufl.diff(law.normal_potential(at_variable, parameters), u_n),
@@ -283,20 +283,22 @@ class PointLaw:
         return PointEvaluator(self._quadrature, expressions, by_points=True)
 
     def _check_own(self, expression: Any) -> None:
-        """Refuse a law that has functions, or places, by another way than its parameters.
+        """Refuse a law that has functions, constants, or places not from its parameters.
+
+        Those are checked, and told apart in checkpoints.
 
         Raises:
             ValueError: It says what.
         """
         submesh = self._quadrature.surface.submesh
         for item in traverse_unique_terminals(ufl.as_ufl(expression)):
-            there = True
+            there = item is self._barely or not isinstance(item, fem.Constant)
             if isinstance(item, fem.Function):
                 there = item.function_space.mesh is submesh or item.function_space.mesh == submesh
             elif isinstance(item, ufl.classes.GeometricQuantity):
                 there = extract_unique_domain(item) == submesh.ufl_domain()
             if not there:
-                what = getattr(item, "name", None) or type(item).__name__
+                what = getattr(item, "name", None) or f"a {type(item).__name__}"
                 raise ValueError(
                     f"{type(self.law).__name__} uses {what} in its response or another method; a "
                     "law knows of a point what its kinematics and parameters tell it: give it as a "
