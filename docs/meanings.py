@@ -81,7 +81,7 @@ GROUPS: list[tuple[str, list[str], str]] = [
     ),
     (
         "Problem and choice of the method",
-        ["problem", "checks.given", "methods.solver", "systems.choice"],
+        ["problem", "checks.given", "methods.solver", "methods.alternating", "systems.choice"],
         "[](choose.md) says which method and linear solver are for what.",
     ),
     (

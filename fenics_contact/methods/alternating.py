@@ -21,16 +21,15 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from fenics_contact.methods.equations import Equations
-from fenics_contact.methods.method import InnerSnes
-from fenics_contact.methods.options import Defaults
+from fenics_contact.contact.contact import Contact
+from fenics_contact.methods.method import InnerSnes, OwnMethod, Tools
 from fenics_contact.types import Array
 
-__all__ = ["OPTIONS", "Alternation"]
+__all__ = ["Alternation"]
 
 logger = logging.getLogger("fenics_contact")
 
-OPTIONS = {
+_OPTIONS = {
     "snes_type": "newtonls",
     "snes_rtol": 0.0,
     "snes_stol": 0.0,
@@ -40,7 +39,7 @@ OPTIONS = {
     "snes_linesearch_max_it": 40,
 }
 # Newton steps without line search finish where the energy has no digits left.
-_FINISH = OPTIONS | {"snes_max_it": 5, "snes_linesearch_type": "basic"}
+_FINISH = _OPTIONS | {"snes_max_it": 5, "snes_linesearch_type": "basic"}
 # Round-off of the energy, by the size of its terms; and residual, as a share of the forces, from
 # which on its differences are not far above that: no line search tells a descent there.
 _NOISE, _NEAR = 10 * np.finfo(float).eps, 1e-6
@@ -59,31 +58,25 @@ _INNER = 1e-2
 _STILL = 1e-6
 
 
-class Alternation:
+class Alternation(OwnMethod):
     """The method.
 
     Attributes:
         snes: Newton's method for the subproblems, prefix "alternating_" behind the problem's.
     """
 
-    def __init__(
-        self, equations: Equations, defaults: Defaults, prefix: str, solver: dict[str, Any]
-    ) -> None:
-        """Set up SNES; the matrices are those of H₀. Collective.
+    def __init__(self, tools: Tools) -> None:
+        """Set up SNES; the matrices are those of H₀. Collective."""
+        equations = self._equations = tools.equations
+        # That of H₀, if it will do.
+        solver = tools.linear_solver(equations.symmetric(False))
 
-        Args:
-            equations: What to solve.
-            defaults: What takes the options.
-            prefix: Of the problem's options.
-            solver: Options of the linear solver; none: it is that of H₀.
-        """
-        self._equations = equations
-        self._search = InnerSnes(
-            equations, defaults, (prefix, "alternating_"), OPTIONS, solver, consistent=False
-        )
-        self._finish = InnerSnes(
-            equations, defaults, (prefix, "finishing_"), _FINISH, solver, consistent=False
-        )
+        def made(prefix: str, options: dict[str, Any]) -> InnerSnes:
+            both = tools.prefix, prefix
+            return InnerSnes(equations, tools.defaults, both, options, solver, consistent=False)
+
+        self._search = made("alternating_", _OPTIONS)
+        self._finish = made("finishing_", _FINISH)
         self.snes = self._search.snes
         self._goal = 0.0
         # Potential at the state asked for last, and where it was last found to have fallen.
@@ -104,9 +97,9 @@ class Alternation:
         self._finish.attach(assemble, lambda: this._test())
 
     def solve(self) -> tuple[int, int]:
-        """Solve; see `Method`. Iterations are Newton's, in all."""
+        """See `Method.solve`. Iterations are Newton's, in all."""
         equations, reasons = self._equations, PETSc.SNES.ConvergedReason
-        if not self.possible():
+        if not self._possible():
             return 0, int(reasons.DIVERGED_LINE_SEARCH)
         self._attach()
         iterations = stalls = 0
@@ -141,12 +134,31 @@ class Alternation:
             for contact in equations.contacts:
                 contact.acting.thaw()
 
-    def possible(self) -> bool:
-        """Whether there are minimum problems, all of which the line search asks for energies."""
-        contacts, full = self._equations.contacts, self._equations.full
-        if full.displacement.mixed:  # a saddle point, whatever the laws
-            return False
-        return bool(contacts) and all(contact.acting.freezes for contact in contacts)
+    def check(self) -> None:
+        """See `OwnMethod.check`: minimum problems, all of which have energies to be lowered."""
+        if self._equations.full.displacement.mixed:
+            raise ValueError(
+                "method is 'alternating', but u is a part of a mixed function, whose equations are "
+                "those of a saddle point and not of a minimum; use another method"
+            )
+        none = self._without_potential()
+        if none:
+            laws = ", ".join(type(c.law).__name__ for c in none)
+            why = "not even under a given pressure"
+            if all(c.finite for c in none):
+                why = "where displacements are finite, whose tangent planes turn"
+            raise ValueError(
+                f"method is 'alternating', but {laws} has no potential, {why}: there is nothing to "
+                "minimise; use another method"
+            )
+
+    def _possible(self) -> bool:
+        """Whether `check` would pass, and there are contacts."""
+        mixed = self._equations.full.displacement.mixed
+        return bool(self._equations.contacts) and not mixed and not self._without_potential()
+
+    def _without_potential(self) -> list[Contact]:
+        return [c for c in self._equations.contacts if not c.acting.freezes]
 
     def _pressure(self) -> Array:
         """Of all contacts at this rank's points."""

@@ -11,21 +11,18 @@ from __future__ import annotations
 
 import logging
 import weakref
-from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact import compat
-from fenics_contact.methods.equations import Equations
-from fenics_contact.methods.method import InnerSnes, Method
-from fenics_contact.methods.options import Defaults
+from fenics_contact.methods.method import InnerSnes, OwnMethod, Tools
 
-__all__ = ["OPTIONS", "Continuation"]
+__all__ = ["Continuation"]
 
 logger = logging.getLogger("fenics_contact")
 
-OPTIONS = {
+_OPTIONS = {
     "snes_type": "newtonls",
     "snes_rtol": 0.0,
     "snes_stol": 0.0,
@@ -45,41 +42,27 @@ _MAX_ITERATIONS = 1000
 _COARSE = 1e-3
 
 
-class Continuation:
+class Continuation(OwnMethod):
     """The method.
 
     Attributes:
         snes: Newton's method for one stiffness, prefix "continuation_" behind the problem's.
-        by_newton: Whether that found the last solution, so that the tangent is factored near it.
+        by_newton: Whether that found the last solution.
     """
 
-    def __init__(
-        self,
-        equations: Equations,
-        otherwise: Method,
-        defaults: Defaults,
-        prefix: str,
-        solver: dict[str, Any],
-    ) -> None:
-        """Set up SNES; the matrix is that of the consistent tangent. Collective.
-
-        Args:
-            equations: What to solve.
-            otherwise: What takes over where no step of the stiffness succeeds.
-            defaults: What takes the options.
-            prefix: Of the problem's options.
-            solver: Options of the linear solver; none: it is that of the consistent tangent.
-        """
-        self._equations, self._otherwise = equations, otherwise
-        self._newton = InnerSnes(
-            equations, defaults, (prefix, "continuation_"), OPTIONS, solver, consistent=True
-        )
+    def __init__(self, tools: Tools) -> None:
+        """Set up SNES; the matrix is that of the consistent tangent. Collective."""
+        equations = self._equations = tools.equations
+        self._otherwise = tools.others["alternating"]
+        solver = tools.linear_solver(equations.symmetric(True))
+        both = tools.prefix, "continuation_"
+        self._newton = InnerSnes(equations, tools.defaults, both, _OPTIONS, solver, consistent=True)
         self.snes = self._newton.snes
         self.by_newton = False
         self._coarse = 0.0
 
     def solve(self) -> tuple[int, int]:
-        """Solve; see `Method`. Iterations are Newton's, in all."""
+        """See `Method.solve`. Iterations are Newton's, in all."""
         equations = self._equations
         this: Continuation = weakref.proxy(self)
         self._newton.attach(

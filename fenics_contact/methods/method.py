@@ -1,11 +1,12 @@
-"""What a method of solution is, and those that are one solution by SNES."""
+"""What a method of solution is: one solution by the main SNES, or by solvers of its own."""
 
 from __future__ import annotations
 
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
@@ -14,7 +15,7 @@ from fenics_contact.methods.callbacks import Callbacks
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.options import Defaults
 
-__all__ = ["InnerSnes", "Method", "Newton", "SnesMethod"]
+__all__ = ["InnerSnes", "Method", "Newton", "OwnMethod", "SnesMethod", "Tools"]
 
 # Iterations without a lower residual after which another method takes over.
 _PATIENCE = 20
@@ -22,16 +23,64 @@ _PATIENCE = 20
 _REASONS = PETSc.SNES.ConvergedReason
 
 
-class Method(Protocol):
-    """A way to solve equations from a start; a new one is a file of its own with such a class."""
+class Method(ABC):
+    """A way to solve equations from a start: on the main SNES, or an `OwnMethod`."""
 
+    @classmethod
+    def main_options(cls, *, linear: bool) -> Mapping[str, Any]:
+        """Options of the main SNES, for a linear bulk or another; by default none of its own."""
+        return {}
+
+    @abstractmethod
     def solve(self) -> tuple[int, int]:
         """Solve from ``solution`` of the equations on, which becomes what was found. Collective.
 
         Returns:
             Iterations, and the reason as SNES has them (positive: converged).
         """
-        ...
+
+
+@dataclass(frozen=True)
+class Tools:
+    """What methods with solvers of their own are made of.
+
+    Attributes:
+        equations: What to solve.
+        defaults: What takes options.
+        prefix: Of the problem's options.
+        linear_solver: Options of a linear solver of one's own, for symmetric matrices or any; none:
+            the one of the matrix will do.
+        others: The methods made before, by name.
+    """
+
+    equations: Equations
+    defaults: Defaults
+    prefix: str
+    linear_solver: Callable[[bool], dict[str, Any]]
+    others: Mapping[str, OwnMethod]
+
+
+class OwnMethod(Method):
+    """A method with solvers of its own; a new one is such a class, and a line in `METHODS`.
+
+    Attributes:
+        by_newton: Whether Newton's method found the last solution, so that the consistent tangent
+            is factored near it.
+    """
+
+    by_newton = False
+
+    @abstractmethod
+    def __init__(self, tools: Tools) -> None:
+        """Set up what solves. Collective."""
+
+    def check(self) -> None:
+        """Look whether there is what it solves, where it was asked for.
+
+        Raises:
+            ValueError: It says why there is not.
+        """
+        return
 
 
 class InnerSnes:
@@ -107,7 +156,7 @@ class InnerSnes:
         self._equations.residual(x, f)
 
 
-class SnesMethod(ABC):
+class SnesMethod(Method):
     """A method on the main SNES, whose options are the user's.
 
     Attributes:
@@ -158,10 +207,6 @@ class SnesMethod(ABC):
             lambda: this.converged(),
         )
 
-    @abstractmethod
-    def solve(self) -> tuple[int, int]:
-        """Solve; see `Method`."""
-
     def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         self._equations.residual(x, f)
 
@@ -181,6 +226,18 @@ class SnesMethod(ABC):
 class Newton(SnesMethod):
     """Newton's method with the consistent tangent."""
 
+    @classmethod
+    def main_options(cls, *, linear: bool) -> Mapping[str, Any]:
+        """See `Method.main_options`.
+
+        With a nonlinear bulk the tangent far from a solution need not point downwards along which
+        `cp` looks for a root, and cells may turn inside out, whereupon `bt` steps shorter.
+        """
+        options: dict[str, Any] = {"snes_type": "newtonls", "snes_max_it": 100}
+        if not linear:
+            options |= {"snes_linesearch_type": "bt", "snes_linesearch_max_it": 40}
+        return options
+
     def solve(self) -> tuple[int, int]:
-        """Solve; see `Method`."""
+        """See `Method.solve`."""
         return self._callbacks.solve(self.snes, self._equations.solution)

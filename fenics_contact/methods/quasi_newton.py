@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
@@ -37,6 +38,18 @@ class QuasiNewton(SnesMethod):
         self._limit: int | None = None
         self._refreshed = False
 
+    @classmethod
+    def main_options(cls, *, linear: bool) -> Mapping[str, Any]:
+        """See `Method.main_options`."""
+        return {
+            "snes_type": "qn",
+            "snes_qn_type": "lbfgs",
+            "snes_qn_scale_type": "jacobian",
+            "snes_qn_restart_type": "none",  # Powell's uses K where K⁻¹ is meant
+            "snes_qn_m": 20,
+            "qn_mat_lmvm_eps": 0.0,  # else pairs are dropped by a test that depends on the units
+        }
+
     @property
     def max_it(self) -> int:
         """Iterations in all before it is given up."""
@@ -50,7 +63,7 @@ class QuasiNewton(SnesMethod):
         """H₀ is made between the rounds, and kept during one."""
 
     def solve(self) -> tuple[int, int]:
-        """Solve; see `Method`. The reason is after a look at the residual itself."""
+        """See `Method.solve`. The reason is after a look at the residual itself."""
         equations, snes = self._equations, self.snes
         limit = self._limit = self.max_it  # SNES has that of a round from now on
         solution = equations.solution

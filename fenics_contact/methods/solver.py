@@ -20,7 +20,7 @@ from fenics_contact.methods.alternating import Alternation
 from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.kept import Kept
-from fenics_contact.methods.method import Method, Newton, SnesMethod
+from fenics_contact.methods.method import Method, Newton, OwnMethod, SnesMethod, Tools
 from fenics_contact.methods.neighbourhood import linearised, respond
 from fenics_contact.methods.options import Defaults, take_command_line
 from fenics_contact.methods.quasi_newton import QuasiNewton
@@ -79,24 +79,12 @@ _COMMON: dict[str, Any] = {
 _VECTORS: dict[str, Any] = {"vec_mdot_use_gemv": False}
 # Options that only make sense for the sparse matrices over all unknowns.
 _NAMES_A_SOLVER = ("ksp_type", "pc_type", "pc_factor_mat_solver_type")
-# The methods, and the options of the main SNES with each.
-METHODS: dict[str, dict[str, Any]] = {
-    "lbfgs": {
-        "snes_type": "qn",
-        "snes_qn_type": "lbfgs",
-        "snes_qn_scale_type": "jacobian",
-        "snes_qn_restart_type": "none",  # Powell's uses K where K⁻¹ is meant
-        "snes_qn_m": 20,
-        "qn_mat_lmvm_eps": 0.0,  # else pairs are dropped by a test that depends on the units
-    },
-    "newton": {"snes_type": "newtonls", "snes_max_it": 100},
-    "alternating": {},
-    "continuation": {},
-}
-# Of some of them with a nonlinear bulk: far from a solution the tangent need not point downwards
-# along which `cp` looks for a root, and cells may turn inside out, whereupon `bt` steps shorter.
-_NONLINEAR: dict[str, dict[str, Any]] = {
-    "newton": {"snes_linesearch_type": "bt", "snes_linesearch_max_it": 40},
+# By name; each may hand over to those above it.
+METHODS: dict[str, type[Method]] = {
+    "lbfgs": QuasiNewton,
+    "newton": Newton,
+    "alternating": Alternation,
+    "continuation": Continuation,
 }
 # What takes over where a method fails.
 _LAST_RESORT = "continuation"
@@ -162,8 +150,7 @@ class Solver:
         self.condensed = False
         self._automatic = settings.method is None
         self.method = settings.method or "lbfgs"
-        self.methods: dict[str, Method] = {}
-        self._led: Continuation
+        self.methods: dict[str, OwnMethod] = {}
         self._quasi_newton = True
         self.snes: PETSc.SNES
         self.main: SnesMethod
@@ -197,20 +184,14 @@ class Solver:
         self._set_system()
         cheap = self.condensed or not self._full.bulk.linear
         self.method = settings.method or ("newton" if cheap else "lbfgs")
-        if self._full.displacement.mixed and self.method == "alternating":
+        options.set(self._main_options(), prefix)
+        snes_type = options.get(prefix + "snes_type")
+        if snes_type is not None and snes_type not in _SNES_TYPES:
             raise ValueError(
-                "method is 'alternating', but u is a part of a mixed function, whose equations are "
-                "those of a saddle point and not of a minimum; use another method"
+                f"the option -{prefix}snes_type is {snes_type!r}, which needs more than residual "
+                f"and tangent, or is none of PETSc's; use one of {', '.join(_SNES_TYPES)}"
             )
-        globalised = {} if self._full.bulk.linear else _NONLINEAR.get(self.method, {})
-        options.set(_COMMON | METHODS[self.method] | globalised, prefix)
-        kind = options.get(prefix + "snes_type")
-        if kind is not None and kind not in _SNES_TYPES:
-            raise ValueError(
-                f"the option -{prefix}snes_type is {kind!r}, which needs more than residual and "
-                f"tangent, or is none of PETSc's; use one of {', '.join(_SNES_TYPES)}"
-            )
-        quasi_newton = kind == PETSc.SNES.Type.QN
+        quasi_newton = snes_type == PETSc.SNES.Type.QN
         newton = linear.newton_options(self.system.linear_kind)
         if not quasi_newton:
             options.set(newton, prefix)
@@ -247,21 +228,14 @@ class Solver:
                 return {}
             return self.system.linear_solver(symmetric=symmetric, accurate=True) | newton
 
-        inside = newton_solver(equations.symmetric(False))
-        alternation = Alternation(equations, options, prefix, inside)
-        if settings.method == "alternating" and self._full.contacts and not alternation.possible():
-            none = [c for c in self._full.contacts if not c.acting.freezes]
-            laws = ", ".join(type(c.law).__name__ for c in none)
-            why = "not even under a given pressure"
-            if all(c.finite for c in none):
-                why = "where displacements are finite, whose tangent planes turn"
-            raise ValueError(
-                f"method is 'alternating', but {laws} has no potential, {why}: there is nothing to "
-                "minimise; use another method"
-            )
-        inside = newton_solver(equations.symmetric(True))
-        self._led = Continuation(equations, alternation, options, prefix, inside)
-        self.methods = {"alternating": alternation, _LAST_RESORT: self._led}
+        self.methods = {}
+        tools = Tools(equations, options, prefix, newton_solver, self.methods)
+        for name, kind in METHODS.items():
+            if issubclass(kind, OwnMethod):
+                self.methods[name] = kind(tools)
+        asked_for = self.methods.get(settings.method or "")
+        if asked_for is not None:
+            asked_for.check()
         equations.rtol = snes.getTolerances()[0]
 
     def expect(self, increments: int) -> None:
@@ -518,8 +492,8 @@ class Solver:
         equations.set_state(equations.solution)
         # With a linear bulk a start by the tangent comes first even where it is far off, which a
         # load that falls to nothing does not forgive after continuation.
-        led = self._led.by_newton and not self._full.bulk.linear
-        by_newton = method not in self.methods or (method == _LAST_RESORT and led)
+        own = self.methods.get(method)
+        by_newton = own is None or (own.by_newton and not self._full.bulk.linear)
         newton = by_newton and not self._quasi_newton
         made = sum(attempt.iterations for attempt in attempts[-1:])
         self.starts.predict = reason > 0 and newton and (factored or made > 0)
@@ -547,8 +521,13 @@ class Solver:
         return bool(
             self._settings.fallback
             and self.method != _LAST_RESORT
-            and self.main.max_it >= (_COMMON | METHODS[self.method])["snes_max_it"]
+            and self.main.max_it >= self._main_options()["snes_max_it"]
         )
+
+    def _main_options(self) -> dict[str, Any]:
+        """Those of the main SNES, where the caller says nothing."""
+        linear = self._full.bulk.linear
+        return {**_COMMON, **METHODS[self.method].main_options(linear=linear)}
 
     # ---- the neighbourhood of a solution ---------------------------------------------------------
 
