@@ -65,6 +65,21 @@ class _Solved:
     contacts: list[Found]
 
 
+@dataclass(frozen=True)
+class _Balance:
+    """What goes with a state of the unknowns.
+
+    Attributes:
+        load: External forces at this rank's unknowns (force).
+        energy: Forces and energies there.
+        pending: What brings up the rest of u, where that is behind; None: it is not.
+    """
+
+    load: Array
+    energy: EnergyState
+    pending: Array | None = None
+
+
 class ContactProblem:
     """A body, its Dirichlet conditions and its contacts: one increment at a time.
 
@@ -226,31 +241,32 @@ class ContactProblem:
             phi=phi,
         )
 
-        self._load: Array = np.zeros(self.unknowns.n_local)
+        # The present state, and the committed one: unknowns (the present ones are those of u), what
+        # goes with them, and how far the last increment moved them.
         self._committed = self._rest = self.full.state()
         for contact in self.contacts:
             contact.evaluate()
-        forces: dict[object, Forces] = {self.full.mark: Forces.none(self._committed)}
-        self._energy = self._committed_energy = EnergyState.unloaded(forces, self.contacts)
         self._commits = [contact.commits for contact in self.contacts]
-        if any(self._commits):
-            self._begin_loaded()
-        # What the present and the committed state need to be completed, and their loads.
-        self._pending_field: Array | None = None
-        self._committed_lag: tuple[Array | None, Array] = None, self._load
+        self._now = self._then = self._loaded() if any(self._commits) else self._unloaded()
         self._rate: Array | None = None
         self._solved: _Solved | None = None
         self._cold = True
         self._fresh = True  # nothing was solved yet
 
-    def _begin_loaded(self) -> None:
-        """Let energies be counted from the state that another problem has left. Collective."""
-        self._load = self.present_load()
-        self.full.begin(self._load)
+    def _unloaded(self) -> _Balance:
+        """That of a body at rest."""
+        forces: dict[object, Forces] = {self.full.mark: Forces.none(self._committed)}
+        load: Array = np.zeros(self.unknowns.n_local)
+        return _Balance(load, EnergyState.unloaded(forces, self.contacts))
+
+    def _loaded(self) -> _Balance:
+        """That of the state that another problem has left. Collective."""
+        load = self.present_load()
+        self.full.begin(load)
         bulk = self.full.with_supports(self.bulk.assemble_residual())
         reaction = np.where(self.constrained, bulk + self.full.contact_force(), 0.0)
         forces: dict[object, Forces] = {self.full.mark: self.full.forces(bulk, reaction)}
-        self._energy = self._committed_energy = EnergyState.at(forces, self.contacts)
+        return _Balance(load, EnergyState.at(forces, self.contacts))
 
     @property
     def snes(self) -> PETSc.SNES:
@@ -304,7 +320,12 @@ class ContactProblem:
     @property
     def load(self) -> Array:
         """External forces of the last solve at this rank's unknowns (force)."""
-        return self._load
+        return self._now.load
+
+    @property
+    def committed_energy(self) -> EnergyState:
+        """Forces and energies at the last commit, from which those of an increment are counted."""
+        return self._then.energy
 
     def present_state(self) -> Array:
         """This rank's unknowns as they are now, completed; a copy (length). Collective."""
@@ -329,7 +350,7 @@ class ContactProblem:
             rank's unknowns. Collective.
         """
         self.complete()
-        with self.solver.linearised(springs, self._load) as solve:
+        with self.solver.linearised(springs, self._now.load) as solve:
             yield solve
 
     def _measure_modulus(self) -> None:
@@ -372,10 +393,10 @@ class ContactProblem:
                 contact.begin()
             if not self.bulk.linear:  # whose tangent is that of u, and E may be another by now
                 self._measure_modulus()
-        if self._pending_field is not None and not self.solver.is_current():
+        if self._now.pending is not None and not self.solver.is_current():
             self.complete()  # what it takes is about to go
         self.solver.equations.factorisations = 0
-        saved = self._saved()
+        saved = self.full.state(), self._now
         try:
             # A trial of a line search may overflow, and the convergence test and the verdict see
             # it: a warning, on the rank that has the point, must not become an error there alone.
@@ -387,13 +408,13 @@ class ContactProblem:
                         step = self._solve(start, ahead, field, tried)
                     # Outside, lest a SNES that is made anew takes its options for the caller's.
                     if step is None:
-                        self._go_back(saved)
+                        self._go_back(*saved)
                         spread = sum(attempt.outcome == _SPREADS for attempt in tried)
                         self.solver.change(anew=spread <= 1)
                 release_interrupt()
         except BaseException as error:
             fail_together(self._comm, error)
-            self._go_back(saved)
+            self._go_back(*saved)
             if not isinstance(error, NotConverged | ValueError):
                 self.solver.recover()
             raise
@@ -402,13 +423,9 @@ class ContactProblem:
                 self.solver.options.warn_of_unread(self.prefix)
         return step
 
-    def _saved(self) -> tuple[Array, Array, Array | None, EnergyState]:
-        """What `solve` changes, apart from the contacts."""
-        return self.full.state(), self._load, self._pending_field, self._energy
-
-    def _go_back(self, saved: tuple[Array, Array, Array | None, EnergyState]) -> None:
+    def _go_back(self, state: Array, balance: _Balance) -> None:
         """To where the increment starts. Collective."""
-        state, self._load, self._pending_field, self._energy = saved
+        self._now = balance
         self.full.set_state(state)
         for contact in self.contacts:
             contact.restore()
@@ -423,7 +440,7 @@ class ContactProblem:
             tried: What was tried before; what is tried here is added.
         """
         solver = self.solver
-        self._check_before()
+        load = self._check_before()
         before = self.full.state()
         for bc in self._bcs:
             bc.set(self.u.x.array)
@@ -432,19 +449,19 @@ class ContactProblem:
         stiffness_changed = self.full.update_stiffness()
         if stiffness_changed and self.bulk.linear:
             self._measure_modulus()
-        self._approach()
+        self._approach(load)
         if solver.chooses():
             return None
         solver.update_system(stiffness_changed)
         self.full.farthest = solver.system.farthest = self._judge.begin()
-        solver.system.begin(self._load)
+        solver.system.begin(load)
         with solver.system.acting():
             reason, attempts, rounds = solver.solve(
                 ahead=ahead, rate=self._rate, cold=self._cold, stiffness_changed=stiffness_changed
             )
         # Points outside of what is kept have to be looked at, and it takes all of u to do so.
         lags = not field and not solver.system.confined and self._may_lag()
-        self._pending_field = solver.system.pending_field if lags else None
+        pending = solver.system.pending_field if lags else None
         if not lags:
             solver.system.complete(solver.system.pending_field)
         for contact in self.contacts:
@@ -456,13 +473,14 @@ class ContactProblem:
         kinematics = reason > 0  # a solver that failed may have no factors for it
         if lags:
             self._begin_energy_kept()
-            verdict = self._judge_kept(kinematics=kinematics)
+            verdict, energies = self._judge_kept(kinematics=kinematics)
         else:
             assemble = field or not solver.system.confined
-            verdict = self._judge_all(kinematics=kinematics, assemble=assemble)
+            verdict, energies = self._judge_all(load, kinematics=kinematics, assemble=assemble)
+        self._now = _Balance(load, energies, pending)
         if reason <= 0 or verdict.failures:
             raise self._not_converged(reason, verdict, tried)
-        energy = self._energy.since(self._committed_energy, self.contacts, self._comm)
+        energy = energies.since(self._then.energy, self.contacts, self._comm)
         verdict = replace(verdict, created=energy.created)
         if verdict.failures:
             raise self._not_converged(reason, verdict, tried)
@@ -496,12 +514,12 @@ class ContactProblem:
             return False
         moved = self._comm.allreduce(int(self._committed.any()))
         at_rest = self.increment == 0 and not moved
-        return at_rest or self.solver.system.mark in self._committed_energy.forces
+        return at_rest or self.solver.system.mark in self._then.energy.forces
 
     def _begin_energy_kept(self) -> None:
         """Have the committed forces in the coordinates of the unknowns kept; at rest are none."""
         nothing = Forces.none(np.zeros(1))
-        self._committed_energy.forces.setdefault(self.solver.system.mark, nothing)
+        self._then.energy.forces.setdefault(self.solver.system.mark, nothing)
 
     def complete(self) -> Verdict | None:
         """Bring all of u up to the increment solved last, if it is behind. Collective.
@@ -515,25 +533,26 @@ class ContactProblem:
         Raises:
             NotConverged: The equations do not hold on all of u.
         """
-        if self._pending_field is None:
+        now = self._now
+        if now.pending is None:
             return None
-        committed = self._committed_lag[0] is self._pending_field
+        committed = self._then.pending is now.pending
         before = self.full.state()
-        self.solver.system.complete(self._pending_field)
-        self.full.begin(self._load)
-        bulk = self._product() - self._load
+        self.solver.system.complete(now.pending)
+        self.full.begin(now.load)
+        bulk = self._product() - now.load
         verdict, reaction = self._judged(self.full, bulk, laws=False)
         if verdict.failures:
             self.full.set_state(before)
             number = self.increment + (not committed)
             reason = int(self.snes.getConvergedReason())
             raise NotConverged(number, reason, verdict, prefix=self.prefix)
-        self._pending_field = None
-        energy = self._committed_energy if committed else self._energy
+        self._now = replace(now, pending=None)
+        energy = self._then.energy if committed else now.energy
         energy.forces[self.full.mark] = self.full.forces(bulk, reaction)
         if committed:
             self._committed = self.full.state()
-            self._committed_lag = None, self._load
+            self._then = replace(self._then, pending=None)
         elif self._solved is not None:
             self._solved = replace(self._solved, state=self.full.state())
         return verdict
@@ -549,7 +568,8 @@ class ContactProblem:
             vector.destroy()
         return product
 
-    def _check_before(self) -> None:
+    def _check_before(self) -> Array:
+        """Look at all that was given; the external forces (force). Collective."""
         self.bulk.check_finite()
         for contact, commits in zip(self.contacts, self._commits, strict=True):
             if contact.commits != commits:
@@ -559,15 +579,16 @@ class ContactProblem:
                     "go on from; make a new ContactProblem of these contacts, with u as it is"
                 )
             contact.check_input()
-        self._load = -self.full.with_supports(self.bulk.update_load())
-        size = global_max(self._comm, np.abs(self._load))
+        load = self.present_load()
+        size = global_max(self._comm, np.abs(load))
         if not np.isfinite(size):
             raise ValueError("the external load is not finite (NaN or inf) at some dof")
         check_values(self._bcs, self.u)
         if self.bulk.linear:
-            self.motions.check_balance(self._load, self.operators)
+            self.motions.check_balance(load, self.operators)
+        return load
 
-    def _approach(self) -> None:
+    def _approach(self, load: Array) -> None:
         """Move bodies that nothing holds yet to first touch, along their load. Collective.
 
         One that was released before rests wherever that ended, turned perhaps by more than the load
@@ -576,11 +597,11 @@ class ContactProblem:
         self._cold = self.increment == 0
         if not len(self.motions.free):
             return
-        borne, load = (
+        borne, outside = (
             np.abs(self.motions.resultants(forces)).max(initial=0.0)
-            for forces in (self.full.contact_force(), self._load)
+            for forces in (self.full.contact_force(), load)
         )
-        if borne < _IDLE * load:
+        if borne < _IDLE * outside:
             self._cold = True
             self.full.set_state(np.where(self.constrained, self.full.state(), self._rest))
         for contact in self.contacts:
@@ -588,30 +609,30 @@ class ContactProblem:
         touching = [bool(np.any(c.status != Status.OPEN)) for c in self.contacts]
         if self._comm.allreduce(any(touching)):
             return
-        way = self.motions.approach(self._load, self.operators)
+        way = self.motions.approach(load, self.operators)
         if way is not None:
             self.full.set_state(self.full.state() + way)
 
-    def _judge_all(self, *, kinematics: bool, assemble: bool) -> Verdict:
+    def _judge_all(
+        self, load: Array, *, kinematics: bool, assemble: bool
+    ) -> tuple[Verdict, EnergyState]:
         """Judge a complete u by assembly, past SNES and its residual, or by K u. Collective."""
         if assemble:
             bulk = self.full.with_supports(self.bulk.assemble_residual())
         else:
-            bulk = self._product() - self._load
+            bulk = self._product() - load
         verdict, reaction = self._judged(self.full, bulk, kinematics=kinematics)
         forces: dict[object, Forces] = {self.full.mark: self.full.forces(bulk, reaction)}
         if self.solver.condensed and self.bulk.symmetric:
             forces[self.solver.system.mark] = self._forces_kept()
-        self._energy = EnergyState.at(forces, self.contacts)
-        return verdict
+        return verdict, EnergyState.at(forces, self.contacts)
 
-    def _judge_kept(self, *, kinematics: bool) -> Verdict:
+    def _judge_kept(self, *, kinematics: bool) -> tuple[Verdict, EnergyState]:
         """Judge the condensed equations; u stays behind. Collective."""
         bulk = self.solver.system.bulk_force()
         verdict, _ = self._judged(self.solver.system, bulk, kinematics=kinematics)
         forces: dict[object, Forces] = {self.solver.system.mark: self._forces_kept()}
-        self._energy = EnergyState.at(forces, self.contacts)
-        return verdict
+        return verdict, EnergyState.at(forces, self.contacts)
 
     def _judged(
         self, system: System, bulk: Array, *, laws: bool = True, kinematics: bool = False
@@ -657,9 +678,8 @@ class ContactProblem:
         state = self.full.state()
         self._rate = state - self._committed
         self._committed = state
-        self._committed_lag = self._pending_field, self._load
         jumps = [contact.opposite.committed_jump for contact in self.contacts]
-        self._committed_energy = self._energy.between(jumps)
+        self._then = replace(self._now, energy=self._now.energy.between(jumps))
         self._commits = [contact.commits for contact in self.contacts]
         self.increment += 1
 
@@ -670,7 +690,7 @@ class ContactProblem:
         """
         self._solved = None
         self.full.set_state(self._committed)
-        self._pending_field, self._load = self._committed_lag
+        self._now = self._then
         for contact in self.contacts:
             contact.restore()
 
@@ -691,7 +711,7 @@ class ContactProblem:
             ValueError: The state is not that of the last commit.
         """
         now = self.full.state()
-        differs = self._pending_field is not self._committed_lag[0] or not np.array_equal(
+        differs = self._now.pending is not self._then.pending or not np.array_equal(
             now, self._committed
         )
         if self._comm.allreduce(int(differs)):
@@ -700,7 +720,7 @@ class ContactProblem:
                 "values were changed; call commit() or restore() before the state is saved"
             )
         self.complete()
-        forces = self._committed_energy.forces[self.full.mark]
+        forces = self._then.energy.forces[self.full.mark]
         kept = np.zeros(self.unknowns.n_local)
         if self.solver.condensed:
             kept[self.solver.system.unknowns.kept] = 1.0
@@ -752,20 +772,19 @@ class ContactProblem:
         self.increment = increment
         self._committed, self._rate = state.copy(), rate.copy() if increment else None
         self.full.set_state(state)
-        self._pending_field, self._load = None, self.present_load()
-        self._committed_lag = None, self._load
-        self.full.begin(self._load)
+        load = self.present_load()
+        self.full.begin(load)
         for contact, (history, values) in zip(self.contacts, points, strict=True):
             contact.take_up(history, values)
         forces: dict[object, Forces] = {self.full.mark: Forces(state, internal, external)}
         energy = EnergyState.at(forces, self.contacts)
-        self._energy = energy.between([c.opposite.committed_jump for c in self.contacts])
-        self._committed_energy = self._energy
+        energy = energy.between([c.opposite.committed_jump for c in self.contacts])
+        self._now = self._then = _Balance(load, energy)
         self._commits = [contact.commits for contact in self.contacts]
         self.restart_solver()
 
     def restart_solver(self) -> None:
         """Drop what the solver has kept from earlier increments. Collective."""
         self.solver.restart()
-        for mark in set(self._committed_energy.forces) - {self.full.mark}:
-            del self._committed_energy.forces[mark]
+        for mark in set(self._then.energy.forces) - {self.full.mark}:
+            del self._then.energy.forces[mark]

@@ -150,7 +150,7 @@ def picture(made: History) -> dict[str, Array]:
         found[name] = _nodal(problem, field)
     for name, values in zip(names[:2], rows[:2], strict=True):
         found[f"{name} of supports"] = problem.unknowns.motions(values)
-    energy = problem._committed_energy
+    energy = problem.committed_energy
     found["springs"] = np.array([COMM.allreduce(energy.springs)])
     if problem.solver.condensed:
         found["kept"] = problem.solver.system.unknowns.kept

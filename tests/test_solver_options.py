@@ -1,4 +1,4 @@
-"""Options of PETSc, by arguments and by the database; and a solver of one's own instead."""
+"""Options of PETSc, by arguments and by the database; a solver or a method of one's own."""
 
 import numpy as np
 import pytest
@@ -8,9 +8,11 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
+from fenics_contact.methods.method import InnerSnes, OwnMethod, Tools
+from fenics_contact.methods.solver import METHODS
 from scenes.blocks import TOP
 from scenes.comparing import at_points, close, gathered, nodal, raised_everywhere
-from scenes.rubbing import PATH, Rub
+from scenes.rubbing import PATH, Rub, pressed
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
@@ -181,3 +183,43 @@ def test_types_of_snes_that_cannot_work(kind):
     raised_everywhere(
         lambda: Rub(petsc_options={"snes_type": kind}), ValueError, "snes_type", kind, "newtonls"
     )
+
+
+class Plain(OwnMethod):
+    """Newton's method without a line search: all that a new method has to say."""
+
+    def __init__(self, tools: Tools) -> None:
+        """One SNES."""
+        self._equations = tools.equations
+        solver = tools.linear_solver(tools.equations.symmetric(True))
+        options = {"snes_type": "newtonls", "snes_linesearch_type": "basic", "snes_max_it": 50}
+        self._newton = InnerSnes(
+            tools.equations,
+            tools.defaults,
+            (tools.prefix, "plain_"),
+            options,
+            solver,
+            consistent=True,
+        )
+
+    def solve(self) -> tuple[int, int]:
+        """See `Method.solve`."""
+        equations = self._equations
+        self._newton.attach(equations.assemble_tangent, lambda: 2 if equations.solved() else 0)
+        return self._newton.solve()
+
+
+@pytest.mark.parametrize("condensation", [True, False])
+def test_a_method_of_ones_own(monkeypatch, condensation):
+    """A class and its name are enough: the state is that of the package's Newton's method.
+
+    Both satisfy the law to 1e-9 of the forces: states agree to 1e-6.
+    """
+    monkeypatch.setitem(METHODS, "plain", Plain)
+    law, states = fc.Coulomb(0.3, k_n=2e3, k_t=1e3), []
+    for method in ("plain", "newton"):
+        scene, problem, _ = pressed("quadrilateral", law, method, n=3, condensation=condensation)
+        step = problem.solve()
+        assert (step.method, step.verdict.failures) == (method, [])
+        states.append(nodal(scene.u))
+    assert close(*states, 1e-6)
