@@ -393,8 +393,9 @@ class ContactProblem:
                 contact.begin()
             if not self.bulk.linear:  # whose tangent is that of u, and E may be another by now
                 self._measure_modulus()
-        if self._now.pending is not None and not self.solver.is_current():
-            self.complete()  # what it takes is about to go
+        behind = self._now.pending is not None or self._then.pending is not None
+        if behind and not self.solver.is_current():
+            self._complete_all()  # what it takes is about to go
         self.solver.equations.factorisations = 0
         saved = self.full.state(), self._now
         try:
@@ -537,6 +538,9 @@ class ContactProblem:
         if now.pending is None:
             return None
         committed = self._then.pending is now.pending
+        if committed:
+            for contact in self.contacts:
+                contact.restore()
         before = self.full.state()
         self.solver.system.complete(now.pending)
         self.full.begin(now.load)
@@ -556,6 +560,17 @@ class ContactProblem:
         elif self._solved is not None:
             self._solved = replace(self._solved, state=self.full.state())
         return verdict
+
+    def _complete_all(self) -> None:
+        """Complete the present state, and the committed one if it is another. Collective."""
+        self.complete()
+        if self._then.pending is None:
+            return
+        state, now, solved = self.full.state(), self._now, self._solved
+        self.restore()
+        self.complete()
+        self._solved = solved
+        self._go_back(state, now)
 
     def _product(self) -> Array:
         """The bulk's stiffness times the present state, (n_local,) (force). Collective."""

@@ -391,6 +391,56 @@ def test_field_on_request():
     assert compared == 2
 
 
+def stiffening(field: str) -> tuple[Rub, list[fc.Step]]:
+    """A history in which the stiffness of bulk and contact changes with the load."""
+    made = Rub(cell="triangle", condensation=True)
+
+    def load(t: float) -> None:
+        made.load(t)
+        made.scene.E.value = 1000.0 * (1 + 0.2 * t)
+        made.contact.parameters["k_n"].value = 2e4 * (1 + 0.2 * t)
+
+    return made, list(fc.increments(made.problem, load, 0.0, 2.0, steps=4, field=field))
+
+
+def test_field_left_behind_while_bulk_and_law_change():
+    """What was left behind is completed with the data it was found with: the same to 1e-7."""
+    (every, all_found), (lazy, lagging) = stiffening("every"), stiffening("last")
+    assert not any(attempt.method == "cut" for s in lagging for attempt in s.attempts)
+    assert not lagging[0].complete
+    for a, b in zip(all_found, lagging, strict=True):
+        one, other = a.contacts["contact"].force, b.contacts["contact"].force
+        assert close(one, other, 1e-7)
+        assert np.isclose(a.energy.elastic, b.energy.elastic, rtol=1e-6)
+    assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
+
+
+@pytest.mark.parametrize("last", [True, False], ids=["found", "behind"])
+def test_solution_dropped_with_the_bulk_it_was_found_with(last):
+    """The committed field is behind, a solution was not committed, and the bulk is another one.
+
+    Reference: the same increments with all fields found, 1e-7.
+    """
+    states = []
+    for first, second in ((True, True), (False, last)):
+        made = Rub(cell="triangle", condensation=True)
+        made.load(1.0)
+        made.problem.solve(field=first)
+        made.problem.commit()
+        made.load(1.5)
+        made.problem.solve(field=second)
+        made.scene.E.value *= 1.5
+        made.load(2.0)
+        step = made.problem.solve(field=first)
+        made.problem.commit()
+        made.problem.complete()
+        states.append([made, step.energy])
+    (every, one), (lazy, other) = states
+    assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
+    assert np.isclose(one.work, other.work, rtol=1e-6)
+    assert np.isclose(one.elastic, other.elastic, rtol=1e-6)
+
+
 def test_field_every_so_many_increments():
     """Every third and the last; a checkpoint has all of u."""
     _, steps = lagging(3)

@@ -89,13 +89,14 @@ class Judge:
             bulk: Residual of the bulk on these.
             start: Norms of `System.terms` where the increment began, (n_bodies,).
             rtol: Residual that passes, as a share of the forces.
-            laws: Whether to check the laws, too.
+            laws: Whether to check the laws, too. If not, tractions are those evaluated last,
+                whatever has become of the laws' data since.
             respond: To look at what small displacements leave out; None: it is not looked at.
 
         Returns:
             The verdict, and the reactions at the unknowns.
         """
-        contacts = system.contact_forces()
+        contacts = system.contact_forces(evaluated=not laws)
         total = sum(contacts, bulk)
         norms = system.norms(total, contacts, start)
         names, tolerance = system.parts.names, norms.tolerance(rtol)

@@ -116,12 +116,18 @@ class System(ABC):
             self._parts = pairings, parts
         return self._parts[1]
 
-    def contact_forces(self) -> list[Array]:
-        """Parts of the residual at the present state by contact, (n_local,) each. Collective."""
+    def contact_forces(self, *, evaluated: bool = False) -> list[Array]:
+        """Parts of the residual at the present state by contact, (n_local,) each. Collective.
+
+        Args:
+            evaluated: Whether tractions are those that `Contact.evaluate` found last, and not the
+                law's with its data as they are now.
+        """
         forces = []
         for operator in self.operators:
             self._contact_vector.set(0.0)
-            operator.add_force(self._contact_vector)
+            traction = operator.contact.traction if evaluated else None
+            operator.add_force(self._contact_vector, traction)
             forces.append(self._contact_vector.array_r.copy())
         return forces
 
