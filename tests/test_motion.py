@@ -1,5 +1,6 @@
 """Supports that move as the force on them says: their translation is unknown, the force given."""
 
+import dolfinx
 import numpy as np
 import pytest
 import ufl
@@ -7,7 +8,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.blocks import LEFT, TOP, block
+from scenes.blocks import BOTTOM, LEFT, TOP, block
 from scenes.comparing import close, gathered, nodal, raised_everywhere
 from scenes.rubbing import cushion
 
@@ -126,6 +127,44 @@ def test_wrong_motions(motion, word):
     raised_everywhere(
         lambda: scene.contact(fc.Frictionless(), displacement=motion), ValueError, word
     )
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_one_motion_of_two_contacts_is_refused(turned):
+    """Each contact has unknowns of its own: one tool on two of them would bear its load twice.
+
+    On both surfaces in one contact it bears it once, to the solver's tolerance (1e-9).
+    """
+    scene = block("triangle", 1)
+    motion = fc.Motion(force=(None, -5.0))
+    rotation = fc.Rotation(None, (0.5, 1.0), moment=0.0) if turned else None
+    kinematics = {"kinematics": "finite" if turned else "small"}
+
+    def tool(displacement):
+        return fc.HalfSpace((0, 1), (0, -1), displacement=displacement, rotation=rotation)
+
+    halves = dolfinx.mesh.locate_entities_boundary(scene.mesh, 1, lambda x: np.isclose(x[1], 1))
+    left = dolfinx.mesh.compute_midpoints(scene.mesh, 1, halves)[:, 0] < 0.5
+    tags = dolfinx.mesh.meshtags(scene.mesh, 1, halves, np.where(left, 1, 2).astype(np.int32))
+    bcs = [scene.hold(BOTTOM, i) for i in range(2)]
+
+    def problem(surfaces):
+        contacts = [
+            fc.Contact(
+                scene.u,
+                fc.ContactSurface(scene.mesh, tags, tag),
+                tool(None if turned and len(surfaces) > 1 else motion),
+                fc.Coulomb(0.2, k_n=1e4, k_t=1e4),
+                name=f"on {tag}",
+                **kinematics,
+            )
+            for tag in surfaces
+        ]
+        return fc.ContactProblem(scene.F, scene.u, bcs=bcs, contacts=contacts)
+
+    raised_everywhere(lambda: problem([1, 2]), ValueError, "on 1 and on 2", "act twice")
+    step = problem([[1, 2]]).solve()
+    assert close(step.contacts["on [1, 2]"].force[1], -5.0, 1e-8)
 
 
 def test_the_form_alone_refuses_an_unknown_motion():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 import ufl
@@ -110,7 +111,7 @@ def check_values(bcs: Sequence[fem.DirichletBC], u: fem.Function) -> None:
 def check_contacts(
     contacts: Sequence[Contact], displacement: Displacement, constrained: Mask
 ) -> None:
-    """Refuse contacts of one name, and Γc where all is prescribed. Collective.
+    """Refuse contacts of one name or one free motion, and Γc where all is prescribed. Collective.
 
     Args:
         contacts: Of a problem.
@@ -123,6 +124,8 @@ def check_contacts(
     names = [c.name for c in contacts]
     if len(set(names)) != len(names):
         raise ValueError(f"contacts are named {names}; give every Contact a name of its own")
+    for one, other in combinations(contacts, 2):
+        _check_shared(one, other)
     space = displacement.whole.function_space
     held = fem.Function(space)
     n_owned = space.dofmap.index_map.size_local * space.dofmap.index_map_bs
@@ -136,6 +139,22 @@ def check_contacts(
                 f"{contact.name}: all displacements of {n_held} facets of Γc are prescribed by "
                 "Dirichlet conditions; contact has nothing to decide there: take these facets "
                 "out of Γc or out of the condition"
+            )
+
+
+def _check_shared(one: Contact, other: Contact) -> None:
+    """Refuse one force or moment for the supports of two contacts, which move each on its own."""
+    moved = one.support.displacement, other.support.displacement
+    turned = one.support.rotation, other.support.rotation
+    for free, (mine, theirs), what in (
+        (bool(one.free_motion), moved, "Motion, whose force"),
+        (one.free_angle is not None, turned, "Rotation, whose moment"),
+    ):
+        if free and mine is theirs:
+            raise ValueError(
+                f"{one.name} and {other.name} have one {what} would act twice, on two supports "
+                "that move each on its own; of one support make one Contact, on "
+                "ContactSurface(mesh, tags, [1, 2]), or give each its own"
             )
 
 
