@@ -140,3 +140,21 @@ def test_cut_increments_tell_what_was_tried():
     assert names == ["lbfgs", "cut", "lbfgs", "cut", "lbfgs"]
     assert [attempt.outcome for attempt in first.attempts[1::2]] == ["to 0.005", "to 0.0025"]
     assert first.load == -0.0025 and all(len(step.attempts) == 1 for step in rest)
+
+
+def test_a_first_increment_on_which_continuation_is_stuck():
+    """With finite kinematics and friction nothing can be alternated: the method itself follows.
+
+    On a flat floor both kinematics are one problem: the same force, to the tolerance of 1e-9 of
+    both residuals.
+    """
+    forces, attempts = [], ()
+    for kinematics in ("small", "finite"):
+        scene = block("triangle", 1, n=6, E=100.0)
+        bcs = [scene.hold(TOP, i, value) for i, value in enumerate((0.005, -0.01))]
+        law, given = fc.Coulomb(0.3, k_n=1e3, k_t=1e3), {"kinematics": kinematics}
+        step = scene.problem(law, bcs, contact=given)[0].solve()
+        forces.append(step.contacts["contact"].force)
+        attempts = step.attempts
+    assert [a.method for a in attempts] == ["continuation", "newton"]
+    assert close(forces[1], forces[0], 1e-7)

@@ -472,7 +472,7 @@ class Solver:
         first = cold and ahead > 0.0  # and no later round of multipliers
         if goes_on and first and self._automatic and self.condensed:
             # From nothing, Newton's method on the stiff problem often gives up first.
-            tries = [(starts[0], _LAST_RESORT)]
+            tries = [(starts[0], _LAST_RESORT), *tries]
         elif goes_on:
             tries.append((starts[0], _LAST_RESORT))
             if self._hurries:
