@@ -12,6 +12,7 @@ from mpi4py import MPI
 from scipy.spatial import ConvexHull
 
 import fenics_contact as fc
+from scenes.blocks import TOP, block
 from scenes.comparing import close, gathered, raised_everywhere, shared_folder, sorted_by_place
 from scenes.rubber import TIGHT, disc, rubber
 from scenes.surfaces import ball, box, circle, ring, write_stl
@@ -525,6 +526,59 @@ def test_a_support_of_ones_own_in_numbers():
         return Bubble((0.0, 1.8), 0.8, shift, fc.Rotation(angle, (0.0, 1.8)))
 
     assert close(pressed("triangle", bubble), pressed("triangle", tool(2, "ball")), 1e-9)
+
+
+class Faulty(fc.SampledSupport):
+    """A floor that says something wrong of places below it at the right."""
+
+    gdim, fingerprint, displacement, rotation = 2, "faulty", None, None
+
+    def __init__(self, fault):
+        """``fault``: what is wrong."""
+        self.fault = fault
+
+    def sample(self, x):
+        """See `SampledSupport.sample`."""
+        distance, normal = x[:, 1].copy(), np.tile([0.0, -1.0], (len(x), 1))
+        wrong = (distance < -1e-6) & (x[:, 0] > 0.9)
+        if wrong.any() and self.fault == "error":
+            raise RuntimeError("beyond my data")
+        distance[wrong] = np.nan if self.fault == "nan" else distance[wrong]
+        x[:] = 7.0
+        if self.fault == "shape":
+            distance = distance[:, None]
+        return fc.Sample(distance, normal, np.zeros((len(x), 2, 2)))
+
+
+@pytest.mark.parametrize(
+    ("fault", "error", "text"),
+    [
+        ("nan", ValueError, "Faulty: distance of its sample is not finite"),
+        ("error", RuntimeError, "beyond my data"),
+    ],
+)
+def test_a_support_in_numbers_that_fails_on_the_way(fault, error, text):
+    """A NaN is no open gap, and the error of one rank is that of all; before, the support works."""
+    scene = block("triangle", 1, n=4)
+    down = fem.Constant(scene.mesh, 0.0)
+    bcs = [scene.hold(TOP, 0), scene.hold(TOP, 1, down)]
+    given = {"support": Faulty(fault), "kinematics": "finite"}
+    problem, contact = scene.problem(fc.Coulomb(0.3), bcs, contact=given)
+    problem.solve()
+    problem.commit()
+    down.value = -0.01
+    raised_everywhere(problem.solve, error, text)
+    down.value = 0.01
+    problem.solve()
+    assert np.all(contact.pressure == 0.0)
+
+
+def test_a_support_in_numbers_of_wrong_shape():
+    """It is told what is expected, where the contact is first evaluated."""
+    given = {"support": Faulty("shape"), "kinematics": "finite"}
+    scene = block("triangle", 1)
+    words = "Faulty: distance of its sample has shape", "need"
+    raised_everywhere(scene.contact(fc.Frictionless(), **given).evaluate, ValueError, *words)
 
 
 def test_a_file_of_other_data_is_refused(tmp_path):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from dolfinx import fem
 
+from fenics_contact.parallel import collective_errors
 from fenics_contact.supports.base import Placement, SampledSupport
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
 from fenics_contact.types import Array, Mask
@@ -75,7 +76,8 @@ class Passage:
             (n_points,) (length) and (n_points, gdim).
         """
         if isinstance(self._support, SampledSupport):
-            found = self._support.sample(place)
+            with collective_errors(self._quadrature.surface.mesh.comm):
+                found = self._support.sample_checked(place)
             return found.distance, found.normal
         if self._place is None or self._evaluate is None:
             self._place = fem.Function(self._quadrature.space(place.shape[1]), name="place")

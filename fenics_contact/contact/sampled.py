@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import ufl
 
+from fenics_contact.parallel import collective_errors
 from fenics_contact.supports.base import Placement, SampledSupport
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
@@ -36,25 +37,30 @@ class SampledPlaces:
             place: Where the points are, seen from the support, (gdim,) (UFL, length).
         """
         d = support.gdim
-        self._support = support
+        self._support, self._comm = support, quadrature.surface.mesh.comm
         self._evaluate = PointEvaluator(quadrature, {"place": place})
         sizes = {"place": d, "distance": 0, "normal": d} | {f"curvature {i}": d for i in range(d)}
         self._fields = PointFields(quadrature, sizes)
         self._at: Array = np.full((quadrature.n_points, d), np.nan)
 
     def update(self) -> None:
-        """Sample where the points are now. Collective."""
+        """Sample where the points are now. Collective.
+
+        Raises:
+            ValueError: See `SampledSupport.sample_checked`; on all ranks, as are its own errors.
+        """
         place = self._evaluate()["place"]
         # A diverged iterate is nowhere.
         place[~(np.abs(place).max(axis=1, initial=0.0) < _NOWHERE)] = np.nan
         changed = np.any(place != self._at, axis=1) & np.isfinite(place[:, 0])
         fields, d = {n: self._fields.values(n) for n in self._fields.names}, self._support.gdim
-        if changed.any():
-            sample = self._support.sample(place[changed])
-            fields["distance"][changed] = sample.distance
-            fields["normal"][changed] = sample.normal
-            for i in range(d):
-                fields[f"curvature {i}"][changed] = sample.curvature[:, i]
+        with collective_errors(self._comm):
+            if changed.any():
+                sample = self._support.sample_checked(place[changed])
+                fields["distance"][changed] = sample.distance
+                fields["normal"][changed] = sample.normal
+                for i in range(d):
+                    fields[f"curvature {i}"][changed] = sample.curvature[:, i]
         self._fields.commit(fields | {"place": place})
         self._at = place
 

@@ -254,6 +254,33 @@ class SampledSupport(Support):
         """
         raise NotImplementedError
 
+    def sample_checked(self, x: Array) -> Sample:
+        """`sample`, which may change its argument; not collective.
+
+        Raises:
+            ValueError: Something has a wrong shape, or is not finite: a NaN would pass for a gap
+                that is open.
+        """
+        given = self.sample(x.copy())
+        (n, d), name = x.shape, type(self).__name__
+        shapes = {"distance": (n,), "normal": (n, d), "curvature": (n, d, d)}
+        arrays = {}
+        for what, shape in shapes.items():
+            array = np.asarray(getattr(given, what), dtype=np.float64)
+            if array.shape != shape:
+                raise ValueError(
+                    f"{name}: {what} of its sample has shape {array.shape}; {n} places in {d} "
+                    f"dimensions need {shape}"
+                )
+            wrong = ~np.isfinite(array).reshape(n, -1).all(axis=1) if n else np.zeros(0, np.bool_)
+            if wrong.any():
+                raise ValueError(
+                    f"{name}: {what} of its sample is not finite at {x[wrong][0].tolist()}; a "
+                    "support must have one at every place, however far off"
+                )
+            arrays[what] = array
+        return Sample(**arrays)
+
 
 def as_vector(name: str, value: Any, gdim: int) -> Any:
     """Check a point or direction given by numbers: ``gdim`` finite entries."""
