@@ -84,25 +84,26 @@ def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
     amplitude, steps = arguments.share * LIMIT, arguments.increments
     origin = comm.allreduce(fem.assemble_scalar(scene.deflection))
     before = contact.gather()["slip"]
-    rows = [{"force": 0.0, "displacement": 0.0, "work": 0.0}]
+    rows = [{"force": 0.0, "displacement": 0.0, "work": 0.0, "iterations": 0}]
     left: dict[str, np.ndarray] = {}
     # One way is two phases, so that one increment ends at no force.
     turns = np.array([0, 1, 0, -1, 0, 1]) * amplitude / (2 * R)
     bar = tqdm(total=5 * steps, disable=None if comm.rank == 0 else True, unit="increment")
     for phase, (first, last) in enumerate(itertools.pairwise(turns)):
-        for _ in fc.increments(scene.problem, scene.shear, first, last, steps=steps):
+        for step in fc.increments(scene.problem, scene.shear, first, last, steps=steps):
             points = contact.gather()
             rubbed = np.linalg.norm(points["tangential_traction"], axis=1) * points["measure"]
             moved = comm.allreduce(fem.assemble_scalar(scene.deflection)) - origin
             row = {"force": 2 * R * float(scene.shear.value), "displacement": moved}
-            rows.append(row | {"work": float(rubbed @ (points["slip"] - before))})
+            row |= {"work": float(rubbed @ (points["slip"] - before))}
+            rows.append(row | {"iterations": step.iterations})
             before = points["slip"]
             bar.update()
         if phase == 1:
             left = points
     bar.close()
 
-    force, moved, work = (np.array([row[k] for row in rows]) for k in rows[0])
+    force, moved, work, _ = (np.array([row[k] for row in rows]) for k in rows[0])
     cycle = slice(steps, None)  # from the first turn on
     area = float(np.trapezoid(force[cycle], moved[cycle]))
     top, bottom = moved[steps], moved[3 * steps]

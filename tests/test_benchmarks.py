@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from benchmarks import large, parallel, run, targets, timing
+from benchmarks import costs, large, parallel, run, targets, timing
+from scenes import problems
 from scenes.processes import ROOT, environment
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="of one process")
@@ -274,6 +275,16 @@ def test_parallel_runs(tmp_path: Path) -> None:
     assert forces[::2] == pytest.approx(forces[1::2], rel=1e-6)
     assert float(rows[1]["messages"]) > 0
     assert "Where the time goes" in (tmp_path / "README.md").read_text()
+
+
+def test_a_history_of_pressing_takes_few_iterations() -> None:
+    """Contact that grows is no load that turns round: Newton's method goes on by the last tangent.
+
+    Measured: 45 iterations in 40 increments; 78 if each starts where the last one ended, and the
+    more the finer the mesh.
+    """
+    case = costs.Case(problems.half_cylinder(0.0, 0.25), 2, 10.0)
+    assert case.package(0.2, 40)["iterations"] <= 55
 
 
 def test_contact_at_large_strains_costs_few_newton_steps(tmp_path: Path) -> None:

@@ -363,6 +363,7 @@ def test_the_choice(caplog):
 def test_what_is_worth_it():
     """Small surfaces, and large ones of large bodies; not the whole of a body, nor gigabytes."""
     assert worthwhile(50, 10, 2) and worthwhile(250_000, 1000, 2) and worthwhile(100_000, 1500, 3)
+    assert worthwhile(12_604, 736, 2) and not worthwhile(2000, 700, 2)
     assert not worthwhile(10_000, 3000, 2)
     assert not worthwhile(100_000, 6000, 3)
     assert not worthwhile(10**8, 20_000, 3)

@@ -14,7 +14,7 @@ __all__ = ["Starts"]
 # A start with up to this many times the residual of the best is taken first if its points slip.
 _FAR = 100.0
 # By how much a step makes the residual larger where the load has turned round: 4 measured in
-# fretting, and up to 1.5 where it has not.
+# fretting. Where contact grows it does so too, and the step goes on in the direction of the last.
 _TURNED = 2.0
 
 
@@ -57,8 +57,8 @@ class Starts:
         the contact inwards; and a body that others slide over is dragged along by all of the way,
         in a state that is near equilibrium and far from the solution. The start by a step on the
         tangent of the last solution has the right ones slipping, and comes first unless it is far
-        off; or unless the load has turned round, so that slipping points stick: then to go on is
-        worse than to stay, by a step as by the last increment.
+        off; or unless the load has turned round, so that slipping points stick: then the step goes
+        back, and to go on is worse than to stay, by a step as by the last increment.
 
         Args:
             ahead: Size of the increment in units of the last one.
@@ -108,10 +108,17 @@ class Starts:
         if ahead and any(c.free_angle is not None for c in equations.contacts):
             add(system.rolled(moved))
         if first is not None and residuals[first] <= _FAR * min(residuals):
-            stays = residuals[0] < residuals[first] / _TURNED
-            if not (stays and last is not None and residuals[0] < residuals[last]):
+            worse = last is not None and residuals[0] < residuals[last]
+            worse = worse and residuals[0] < residuals[first] / _TURNED
+            if not (worse and self._goes_back(starts[first] - present, rate)):
                 residuals[first] = 0.0
         return [starts[i] for i in np.argsort(residuals, kind="stable")]
+
+    def _goes_back(self, step: Array, rate: Array | None) -> bool:
+        """Whether a step of the system is against the last increment. Collective."""
+        assert rate is not None
+        along = float(step @ self._equations.system.part(rate))
+        return bool(self._equations.full.unknowns.comm.allreduce(along) < 0.0)
 
     def _turns(self, rate: Array | None) -> bool:
         """Whether the values prescribed go back to where they came from. Collective."""
