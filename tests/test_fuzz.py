@@ -74,6 +74,18 @@ def test_scenes_of_finite_kinematics_are_right(number):
 
 
 @serial
+def test_a_step_across_the_residual_is_no_solution():
+    """A support held by a prescribed pressure alone: PETSc's line search ends all where F·y = 0.
+
+    Found as an attempt that "converged" in no iterations with a residual as large as the forces.
+    """
+    outcome = played(fuzz_scenes.draw(761592, family=761592 // 48))
+    assert outcome.outcome == "refused"
+    assert "Tried: continuation: no progress" in outcome.detail[0]
+    assert "newton: converged" not in outcome.detail[0]
+
+
+@serial
 def test_most_scenes_are_solved_and_compared():
     # A machine that refuses everything, or compares nothing, would pass the test above.
     found = [played(scene) for scene in SCENES["scenes"][::7]]

@@ -240,4 +240,8 @@ class Newton(SnesMethod):
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`."""
-        return self._callbacks.solve(self.snes, self._equations.solution)
+        iterations, reason = self._callbacks.solve(self.snes, self._equations.solution)
+        # The line search `cp` takes a step across the residual, F·y = 0, for the end of all.
+        if reason == _REASONS.CONVERGED_FNORM_ABS:
+            reason = int(_REASONS.DIVERGED_LINE_SEARCH)
+        return iterations, reason
