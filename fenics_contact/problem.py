@@ -134,8 +134,9 @@ class ContactProblem:
                 it is stuck), or "alternating" (minimum problems in turn, each by Newton's method
                 with a line search on the energy). By default "lbfgs" on all unknowns, where a
                 factorisation costs as much as dozens of iterations, and condensed, where it costs
-                as much as ten, "newton", with "continuation" for the first increment; "newton" for
-                a nonlinear bulk, too, whose tangent changes. With a mixed function the equations
+                as much as ten, "newton", with "continuation" for the first increment, and again
+                "newton" where that is stuck; "newton" for a nonlinear bulk, too, whose tangent
+                changes. With a mixed function the equations
                 are those of a saddle point: "alternating" is refused there.
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
@@ -425,11 +426,12 @@ class ContactProblem:
         return step
 
     def _go_back(self, state: Array, balance: _Balance) -> None:
-        """To where the increment starts. Collective."""
+        """To where the increment starts: committed, or solved and not committed. Collective."""
         self._now = balance
         self.full.set_state(state)
-        for contact in self.contacts:
-            contact.restore()
+        found = [None] * len(self.contacts) if self._solved is None else self._solved.contacts
+        for contact, solved in zip(self.contacts, found, strict=True):
+            contact.restore(solved)
 
     def _solve(self, start: float, ahead: float, field: bool, tried: list[Attempt]) -> Step | None:
         """`solve`; None if it takes other unknowns than are kept. Collective.
@@ -567,10 +569,12 @@ class ContactProblem:
         if self._then.pending is None:
             return
         state, now, solved = self.full.state(), self._now, self._solved
-        self.restore()
-        self.complete()
-        self._solved = solved
-        self._go_back(state, now)
+        try:
+            self.restore()
+            self.complete()
+        finally:
+            self._solved = solved
+            self._go_back(state, now)
 
     def _product(self) -> Array:
         """The bulk's stiffness times the present state, (n_local,) (force). Collective."""

@@ -480,6 +480,25 @@ def test_a_failure_leaves_the_field_to_be_completed():
     assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
 
 
+def test_a_failure_leaves_what_was_solved_and_not_committed():
+    """Its field is completed with its own tractions, and its results are shown."""
+    every, lazy = Rub(cell="triangle", condensation=True), Rub(cell="triangle", condensation=True)
+    for made in (every, lazy):
+        for t in (0.5, 1.5):
+            made.load(t)
+            made.problem.solve(field=made is every)
+            if t == 0.5:
+                made.problem.commit()
+    pressure = lazy.contact.pressure.copy()
+    lazy.push[-1].value = np.nan
+    with pytest.raises(ValueError, match="finite"):
+        lazy.problem.solve(field=False)
+    assert np.array_equal(lazy.contact.pressure, pressure)
+    lazy.load(1.5)
+    lazy.problem.complete()
+    assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
+
+
 def test_a_field_that_is_wrong_is_refused(monkeypatch):
     """What is recovered is checked by the product with K, not by what recovered it."""
     made = Rub(cell="triangle", condensation=True)

@@ -487,10 +487,11 @@ class Judge:
         self._own_u, self._own_motion = u, motion
 
     def _determined(self, problem: Any, i: int, found: list[dict], load: Any) -> Array:
-        """Force of a contact, less what multipliers of friction leave open.
+        """Force of a contact; with multipliers of friction that on the free unknowns alone.
 
         Where a displacement is prescribed and the point sticks, neither slip nor balance tells how
-        much of the reaction is friction: any multiplier within the limit is a solution.
+        much of the reaction is contact: any multiplier within the limit is a solution, and where
+        the normal is aslant so are pressures with it.
         """
         contact = problem.contacts[i]
         if contact.project is None or not contact.law.slips:

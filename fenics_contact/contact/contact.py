@@ -513,14 +513,17 @@ class Contact(PointResults):
         """Drop what was evaluated: the next look at a result evaluates the present ``u``."""
         self._values = None
 
-    def restore(self) -> None:
-        """Multipliers and results as at the last commit; before one none are. Collective.
+    def restore(self, found: Found | None = None) -> None:
+        """Multipliers as at the last commit, and results; before one none are. Collective.
 
         At that state the law would call points that have slipped to it sticking ones.
+
+        Args:
+            found: A state solved since, whose results these are to be.
         """
         if self.multipliers is not None:
             self.multipliers.restore(self.history)
-        self._values = self._committed_values
+        self._values = self._committed_values if found is None else found.points
 
     def enforcement_error(self) -> float:
         """What the springs bear at the last evaluated state, relative: 0 if exact. Collective.

@@ -8,16 +8,12 @@ import numpy as np
 import ufl
 
 from fenics_contact.parallel import collective_errors
-from fenics_contact.supports.base import Placement, SampledSupport
+from fenics_contact.supports.base import NOWHERE, Placement, SampledSupport
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
 from fenics_contact.types import Array
 
 __all__ = ["SampledPlaces"]
-
-
-# A coordinate whose square is still a number.
-_NOWHERE = 1e100
 
 
 class SampledPlaces:
@@ -51,7 +47,7 @@ class SampledPlaces:
         """
         place = self._evaluate()["place"]
         # A diverged iterate is nowhere.
-        place[~(np.abs(place).max(axis=1, initial=0.0) < _NOWHERE)] = np.nan
+        place[~(np.abs(place).max(axis=1, initial=0.0) < NOWHERE)] = np.nan
         changed = np.any(place != self._at, axis=1) & np.isfinite(place[:, 0])
         fields, d = {n: self._fields.values(n) for n in self._fields.names}, self._support.gdim
         with collective_errors(self._comm):

@@ -42,7 +42,7 @@ class Method(ABC):
 
 @dataclass(frozen=True)
 class Tools:
-    """What methods with solvers of their own are made of.
+    """What methods with solvers of their own are made of, and do not keep: it leads to PETSc's.
 
     Attributes:
         equations: What to solve.
@@ -241,7 +241,7 @@ class Newton(SnesMethod):
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`."""
         iterations, reason = self._callbacks.solve(self.snes, self._equations.solution)
-        # The line search `cp` takes a step across the residual, F·y = 0, for the end of all.
+        # `cp` takes a step across the residual, F·y = 0, for the end of all: see `_COMMON`.
         if reason == _REASONS.CONVERGED_FNORM_ABS:
             reason = int(_REASONS.DIVERGED_LINE_SEARCH)
         return iterations, reason

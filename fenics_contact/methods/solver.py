@@ -79,7 +79,7 @@ _COMMON: dict[str, Any] = {
 _VECTORS: dict[str, Any] = {"vec_mdot_use_gemv": False}
 # Options that only make sense for the sparse matrices over all unknowns.
 _NAMES_A_SOLVER = ("ksp_type", "pc_type", "pc_factor_mat_solver_type")
-# By name; each may hand over to those above it.
+# By name. Of those with solvers of their own each sees the ones made before it.
 METHODS: dict[str, type[Method]] = {
     "lbfgs": QuasiNewton,
     "newton": Newton,

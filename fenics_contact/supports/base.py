@@ -18,6 +18,7 @@ from fenics_contact.arguments import is_number
 from fenics_contact.types import Array
 
 __all__ = [
+    "NOWHERE",
     "Motion",
     "Placement",
     "Rotation",
@@ -31,6 +32,9 @@ __all__ = [
 ]
 
 ToUFL = Callable[[Any], ufl.core.expr.Expr]
+
+# A coordinate whose square is still a number: a diverged state has points beyond.
+NOWHERE = 1e100
 
 
 @dataclass(frozen=True)
@@ -250,19 +254,25 @@ class SampledSupport(Support):
         """Distance, normal and curvature at places; not collective.
 
         Args:
-            x: Finite coordinates where the support has neither moved nor turned, (n, gdim), n ≥ 0.
+            x: Finite coordinates where the support has neither moved nor turned, (n, gdim), n ≥ 0;
+                those of a trial of the solver may be far off. Distance and normal must be finite
+                wherever they are.
         """
         raise NotImplementedError
 
     def sample_checked(self, x: Array) -> Sample:
-        """`sample`, which may change its argument; not collective.
+        """`sample`, which may change its argument; NaN at places of a diverged state.
+
+        Not collective.
 
         Raises:
-            ValueError: Something has a wrong shape, or is not finite: a NaN would pass for a gap
-                that is open.
+            ValueError: Something has a wrong shape, or a distance or normal is not finite: a NaN
+                would pass for a gap that is open.
         """
-        given = self.sample(x.copy())
-        (n, d), name = x.shape, type(self).__name__
+        there = np.abs(x).max(axis=1, initial=0.0) < NOWHERE
+        given = self.sample(x[there])
+        d, name = x.shape[1], type(self).__name__
+        n = int(np.count_nonzero(there))
         shapes = {"distance": (n,), "normal": (n, d), "curvature": (n, d, d)}
         arrays = {}
         for what, shape in shapes.items():
@@ -272,13 +282,16 @@ class SampledSupport(Support):
                     f"{name}: {what} of its sample has shape {array.shape}; {n} places in {d} "
                     f"dimensions need {shape}"
                 )
-            wrong = ~np.isfinite(array).reshape(n, -1).all(axis=1) if n else np.zeros(0, np.bool_)
-            if wrong.any():
-                raise ValueError(
-                    f"{name}: {what} of its sample is not finite at {x[wrong][0].tolist()}; a "
-                    "support must have one at every place, however far off"
-                )
-            arrays[what] = array
+            if what != "curvature":  # a round support has none at its centre
+                wrong = ~np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+                if wrong.any():
+                    raise ValueError(
+                        f"{name}: {what} of its sample is not finite at "
+                        f"{x[there][wrong][0].tolist()}; a support must have one at every place, "
+                        "however far off"
+                    )
+            arrays[what] = np.full((len(x), *shape[1:]), np.nan)
+            arrays[what][there] = array
         return Sample(**arrays)
 
 

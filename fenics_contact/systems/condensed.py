@@ -33,10 +33,12 @@ _SMALL = 500
 # 4 n² in three. Up to this share of n^((d-1)/d), the size of a surface of all of the mesh, the
 # dense one costs a quarter of the sparse one.
 _SURFACE_SHARE = {2: 3.0, 3: 1.2}
-# In the plane, up to this share and this many, it costs more than that, and still a third of what
-# dozens of iterations on all unknowns take: two cylinders sheared to and fro in 20 increments, of
-# 9,724 unknowns with 596 kept 2.4 s against 8.6; 12,604 and 736, 2.4 and 7.9; 32,256 and 1004, 12
-# and 24.
+# In the plane, up to this many and this share, it costs more than that, and less than the dozens of
+# iterations that all unknowns take. Two cylinders of `demos/fretting.py`, by cells in the contact's
+# half-width: unknowns and those kept, seconds condensed and not, pressed by one increment without
+# friction, then sheared to and fro by 20 (25 at first):
+#     16: 9,724, 596: 0.7 and 1.4, 2.2 and 8.6;  20: 12,604, 736: 1.2 and 1.9, 2.4 and 7.9;
+#     40: 32,256, 1004, the pressing all but on all unknowns: 4.1 and 24.
 _QUICK, _QUICK_SHARE = 1200, 8.0
 # Share of these up to which what is kept is hardly felt in the cost.
 _CHEAP = 0.25
