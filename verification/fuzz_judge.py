@@ -332,7 +332,7 @@ class Judge:
             # So do surfaces that are not flat, unloaded, by a little of what they differ, which
             # few points do not tell, and what a facet bulges between its corners is not seen from
             # these.
-            differ = 0.1 * max(float(np.ptp(found[i]["closing"])), self._bulge)
+            differ = 0.1 * max(self._bulge, *(float(np.ptp(found[j]["closing"])) for j in same))
             if self.scene["contacts"][i].get("scheme") == "vertex":
                 differ += self._bulge
             allowed += float(contact.k_n.mean() * contact.weights.sum()) * differ
@@ -467,8 +467,10 @@ class Judge:
         tolerance = self._tolerance(record, _APART)
         worst = 0.0
         rounding = max(b["rounding"] for b in now["bodies"])
-        for i, contact in enumerate(now["contacts"]):
-            force, here = self._determined(problem, i, found, load), contact["determined"]
+        forces = [self._determined(problem, i, found, load) for i in range(len(found))]
+        told = [contact["determined"] for contact in now["contacts"]]
+        for i in range(len(forces)):
+            force, here = self._shared(forces, i), self._shared(told, i)
             size = max(self._size(now, "contacts", i), float(np.abs(force).max()))
             error = np.abs(force - here).max()
             allowed = tolerance * size + 30 * rounding
@@ -485,6 +487,18 @@ class Judge:
         ]
         self._pair_anew(problem, self._own_old, u)
         self._own_u, self._own_motion = u, motion
+
+    def _shared(self, forces: list[Array], i: int) -> Array:
+        """Force on the body of a contact by all contacts between the same two surfaces.
+
+        How much of it which one bears is not determined where multipliers are on both sides.
+        """
+        total, body = np.zeros_like(forces[i]), self.scene["contacts"][i]["body"]
+        for j, contact in enumerate(self.problem.contacts):
+            if j == i or (contact.project is not None and self._between(j) == self._between(i)):
+                sign = 1.0 if self.scene["contacts"][j]["body"] == body else -1.0
+                total += sign * forces[j]
+        return total
 
     def _determined(self, problem: Any, i: int, found: list[dict], load: Any) -> Array:
         """Force of a contact; with multipliers of friction that on the free unknowns alone.
