@@ -19,10 +19,11 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import checkpoint
-from scenes.comparing import at_points, close, raised_everywhere, shared_folder
+from scenes.comparing import at_points, close, owned, raised_everywhere, shared_folder
 from scenes.elasticity import strain
 from scenes.histories import Press, Ramp, differences, goes_on
 from scenes.processes import command, environment
+from scenes.rubbing import Rub
 
 COMM = MPI.COMM_WORLD
 
@@ -318,3 +319,19 @@ def test_results_of_a_finished_history(support, enforcement, tmp_path):
         for name in ("force", "normal_force", "tangential_force", "area", "max_pressure"):
             assert close(getattr(found, name), getattr(last, name), tolerance), name
         assert close(at_points(contact, contact.slip_increment), slid, tolerance)
+
+
+def test_a_rank_without_nodes_goes_on(tmp_path):
+    """A body of one cell, of which other ranks than one have nothing: as one that went on."""
+    folder = shared_folder(tmp_path)
+    whole, stopped, after = (Rub(mesh={"n": 1}) for _ in range(3))
+    for _ in fc.increments(whole.problem, whole.load, 0.0, 2.0, steps=4):
+        pass
+    options = {"steps": 4, "checkpoint": folder / "one.npz"}
+    for step in fc.increments(stopped.problem, stopped.load, 0.0, 2.0, **options):
+        if step.increment == 2:
+            break
+    rest = list(fc.increments(after.problem, after.load, 0.0, 2.0, **options))
+    assert [step.increment for step in rest] == [3, 4]
+    assert close(owned(after.scene.u), owned(whole.scene.u), 1e-7)
+    assert close(after.contact.resultants().force, whole.contact.resultants().force, 1e-7)

@@ -288,8 +288,10 @@ def take_up(
     rows = np.zeros((len(motions), problem.unknowns.n_dofs))
     for part in _parts(problem):
         nodes = _find(comm, stored, part.name, _node_places(part.space), size)
-        by_row = nodes.reshape(len(nodes), len(motions), -1).swapaxes(0, 1)
-        rows[:, part.dofs] = by_row.reshape(len(motions), -1)
+        # A rank may have no nodes, of which no shape can be told.
+        width = nodes.shape[1] // len(motions)
+        by_row = nodes.reshape(len(nodes), len(motions), width).swapaxes(0, 1)
+        rows[:, part.dofs] = by_row.reshape(len(motions), len(nodes) * width)
     joined = (problem.unknowns.joined(row, motions[i]) for i, row in enumerate(rows))
     unknowns = np.stack(list(joined))
     unknowns = _physical(problem, unknowns, back=True)
