@@ -95,8 +95,8 @@ def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
             rubbed = np.linalg.norm(points["tangential_traction"], axis=1) * points["measure"]
             moved = comm.allreduce(fem.assemble_scalar(scene.deflection)) - origin
             row = {"force": 2 * R * float(scene.shear.value), "displacement": moved}
-            row |= {"work": float(rubbed @ (points["slip"] - before))}
-            rows.append(row | {"iterations": step.iterations})
+            work = float(rubbed @ (points["slip"] - before))
+            rows.append(row | {"work": work, "iterations": step.iterations})
             before = points["slip"]
             bar.update()
         if phase == 1:

@@ -214,18 +214,23 @@ class Judge:
                 }
             )
         contacts = []
-        for i, (c, f) in enumerate(zip(problem.contacts, found, strict=True)):
+        for c, f in zip(problem.contacts, found, strict=True):
             w = c.weights * c.paired
             contacts.append(
                 {
                     "force": w @ f["traction"],
-                    "determined": self._determined(problem, i, found, load),
                     "normal": float(w @ -f["r_n"]),
                     "tangential": float(w @ np.linalg.norm(f["tau"], axis=1)),
                     "size": float(w @ np.linalg.norm(f["traction"], axis=1)),
                 }
             )
-        return {"bodies": bodies, "contacts": contacts, "total": total, "motion rest": motion}
+        return {
+            "bodies": bodies,
+            "contacts": contacts,
+            "determined": self._determined(problem, found, forces, load),
+            "total": total,
+            "motion rest": motion,
+        }
 
     def _size(self, now: dict[str, Any], kind: str, i: int) -> float:
         """Forces of a body or contact at the ends of the increment, the larger one."""
@@ -467,10 +472,9 @@ class Judge:
         tolerance = self._tolerance(record, _APART)
         worst = 0.0
         rounding = max(b["rounding"] for b in now["bodies"])
-        forces = [self._determined(problem, i, found, load) for i in range(len(found))]
-        told = [contact["determined"] for contact in now["contacts"]]
+        forces = self._determined(problem, found, problem.contact_force(found), load)
         for i in range(len(forces)):
-            force, here = self._shared(forces, i), self._shared(told, i)
+            force, here = self._shared(forces, i), self._shared(now["determined"], i)
             size = max(self._size(now, "contacts", i), float(np.abs(force).max()))
             error = np.abs(force - here).max()
             allowed = tolerance * size + 30 * rounding
@@ -500,20 +504,26 @@ class Judge:
                 total += sign * forces[j]
         return total
 
-    def _determined(self, problem: Any, i: int, found: list[dict], load: Any) -> Array:
-        """Force of a contact; with multipliers of friction that on the free unknowns alone.
+    def _determined(
+        self, problem: Any, found: list[dict], forces: list[Array], load: Any
+    ) -> list[Array]:
+        """Force of every contact; with multipliers of friction that on the free unknowns alone.
 
         Where a displacement is prescribed and the point sticks, neither slip nor balance tells how
         much of the reaction is contact: any multiplier within the limit is a solution, and where
         the normal is aslant so are pressures with it.
         """
-        contact = problem.contacts[i]
-        if contact.project is None or not contact.law.slips:
-            return (contact.weights * contact.paired) @ found[i]["traction"]
-        force = problem.contact_force(found)[i]
-        force[load.fixed] = 0.0
-        own = problem.body.parts == self.scene["contacts"][i]["body"]
-        return force.reshape(-1, contact.d)[own].sum(axis=0)
+        told = []
+        given = zip(problem.contacts, found, forces, self.scene["contacts"], strict=True)
+        for c, f, force, scene in given:
+            if c.project is None or not c.law.slips:
+                told.append((c.weights * c.paired) @ f["traction"])
+                continue
+            free = force.copy()
+            free[load.fixed] = 0.0
+            own = problem.body.parts == scene["body"]
+            told.append(free.reshape(-1, c.d)[own].sum(axis=0))
+        return told
 
     @staticmethod
     def _pair_anew(problem: Any, states: list[Any], u: Array) -> None:

@@ -82,12 +82,7 @@ class PointLaw:
         self.law, self.seen = law, seen
         self._kinematics, self._quadrature, self._jump = kinematics, quadrature, jump
         self._acts, self._free = acts, list(free)
-        surface = quadrature.surface
-        self._gdim = surface.mesh.geometry.dim
-        comm, x = surface.mesh.comm, surface.mesh.geometry.x
-        # A length that is nothing beside the mesh.
-        size = global_max(comm, x) - global_min(comm, x)
-        self._barely = fem.Constant(surface.submesh, _BARELY * size)
+        self._gdim = quadrature.surface.mesh.geometry.dim
 
     def with_law(self, law: Law, parameters: Mapping[str, Any]) -> PointLaw:
         """Another law at the same points, with parameters of its own."""
@@ -263,6 +258,16 @@ class PointLaw:
                 told |= {"elastic_slip": self._kinematics.framed(slip)}
         return self._evaluator(told)
 
+    @cached_property
+    def _barely(self) -> fem.Constant:
+        """A length that is nothing beside the mesh, of laws with a normal of their own. Collective.
+
+        It is measured where it is asked for alone.
+        """
+        surface = self._quadrature.surface
+        comm, x = surface.mesh.comm, surface.mesh.geometry.x
+        return fem.Constant(surface.submesh, _BARELY * (global_max(comm, x) - global_min(comm, x)))
+
     def _own_normal(self, felt: Kinematics, response: Response) -> dict[str, Any]:
         """What is known of r_n that does not follow from k_n (UFL): stiffness, and another way."""
         law, parameters = self.law, self.seen.parameters
@@ -292,8 +297,10 @@ class PointLaw:
         """
         submesh = self._quadrature.surface.submesh
         for item in traverse_unique_terminals(ufl.as_ufl(expression)):
-            there = item is self._barely or not isinstance(item, fem.Constant)
-            if isinstance(item, fem.Function):
+            there = True
+            if isinstance(item, fem.Constant):
+                there = item is self._barely
+            elif isinstance(item, fem.Function):
                 there = item.function_space.mesh is submesh or item.function_space.mesh == submesh
             elif isinstance(item, ufl.classes.GeometricQuantity):
                 there = extract_unique_domain(item) == submesh.ufl_domain()
