@@ -81,7 +81,14 @@ GROUPS: list[tuple[str, list[str], str]] = [
     ),
     (
         "Problem and choice of the method",
-        ["problem", "checks.given", "methods.solver", "methods.alternating", "systems.choice"],
+        [
+            "problem",
+            "checks.given",
+            "methods.solver",
+            "methods.options",
+            "methods.alternating",
+            "systems.choice",
+        ],
         "[](choose.md) says which method and linear solver are for what.",
     ),
     (
@@ -317,5 +324,9 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "iterating on all unknowns": ("Why the problem is not condensed.", "Nothing."),
         "linear systems of": ("Which linear solver, and why.", "Nothing."),
         "condensed onto": ("How many unknowns are iterated on.", "Nothing."),
+        "pairs are found anew": (
+            "Points slide along another body: who lies opposite them changes.",
+            'Nothing; `DeformableBody(update="never")` where the first pairs are to stay.',
+        ),
     },
 }

@@ -28,7 +28,7 @@ from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.step import Step
 from fenics_contact.checks.verdict import Attempt, NotConverged, Verdict
 from fenics_contact.contact.contact import Contact, Found
-from fenics_contact.contact.values import Status
+from fenics_contact.methods.approach import Approach
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
 from fenics_contact.methods.solver import METHODS, Settings, Solver
 from fenics_contact.parallel import fail_together, global_max
@@ -46,8 +46,6 @@ __all__ = ["ContactProblem"]
 
 logger = logging.getLogger("fenics_contact")
 
-# Contact that bears less than this share of the load on a free motion bears nothing yet.
-_IDLE = 1e-3
 # What became of an attempt on too few unknowns.
 _SPREADS = "contact spreads beyond the unknowns kept"
 
@@ -244,14 +242,14 @@ class ContactProblem:
 
         # The present state, and the committed one: unknowns (the present ones are those of u), what
         # goes with them, and how far the last increment moved them.
-        self._committed = self._rest = self.full.state()
+        self._committed = self.full.state()
+        self._approach = Approach(self.full, self.motions)
         for contact in self.contacts:
             contact.evaluate()
         self._commits = [contact.commits for contact in self.contacts]
         self._now = self._then = self._loaded() if any(self._commits) else self._unloaded()
         self._rate: Array | None = None
         self._solved: _Solved | None = None
-        self._cold = True
         self._fresh = True  # nothing was solved yet
 
     def _unloaded(self) -> _Balance:
@@ -265,8 +263,7 @@ class ContactProblem:
         load = self.present_load()
         self.full.begin(load)
         bulk = self.full.with_supports(self.bulk.assemble_residual())
-        reaction = np.where(self.constrained, bulk + self.full.contact_force(), 0.0)
-        forces: dict[object, Forces] = {self.full.mark: self.full.forces(bulk, reaction)}
+        forces: dict[object, Forces] = {self.full.mark: self.full.present_forces(bulk)}
         return _Balance(load, EnergyState.at(forces, self.contacts))
 
     @property
@@ -452,7 +449,7 @@ class ContactProblem:
         stiffness_changed = self.full.update_stiffness()
         if stiffness_changed and self.bulk.linear:
             self._measure_modulus()
-        self._approach(load)
+        cold = self._approach.lead(load, first=self.increment == 0)
         if solver.chooses():
             return None
         solver.update_system(stiffness_changed)
@@ -460,7 +457,7 @@ class ContactProblem:
         solver.system.begin(load)
         with solver.system.acting():
             reason, attempts, rounds = solver.solve(
-                ahead=ahead, rate=self._rate, cold=self._cold, stiffness_changed=stiffness_changed
+                ahead=ahead, rate=self._rate, cold=cold, stiffness_changed=stiffness_changed
             )
         # Points outside of what is kept have to be looked at, and it takes all of u to do so.
         lags = not field and not solver.system.confined and self._may_lag()
@@ -479,7 +476,7 @@ class ContactProblem:
             verdict, energies = self._judge_kept(kinematics=kinematics)
         else:
             assemble = field or not solver.system.confined
-            verdict, energies = self._judge_all(load, kinematics=kinematics, assemble=assemble)
+            verdict, energies = self._judge_all(kinematics=kinematics, assemble=assemble)
         self._now = _Balance(load, energies, pending)
         if reason <= 0 or verdict.failures:
             raise self._not_converged(reason, verdict, tried)
@@ -546,8 +543,7 @@ class ContactProblem:
         before = self.full.state()
         self.solver.system.complete(now.pending)
         self.full.begin(now.load)
-        bulk = self._product() - now.load
-        verdict, reaction = self._judged(self.full, bulk, laws=False)
+        verdict, forces = self._judged(self.full, self.full.product_force(), laws=False)
         if verdict.failures:
             self.full.set_state(before)
             number = self.increment + (not committed)
@@ -555,7 +551,7 @@ class ContactProblem:
             raise NotConverged(number, reason, verdict, prefix=self.prefix)
         self._now = replace(now, pending=None)
         energy = self._then.energy if committed else now.energy
-        energy.forces[self.full.mark] = self.full.forces(bulk, reaction)
+        energy.forces[self.full.mark] = forces
         if committed:
             self._committed = self.full.state()
             self._then = replace(self._then, pending=None)
@@ -575,17 +571,6 @@ class ContactProblem:
         finally:
             self._solved = solved
             self._go_back(state, now)
-
-    def _product(self) -> Array:
-        """The bulk's stiffness times the present state, (n_local,) (force). Collective."""
-        state, image = self.unknowns.vector(), self.unknowns.vector()
-        state.array[:] = self.full.state()
-        assert self.full.stiffness is not None
-        self.full.stiffness.mult(state, image)
-        product = image.array_r.copy()
-        for vector in (state, image):
-            vector.destroy()
-        return product
 
     def _check_before(self) -> Array:
         """Look at all that was given; the external forces (force). Collective."""
@@ -607,55 +592,27 @@ class ContactProblem:
             self.motions.check_balance(load, self.operators)
         return load
 
-    def _approach(self, load: Array) -> None:
-        """Move bodies that nothing holds yet to first touch, along their load. Collective.
-
-        One that was released before rests wherever that ended, turned perhaps by more than the load
-        will press it together: it starts again from where it began.
-        """
-        self._cold = self.increment == 0
-        if not len(self.motions.free):
-            return
-        borne, outside = (
-            np.abs(self.motions.resultants(forces)).max(initial=0.0)
-            for forces in (self.full.contact_force(), load)
-        )
-        if borne < _IDLE * outside:
-            self._cold = True
-            self.full.set_state(np.where(self.constrained, self.full.state(), self._rest))
-        for contact in self.contacts:
-            contact.evaluate()
-        touching = [bool(np.any(c.status != Status.OPEN)) for c in self.contacts]
-        if self._comm.allreduce(any(touching)):
-            return
-        way = self.motions.approach(load, self.operators)
-        if way is not None:
-            self.full.set_state(self.full.state() + way)
-
-    def _judge_all(
-        self, load: Array, *, kinematics: bool, assemble: bool
-    ) -> tuple[Verdict, EnergyState]:
+    def _judge_all(self, *, kinematics: bool, assemble: bool) -> tuple[Verdict, EnergyState]:
         """Judge a complete u by assembly, past SNES and its residual, or by K u. Collective."""
         if assemble:
             bulk = self.full.with_supports(self.bulk.assemble_residual())
         else:
-            bulk = self._product() - load
-        verdict, reaction = self._judged(self.full, bulk, kinematics=kinematics)
-        forces: dict[object, Forces] = {self.full.mark: self.full.forces(bulk, reaction)}
+            bulk = self.full.product_force()
+        verdict, found = self._judged(self.full, bulk, kinematics=kinematics)
+        forces: dict[object, Forces] = {self.full.mark: found}
         if self.solver.condensed and self.bulk.symmetric:
-            forces[self.solver.system.mark] = self._forces_kept()
+            forces[self.solver.system.mark] = self.solver.system.present_forces()
         return verdict, EnergyState.at(forces, self.contacts)
 
     def _judge_kept(self, *, kinematics: bool) -> tuple[Verdict, EnergyState]:
         """Judge the condensed equations; u stays behind. Collective."""
-        bulk = self.solver.system.bulk_force()
-        verdict, _ = self._judged(self.solver.system, bulk, kinematics=kinematics)
-        forces: dict[object, Forces] = {self.solver.system.mark: self._forces_kept()}
-        return verdict, EnergyState.at(forces, self.contacts)
+        system = self.solver.system
+        verdict, found = self._judged(system, system.bulk_force(), kinematics=kinematics)
+        return verdict, EnergyState.at({system.mark: found}, self.contacts)
 
     def _judged(
         self, system: System, bulk: Array, *, laws: bool = True, kinematics: bool = False
-    ) -> tuple[Verdict, Array]:
+    ) -> tuple[Verdict, Forces]:
         """`Judge.judge` for the increment that was solved last. Collective."""
         equations = self.solver.equations
         return self._judge.judge(
@@ -667,12 +624,6 @@ class ContactProblem:
             respond=self.solver.respond if kinematics else None,
         )
 
-    def _forces_kept(self) -> Forces:
-        bulk, contact = self.solver.system.bulk_force(), self.solver.system.contact_force()
-        return self.solver.system.forces(
-            bulk, np.where(self.solver.system.constrained, bulk + contact, 0.0)
-        )
-
     @interrupts_held()
     def commit(self) -> None:
         """Make the solved state the start of the next increment, history included. Collective.
@@ -680,9 +631,14 @@ class ContactProblem:
         It is what `solve` found, whatever has changed since: constants, or u. Where nothing was
         solved since the last commit nothing happens. If it fails, the history is as before.
         """
-        solved, self._solved = self._solved, None
-        if solved is None:
+        if self._solved is None:
             return
+        solutions = zip(self.contacts, self._solved.contacts, strict=True)
+        due = [contact.opposite.pairs_due(found.points) for contact, found in solutions]
+        if any(due):  # which takes all of u, whatever of it was wanted
+            self.complete()
+            assert self._solved
+        solved, self._solved = self._solved, None
         before = [c.committed() for c in self.contacts]
         try:
             self.full.set_state(solved.state)
@@ -723,8 +679,8 @@ class ContactProblem:
         Returns:
             Rows over this rank's unknowns, (6, n_local): their values, by how much the last
             increment moved them, internal and external forces at them (force), and masks of those
-            kept when condensed and of those with Dirichlet conditions; and two numbers: of
-            increments, and how many of them were expected.
+            kept when condensed and of those with Dirichlet conditions; and numbers: of increments,
+            how many of them were expected, and of each contact whether pairs are found anew.
 
         Raises:
             ValueError: The state is not that of the last commit.
@@ -745,7 +701,8 @@ class ContactProblem:
             kept[self.solver.system.unknowns.kept] = 1.0
         rate = np.zeros_like(kept) if self._rate is None else self._rate
         rows = (self._committed, rate, forces.internal, forces.external, kept, self.constrained)
-        numbers = np.array([self.increment, self.solver.expected], dtype=np.float64)
+        anew = [contact.opposite.pairs_anew for contact in self.contacts]
+        numbers = np.array([self.increment, self.solver.expected, *anew], dtype=np.float64)
         return np.stack(rows).astype(np.float64), numbers
 
     @contextmanager
@@ -784,7 +741,7 @@ class ContactProblem:
             points: Of every contact what `Contact.take_up` takes.
         """
         state, rate, internal, external, kept, _ = rows
-        increment, expected = (int(value) for value in numbers)
+        increment, expected, *anew = (int(value) for value in numbers)
         self.expect(expected)
         self._fresh, self._solved = False, None
         self.solver.keep(np.flatnonzero(kept).astype(np.int32))
@@ -793,8 +750,8 @@ class ContactProblem:
         self.full.set_state(state)
         load = self.present_load()
         self.full.begin(load)
-        for contact, (history, values) in zip(self.contacts, points, strict=True):
-            contact.take_up(history, values)
+        for contact, (history, values), found in zip(self.contacts, points, anew, strict=True):
+            contact.take_up(history, values, anew=bool(found))
         forces: dict[object, Forces] = {self.full.mark: Forces(state, internal, external)}
         energy = EnergyState.at(forces, self.contacts)
         energy = energy.between([c.opposite.committed_jump for c in self.contacts])

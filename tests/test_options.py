@@ -9,6 +9,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from scenes.comparing import raised_everywhere
 from scenes.processes import command, environment
 from scenes.rubbing import Rub, walk
 
@@ -83,6 +84,25 @@ def test_who_wins(command_line) -> None:
     assert made.problem.snes.getType() == "newtonls"
     usual = Rub(prefix="").problem.snes.getTolerances()[3]
     assert usual == Rub().problem.snes.getTolerances()[3] != 9
+
+
+@pytest.mark.parametrize("said", ["command line", "petsc_options"])
+@pytest.mark.parametrize(
+    ("name", "value", "why"),
+    [
+        ("snes_max_it", "many", "Input string many"),
+        ("snes_rtol", "-3", "must be non-negative"),
+        ("tangent_ksp_type", "gmresss", "KSP type gmresss"),
+        ("continuation_snes_max_it", "-5", "must be non-negative"),
+    ],
+)
+def test_values_that_petsc_refuses(command_line, said, name, value, why) -> None:
+    """They are named with what PETSc says of them, wherever they were given."""
+    options = {"petsc_options": {name: value}} if said == "petsc_options" else {}
+    if not options:
+        command_line(f"-contact_{name}", value)
+    words = "PETSc refuses an option of prefix", why, f"-contact_{name} {value}"
+    raised_everywhere(lambda: Rub(method="newton", **options), ValueError, *words)
 
 
 def test_one_command_line_for_all_ranks(command_line) -> None:

@@ -33,14 +33,21 @@ pytestmark = pytest.mark.mpi
 # ---- the same digits -----------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("update", "stop"), [("increment", 5), ("auto", 2), ("auto", 5)])
 @pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_pairs_found_anew(cell, condensation, tmp_path):
-    """Up a ramp: the pairs, and the unknowns kept when condensed, are those of the slid block."""
+def test_pairs_found_anew(cell, condensation, update, stop, tmp_path):
+    """Up a ramp: the pairs, and the unknowns kept when condensed, are those of the slid block.
+
+    By default they are found anew only once it has slid: broken off before, and after that.
+    """
     make = lambda: Ramp(  # noqa: E731
-        cell=cell, condensation=condensation, n=(10, 4) if cell == "quadrilateral" else (6, 2)
+        cell=cell,
+        condensation=condensation,
+        update=update,
+        n=(10, 4) if cell == "quadrilateral" else (6, 2),
     )
-    goes_on(make, shared_folder(tmp_path), stop=5)
+    goes_on(make, shared_folder(tmp_path), stop=stop)
 
 
 LAWS = {

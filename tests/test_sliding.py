@@ -14,15 +14,16 @@ K_N = 1e7
 pytestmark = pytest.mark.mpi
 
 
+@pytest.mark.parametrize("update", ["increment", "auto"])
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
-def test_found_where_the_body_has_gone(cell):
+def test_found_where_the_body_has_gone(cell, update):
     """A block that was carried over the base and then pressed is one that stood there before.
 
     Both solve the same equations, to the solver's tolerance.
     """
     n = (14, 4) if cell in ("triangle", "quadrilateral") else (7, 2)
     law = fc.Frictionless(k_n=K_N)
-    carried, standing = (Slider(cell, law, start=s, n=n) for s in (0.4, 1.73))
+    carried, standing = (Slider(cell, law, start=s, n=n, update=update) for s in (0.4, 1.73))
     carried.step(-0.01, 1.33)  # lifted, so that nothing touches
     assert carried.contact.resultants().normal_force == 0.0
     carried.step(0.002, 1.33)
@@ -89,7 +90,55 @@ def test_off_the_edge_points_are_open_and_counted():
     assert made.contact.resultants().normal_force > 0
 
 
-def test_update_has_two_values():
+@pytest.mark.parametrize("condensation", [None, False])
+def test_by_default_found_anew_from_a_quarter_of_a_facet_on(condensation):
+    """Pairs stay while points slip little, as with "never", and follow from then on.
+
+    The facets of Γc are 0.25 long: a way of 0.05 is not yet a quarter of them, one of 0.1 is.
+    What comes then is what the same steps give that were followed from the start, to what the
+    pairs of the first few differ by: the facets of both match in size, 1e-3.
+    """
+    law = fc.Coulomb(0.3, k_n=K_N, k_t=K_N)
+    ways = [0.0, 0.05, 0.1, 0.2, 0.3]
+    made = {
+        update: Slider(
+            "quadrilateral", law, start=0.8, update=update, condensation=condensation, n=(14, 4)
+        )
+        for update in ("never", "auto", "increment")
+    }
+    numbers, forces = {}, {}
+    for update, slider in made.items():
+        slider.problem.kinematics = np.inf
+        first = slider.contact.pairs.number
+        numbers[update], forces[update] = [], []
+        for way in ways:
+            step = slider.step(0.002, way)
+            numbers[update].append(slider.contact.pairs.number - first)
+            forces[update].append(step.contacts["contact"].force)
+    assert numbers == {"never": [0] * 5, "auto": [0, 0, 1, 2, 3], "increment": [1, 2, 3, 4, 5]}
+    never, auto, increment = (np.array(forces[update]) for update in made)
+    assert close(auto[:3], never[:3], 1e-12)
+    assert close(auto[3:], increment[3:], 1e-3)
+
+
+def test_found_anew_where_the_field_lags():
+    """Where u may stay behind it is brought up for the search, and nothing else is found."""
+    law = fc.Coulomb(0.3, k_n=K_N, k_t=K_N)
+    forces = []
+    for field in (True, False):
+        made = Slider("quadrilateral", law, start=0.8, update="auto", condensation=True)
+        steps = []
+        for way in [0.0, 0.05, 0.1, 0.2]:
+            made.move[-1].value, made.move[0].value = -0.002, way
+            steps.append(made.problem.solve(field=field))
+            made.problem.commit()
+        assert [step.complete for step in steps] == [True] * 4 if field else [False] * 3 + [True]
+        assert made.contact.pairs.number > 1
+        forces.append([step.contacts["contact"].force for step in steps])
+    assert close(np.array(forces[1]), np.array(forces[0]), 1e-9)
+
+
+def test_update_has_three_values():
     """Anything else is refused."""
     mesh, tags = two_blocks("triangle", (3, 4))
     assert mesh is not None

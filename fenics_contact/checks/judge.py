@@ -13,6 +13,7 @@ from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.second_route import SecondRoute
 from fenics_contact.checks.verdict import Balance, Verdict, check_laws
 from fenics_contact.parallel import global_max, global_sum, warn
+from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.system import System
 from fenics_contact.types import Array
@@ -81,7 +82,7 @@ class Judge:
         rtol: float,
         laws: bool = True,
         respond: Respond | None = None,
-    ) -> tuple[Verdict, Array]:
+    ) -> tuple[Verdict, Forces]:
         """Recompute residual, balance and laws at evaluated contacts. Collective.
 
         Args:
@@ -94,7 +95,7 @@ class Judge:
             respond: To look at what small displacements leave out; None: it is not looked at.
 
         Returns:
-            The verdict, and the reactions at the unknowns.
+            The verdict, and the forces at the unknowns, reactions included.
         """
         contacts = system.contact_forces(evaluated=not laws)
         total = sum(contacts, bulk)
@@ -126,7 +127,7 @@ class Judge:
             inverted=self._full.bulk.is_inverted(),
             routes=self._second_route.compare() if self._second_route and laws else {},
         )
-        return verdict, reaction
+        return verdict, system.forces(bulk, reaction)
 
     def warn_of_large_motion(self, verdict: Verdict) -> None:
         """Say once of every contact that displacements are not small. Collective."""

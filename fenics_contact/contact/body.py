@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -14,11 +15,17 @@ from fenics_contact.contact.pairs import Pairs
 from fenics_contact.contact.point_law import PointLaw, PointTangent
 from fenics_contact.contact.present import PresentKinematics, PresentPairs
 from fenics_contact.contact.values import PointValues
+from fenics_contact.parallel import global_max
 from fenics_contact.supports.base import Placement
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.types import Array, Mask
 
 __all__ = ["BodyOpposite", "FollowedOpposite"]
+
+logger = logging.getLogger("fenics_contact")
+
+# Way along the opposite, in sizes of the point's facet, from which on pairs are found anew.
+_SLIDES = 0.25
 
 
 class BodyOpposite(Opposite):
@@ -62,27 +69,53 @@ class BodyOpposite(Opposite):
     @property
     def pairs_anew(self) -> bool:
         """See `Opposite`."""
+        found_before = self.pairs.found_at is not None
+        return self._update == "increment" or (self._update == "auto" and found_before)
+
+    @property
+    def may_pair_anew(self) -> bool:
+        """See `Opposite`."""
+        return self._update != "never"
+
+    @property
+    def _update(self) -> str:
         support = self._parts.support
-        return isinstance(support, DeformableBody) and support.update == "increment"
+        assert isinstance(support, DeformableBody)
+        return support.update
+
+    def pairs_due(self, values: PointValues) -> bool:
+        """See `Opposite`."""
+        if self.pairs_anew or self._update != "auto":
+            return self.pairs_anew
+        ways = np.linalg.norm(values.arrays["slide"], axis=1) / self._parts.quadrature.facet_sizes
+        return global_max(self._mesh.comm, ways[self.pairs.paired]) > _SLIDES
 
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
         """See `Opposite`."""
         self.update_data()
         self.pairs.find(self.data.values["x"], self.data.values["normal"], depth, u)
 
-    def resume(self, depth: Array, evaluate: Callable[[], PointValues]) -> None:
+    def resume(self, depth: Array, evaluate: Callable[[], PointValues], *, anew: bool) -> None:
         """See `Opposite`: the pairs by which points were as deep as that are gone."""
-        if self.pairs_anew:
+        if anew:
             self.find_pairs(self._parts.displacement.u, depth)
-        super().resume(depth, evaluate)
-        if self.pairs_anew:  # to the last digit as `commit` has it
+        super().resume(depth, evaluate, anew=anew)
+        if anew:  # to the last digit as `commit` has it
             self.committed_jump = self.present_jump()
 
     def commit(self, values: PointValues) -> Array | None:
         """See `Opposite`."""
+        due = self.pairs_due(values)
         super().commit(values)
-        if not self.pairs_anew:
+        if not due:
             return None
+        if not self.pairs_anew and self._mesh.comm.rank == 0:
+            logger.info(
+                "%s: pairs are found anew at every increment from here on: points have moved along "
+                "the opposite by more than %g of a facet",
+                self._parts.name,
+                _SLIDES,
+            )
         # The traction stays with the points of Γc; what they slip over has moved on.
         self.find_pairs(self._parts.displacement.u, values.depth)
         self.committed_jump = self.present_jump()
@@ -137,6 +170,15 @@ class FollowedOpposite(BodyOpposite):
         return False
 
     @property
+    def may_pair_anew(self) -> bool:
+        """See `Opposite`: they follow without."""
+        return False
+
+    def pairs_due(self, values: PointValues) -> bool:
+        """See `Opposite`."""
+        return False
+
+    @property
     def flat(self) -> bool:
         """See `Opposite`."""
         return self._present.flat
@@ -166,10 +208,10 @@ class FollowedOpposite(BodyOpposite):
         turned = {n: self.turned(fields[n]) for n in ("traction", "jump") if n in fields}
         return dict(fields) | turned
 
-    def resume(self, depth: Array, evaluate: Callable[[], PointValues]) -> None:
+    def resume(self, depth: Array, evaluate: Callable[[], PointValues], *, anew: bool) -> None:
         """See `Opposite`."""
         self._present.commit()
-        super().resume(depth, evaluate)
+        super().resume(depth, evaluate, anew=anew)
 
     def commit(self, values: PointValues) -> Array | None:
         """See `Opposite`."""

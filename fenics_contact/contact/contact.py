@@ -172,6 +172,7 @@ class Contact(PointResults):
         self.displacement = Displacement(u, surface.mesh, name)
         self.u, degree = self.displacement.u, self.displacement.degree
         try:
+            support.check_complete()
             law.check_complete()
             law.check_dimension(gdim)
         except ValueError as error:
@@ -416,7 +417,7 @@ class Contact(PointResults):
         data = self.opposite.data.values
         names = ["weight", "normal", "shift", "turn", "about", "axis"]
         # Else it is that of the latest pairs.
-        if self.gap_prescribed or not self.opposite.pairs_anew:
+        if self.gap_prescribed or not self.opposite.may_pair_anew:
             names.append("initial_gap")
         return {n: v for n, v in data.items() if n in names or n.startswith("parameter ")}
 
@@ -636,12 +637,13 @@ class Contact(PointResults):
         self.opposite.set_state(state.opposite)
         self.commits, self._committed_values = state.commits, state.points
 
-    def take_up(self, history: Array, values: Mapping[str, Array]) -> None:
+    def take_up(self, history: Array, values: Mapping[str, Array], *, anew: bool) -> None:
         """Make a state of another run the committed one, at the u that it has. Collective.
 
         Args:
             history: `PointFields.rows` of that run, with ``u`` and loads as they were in it.
             values: The arrays of its `values`, for the results to be those of its solution.
+            anew: Whether pairs were found anew at its commits.
         """
         self.history.set_rows(history)
         self._committed_values = None
@@ -651,7 +653,7 @@ class Contact(PointResults):
             return self.values
 
         unknown = np.zeros(self.quadrature.n_points)
-        self.opposite.resume(values.get("depth", unknown), present)
+        self.opposite.resume(values.get("depth", unknown), present, anew=anew)
         self.commits += 1
         mine = self.values.arrays
         if {n: v.shape for n, v in values.items()} == {n: v.shape for n, v in mine.items()}:

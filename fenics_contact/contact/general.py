@@ -44,7 +44,7 @@ def contact_pairs(
     tags: int | Sequence[int] | None = None,
     surface_on: Sequence[Hashable] = (),
     itself: bool = False,
-    update: str = "never",
+    update: str = "auto",
     release: float | None = None,
     **options: Any,
 ) -> list[Contact]:

@@ -348,6 +348,19 @@ class Opposite(ABC):
         return False
 
     @property
+    def may_pair_anew(self) -> bool:
+        """Whether pairs are, or may come to be, other ones than those of the undeformed bodies."""
+        return False
+
+    def pairs_due(self, values: PointValues) -> bool:
+        """Whether `commit` will find pairs anew, for which it needs all of ``u``. Collective.
+
+        Args:
+            values: Of the state to be committed.
+        """
+        return False
+
+    @property
     def flat(self) -> bool:
         """See the class."""
         return False
@@ -403,12 +416,13 @@ class Opposite(ABC):
         self.committed_jump = values.jump
         self.committed_angle = self.angle(values)
 
-    def resume(self, depth: Array, evaluate: Callable[[], PointValues]) -> None:
+    def resume(self, depth: Array, evaluate: Callable[[], PointValues], *, anew: bool) -> None:
         """Take the present ``u`` for the committed one, of another run. Collective.
 
         Args:
             depth: Of the points in the opposite then, (n_points,) (length).
             evaluate: Gives what is at the points now.
+            anew: Whether pairs were found anew there, see `pairs_anew`.
         """
         self.count_from(evaluate())
 

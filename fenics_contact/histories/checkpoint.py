@@ -51,7 +51,7 @@ __all__ = [
 
 logger = logging.getLogger("fenics_contact")
 
-_FORMAT = 3
+_FORMAT = 4
 # The file's end: these words, and the digest of all before them.
 _MARK = b"\nfenics_contact checkpoint, sha256 "
 # Distance, relative to the mesh, within which a place is found again: computed on other ranks its
@@ -539,7 +539,7 @@ def _compare_shapes(
     gdim, n_motions = len(problem.displacement.u), problem.unknowns.n_motions
     wanted: dict[str, tuple[int | None, ...]] = {
         "numbers": (None,),
-        "state": (2,),
+        "state": (2 + len(problem.contacts),),
         "motions": (6, n_motions),
         "stiffness": (2, 9),
         "loads": (2, 3 + n_motions),

@@ -131,9 +131,28 @@ class Defaults:
         self.set(options, prefix + part)
         monitors = {name: self.get(prefix + name) for name in _MONITORS}
         self.set({k: v for k, v in monitors.items() if v is not None}, prefix + part)
-        with self.present():
-            snes.setFromOptions()
+        self.let_read(snes)
         return snes
+
+    def let_read(self, solver: PETSc.SNES | PETSc.KSP) -> None:
+        """Let a solver take the options of its prefix. Collective.
+
+        Raises:
+            ValueError: PETSc refuses one of them; the text has all that were given.
+        """
+        with self.present():
+            try:
+                solver.setFromOptions()
+            except PETSc.Error as error:
+                prefix = solver.getOptionsPrefix() or ""
+                here = PETSc.Options().getAll().items()
+                mine = {k: v for k, v in here if k in self._given or k not in self._values}
+                told = [f"-{k} {v}" for k, v in sorted(mine.items()) if k.startswith(prefix)]
+                why = str(error).splitlines()[-1].split("] ", 1)[-1]
+                raise ValueError(
+                    f"PETSc refuses an option of prefix {prefix!r}: {why}; given are "
+                    f"{', '.join(told) or 'none'}"
+                ) from error
 
     @contextmanager
     def present(self) -> Iterator[None]:

@@ -209,8 +209,7 @@ class Solver:
             options.set(
                 self.system.linear_solver(symmetric=symmetric, accurate=not quasi_newton), part
             )
-            with options.present():
-                ksp.setFromOptions()
+            options.let_read(ksp)
             equations.solvers[consistent] = ksp
         this: Solver = weakref.proxy(self)  # SNES would keep what keeps it
         main = QuasiNewton if quasi_newton else Newton
@@ -218,8 +217,8 @@ class Solver:
         self._quasi_newton = quasi_newton
         self._forget_matrices()
         self.main.attach(consistent=not quasi_newton)
+        options.let_read(snes)
         with options.present():
-            snes.setFromOptions()
             snes.setUp()
 
         def newton_solver(symmetric: bool) -> dict[str, Any]:

@@ -190,6 +190,23 @@ class Support:
     displacement: Any = None
     rotation: Rotation | None = None
 
+    def check_complete(self) -> None:
+        """Refuse a subclass that does not say where the support is.
+
+        Raises:
+            ValueError: It names what is missing.
+        """
+        self._check_said(Support, place="its gap and direction, as UFL")
+
+    def _check_said(self, abstract: type[Support], **members: str) -> None:
+        """Refuse members that are still those of a class that has them only to be replaced."""
+        for member, meaning in members.items():
+            if getattr(type(self), member) is getattr(abstract, member):
+                raise ValueError(
+                    f"{type(self).__name__} is no support: a subclass of {abstract.__name__} must "
+                    f"say its {member}: {meaning}"
+                )
+
     @property
     def is_distance(self) -> bool:
         """Whether the direction of `place` is the gradient of its gap, as it was given."""
@@ -239,6 +256,15 @@ class SampledSupport(Support):
     and their derivatives are those of the distance itself. Subclasses have ``displacement`` and
     ``rotation`` as attributes; see `Support`.
     """
+
+    def check_complete(self) -> None:
+        """See `Support.check_complete`."""
+        self._check_said(
+            SampledSupport,
+            gdim="the dimension of space, 2 or 3",
+            fingerprint="a word that tells its data from others",
+            sample="distance, normal and curvature at places, in numbers",
+        )
 
     @property
     def gdim(self) -> int:

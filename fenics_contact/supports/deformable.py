@@ -28,7 +28,8 @@ class DeformableBody(Support):
         search_distance: Points whose opposite lies farther (length) than this have none; no limit
             by default.
         update: "never": the pairs are those of the undeformed bodies; "increment": they are found
-            anew in the deformed bodies at every commit, for slip over many facets. Normals stay
+            anew in the deformed bodies at every commit; "auto": likewise, from the first commit on
+            at which a point has moved along its opposite by a quarter of its facet. Normals stay
             those of the undeformed Γc (small rotations). With `Contact(kinematics="finite")` they
             are those of the present bodies, whatever this says.
         release: How far behind a point (length) its opposite may lie, where the bodies penetrate
@@ -40,7 +41,7 @@ class DeformableBody(Support):
     facet_tags: dolfinx.mesh.MeshTags
     tags: int | Sequence[int]
     search_distance: float = np.inf
-    update: str = "never"
+    update: str = "auto"
     release: float | None = None
 
     def __post_init__(self) -> None:
@@ -50,7 +51,10 @@ class DeformableBody(Support):
                 f"search_distance is {self.search_distance!r}; it must be a length greater "
                 "than zero"
             )
-        if self.update not in ("never", "increment"):
-            raise ValueError(f"update is {self.update!r}; use 'never' or 'increment'")
+        if self.update not in ("auto", "never", "increment"):
+            raise ValueError(f"update is {self.update!r}; use 'auto', 'never' or 'increment'")
         if self.release is not None and not self.release >= 0:
             raise ValueError(f"release is {self.release!r}; it must be a length, zero or greater")
+
+    def check_complete(self) -> None:
+        """Its place is found by a search: nothing is missing."""

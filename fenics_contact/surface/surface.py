@@ -255,6 +255,14 @@ class SurfaceQuadrature:
         parents = self.surface.parent_facets()
         return self.space().dofmap.list[: parents.size][np.argsort(parents)]
 
+    @cached_property
+    def facet_sizes(self) -> Array:
+        """Length of the point's facet, in space the root of its area, (n_points,) (length)."""
+        rows, sizes = self.point_rows(), np.empty(self.n_points)
+        areas = self.weights[rows].sum(axis=1)
+        sizes[rows] = areas[:, None] ** (1.0 / (self.surface.mesh.geometry.dim - 1))
+        return sizes
+
     def interpolation_matrix(self, space: fem.FunctionSpace) -> PETSc.Mat:
         """Sparse matrix from the dofs of a function to its values at the points. Collective.
 

@@ -131,6 +131,17 @@ class FullSystem(System):
         """The residual of the bulk, and the forces on free supports. Collective."""
         return self.with_supports(self.bulk.residual())
 
+    def product_force(self) -> Array:
+        """The same by the bulk's matrix, if it is linear: K u less the loads. Collective."""
+        assert self.stiffness is not None
+        state, image = self.unknowns.vector(), self.unknowns.vector()
+        state.array[:] = self.state()
+        self.stiffness.mult(state, image)
+        force = np.asarray(image.array_r - self.load)
+        for vector in (state, image):
+            vector.destroy()
+        return force
+
     def bulk_energy(self) -> float:
         """This rank's part of the potential of a linear bulk and its loads, up to a constant."""
         # F(u) = K u + F(0), so that it is (F(u) + F(0))·u/2.

@@ -284,6 +284,15 @@ class System(ABC):
             reaction: Forces at the constrained unknowns, zero at others, (n,) (force).
         """
 
+    def present_forces(self, bulk: Array | None = None) -> Forces:
+        """`forces` of the present state, with the reactions that balance it. Collective.
+
+        Args:
+            bulk: Residual of the bulk, by default `bulk_force`.
+        """
+        bulk = self.bulk_force() if bulk is None else bulk
+        return self.forces(bulk, np.where(self.constrained, bulk + self.contact_force(), 0.0))
+
     @abstractmethod
     def forget(self) -> None:
         """Drop what was kept of earlier increments and could show in the digits of the next."""
