@@ -126,9 +126,9 @@ def global_sum(comm: MPI.Comm, values: npt.ArrayLike) -> Array:
 
 def global_max(comm: MPI.Comm, values: Array, empty: float = 0.0) -> float:
     """Largest entry over the ranks; ``empty`` where no rank has one; NaN wins. Collective."""
-    local = float(np.max(values)) if values.size else -np.inf
-    # max() of MPI has no rule for NaN, so it goes through a gather.
-    largest = float(np.max(comm.allgather(local)))
+    largest = float(values.max()) if values.size else -np.inf
+    if comm.size > 1:  # max() of MPI has no rule for NaN, so it goes through a gather
+        largest = float(np.max(comm.allgather(largest)))
     return empty if largest == -np.inf else largest
 
 

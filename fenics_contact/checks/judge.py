@@ -68,7 +68,8 @@ class Judge:
         """
         imposed = [self._full.state()[self._full.constrained]]
         for contact in self._contacts:
-            imposed += [contact.values.shift, contact.values.initial_gap]
+            data = contact.opposite.data.values
+            imposed += [data["shift"], data["initial_gap"]]
         largest = (global_max(self._comm, np.abs(v)) for v in imposed)
         self._imposed = max(self._motions.size, *largest)
         return _FARTHEST * self._imposed

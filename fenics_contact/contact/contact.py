@@ -404,8 +404,9 @@ class Contact(PointResults):
         """
         self.surface.check_places(self.name)
         self.inputs.update()
-        self.evaluate()
-        self.inputs.check(self.values)
+        self.opposite.update()
+        self.forget()
+        self.inputs.check(self.opposite.data.values)
 
     def given(self) -> dict[str, Array]:
         """The data of law, support and contact at this rank's points, by name. Collective.

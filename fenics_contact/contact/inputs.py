@@ -322,24 +322,27 @@ class Inputs:
 
     # ---- checks ----------------------------------------------------------------------------------
 
-    def check(self, values: PointValues) -> None:
+    def check(self, data: Mapping[str, Array]) -> None:
         """Refuse what is out of range or not finite at some point of Γc. Collective.
 
         Args:
-            values: Evaluated with the data as they are.
+            data: As sampled at the points, by name; see `PointValues`.
 
         Raises:
             ValueError: On all ranks.
         """
-        comm, parameters = self._surface.mesh.comm, values.parameters
-        shortest = global_min(comm, values.direction_length, empty=1.0)
+        comm = self._surface.mesh.comm
+        prefix = "parameter "
+        parameters = {n.removeprefix(prefix): v for n, v in data.items() if n.startswith(prefix)}
+        shortest = global_min(comm, data["direction_length"], empty=1.0)
         if not shortest > 0.0:
             raise ValueError(
                 f"{self._name}: the normal of the support has length {shortest:g} at a point of "
                 "Γc; it must point from the body to the support everywhere"
             )
         # Only what was given: what follows from u is checked with u.
-        given = {"weight": values.weight, "gap": values.initial_gap, "normal": values.normal}
+        weight = data["weight"]
+        given = {"weight": weight, "gap": data["initial_gap"], "normal": data["normal"]}
         for name, array in {**given, **parameters}.items():
             low, high = global_min(comm, array), global_max(comm, array)
             if not (np.isfinite(low) and np.isfinite(high)):
@@ -352,17 +355,17 @@ class Inputs:
             positive = name in self._law.positive
             if low < 0 or (low == 0 and positive):
                 raise ValueError(_range_error(self._name, name, low, positive))
-        least = global_min(comm, values.weight)
+        least = global_min(comm, weight)
         if least < 0:
             raise ValueError(f"{self._name}: weight is negative at a point of Γc")
-        if self._quadrature.at_vertices and least <= _NOTHING * global_max(comm, values.weight):
+        if self._quadrature.at_vertices and least <= _NOTHING * global_max(comm, weight):
             raise ValueError(
                 f"{self._name}: weight is {least:g} at a vertex of Γc, as 2πr is on the axis, and "
                 'with quadrature_scheme="vertex" that is its area: whatever its pressure, it bears '
                 "nothing; take the default rule, whose points lie inside of the facets"
             )
         if "direction" in parameters:
-            self._check_direction(parameters, values)
+            self._check_direction(parameters["direction"], data["normal"])
 
     def check_side(self, values: PointValues, *, gap_prescribed: bool) -> None:
         """Refuse, or warn of, a support that all of Γc looks away from. Collective.
@@ -389,10 +392,9 @@ class Inputs:
         if comm.rank == 0:
             logger.warning(text)
 
-    def _check_direction(self, parameters: Mapping[str, Array], values: PointValues) -> None:
-        given = parameters["direction"]
+    def _check_direction(self, given: Array, normal: Array) -> None:
         length = np.linalg.norm(given, axis=1)
-        across = np.linalg.norm(values.tangential(given), axis=1)
+        across = np.linalg.norm(given - np.sum(given * normal, axis=1)[:, None] * normal, axis=1)
         share = across / np.where(length > 0, length, 1.0)
         least = global_min(self._surface.mesh.comm, share, empty=1.0)
         if not least > _PARALLEL:

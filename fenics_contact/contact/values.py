@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -80,6 +80,12 @@ class Resultants:
     def area(self) -> float:
         """Measure of the closed part."""
         return self.extents["contact"].area
+
+
+@lru_cache(maxsize=64)
+def _everywhere(value: float, shape: tuple[int, ...]) -> Array:
+    """An array of one value, which cannot be written to."""
+    return np.broadcast_to(value, shape)
 
 
 @dataclass(frozen=True)
@@ -174,13 +180,13 @@ class PointValues:
         }
 
         def get(name: str, *shape: int) -> Array:
-            return arrays[name] if name in arrays else np.broadcast_to(0.0, (n, *shape))
+            return arrays[name] if name in arrays else _everywhere(0.0, (n, *shape))
 
-        stiffness: Array = np.broadcast_to(0.0, (n, d, d))
+        stiffness = _everywhere(0.0, (n, d, d))
         if "tangential_stiffness 0" in arrays:
             rows = [arrays[f"tangential_stiffness {i}"] for i in range(d)]
             stiffness = np.stack(rows, axis=1)
-        by_penalty = parameters.get("k_n", np.broadcast_to(0.0, (n,)))
+        by_penalty = parameters.get("k_n", _everywhere(0.0, (n,)))
         scalars = (
             *("normal_reaction", "grip", "limit", "limit_told", "limit_slope", "dissipated"),
             *("multiplier", "depth"),
@@ -199,7 +205,7 @@ class PointValues:
             **{name: get(name) for name in scalars},
             **{name: get(name, d) for name in vectors},
             parameters=parameters,
-            paired=arrays.get("paired", np.broadcast_to(1.0, (n,))),
+            paired=arrays.get("paired", _everywhere(1.0, (n,))),
             normal_stiffness=arrays.get("normal_stiffness", by_penalty),
             tangential_stiffness=stiffness,
             slip_increment=get("slip_increment", 0),
