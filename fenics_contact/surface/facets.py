@@ -27,6 +27,8 @@ _OVERLAP = 1e-6
 _NEWTON_STEPS = 25
 # Pairs of points and facets looked at in one go, to bound the memory.
 _CHUNK = 2_000_000
+# How far from its middle a curved facet reaches, by the farthest of its corners.
+_BENT = 1.3
 
 
 def facet_cells(mesh: dolfinx.mesh.Mesh, facets: Index) -> Index:
@@ -205,8 +207,9 @@ class FacetSet:
         if n_facets == 0 or n == 0:
             return best
         every = np.arange(n_facets)
-        middle, tangents = self.positions(every, self._middle.repeat(n_facets, axis=0), u)
-        radius = 1.5 * np.linalg.norm(tangents, axis=1).max(axis=1)
+        middle, _ = self.positions(every, self._middle.repeat(n_facets, axis=0), u)
+        reach = np.linalg.norm(self.moved_corners(u) - middle[:, None], axis=2).max(axis=1)
+        radius = _BENT * reach
         near = min(_NEAREST, n_facets)
         away, candidates = scipy.spatial.cKDTree(middle).query(x, k=[*range(1, near + 1)])
         point, facet = np.repeat(np.arange(n), near), candidates.reshape(-1)
@@ -218,7 +221,7 @@ class FacetSet:
         # The nearest need not be the ones ahead: a long facet, or a far one. Where something was
         # met, all that is nearer has its middle within its own radius of there.
         missed = best[0] < 0
-        size = 1.1 * np.linalg.norm(self.moved_corners(u) - middle[:, None], axis=2).max()
+        size = 1.1 * reach.max()
         unsure = ~missed & (away[:, -1] < np.abs(best[2]) + size)
         for rows in (np.flatnonzero(missed), np.flatnonzero(unsure)):
             step = max(1, _CHUNK // n_facets)
@@ -272,10 +275,12 @@ class FacetSet:
             system[singular[rows]] = np.eye(d)
             rest[singular[rows]] = 0.0
             step = np.linalg.solve(system, -rest[..., None])[..., 0]
-            # Far outside, a curved facet may bend any way: stay near it.
-            place[rows] = np.clip(place[rows] + step[:, :-1], -1.0, 2.0)
+            # Far outside, a curved facet may bend any way: stay near it. What does not move any
+            # more has met the facet, or wants to leave there, now and in every further step.
+            old = place[rows]
+            place[rows] = np.clip(old + step[:, :-1], -1.0, 2.0)
             distance[rows] += step[:, -1]
-            rows = rows[np.any(np.abs(step[:, :-1]) >= 1e-13, axis=1)]
+            rows = rows[np.any(np.abs(place[rows] - old) >= 1e-13, axis=1)]
             if not len(rows):
                 break
         position, tangents = self.positions(facet, place, u)
