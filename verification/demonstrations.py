@@ -261,6 +261,22 @@ DEMOS = [
         budget="the formula is a fit, known to less than the error",
     ),
     demo(
+        "Tapered pin pressed in, released, pulled out, finite",
+        "0.5 % where pin and hub are level: axial displacements of the flanks 0.2 %, cells and "
+        "penalty 0.1 %; before that, bare ends over length; 1 % for the way by a dry force: strain "
+        "of the pin; 1 % for the work: trapezia",
+        "tapered_pin",
+        source={
+            "work": "energy",
+            "out": "no contact",
+            "released": "self-locking: tan α and μ",
+            "left": "statics: tan α and μ",
+            "dry, pu": "Lamé, Coulomb",
+            "": "Lamé",
+        },
+        budget="ends that are not covered and axial displacements weigh more than the error",
+    ),
+    demo(
         "Disc pressed into rubber, turned and dragged, finite",
         "1e-7 of the force that presses, the digits that are written down; 1e-10 between two "
         "routes of one program; 2 % for what penetration takes off the radius",

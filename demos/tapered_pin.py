@@ -1,0 +1,389 @@
+"""Tapered pin: pressed into a hub, released, pulled out; and what oil in the joint changes.
+
+Axisymmetric, lengths in mm, stresses in MPa, forces in N. A solid pin of steel stands in the taper
+1:50 of a thick hub of steel (slope of the flanks t = tan α = 0.01, mean radius 10, length 40,
+outer radius 30), without pressure. It is driven in by s = 2, until its ends are level with those of
+the hub: its flank passes over several facets of the bore, by which it comes to oversize s t = 0.02.
+
+    python demos/tapered_pin.py
+    python demos/tapered_pin.py --slope 0.02 --oil 0.01
+    mpirun -n 2 python demos/tapered_pin.py
+
+Three histories: dry (μ = 0.15 > t), both ends of the pin led in, and back until the pin is out;
+dry, pushed by a force, half of it on each end, that is taken away again; and the same with oil
+between pin and hub (μ = 0.005 < t), as it is injected to take such joints apart.
+
+References: Lamé's thick rings, slice by slice along the taper. The ends of the hub are on rollers,
+plane strain. The pin's ends are led (plane strain) or free (plane stress): friction strains the
+pin, but as much to the one side of its middle as to the other, so the mean over the joint holds.
+The pressure itself leans, with dry friction by an eighth at the ends. With Q the radial force on
+all of the joint, the pressure times its area is Q / (cos α (1 ∓ μ t)), the upper sign pushed in,
+and the forces are
+
+    in: Q tan(φ + α),    out: Q tan(φ - α),    tan φ = μ.
+
+So with μ > t the pin stays when the push is released, and has to be pulled. With
+μ < t this is negative: only a push of more than tan(α - φ) / tan(α + φ), a third of the first,
+holds the pin, and as the push gets less it comes out in proportion to it, all the way.
+
+Lamé's slices hold where pin and hub are level, at the end of the way in; there they are met to
+0.5 %: the axial displacements of the flanks make 0.2 % of the interference, cells and penalty
+0.1 %. On the way there the bare ends, each as long as e, are still loaded by their neighbours, and
+the joint is stiffer by up to e over its length. The exit code is 1 if a reference is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import dolfinx
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from tqdm import tqdm
+
+import fenics_contact as fc
+from fenics_contact import output, plotting
+from fenics_contact.elasticity import LinearElastic
+
+E, NU, OVERSIZE = 210e3, 0.3, 0.02
+R, OUTER, LENGTH = 10.0, 30.0, 40.0
+BOTTOM, TOP, INSIDE, OUTSIDE = 1, 2, 3, 4
+TURNING = 0.006  # shares of the way in in which friction turns round
+BITS = 6
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Lamé's slices of a joint.
+
+    Attributes:
+        slope: tan α.
+        friction: μ.
+        free_ends: Of the pin: plane stress; else plane strain.
+    """
+
+    slope: float
+    friction: float
+    free_ends: bool
+
+    @property
+    def way(self) -> float:
+        """That makes the oversize (length)."""
+        return OVERSIZE / self.slope
+
+    def lame(self, s: float, z: np.ndarray) -> np.ndarray:
+        """Radial traction between pin and hub at the heights ``z`` (stress)."""
+        r = R + self.slope * (z - LENGTH / 2)
+        modulus, nu = E / (1 - NU**2), NU / (1 - NU)  # of plane strain
+        hub = ((OUTER**2 + r**2) / (OUTER**2 - r**2) + nu) / modulus
+        pin = (1 - NU) / E if self.free_ends else (1 - nu) / modulus
+        return s * self.slope / (r * (hub + pin))
+
+    def pressure(self, s: float, z: np.ndarray, way: int) -> np.ndarray:
+        """Normal to the flank: pushed in (``way`` 1) friction bears a part of it, out (-1) adds."""
+        return self.lame(s, z) / (1 - way * self.friction * self.slope)
+
+    def mean_pressure(self, s: float, way: int) -> float:
+        """Over the joint's area."""
+        z = np.linspace(0, LENGTH, 201)
+        r = R + self.slope * (z - LENGTH / 2)
+        return float(np.trapezoid(r * self.pressure(s, z, way), z) / np.trapezoid(r, z))
+
+    def force(self, s: float, way: int) -> float:
+        """On the pin after the way ``s``: a push is positive, ``way`` as above (force)."""
+        z = np.linspace(0, LENGTH, 201)
+        r = R + self.slope * (z - LENGTH / 2)
+        covered = 1 - (self.way - s) / LENGTH
+        radial = covered * float(np.trapezoid(2 * np.pi * r * self.lame(s, z), z))
+        return radial * self.tangent(way)
+
+    def tangent(self, way: int) -> float:
+        """tan(α ± φ): force along over radial force."""
+        t, m = self.slope, way * self.friction
+        return (t + m) / (1 - t * m)
+
+
+@dataclass
+class Scene:
+    """Pin and hub, their contact, and what has been found of them.
+
+    Attributes:
+        joint: Its reference.
+        way: How far the ends of the pin are led (length).
+        traction: On both ends of the pin, downwards (stress).
+        path: Load parameter, way and push after every increment; a pull is negative.
+        pressures: By name, heights of the points of the joint at its ends, and their pressure.
+    """
+
+    joint: Joint
+    steel: LinearElastic
+    problem: fc.ContactProblem
+    way: fem.Constant
+    traction: fem.Constant
+    path: list[tuple[float, float, float]] = field(default_factory=list)
+    iterations: list[int] = field(default_factory=list)
+    pressures: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    mean_pressure: dict[str, float] = field(default_factory=dict)
+    dissipation: float = 0.0
+
+    def lead(self, steps: list[float]) -> None:
+        """Go on to the ways ``steps`` (ends led), or to these shares of the push. Collective."""
+        joint, contact = self.joint, self.problem.contacts[0]
+        area = np.pi * sum(
+            (R + joint.slope * (z - LENGTH / 2)) ** 2 for z in (joint.way, joint.way + LENGTH)
+        )
+        most = joint.force(joint.way, 1)
+
+        def load(value: float) -> None:
+            if joint.free_ends:
+                self.traction.value = value * most / area
+            else:
+                self.way.value = -value
+
+        start = self.path[-1][0] if self.path else 0.0
+        history: Any = fc.increments(self.problem, load, start, steps[-1], steps=steps)
+        words = f"μ = {joint.friction:g}, {'force' if joint.free_ends else 'way'}"
+        quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
+        for step in tqdm(history, words, len(steps), disable=quiet, unit="increment"):
+            # Friction strains both halves of the pin, one as much as the other.
+            ends = [
+                output.at_node(self.problem.u, (0.0, z))[1] for z in (joint.way, joint.way + LENGTH)
+            ]
+            push = float(contact.resultants().force[1])
+            self.path.append((step.load, -float(np.mean(ends)), push))
+            self.iterations.append(step.iterations)
+            self.dissipation += step.energy.dissipation
+
+    def keep(self, name: str) -> None:
+        """Keep the pressure along the joint as it is now. Collective."""
+        points = self.problem.contacts[0].gather()
+        order = np.argsort(points["x"][:, 1])
+        z, pressure = points["x"][order, 1] - self.path[-1][1], points["pressure"][order]
+        self.pressures[name] = (z, pressure)
+        area = 2 * np.pi * R * LENGTH * np.hypot(1, self.joint.slope)
+        self.mean_pressure[name] = float(points["pressure"] @ points["measure"] / area)
+
+    def at(self, load: float) -> tuple[float, float]:
+        """Way and push when the load parameter was last ``load``."""
+        return next((s, f) for q, s, f in reversed(self.path) if abs(q - load) < 1e-9)
+
+
+def block(
+    flanks: tuple[tuple[float, float], tuple[float, float]],
+    heights: tuple[float, float],
+    cells: tuple[int, int],
+) -> tuple[dolfinx.mesh.Mesh, None, dolfinx.mesh.MeshTags]:
+    """A section between two flanks, each a radius at z = LENGTH/2 and a slope. Collective."""
+    low, high = heights
+    mesh = dolfinx.mesh.create_rectangle(
+        MPI.COMM_WORLD, [(0, low), (1, high)], cells, dolfinx.mesh.CellType.quadrilateral
+    )
+    facets = dolfinx.mesh.locate_entities_boundary(mesh, 1, lambda x: np.isfinite(x[0]))
+    x, z, _ = dolfinx.mesh.compute_midpoints(mesh, 1, facets).T
+    sides = [np.isclose(z, low), np.isclose(z, high), np.isclose(x, 0), np.isclose(x, 1)]
+    tags = np.select(sides, [BOTTOM, TOP, INSIDE, OUTSIDE]).astype(np.int32)
+    share, z = mesh.geometry.x[:, 0].copy(), mesh.geometry.x[:, 1]
+    inner, outer = (r + slope * (z - LENGTH / 2) for r, slope in flanks)
+    mesh.geometry.x[:, 0] = inner + (outer - inner) * share
+    return mesh, None, dolfinx.mesh.meshtags(mesh, 1, facets, tags)
+
+
+def make(joint: Joint, cells: int) -> Scene:
+    """Pin and hub as they touch, the pin higher by the way it has to go. Collective."""
+    # Cells of the pin, which has Γc, are half as long as those of the hub: of equal ones the
+    # pressures scatter three times as much.
+    flank, finer = (R, joint.slope), round(2.1 * cells)
+    parts = {
+        "hub": block((flank, (OUTER, 0.0)), (0.0, LENGTH), (6, cells)),
+        "pin": block(((0.0, 0.0), flank), (joint.way, joint.way + LENGTH), (3, finer)),
+    }
+    joined = fc.join_meshes(parts)
+    mesh = joined.mesh
+    V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
+    u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
+    # Small strains, as Lamé has them: a body that is moved along its axis is the same for them.
+    steel = LinearElastic(u, E, NU, "axisymmetric")
+    way, traction = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
+    ends = tuple(joined.facet("pin", tag) for tag in (BOTTOM, TOP))
+    rollers = tuple(joined.facet("hub", tag) for tag in (BOTTOM, TOP))
+
+    def hold(i: int, tags: tuple[int, ...], value: Any) -> fem.DirichletBC:
+        facets = np.concatenate([joined.facets.find(tag) for tag in tags])
+        return fem.dirichletbc(value, fem.locate_dofs_topological(V.sub(i), 1, facets), V.sub(i))
+
+    bcs = [hold(1, rollers, 0.0), hold(0, (joined.facet("pin", INSIDE),), 0.0)]
+    F = steel.residual(v)
+    if joint.free_ends:
+        ds = ufl.Measure("ds", domain=mesh, subdomain_data=joined.facets)
+        F += steel.weight * traction * v[1] * ds(ends)
+    else:
+        bcs.append(hold(1, ends, way))
+    contact = fc.Contact(
+        u,
+        fc.ContactSurface(mesh, joined.facets, joined.facet("pin", OUTSIDE)),
+        fc.DeformableBody(joined.facets, joined.facet("hub", INSIDE)),
+        # Springs of 10 E/h would take 1 % off the interference; soft ones along the joint give way
+        # by less than a micrometre, and friction that turns round takes fewer steps.
+        fc.Coulomb(joint.friction, fc.Scaled(100), fc.Scaled(1)),
+        kinematics="finite",
+        weight=steel.weight,
+    )
+    problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method="newton")
+    return Scene(joint, steel, problem, way, traction)
+
+
+def led(joint: Joint, cells: int) -> Scene:
+    """In, back, and out. Collective."""
+    scene, s = make(joint, cells), joint.way
+    # Increments of a fifth of a facet; where friction turns round, of a thousandth of the way.
+    number = 2 * int(np.ceil(s / (0.4 * LENGTH / cells)))
+    way_in = [s * i / number for i in range(1, number + 1)]
+    scene.lead(way_in)
+    scene.keep("pushed")
+    scene.lead([s * (1 - TURNING * i / BITS) for i in range(1, 2 * BITS + 1)])
+    scene.keep("pulled")
+    scene.lead([*(x for x in reversed(way_in) if x < 0.98 * s), 0.0, -0.02 * s])
+    return scene
+
+
+def forced(joint: Joint, cells: int) -> Scene:
+    """By a force on the pin, which is taken away again. Collective.
+
+    Load parameters are shares of the push that brings the pin in.
+    """
+    scene = make(joint, cells)
+    scene.lead([0.1 * i for i in range(1, 11)])
+    scene.keep("pushed")
+    if joint.friction > joint.slope:
+        scene.lead([0.75, 0.5, 0.25, 0.0])
+    else:
+        hold = joint.tangent(-1) / joint.tangent(1)
+        # A tenth more than holds the pin; then less, evenly.
+        scene.lead([1.1 * hold, *(hold * i / 10 for i in range(9, -1, -1))])
+    return scene
+
+
+def compare(dry: Scene, pushed: Scene, oiled: Scene) -> dict[str, Any]:
+    """What was found beside Lamé and Coulomb."""
+    entries: dict[str, tuple[float, float, float]] = {}  # value, reference, tolerance
+    joint, s = dry.joint, dry.joint.way
+    # Of both ends that are not covered yet, over the joint's length.
+    bare = s / 2 / LENGTH
+    for name, way in (("pushed", 1), ("pulled", -1)):
+        at = s if way == 1 else s * (1 - 2 * TURNING)
+        value = dry.mean_pressure[name]
+        entries[f"mean pressure {name} [MPa]"] = (value, joint.mean_pressure(at, way), 0.005)
+        value = abs(dry.at(at)[1])
+        entries[f"dry, {name} [N]"] = (value, abs(joint.force(at, way)), 0.005)
+        # The last time, on the way back; so the first on the way in.
+        rows = dry.path if way == 1 else dry.path[::-1]
+        value = next(abs(f) for q, _, f in rows if abs(q - s / 2) < 1e-9)
+        entries[f"dry, {name} half-way [N]"] = (value, abs(joint.force(s / 2, way)), bare)
+    _, places, forces = np.array([(0.0, 0.0, 0.0), *dry.path]).T
+    gone = int(np.argmax((places < s) & (forces < 0) & (np.arange(len(places)) > 0)))
+    share = np.interp(0.0, forces[gone : gone - 2 : -1], places[gone : gone - 2 : -1]) / s
+    entries["dry, way left when released"] = (float(share), 1.0, 0.005)
+    entries["dry, force when out [N]"] = (forces[-1], 0.0, 1e-6 * joint.force(s, 1))
+    work = float(np.trapezoid(forces, places))
+    entries["work in and out over friction's"] = (work / dry.dissipation, 1.0, 0.01)
+
+    way = pushed.at(1.0)[0]
+    entries["dry, by force: way [mm]"] = (way, s, 0.01)
+    entries["dry, by force: left, released"] = (pushed.at(0.0)[0] / way, 1.0, 0.005)
+    way, hold = oiled.at(1.0)[0], oiled.joint.tangent(-1) / oiled.joint.tangent(1)
+    entries["oil: way [mm]"] = (way, s, 0.005)
+    entries["oil: left, held"] = (oiled.at(1.1 * hold)[0] / way, 1.0, 0.005)
+    for share in (0.5, 0.2):
+        name = f"oil: left, {share:g} of what holds"
+        entries[name] = (oiled.at(hold * share)[0] / way, share, (1 - share) * s / LENGTH)
+    entries["oil: left, released"] = (oiled.at(0.0)[0] / way, 0.0, 1e-6)
+    # Where cells of both do not match, stiff springs scatter from point to point.
+    z, pressure = oiled.pressures["pushed"]
+    share = pressure / oiled.joint.pressure(s, z, 1)
+    tenths = [share[np.floor(10 * z / LENGTH) == i].mean() for i in range(1, 9)]
+    uneven = float(np.abs(np.array(tenths) - 1).max())
+    entries["oil: unevenness, eight tenths"] = (uneven, 0.0, 0.02)
+    return output.compare(
+        {name: value for name, (value, _, _) in entries.items()},
+        {name: (reference, tolerance) for name, (_, reference, tolerance) in entries.items()},
+    )
+
+
+def draw(path: Path, dry: Scene, pushed: Scene, oiled: Scene) -> None:
+    """Pressure along the joint, and forces over the way. On this rank."""
+    joint, s = dry.joint, dry.joint.way
+    z = np.linspace(0, LENGTH, 200)
+    x = np.linspace(0, s, 100)
+    with plotting.figure(path, 3, (5.2, 4.6)) as (left, middle, right):
+        colours = {"pushed": "#1f5fa8", "pulled": "#c8502a"}
+        for name, colour in colours.items():
+            left.plot(*dry.pressures[name], ".", ms=3, color=colour, label=f"dry, {name}")
+        left.plot(*oiled.pressures["pushed"], ".", ms=3, color="#4a9a4a", label="oil, pushed")
+        left.plot(z, joint.pressure(s, z, 1), "k--", label="Lamé, pin led")
+        left.plot(z, oiled.joint.pressure(s, z, 1), "k:", label="Lamé, ends free")
+        left.set(xlabel="height in the hub [mm]", ylabel="contact pressure [MPa]")
+        left.set(title=f"Pressure along the joint, oversize {OVERSIZE:g} mm", ylim=(0, None))
+        left.legend()
+        _, places, forces = np.array([(0.0, 0.0, 0.0), *dry.path]).T
+        middle.plot(places, forces / 1e3, ".-", color="#1f5fa8", label="led in and out")
+        _, places, forces = np.array([(0.0, 0.0, 0.0), *pushed.path]).T
+        middle.plot(places, forces / 1e3, "x", color="#c8502a", label="pushed, released")
+        _, places, forces = np.array([(0.0, 0.0, 0.0), *oiled.path]).T
+        right.plot(places, forces / 1e3, ".-", color="#4a9a4a", label="pushed, released")
+        for ax, one in ((middle, joint), (right, oiled.joint)):
+            for way in (1, -1):
+                known = [one.force(at, way) / 1e3 for at in x]
+                label = "Q tan(φ ± α)" if way == 1 else None
+                ax.plot(x, known, "k--", lw=1, label=label)
+            ax.axhline(0, color="k", lw=0.5)
+            ax.set(xlabel="way of the pin s [mm]", ylabel="push (pull below zero) [kN]")
+            ax.legend(loc="upper left")
+        middle.set(title=f"Dry, μ = {joint.friction:g} > tan α = {joint.slope:g}: it stays")
+        right.set(title=f"Oil, μ = {oiled.joint.friction:g} < tan α: it comes out")
+        for ax in (left, middle, right):
+            ax.grid(alpha=0.25)
+
+
+def main() -> int:
+    """Press the pin in and get it out three times; 0 if every reference is met."""
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.add_argument("--slope", type=float, default=0.01, help="of the flanks, tan α")
+    parser.add_argument("--friction", type=float, default=0.15, help="dry, above the slope")
+    parser.add_argument("--oil", type=float, default=0.005, help="friction below the slope")
+    parser.add_argument("--cells", type=int, default=40, help="of the hub along the joint")
+    parser.add_argument("--output", type=Path, default=Path("output/tapered_pin"), help="folder")
+    arguments, _ = parser.parse_known_args()
+    slope, friction, oil = arguments.slope, arguments.friction, arguments.oil
+    if not 0 < oil < slope < friction:
+        parser.error("the pin needs 0 < oil < slope < friction")
+    start, comm = time.perf_counter(), MPI.COMM_WORLD
+    dry = led(Joint(slope, friction, free_ends=False), arguments.cells)
+    pushed = forced(Joint(slope, friction, free_ends=True), arguments.cells)
+    oiled = forced(Joint(slope, oil, free_ends=True), arguments.cells)
+    result: dict[str, Any] = {
+        "references": compare(dry, pushed, oiled),
+        "dofs": dry.problem.u.function_space.dofmap.index_map.size_global * 2,
+        "iterations": [one.iterations for one in (dry, pushed, oiled)],
+        "paths": [one.path for one in (dry, pushed, oiled)],
+        "wall_seconds": time.perf_counter() - start,
+    }
+    fc.Writer(arguments.output, pushed.problem, stress=pushed.steel.stress).write(1)
+    if comm.rank == 0:
+        print(f"{result['dofs']} dofs, {result['wall_seconds']:.1f} s")
+        print(output.table(result["references"]))
+        draw(arguments.output / "tapered_pin.png", dry, pushed, oiled)
+    output.write_json(arguments.output / "result.json", result, comm)
+    return 0 if all(entry["passed"] for entry in result["references"].values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
