@@ -334,7 +334,7 @@ def draw(path: Path, dry: Scene, pushed: Scene, oiled: Scene) -> None:
         _, places, forces = np.array([(0.0, 0.0, 0.0), *dry.path]).T
         middle.plot(places, forces / 1e3, ".-", color="#1f5fa8", label="led in and out")
         _, places, forces = np.array([(0.0, 0.0, 0.0), *pushed.path]).T
-        middle.plot(places, forces / 1e3, "x", color="#c8502a", label="pushed, released")
+        middle.plot(places, forces / 1e3, "x", color="#c8502a", label="by force, ends free")
         _, places, forces = np.array([(0.0, 0.0, 0.0), *oiled.path]).T
         right.plot(places, forces / 1e3, ".-", color="#4a9a4a", label="pushed, released")
         for ax, one in ((middle, joint), (right, oiled.joint)):
