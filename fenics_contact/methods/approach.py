@@ -6,12 +6,13 @@ import numpy as np
 
 from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.contact.values import Status
+from fenics_contact.parallel import global_sum
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.types import Array
 
 __all__ = ["Approach"]
 
-# Contact that bears less than this share of the load on a free motion bears nothing yet.
+# Contact forces that sum up to less than this share of the load on a free motion are none yet.
 _IDLE = 1e-3
 
 
@@ -40,10 +41,9 @@ class Approach:
         if not len(motions.free):
             return first
         cold = first
-        borne, outside = (
-            np.abs(motions.resultants(forces)).max(initial=0.0)
-            for forces in (full.contact_force(), load)
-        )
+        # Of contact not the resultants: those of a body that friction has locked are zero.
+        borne = float(global_sum(full.unknowns.comm, np.abs(full.contact_force()).sum()))
+        outside = np.abs(motions.resultants(load)).max(initial=0.0)
         if borne < _IDLE * outside:
             cold = True
             full.set_state(np.where(full.constrained, full.state(), self._rest))
