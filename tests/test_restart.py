@@ -33,7 +33,7 @@ pytestmark = pytest.mark.mpi
 # ---- the same digits -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("update", "stop"), [("increment", 5), ("auto", 2), ("auto", 5)])
+@pytest.mark.parametrize(("update", "stop"), [("increment", 5), ("auto", 2), ("auto", 6)])
 @pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_pairs_found_anew(cell, condensation, update, stop, tmp_path):

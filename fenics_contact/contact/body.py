@@ -24,8 +24,9 @@ __all__ = ["BodyOpposite", "FollowedOpposite"]
 
 logger = logging.getLogger("fenics_contact")
 
-# Way along the opposite, in sizes of the point's facet, from which on pairs are found anew.
-_SLIDES = 0.25
+# Way along the opposite, in sizes of the point's facet, from which on pairs are found anew. In
+# partial slip of fine meshes ways are half of a facet, and nothing is gained by other pairs.
+_SLIDES = 1.0
 
 
 class BodyOpposite(Opposite):
@@ -87,8 +88,13 @@ class BodyOpposite(Opposite):
         """See `Opposite`."""
         if self.pairs_anew or self._update != "auto":
             return self.pairs_anew
+        comm = self._mesh.comm
         ways = np.linalg.norm(values.arrays["slide"], axis=1) / self._parts.quadrature.facet_sizes
-        return global_max(self._mesh.comm, ways[self.pairs.paired]) > _SLIDES
+        # Of open points, to whom pairs are nothing yet, only where a body was carried elsewhere.
+        counted = self.pairs.paired & (values.normal_traction < 0)
+        if not comm.allreduce(int(np.any(counted))):
+            counted = self.pairs.paired
+        return global_max(comm, ways[counted]) > _SLIDES
 
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
         """See `Opposite`."""
@@ -112,9 +118,8 @@ class BodyOpposite(Opposite):
         if not self.pairs_anew and self._mesh.comm.rank == 0:
             logger.info(
                 "%s: pairs are found anew at every increment from here on: points have moved along "
-                "the opposite by more than %g of a facet",
+                "the opposite by more than a facet",
                 self._parts.name,
-                _SLIDES,
             )
         # The traction stays with the points of Γc; what they slip over has moved on.
         self.find_pairs(self._parts.displacement.u, values.depth)

@@ -29,9 +29,9 @@ class DeformableBody(Support):
             by default.
         update: "never": the pairs are those of the undeformed bodies; "increment": they are found
             anew in the deformed bodies at every commit; "auto": likewise, from the first commit on
-            at which a point has moved along its opposite by a quarter of its facet. Normals stay
-            those of the undeformed Γc (small rotations). With `Contact(kinematics="finite")` they
-            are those of the present bodies, whatever this says.
+            at which a closed point, or where none is any, has moved along its opposite by more than
+            its facet. Normals stay those of the undeformed Γc (small rotations). With
+            `Contact(kinematics="finite")` they are those of the present bodies, whatever this says.
         release: How far behind a point (length) its opposite may lie, where the bodies penetrate
             each other from the start. By default as far as they do, if they are two; in one and the
             same body half the height of the point's cell. In deformed bodies always twice as far
