@@ -277,6 +277,12 @@ def block(
     return made
 
 
+def bulge(scene: Block, depth: float = 0.01) -> fc.Obstacle:
+    """A floor that is lower to the sides, by the depth times the distance squared."""
+    x = ufl.SpatialCoordinate(scene.mesh)
+    return fc.Obstacle(depth * (x[0] - 0.4) ** 2, scene.vector(up=-1.0))
+
+
 def kirchhoff(scene: Block) -> ufl.Form:
     """Another bulk form of a block, St Venant-Kirchhoff's with ν = 0: S = E · Green strain."""
     v = ufl.TestFunction(scene.u.function_space)

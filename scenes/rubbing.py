@@ -7,11 +7,17 @@ from typing import Any
 
 import numpy as np
 from dolfinx import fem
+from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.blocks import TOP, Block, block, dimension
+from scenes.comparing import at_points, close, nodal
 
+COMM = MPI.COMM_WORLD
 Array = np.ndarray
+# On several ranks MUMPS adds in the order in which messages come: no two runs agree in the last
+# bit, and two solutions within the tolerance of 1e-9 on the residual are compared.
+SAME = 0.0 if COMM.size == 1 else 1e-7
 
 
 def cushion(d: int, displacement: Any = None, *, length: float = 1.0) -> fc.Ball:
@@ -118,3 +124,45 @@ def pressed(
     made = Rub(law, cell=cell, mesh={"n": n}, method=method, **options)
     made.move(side, down)
     return made.scene, made.problem, made.contact
+
+
+def same_states(a: Rub, b: Rub, rtol: float) -> bool:
+    """Displacements and histories; 0: bit for bit."""
+    pairs = [
+        [nodal(made.scene.u) for made in (a, b)],
+        [at_points(made.contact, made.contact.history.rows()) for made in (a, b)],
+    ]
+    if rtol == 0.0:
+        return all(np.array_equal(x, y) for x, y in pairs)
+    return all(close(x, y, rtol) for x, y in pairs)
+
+
+def limited(made: Rub, largest: float) -> list[float]:
+    """Let increments fail whose load grows by more than ``largest``; returns those tried."""
+    solve, tried, at = made.problem.solve, [], [0.0]
+    now = [0.0]
+    load, commit = made.load, made.problem.commit
+
+    def note(t):
+        now[0] = t
+        load(t)
+
+    def choosy(**kwargs):
+        tried.append(now[0])
+        if now[0] - at[0] > largest:
+            made.problem.solver.main.max_it, kept = 0, made.problem.solver.main.max_it
+            made.problem.snes.setTolerances(max_it=0)
+            made.problem.solver.starts.predict = False  # that guess can be the solution
+            try:
+                return solve(**kwargs)
+            finally:
+                made.problem.solver.main.max_it = kept
+                made.problem.snes.setTolerances(max_it=kept)
+        return solve(**kwargs)
+
+    def keep():
+        commit()
+        at[0] = now[0]
+
+    made.load, made.problem.solve, made.problem.commit = note, choosy, keep
+    return tried

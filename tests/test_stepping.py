@@ -16,27 +16,11 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact import checkpoint
 from scenes.blocks import TOP, block
-from scenes.comparing import at_points, close, nodal, owned, raised_everywhere, shared_folder
+from scenes.comparing import close, owned, raised_everywhere, shared_folder
 from scenes.processes import command, environment
-from scenes.rubbing import Rub
+from scenes.rubbing import SAME, Rub, limited, same_states
 
 COMM = MPI.COMM_WORLD
-
-
-# On several ranks MUMPS adds in the order in which messages come: no two runs agree in the last
-# bit, and two solutions within the tolerance of 1e-9 on the residual are compared.
-SAME = 0.0 if COMM.size == 1 else 1e-7
-
-
-def same_states(a: Rub, b: Rub, rtol: float) -> bool:
-    """Displacements and histories; 0: bit for bit."""
-    pairs = [
-        [nodal(made.scene.u) for made in (a, b)],
-        [at_points(made.contact, made.contact.history.rows()) for made in (a, b)],
-    ]
-    if rtol == 0.0:
-        return all(np.array_equal(x, y) for x, y in pairs)
-    return all(close(x, y, rtol) for x, y in pairs)
 
 
 # ---- loads ---------------------------------------------------------------------------------------
@@ -101,37 +85,6 @@ def test_one_file_for_checkpoint_and_table(tmp_path):
 
 
 # ---- cutting -------------------------------------------------------------------------------------
-
-
-def limited(made: Rub, largest: float) -> list[float]:
-    """Let increments fail whose load grows by more than ``largest``; returns those tried."""
-    solve, tried, at = made.problem.solve, [], [0.0]
-    now = [0.0]
-    load, commit = made.load, made.problem.commit
-
-    def note(t):
-        now[0] = t
-        load(t)
-
-    def choosy(**kwargs):
-        tried.append(now[0])
-        if now[0] - at[0] > largest:
-            made.problem.solver.main.max_it, kept = 0, made.problem.solver.main.max_it
-            made.problem.snes.setTolerances(max_it=0)
-            made.problem.solver.starts.predict = False  # that guess can be the solution
-            try:
-                return solve(**kwargs)
-            finally:
-                made.problem.solver.main.max_it = kept
-                made.problem.snes.setTolerances(max_it=kept)
-        return solve(**kwargs)
-
-    def keep():
-        commit()
-        at[0] = now[0]
-
-    made.load, made.problem.solve, made.problem.commit = note, choosy, keep
-    return tried
 
 
 def test_failed_increments_are_cut_and_grow_again():
@@ -290,7 +243,7 @@ def test_a_failed_write_leaves_the_old_file(said, tmp_path, monkeypatch):
 SCRIPT = """
 import json
 import fenics_contact as fc
-from scenes.rubbing import Rub
+from scenes.rubbing import SAME, Rub, limited, same_states
 made = Rub()
 for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=40, checkpoint={path!r}):
     print(step.increment, flush=True)
@@ -333,189 +286,3 @@ def test_killed_and_started_again(ranks, tmp_path):
     if first == second:
         assert after[-1] == alone[-1]
     assert close(json.loads(after[-1]), json.loads(alone[-1]), 1e-6)
-
-
-# ---- the field left behind -----------------------------------------------------------------------
-
-
-def lagging(field, tmp_path=None, *, law=None, steps=8, **kwargs):
-    """The history with the field found when ``field`` says."""
-    made = Rub(law, cell="hexahedron", condensation=True)
-    options = {"steps": steps, "field": field} | kwargs
-    return made, list(fc.increments(made.problem, made.load, 0.0, 4.0, **options))
-
-
-@pytest.mark.parametrize("law", [fc.Frictionless(k_n=2e4), fc.Coulomb(0.3, k_n=2e4, k_t=1e4)])
-def test_field_at_the_last_increment(law):
-    """The same forces, energies and final field as with all fields found.
-
-    Both solve to 1e-9 of the forces, and eight increments add up: 1e-7, which energies have of the
-    larger of work and elastic energy. The top moves: prescribed values that change do work.
-    """
-    every, all_steps = lagging("every", law=law)
-    last, steps = lagging("last", law=law)
-    assert [s.complete for s in all_steps] == [True] * 8
-    assert [s.complete for s in steps] == [False] * 7 + [True]
-    assert same_states(last, every, 1e-7)
-    for a, b in zip(steps, all_steps, strict=True):
-        assert close(a.contacts["contact"].force, b.contacts["contact"].force, 1e-7)
-        size = abs(b.energy.work) + abs(b.energy.elastic)
-        for name in ("work", "elastic", "springs", "dissipation", "remainder"):
-            assert close(getattr(a.energy, name), getattr(b.energy, name), 1e-7, scale=size), name
-        assert abs(a.energy.imbalance) <= 1e-6 * size
-        assert a.verdict.failures == [] and a.verdict.laws.keys() == {"contact"}
-
-
-def test_field_on_request():
-    """`complete` brings u to what it is where all fields are found (1e-7), and then has no work.
-
-    What the contact says of the increment stays: what slipped in it is not said to stick.
-    """
-    every, lazy = Rub(cell="triangle", condensation=True), Rub(cell="triangle", condensation=True)
-    compared = 0
-    for step in fc.increments(every.problem, every.load, 0.0, 4.0, steps=8):
-        made = lazy.problem
-        lazy.load(step.load)
-        assert not made.solve(field=False).complete
-        made.commit()
-        status = lazy.contact.status.copy()
-        assert np.array_equal(status, every.contact.status)
-        behind = owned(lazy.scene.u).copy()
-        if step.increment % 3 == 0:
-            verdict = made.complete()
-            assert verdict.failures == [] and made.complete() is None
-            assert not close(behind, owned(every.scene.u), 1e-3)
-            assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
-            assert np.array_equal(lazy.contact.status, status)
-            compared += 1
-    assert compared == 2
-
-
-def stiffening(field: str) -> tuple[Rub, list[fc.Step]]:
-    """A history in which the stiffness of bulk and contact changes with the load."""
-    made = Rub(cell="triangle", condensation=True)
-
-    def load(t: float) -> None:
-        made.load(t)
-        made.scene.E.value = 1000.0 * (1 + 0.2 * t)
-        made.contact.parameters["k_n"].value = 2e4 * (1 + 0.2 * t)
-
-    return made, list(fc.increments(made.problem, load, 0.0, 2.0, steps=4, field=field))
-
-
-def test_field_left_behind_while_bulk_and_law_change():
-    """What was left behind is completed with the data it was found with: the same to 1e-7."""
-    (every, all_found), (lazy, lagging) = stiffening("every"), stiffening("last")
-    assert not any(attempt.method == "cut" for s in lagging for attempt in s.attempts)
-    assert not lagging[0].complete
-    for a, b in zip(all_found, lagging, strict=True):
-        one, other = a.contacts["contact"].force, b.contacts["contact"].force
-        assert close(one, other, 1e-7)
-        assert np.isclose(a.energy.elastic, b.energy.elastic, rtol=1e-6)
-    assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
-
-
-@pytest.mark.parametrize("last", [True, False], ids=["found", "behind"])
-def test_solution_dropped_with_the_bulk_it_was_found_with(last):
-    """The committed field is behind, a solution was not committed, and the bulk is another one.
-
-    Reference: the same increments with all fields found, 1e-7.
-    """
-    states = []
-    for first, second in ((True, True), (False, last)):
-        made = Rub(cell="triangle", condensation=True)
-        made.load(1.0)
-        made.problem.solve(field=first)
-        made.problem.commit()
-        made.load(1.5)
-        made.problem.solve(field=second)
-        made.scene.E.value *= 1.5
-        made.load(2.0)
-        step = made.problem.solve(field=first)
-        made.problem.commit()
-        made.problem.complete()
-        states.append([made, step.energy])
-    (every, one), (lazy, other) = states
-    assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
-    assert np.isclose(one.work, other.work, rtol=1e-6)
-    assert np.isclose(one.elastic, other.elastic, rtol=1e-6)
-
-
-def test_field_every_so_many_increments():
-    """Every third and the last; a checkpoint has all of u."""
-    _, steps = lagging(3)
-    assert [s.complete for s in steps] == [False, False, True, False, False, True, False, True]
-
-
-def test_checkpoint_of_a_field_left_behind(tmp_path):
-    """Going on from a file gives the digits of the run that wrote it."""
-    folder = shared_folder(tmp_path)
-    whole, _ = lagging("last", checkpoint=folder / "whole.npz", checkpoint_every=3)
-    made = Rub(cell="hexahedron", condensation=True)
-    options = {"steps": 8, "field": "last", "checkpoint": folder / "part.npz"}
-    options["checkpoint_every"] = 3
-    for step in fc.increments(made.problem, made.load, 0.0, 4.0, **options):
-        if step.increment == 5:
-            break
-    after = Rub(cell="hexahedron", condensation=True)
-    rest = list(fc.increments(after.problem, after.load, 0.0, 4.0, **options))
-    assert rest[0].increment == 4
-    assert same_states(after, whole, SAME)
-
-
-def test_a_failure_leaves_the_field_to_be_completed():
-    """After an increment that fails u is completed as that of the last commit."""
-    every, lazy = Rub(cell="triangle", condensation=True), Rub(cell="triangle", condensation=True)
-    limited(lazy, 0.6)
-    for made in (every, lazy):
-        options = {"steps": [0.5, 4.0] if made is lazy else [0.5], "max_cuts": 0, "field": "last"}
-        history = fc.increments(made.problem, made.load, 0.0, options["steps"][-1], **options)
-        if made is every:
-            list(history)
-        else:
-            next(history)
-            assert not close(owned(lazy.scene.u), owned(every.scene.u), 1e-3)
-            with pytest.raises(fc.NotConverged):
-                next(history)
-    assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
-
-
-def test_a_failure_leaves_what_was_solved_and_not_committed():
-    """Its field is completed with its own tractions, and its results are shown."""
-    every, lazy = Rub(cell="triangle", condensation=True), Rub(cell="triangle", condensation=True)
-    for made in (every, lazy):
-        for t in (0.5, 1.5):
-            made.load(t)
-            made.problem.solve(field=made is every)
-            if t == 0.5:
-                made.problem.commit()
-    pressure = lazy.contact.pressure.copy()
-    lazy.push[-1].value = np.nan
-    with pytest.raises(ValueError, match="finite"):
-        lazy.problem.solve(field=False)
-    assert np.array_equal(lazy.contact.pressure, pressure)
-    lazy.load(1.5)
-    lazy.problem.complete()
-    assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
-
-
-def test_a_field_that_is_wrong_is_refused(monkeypatch):
-    """What is recovered is checked by the product with K, not by what recovered it."""
-    made = Rub(cell="triangle", condensation=True)
-    made.load(1.0)
-    made.problem.solve(field=False)
-    made.problem.commit()
-    field = made.problem.solver.system.pending_field
-    field[field != 0.0] *= 1.001
-    with pytest.raises(fc.NotConverged, match="residual"):
-        made.problem.complete()
-
-
-def test_wrong_field():
-    """No such choice."""
-    made = Rub()
-    for field in ("never", 0, 1.5):
-        call = lambda field=field: list(  # noqa: E731
-            fc.increments(made.problem, made.load, field=field)
-        )
-        raised_everywhere(call, ValueError, "every")
