@@ -1,0 +1,133 @@
+"""Two plates under a bolt that friction alone holds: tightened, then pulled until all slips.
+
+Plates of 40 x 20 x 4 mm overlap by 30 mm, each with a bore of 6.6 mm; the bolt has a shank of 6 mm
+and, as head and nut, discs of 11 x 3 mm. It is tightened by an interference under its head. The
+lower plate is held at one end, the upper one guided at the other and pulled along. The shank meets
+no bore: what holds it in place is friction under head and nut, and what is pulled beyond the
+friction of all three joints finds no equilibrium.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import dolfinx
+import gmsh
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from scenes.elasticity import displacement_space, hold, residual
+from scenes.histories import History
+
+LENGTH, WIDTH, THICKNESS, OVERLAP = 40.0, 20.0, 4.0, 30.0  # mm
+BORE, SHANK, HEAD, HEIGHT = 3.3, 3.0, 5.5, 3.0  # radii, and the height of head and nut
+E, NU, FRICTION, INTERFERENCE = 210e3, 0.3, 0.2, 0.02  # MPa, mm
+# Sides: ends of the plates, both sides of the three joints.
+HELD, PULLED, UNDER, OVER, SEAT, RING, NUT_SEAT, NUT_RING = range(1, 9)
+_LOWER, _UPPER, _BOLT = 1, 2, 3
+_JOINTS = {"plates": (UNDER, OVER), "head": (RING, SEAT), "nut": (NUT_RING, NUT_SEAT)}
+
+
+def joint_mesh(size: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
+    """Tetrahedra of a size (mm), at the bolt of half of it, and tags of the sides. Collective."""
+    gmsh.initialize()
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.model.add("bolted joint")
+        if MPI.COMM_WORLD.rank == 0:
+            occ = gmsh.model.occ
+            shift, middle = LENGTH - OVERLAP, LENGTH - OVERLAP / 2
+            top, volumes = 2 * THICKNESS, {}
+            for body, x, z in ((_LOWER, 0.0, 0.0), (_UPPER, shift, THICKNESS)):
+                plate = occ.addBox(x, -WIDTH / 2, z, LENGTH, WIDTH, THICKNESS)
+                bore = occ.addCylinder(middle, 0, z, 0, 0, THICKNESS, BORE)
+                volumes[body] = occ.cut([(3, plate)], [(3, bore)])[0][0]
+            shank = occ.addCylinder(middle, 0, 0, 0, 0, top, SHANK)
+            head = occ.addCylinder(middle, 0, top, 0, 0, HEIGHT, HEAD)
+            nut = occ.addCylinder(middle, 0, -HEIGHT, 0, 0, HEIGHT, HEAD)
+            volumes[_BOLT] = occ.fuse([(3, shank)], [(3, head), (3, nut)])[0][0]
+            occ.synchronize()
+            groups: dict[int, list[int]] = {tag: [] for tag in range(1, 9)}
+            places = {
+                _LOWER: {UNDER: (2, THICKNESS), NUT_SEAT: (2, 0.0), HELD: (0, 0.0)},
+                _UPPER: {OVER: (2, THICKNESS), SEAT: (2, top), PULLED: (0, shift + LENGTH)},
+                _BOLT: {RING: (2, top), NUT_RING: (2, 0.0)},
+            }
+            for body, sides in places.items():
+                gmsh.model.addPhysicalGroup(3, [volumes[body][1]], body)
+                for _, face in gmsh.model.getBoundary([volumes[body]], oriented=False):
+                    box = np.array(gmsh.model.getBoundingBox(2, face)).reshape(2, 3)
+                    for tag, (axis, at) in sides.items():
+                        if np.all(np.abs(box[:, axis] - at) < 1e-3):
+                            groups[tag].append(face)
+            for tag, faces in groups.items():
+                gmsh.model.addPhysicalGroup(2, faces, tag)
+
+            def cell_size(dim: int, tag: int, x: float, y: float, z: float, lc: float) -> float:
+                return size * (0.5 + 0.1 * max(0.0, np.hypot(x - middle, y) - HEAD))
+
+            gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
+            gmsh.model.mesh.setSizeCallback(cell_size)
+            gmsh.model.mesh.generate(3)
+        mesh, _, tags = fc.model_to_mesh(gmsh.model, MPI.COMM_WORLD)
+        return mesh, tags
+    finally:
+        gmsh.finalize()
+
+
+class BoltedJoint(History):
+    """The joint: tightened until t = 1, then pulled by 1000 N a unit of t.
+
+    Attributes:
+        u: Displacement.
+        contacts: Of plates, head and nut.
+        pull: On the end of the upper plate (force).
+        problem: With all of them.
+    """
+
+    def __init__(
+        self,
+        size: float = 2.6,
+        *,
+        degree: int = 2,
+        friction: float = FRICTION,
+        made: tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags] | None = None,
+        contact: dict | None = None,
+        **options: Any,
+    ) -> None:
+        """Make it, not tightened.
+
+        Args:
+            size: See `joint_mesh`.
+            degree: Of the displacement.
+            friction: Coefficient in all joints.
+            made: Mesh and tags; by default of `joint_mesh`.
+            contact: Arguments of every contact.
+            options: Those of the problem.
+        """
+        mesh, tags = made or joint_mesh(size)
+        space = displacement_space(mesh, degree)
+        self.u, v = fem.Function(space, name="displacement"), ufl.TestFunction(space)
+        self.tight, self.pull = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
+        contact = {"accuracy": "standard"} | (contact or {})
+        self.contacts = []
+        for name, (mine, other) in _JOINTS.items():
+            gap = {"gap": -self.tight} if name == "head" else {}
+            surface = fc.ContactSurface(mesh, tags, mine)
+            support = fc.DeformableBody(tags, other)
+            law = fc.Coulomb(friction)
+            made_one = fc.Contact(self.u, surface, support, law, name=name, **gap, **contact)
+            self.contacts.append(made_one)
+        ds = ufl.Measure("ds", mesh, subdomain_data=tags)(PULLED)
+        F = residual(self.u, v, E, NU) - self.pull / (WIDTH * THICKNESS) * v[0] * ds
+        bcs = [hold(self.u, tags, HELD, i) for i in range(3)]
+        bcs += [hold(self.u, tags, PULLED, i) for i in (1, 2)]
+        self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=self.contacts, **options)
+
+    def load(self, t: float) -> None:
+        """Tighten, then pull."""
+        self.tight.value = INTERFERENCE * min(t, 1.0)
+        self.pull.value = 1000.0 * max(t - 1.0, 0.0)

@@ -1,0 +1,39 @@
+"""Three bodies and three contacts, one of the bodies held by friction alone."""
+
+from __future__ import annotations
+
+import pytest
+
+import fenics_contact as fc
+from scenes.bolted_joint import FRICTION, BoltedJoint
+from scenes.comparing import raised_everywhere
+
+pytestmark = pytest.mark.mpi
+
+
+def test_tightened_and_pulled_until_it_slips() -> None:
+    """The bolt and the upper plate are in equilibrium, friction bears what it can, and no more.
+
+    The references are statics: what pulls is borne by plates and bolt, and what the bolt takes at
+    its head it gives at its nut, to 1e-3 of the clamping force (the preset solves to 1e-4 of each
+    body's forces). Linear elements, on which the clamping force itself depends, serve for that.
+    """
+    made = BoltedJoint(5.0, degree=1)
+    plates, head, nut = made.contacts
+    for _ in made.increments(4.0 - 0.5, steps=7):
+        r = {c.name: c.resultants() for c in made.contacts}
+        clamped = r["head"].normal_force
+        assert r["nut"].normal_force == pytest.approx(clamped, rel=1e-3)
+        assert abs(r["nut"].force[0] + r["head"].force[0]) < 1e-3 * clamped
+        borne = r["plates"].force[0] + r["head"].force[0]
+        assert abs(borne - float(made.pull.value)) < 1e-3 * clamped
+        for c in (plates, head, nut):
+            found = r[c.name]
+            assert found.tangential_force <= FRICTION * found.normal_force * (1 + 1e-9)
+    # The plates slip as a whole by now; what is more goes through the bolt.
+    assert r["plates"].stick == 0
+    assert r["plates"].force[0] == pytest.approx(FRICTION * r["plates"].normal_force, rel=1e-3)
+    limit = FRICTION * (r["plates"].normal_force + clamped)
+    assert limit > float(made.pull.value) > 0.7 * limit
+    made.load(1.0 + 1.02 * limit / 1000.0)
+    raised_everywhere(made.problem.solve, fc.NotConverged)
