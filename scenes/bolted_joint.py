@@ -84,6 +84,7 @@ class BoltedJoint(History):
     Attributes:
         u: Displacement.
         contacts: Of plates, head and nut.
+        tight: Interference under the head (length).
         pull: On the end of the upper plate (force).
         problem: With all of them.
     """
@@ -93,8 +94,6 @@ class BoltedJoint(History):
         size: float = 2.6,
         *,
         degree: int = 2,
-        friction: float = FRICTION,
-        made: tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags] | None = None,
         contact: dict | None = None,
         **options: Any,
     ) -> None:
@@ -103,12 +102,10 @@ class BoltedJoint(History):
         Args:
             size: See `joint_mesh`.
             degree: Of the displacement.
-            friction: Coefficient in all joints.
-            made: Mesh and tags; by default of `joint_mesh`.
             contact: Arguments of every contact.
             options: Those of the problem.
         """
-        mesh, tags = made or joint_mesh(size)
+        mesh, tags = joint_mesh(size)
         space = displacement_space(mesh, degree)
         self.u, v = fem.Function(space, name="displacement"), ufl.TestFunction(space)
         self.tight, self.pull = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
@@ -118,9 +115,9 @@ class BoltedJoint(History):
             gap = {"gap": -self.tight} if name == "head" else {}
             surface = fc.ContactSurface(mesh, tags, mine)
             support = fc.DeformableBody(tags, other)
-            law = fc.Coulomb(friction)
-            made_one = fc.Contact(self.u, surface, support, law, name=name, **gap, **contact)
-            self.contacts.append(made_one)
+            law = fc.Coulomb(FRICTION)
+            made = fc.Contact(self.u, surface, support, law, name=name, **gap, **contact)
+            self.contacts.append(made)
         ds = ufl.Measure("ds", mesh, subdomain_data=tags)(PULLED)
         F = residual(self.u, v, E, NU) - self.pull / (WIDTH * THICKNESS) * v[0] * ds
         bcs = [hold(self.u, tags, HELD, i) for i in range(3)]

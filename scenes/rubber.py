@@ -280,3 +280,9 @@ class Tool(History):
     def tractions(self) -> Array:
         """On the body at all points, ordered by their places in the undeformed body."""
         return at_points(self.contact, self.contact.traction)
+
+
+def domed(x):
+    """The top of a block [0, 2] x [0, 1] bent to a circle of radius 2 about (1, -1)."""
+    top = np.sqrt(4 - (x[:, 0] - 1) ** 2) - 1
+    return np.column_stack([x[:, 0], x[:, 1] * top])

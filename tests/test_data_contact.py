@@ -10,7 +10,7 @@ from mpi4py import MPI
 import fenics_contact as fc
 from scenes.blocks import TOP, block
 from scenes.comparing import close, gathered, raised_everywhere, shared_folder, sorted_by_place
-from scenes.rubber import TIGHT, disc, rubber
+from scenes.rubber import TIGHT, disc, domed, rubber
 from scenes.surfaces import ball, circle, ring
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
@@ -308,7 +308,7 @@ def test_small_and_finite_agree_where_displacements_are_small(law):
     for size in (4e-3, 1e-3):
         found = []
         for kinematics, profile in (("finite", True), ("small", True), ("small", False)):
-            scene = rubber("triangle", n=(12, 6), linear=True, bend=_domed)
+            scene = rubber("triangle", n=(12, 6), linear=True, bend=domed)
             shift = fem.Constant(scene.mesh, np.zeros(2))
             cavity = fc.Ball((0, -1), 2.0, inside=True, displacement=shift)
             spline = fc.RigidProfile(arc, displacement=shift)
@@ -330,9 +330,3 @@ def test_small_and_finite_agree_where_displacements_are_small(law):
         assert told[-3] == 0.0 and told[-2] == pytest.approx(told[-1], rel=1e-2)
     assert share[0] > 1e-5
     assert share[0] / share[1] == pytest.approx(4.0, rel=0.25)
-
-
-def _domed(x):
-    """The top of a block [0, 2] x [0, 1] bent to a circle of radius 2 about (1, -1)."""
-    top = np.sqrt(4 - (x[:, 0] - 1) ** 2) - 1
-    return np.column_stack([x[:, 0], x[:, 1] * top])

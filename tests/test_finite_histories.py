@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.comparing import close
-from scenes.rubber import TIGHT, Tool, disc, rubber
+from scenes.rubber import TIGHT, Tool, disc, domed, rubber
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
 COMM = MPI.COMM_WORLD
@@ -102,12 +102,6 @@ def test_turning_the_whole_scene_only_turns_the_answer(cell, shape, enforcement)
         assert close(tool.tractions(), before @ matrix.T, allowed)
 
 
-def _domed(x):
-    """The top of a block [0, 2] x [0, 1] bent to a circle of radius 2 about (1, -1)."""
-    top = np.sqrt(4 - (x[:, 0] - 1) ** 2) - 1
-    return np.column_stack([x[:, 0], x[:, 1] * top])
-
-
 @pytest.mark.parametrize("law", [fc.Frictionless(1e4), fc.Coulomb(0.2, 1e4, 1e4)])
 def test_small_and_finite_agree_to_first_order(law):
     """Linear elastic block with a domed top in the cavity that it fits.
@@ -119,7 +113,7 @@ def test_small_and_finite_agree_to_first_order(law):
     for size in (4e-3, 1e-3):
         found = []
         for kinematics in ("finite", "small"):
-            scene = rubber("triangle", n=(12, 6), linear=True, bend=_domed)
+            scene = rubber("triangle", n=(12, 6), linear=True, bend=domed)
             shift = fem.Constant(scene.mesh, np.zeros(2))
             problem, contact = scene.problem(
                 fc.Ball((0, -1), 2.0, inside=True, displacement=shift),

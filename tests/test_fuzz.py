@@ -89,13 +89,14 @@ def test_a_step_across_the_residual_is_no_solution():
 
 @serial
 def test_most_scenes_are_solved_and_compared():
-    # A machine that refuses everything, or compares nothing, would pass the test above. The history
-    # apart may be lost in its first increment; the nearest exact solution is found for all.
-    found = [played(scene) for scene in SCENES["scenes"][::7]]
-    solved = [o for o in found if o.outcome in ("right", "another")]
+    # A machine that refuses everything, or compares nothing, would pass the test above.
+    found = [(scene["seed"], played(scene)) for scene in SCENES["scenes"][::7]]
+    solved = [(seed, o) for seed, o in found if o.outcome in ("right", "another")]
     assert len(solved) > 0.7 * len(found)
-    assert all(o.increments and {"equations", "nearest"} <= set(o.worst) for o in solved)
-    assert sum("apart" in o.worst for o in solved) >= 0.9 * len(solved)
+    for seed, outcome in solved:
+        # Of one scene the first increment is not solved apart, the nearest exact solution is.
+        wanted = {"equations", "nearest"} | ({"apart"} if seed != 600209 else set())
+        assert outcome.increments and wanted <= set(outcome.worst), seed
 
 
 @pytest.mark.mpi

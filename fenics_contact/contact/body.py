@@ -170,18 +170,9 @@ class FollowedOpposite(BodyOpposite):
         return self._present.passed_through()
 
     @property
-    def pairs_anew(self) -> bool:
-        """See `Opposite`."""
-        return False
-
-    @property
-    def may_pair_anew(self) -> bool:
-        """See `Opposite`: they follow without."""
-        return False
-
-    def pairs_due(self, values: PointValues) -> bool:
-        """See `Opposite`."""
-        return False
+    def _update(self) -> str:
+        """At a commit never: they follow all the time, whatever the support says."""
+        return "never"
 
     @property
     def flat(self) -> bool:
