@@ -245,16 +245,21 @@ import json
 import fenics_contact as fc
 from scenes.rubbing import SAME, Rub, limited, same_states
 made = Rub()
+first = made.scene.mesh.comm.rank == 0
 for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=40, checkpoint={path!r}):
-    print(step.increment, flush=True)
+    if first:
+        print(step.increment, flush=True)
 pressure = made.contact.gather()["pressure"].tolist()
-if made.scene.mesh.comm.rank == 0:
+if first:
     print(json.dumps(pressure), flush=True)
 """
 
 
 def run_script(path: Path, ranks: int, *, kill_after: int | None = None) -> list[str]:
-    """Run the history in a process of its own, killed after so many increments."""
+    """Run the history in a process of its own, killed after so many increments.
+
+    One rank alone speaks: lines of several ranks arrive in any order.
+    """
     script = SCRIPT.format(path=str(path))
     words = command(ranks, "-c", script)
     process = subprocess.Popen(words, env=environment(), stdout=subprocess.PIPE, text=True)
