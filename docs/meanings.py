@@ -246,6 +246,11 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "The line search finds no step that makes the residual smaller.",
             "The next method, or a cut, follows by itself.",
         ),
+        "overload": (
+            "Along the motion that is named the load does more than friction takes, by the "
+            "pressures of equilibria in which friction is as large as it would have to be.",
+            "Less load, more friction, or a condition that holds the body along this motion.",
+        ),
         "the matrix is singular": (
             "The tangent of the present state holds a body nowhere.",
             "If the last attempt ends so: look for a body that nothing holds where contact opens.",

@@ -22,7 +22,7 @@ HOLE = "…"
 # More ways than this to fill a hole are left open.
 _MOST = 4
 # Functions whose strings are parts of a verdict, and of what is told of an attempt.
-_VERDICT, _ATTEMPT = {"failures"}, {"chattering"}
+_VERDICT, _ATTEMPT = {"failures"}, {"chattering", "in_words"}
 
 
 @dataclass(frozen=True)
@@ -152,6 +152,8 @@ class _Module:
             value = node.value
             if isinstance(value, ast.ListComp):
                 yield told[name], value.elt
+        if isinstance(node, ast.Return) and isinstance(node.value, ast.JoinedStr) and name in told:
+            yield told[name], node.value
         if isinstance(node, ast.Assign | ast.AnnAssign) and isinstance(node.value, ast.Dict):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             if any(isinstance(t, ast.Name) and t.id == "_OUTCOMES" for t in targets):

@@ -45,10 +45,13 @@ class RigidMotions:
     middle and scaled by its size, so that every motion is a displacement of order one.
 
     Attributes:
+        comm: The ranks.
         size: Diagonal of the mesh's bounding box (length).
         names: Name of every motion, those of the bodies first.
         of_bodies: Their fields at this rank's unknowns, (n_bodies, n_per_body, n_local).
         free: Coefficients of the free motions, shape (n_free, n_motions).
+        resultant: Work on them of the load that was checked last, but for those by which supports
+            turn (force); none before.
     """
 
     def __init__(
@@ -68,7 +71,7 @@ class RigidMotions:
             turning: Which of them are rotations, whose arms change with the state.
         """
         space = displacement.u.function_space
-        self._comm = space.mesh.comm
+        self.comm = space.mesh.comm
         gdim = space.mesh.geometry.dim
         n_owned = space.dofmap.index_map.size_local
         x = space.tabulate_dof_coordinates()[:n_owned, :gdim]
@@ -78,8 +81,8 @@ class RigidMotions:
         for b in np.unique(body):
             mine = x[body == b] if n_bodies > 1 else x
             low[b], high[b] = mine.min(axis=0), mine.max(axis=0)
-        self._comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-        self._comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
+        self.comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
+        self.comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
         self.size = float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
         self._space, self._centres = space, (low + high) / 2
         self._sizes = np.linalg.norm(high - low, axis=1)
@@ -100,6 +103,7 @@ class RigidMotions:
         shape = n_bodies, len(modes) // n_bodies, unknowns.n_local
         self.of_bodies = self._modes[: len(modes)].reshape(shape)
         self.free: Array = np.zeros((0, len(modes)))
+        self.resultant: Array = np.zeros(0)
         self._free_fields: Array = np.zeros((0, unknowns.n_local))
         self._balanced: list[Array] = []
         # Masks of points that were found to hold all motions, and of which contacts.
@@ -127,10 +131,10 @@ class RigidMotions:
             held = np.where(constrained, mode, 0.0)
             gram[0, :, j] = self._modes @ (image.array / top + held)
             gram[1, :, j] = self._modes @ mode
-        energy, mass = global_sum(self._comm, gram)
+        energy, mass = global_sum(self.comm, gram)
         scale = 1 / np.sqrt(np.diag(mass))
         values, vectors = np.linalg.eigh((energy + energy.T) / 2 * np.outer(scale, scale))
-        free = agreed(self._comm, (vectors * scale[:, None])[:, values < _FREE])
+        free = agreed(self.comm, (vectors * scale[:, None])[:, values < _FREE])
         self._jumps.clear()
         self.free = _plain(free.T)
         self._free_fields = self.free @ self._modes
@@ -219,7 +223,7 @@ class RigidMotions:
         same = same and not self._turning.any()
         known = self._holding if same else []
         lacks = [np.any(was & ~now) for was, now in zip(known, bearing, strict=bool(known))]
-        if self._comm.allreduce(not known or any(lacks)) == 0:
+        if self.comm.allreduce(not known or any(lacks)) == 0:
             return True
         held = not self._loose(operators, closed_only=True).size
         if held:
@@ -260,20 +264,33 @@ class RigidMotions:
                 grip = weights * (values.grip > 0)
                 across = modes - along[:, :, None] * values.normal[None]
                 gram += np.einsum("mqd,q,nqd->mn", across, grip, across)
-        mean = global_sum(self._comm, gram) / max(float(global_sum(self._comm, area)), 1e-300)
+        mean = global_sum(self.comm, gram) / max(float(global_sum(self.comm, area)), 1e-300)
         sizes, vectors = np.linalg.eigh(mean)
-        return agreed(self._comm, vectors[:, sizes < _FELT].T @ self.free)
+        return agreed(self.comm, vectors[:, sizes < _FELT].T @ self.free)
 
     def _straight(self) -> Index:
         """Numbers of the free motions but for those by which supports turn."""
         return np.flatnonzero(~np.any(self.free[:, self._turning] != 0.0, axis=1))
+
+    @property
+    def turning(self) -> bool:
+        """Whether some are rotations of supports, whose arms change with the state."""
+        return bool(self._turning.any())
+
+    def straight_at_points(self, operator: ContactOperator) -> Array:
+        """Jumps at a contact's points, (n, n_points, gdim), of those without arms. Collective."""
+        return self._at_points(operator)[self._straight()]
+
+    def describe_straight(self, coefficients: Array) -> str:
+        """Name a motion of those without arms by its share of each of them, (n,)."""
+        return self._describe(coefficients @ self.free[self._straight()])
 
     def resultants(self, forces: Array) -> Array:
         """Work of forces at this rank's unknowns on the free motions. Collective.
 
         But for those by which supports turn: what presses may have no moment.
         """
-        return global_sum(self._comm, self._free_fields[self._straight()] @ forces)
+        return global_sum(self.comm, self._free_fields[self._straight()] @ forces)
 
     def approach(self, load: Array, operators: Sequence[ContactOperator]) -> Array | None:
         """Rigid motion to first touch, where the load sets free bodies moving. Collective.
@@ -288,11 +305,11 @@ class RigidMotions:
         if not len(self.free):
             return None
         free = self._free_fields
-        drive = global_sum(self._comm, free @ load)
-        mass = global_sum(self._comm, free @ free.T)
+        drive = global_sum(self.comm, free @ load)
+        mass = global_sum(self.comm, free @ free.T)
         if not np.abs(drive).max() > 0:
             return None
-        coefficients = agreed(self._comm, np.linalg.solve(mass, drive))
+        coefficients = agreed(self.comm, np.linalg.solve(mass, drive))
         coefficients /= np.abs(coefficients).max()
         way = np.inf
         for operator in operators:
@@ -301,7 +318,7 @@ class RigidMotions:
             closing = np.einsum("qd,qd->q", jump, values.normal)
             nearing = closing > _FELT
             ways = values.opening[nearing] / closing[nearing]
-            way = min(way, global_min(self._comm, ways, empty=np.inf))
+            way = min(way, global_min(self.comm, ways, empty=np.inf))
         return None if way == np.inf else way * coefficients @ free
 
     def check_balance(self, load: Array, operators: Sequence[ContactOperator]) -> None:
@@ -319,19 +336,21 @@ class RigidMotions:
             ValueError: It gives the resultant and the motion.
         """
         rows = self._straight()  # arms turn with a support: what it cannot bear here it may there
+        self.resultant = np.zeros(len(rows))
         if not len(rows):
             return
         named, free = self.free[rows], self._free_fields[rows]
-        resultant = global_sum(self._comm, free @ load)
+        resultant = global_sum(self.comm, free @ load)
         # What the load could do at most, were all of it along the motion: the scale of "zero".
-        size = float(global_sum(self._comm, np.abs(free) @ np.abs(load)).max())
+        size = float(global_sum(self.comm, np.abs(free) @ np.abs(load)).max())
         contacts = [operator.contact for operator in operators]
         for operator, contact in zip(operators, contacts, strict=True):
             if not contact.law.has_normal_stiffness:  # a prescribed normal traction is a load
                 force = -contact.values.parameters["pressure"][:, None] * contact.values.normal
                 modes = self._at_points(operator)[rows]
                 work = np.einsum("mqd,qd,q->m", modes, force, contact.measure)
-                resultant += global_sum(self._comm, work)
+                resultant += global_sum(self.comm, work)
+        self.resultant = resultant
         if np.abs(resultant).max() <= _BALANCED * size:
             return
         # A history often has one direction of load and one support: what balanced it does again.
@@ -340,7 +359,7 @@ class RigidMotions:
             data += [contact.values.normal, contact.values.grip]
             data += [np.array([contact.pairs.number])]
         known = len(data) == len(self._balanced) and all(map(_alike, data, self._balanced))
-        if self._comm.allreduce(not known) == 0:
+        if self.comm.allreduce(not known) == 0:
             return
         rays = np.concatenate([self._rays(operator, rows) for operator in operators], axis=0)
         # Unit columns: a ray's length has no meaning, and badly scaled ones spoil the solution. One
@@ -350,10 +369,10 @@ class RigidMotions:
         rays = rays[felt] / length[felt, None]
         rest = np.abs(resultant).max()
         if len(rays):
-            rest *= agreed(self._comm, _unbalanced(rays.T, -resultant / rest))
+            rest *= agreed(self.comm, _unbalanced(rays.T, -resultant / rest))
         if rest > _BALANCED * max(size, np.abs(resultant).max()):
             scale = np.abs(resultant).max()
-            limits = scale * agreed(self._comm, _borne(rays.T, -resultant / scale))
+            limits = scale * agreed(self.comm, _borne(rays.T, -resultant / scale))
             size = max(size, scale)
             beyond = [i for i, r in enumerate(resultant) if abs(r) > limits[i] + _BALANCED * size]
             said = [
@@ -399,7 +418,7 @@ class RigidMotions:
             directions.append(normal)
         modes = self._at_points(operator)[rows]
         rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
-        return gather_rows(self._comm, np.concatenate(rays).reshape(-1, len(rows)))
+        return gather_rows(self.comm, np.concatenate(rays).reshape(-1, len(rows)))
 
 
 def _alike(one: Array, other: Array) -> bool:

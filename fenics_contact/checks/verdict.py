@@ -196,7 +196,8 @@ class Verdict:
                 found.append(
                     f"{contact}: how far displacements are too large to be taken as small cannot "
                     "be told, because the springs of contact at its points hold a body against "
-                    "nothing; hold it by a condition or a weak spring, or accept it: "
+                    "nothing; where friction alone holds it and all points slip, the load is at "
+                    "its limit; hold it by a condition or a weak spring, or accept it: "
                     "ContactProblem(kinematics=inf)"
                 )
             elif change.judged > self.kinematics_allowed:

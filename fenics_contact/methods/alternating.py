@@ -22,7 +22,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
-from fenics_contact.methods.method import InnerSnes, OwnMethod, Tools
+from fenics_contact.methods.method import OVERLOADED, InnerSnes, OwnMethod, Tools
 from fenics_contact.types import Array
 
 __all__ = ["Alternation"]
@@ -52,6 +52,11 @@ _MAX_STALLS = 20
 # least share: two cycles may undo one another.
 _PATIENCE = 2
 _LEAST = 1 / 8
+# Where the load needs more friction than there is, the problem with the limit given has no solution
+# but with this much more than it needs. It is believed after so many cycles in a row that find so;
+# if more than so many times the friction is needed, after the second, whose pressures are those of
+# an equilibrium.
+_MORE, _OVERLOADS, _CLEARLY = 1.01, 3, 1.02
 # Share of the whole law's residual to which a subproblem is solved: more would be lost again.
 _INNER = 1e-2
 # Share of k_t that keeps a slipping body in place in the matrix (not in the equations).
@@ -102,13 +107,22 @@ class Alternation(OwnMethod):
         if not self._possible():
             return 0, int(reasons.DIVERGED_LINE_SEARCH)
         self._attach()
-        iterations = stalls = 0
+        iterations = stalls = overloads = 0
         best = np.inf
         relaxation = 1.0
         try:
             residual = self._residual()
             pressure: Array = self._pressure()
             for cycle in range(_MAX_CYCLES):
+                needed = equations.friction_needed()
+                overloads = overloads + 1 if 1.0 < needed < np.inf else 0
+                # Limits that the pressure does not set are what they are.
+                enough = 1 if equations.has_potential else 2 if needed > _CLEARLY else _OVERLOADS
+                if overloads >= enough:
+                    logger.debug("%d cycles, %d Newton iterations: overload", cycle, iterations)
+                    return iterations, OVERLOADED
+                if overloads:
+                    pressure = _MORE * needed * pressure
                 ends = np.cumsum([c.quadrature.n_points for c in equations.contacts])[:-1]
                 for contact, part in zip(equations.contacts, np.split(pressure, ends), strict=True):
                     contact.acting.freeze(part)

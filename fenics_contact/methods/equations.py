@@ -12,6 +12,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact.checks.chattering import StatusWatch
+from fenics_contact.checks.overload import Overload, find_overload
 from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_max, global_sum
@@ -49,6 +50,7 @@ class Equations:
         solvers: Linear solvers for H₀ (False) and the consistent tangent (True).
         h0_is_made: Whether the matrix of H₀ holds what the method made it of.
         factorisations: Of sparse matrices, counted.
+        overload: By what the load outdid friction where `friction_needed` looked last, if it did.
     """
 
     def __init__(
@@ -74,6 +76,7 @@ class Equations:
         self.solvers: dict[bool, PETSc.KSP] = {}
         self.h0_is_made = False
         self.factorisations = 0
+        self.overload: Overload | None = None
         self._matrices: dict[bool, PETSc.Mat] = {}
         self._filled: set[bool] = set()
         self.system: System = full
@@ -132,6 +135,14 @@ class Equations:
     def solved(self, rtol: float = 0.0) -> bool:
         """Whether the residual computed last ends the present round, or is below ``rtol``."""
         return self.norms.within(max(self.rtol, self.round_rtol, rtol))
+
+    def friction_needed(self) -> float:
+        """How many times the friction by the pressures evaluated last the load needs. Collective.
+
+        1 where it can be borne, infinite where there is no friction at all; see `find_overload`.
+        """
+        self.overload = find_overload(self.motions, self.full.operators)
+        return self.overload.factor if self.overload else 1.0
 
     # ---- matrices --------------------------------------------------------------------------------
 

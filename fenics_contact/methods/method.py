@@ -15,12 +15,15 @@ from fenics_contact.methods.callbacks import Callbacks
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.options import Defaults
 
-__all__ = ["InnerSnes", "Method", "Newton", "OwnMethod", "SnesMethod", "Tools"]
+__all__ = ["OVERLOADED", "InnerSnes", "Method", "Newton", "OwnMethod", "SnesMethod", "Tools"]
 
 # Iterations without a lower residual after which another method takes over.
 _PATIENCE = 20
 
 _REASONS = PETSc.SNES.ConvergedReason
+# Why a method ends that has found an `Equations.overload`: SNES has no such reason, and does not
+# use this one in the methods here.
+OVERLOADED = int(_REASONS.DIVERGED_LOCAL_MIN)
 
 
 class Method(ABC):

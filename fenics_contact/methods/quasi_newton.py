@@ -17,6 +17,8 @@ __all__ = ["QuasiNewton"]
 # Rounds in a row that do not lower the residual before the increment is given up: the potential may
 # fall for long before the residual does.
 _MAX_STALLS = 10
+# The same where friction seems not to bear the load, which another method can tell.
+_FEW_STALLS = 3
 # Contact that bears less than this share of the residual an increment begins with tells nothing of
 # which points will be closed.
 _IDLE = 1e-3
@@ -99,6 +101,8 @@ class QuasiNewton(SnesMethod):
                 return iterations, failure
             if not self._refresh():
                 return iterations, compat.NOT_FINITE
+            if stalls >= _FEW_STALLS and self.gives_up() and equations.friction_needed() > 1.0:
+                return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
 
     def _start(self) -> None:
         """H₀ = (K + αK_n + φK_t)⁻¹, all of Γc closed and sticking (section 5). Collective."""

@@ -20,7 +20,7 @@ from fenics_contact.methods.alternating import Alternation
 from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.kept import Kept
-from fenics_contact.methods.method import Method, Newton, OwnMethod, SnesMethod, Tools
+from fenics_contact.methods.method import OVERLOADED, Method, Newton, OwnMethod, SnesMethod, Tools
 from fenics_contact.methods.neighbourhood import linearised, respond
 from fenics_contact.methods.options import Defaults, take_command_line
 from fenics_contact.methods.quasi_newton import QuasiNewton
@@ -476,6 +476,7 @@ class Solver:
             tries.append((starts[0], _LAST_RESORT))
             if self._hurries:
                 tries = [tries[0], tries[-1], *tries[:-1]]
+        suspected = cold
         for number, (start, method) in enumerate(tries):
             self.main.enough = _ENOUGH if self._hurries and number == 0 else np.inf
             equations.solution.array[:] = start
@@ -488,6 +489,12 @@ class Solver:
                 break
             if self._comm.rank == 0:
                 logger.info("%s", attempts[-1])
+            if reason == OVERLOADED:
+                break
+            if goes_on and not suspected and self._is_overloaded():
+                # Minimum problems tell whether it is so, from where the increment starts.
+                suspected = True
+                tries.insert(number + 1, (starts[0], "alternating"))
         equations.set_state(equations.solution)
         # With a linear bulk a start by the tangent comes first even where it is far off, which a
         # load that falls to nothing does not forgive after continuation.
@@ -497,6 +504,13 @@ class Solver:
         made = sum(attempt.iterations for attempt in attempts[-1:])
         self.starts.predict = reason > 0 and newton and (factored or made > 0)
         return int(reason), attempts
+
+    def _is_overloaded(self) -> bool:
+        """Whether friction cannot bear the load by the pressures at ``solution``. Collective."""
+        self.equations.set_state(self.equations.solution)
+        for contact in self._full.contacts:
+            contact.evaluate()
+        return self.equations.friction_needed() > 1.0
 
     @property
     def _hurries(self) -> bool:
@@ -512,6 +526,9 @@ class Solver:
         """What became of an attempt, in words. Collective."""
         if reason > 0:
             return "converged"
+        overload = self.equations.overload
+        if reason == OVERLOADED and overload is not None:
+            return overload.in_words()
         words = _OUTCOMES.get(reason, f"SNES reason {reason}")
         return "; ".join(filter(None, (words, self.equations.watch.chattering())))
 

@@ -1,0 +1,149 @@
+"""Loads that friction cannot bear, by limit analysis with the pressures that were found.
+
+Of a body that the load would move along a rigid motion r contact takes at most
+D(r) = ∫ limit |r_t|, where limit (μ p) is given and r does not press the body into its opposite.
+There is an equilibrium under given limits if no such motion has load · r > D(r): elasticity has no
+say, for it does no work on rigid motions. The worst of them is sought by cutting planes: D is
+convex, and the motions are few.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.optimize
+from mpi4py import MPI
+
+from fenics_contact.checks.rigid_motions import RigidMotions
+from fenics_contact.contact.values import PointValues
+from fenics_contact.parallel import agreed, global_max, global_sum
+from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.types import Array
+
+__all__ = ["Overload", "find_overload"]
+
+# Steps of the search, and how close to the worst motion it ends.
+_STEPS, _NEAR = 200, 1e-3
+# Motions are of order one; where friction takes nothing of one, the search is kept within this.
+_FAR = 1e4
+# Share of the largest motion below which one is not named.
+_SLIGHT = 0.02
+# Approach at a point, by the largest motion, that is round-off.
+_TOUCHES = 1e-9
+
+
+@dataclass(frozen=True)
+class Overload:
+    """A rigid motion by which the load outdoes friction.
+
+    Attributes:
+        motion: Its name.
+        load: What the load does along it (force).
+        borne: What friction takes of that at most (force).
+    """
+
+    motion: str
+    load: float
+    borne: float
+
+    @property
+    def factor(self) -> float:
+        """How many times the limits of friction the load needs; infinite where there are none."""
+        return self.load / self.borne if self.borne > 0 else np.inf
+
+    def in_words(self) -> str:
+        """What outdoes what."""
+        return (
+            f"overload: along the {self.motion} the load is {self.load:.4g}, and friction under "
+            f"the pressures found bears at most {self.borne:.4g}"
+        )
+
+
+def _bound(values: PointValues) -> Array:
+    """What no tangential traction exceeds in any direction, (n_points,) (stress).
+
+    Of a polygon or an ellipse the limit is that of one direction alone.
+    """
+    friction = values.parameters["friction"]
+    ratio = np.divide(values.grip, friction, out=np.ones_like(friction), where=friction > 0)
+    return values.limit * np.maximum(ratio, 1.0)
+
+
+def find_overload(motions: RigidMotions, operators: Sequence[ContactOperator]) -> Overload | None:
+    """The worst motion by which the load outdoes friction at its present limits. Collective.
+
+    Args:
+        motions: Which of them are free, and what the load checked last does on them.
+        operators: Of evaluated contacts, over all unknowns.
+
+    Returns:
+        None where friction can bear the load, or nothing can be told: supports that turn, places
+        that follow the bodies, tangential forces without limit.
+    """
+    comm, wanted = motions.comm, motions.resultant
+    contacts = [operator.contact for operator in operators]
+    rubbing = [c for c in contacts if c.law.has_friction]
+    unlimited = any(c.law.has_tangential and not c.law.has_friction for c in contacts)
+    if unlimited or not rubbing or any(c.finite or c.law.has_tension for c in contacts):
+        return None
+    size = np.abs(wanted).max(initial=0.0)
+    if motions.turning or not size > 0:
+        return None
+    finite = all(np.isfinite(c.values.limit).all() for c in rubbing)
+    if not comm.allreduce(finite, op=MPI.LAND):  # of a state that has gone astray
+        return None
+    sliding, closing = [], []
+    for operator, contact in zip(operators, contacts, strict=True):
+        normal = contact.values.normal
+        modes = motions.straight_at_points(operator)
+        along = np.einsum("mqd,qd->mq", modes, normal)
+        if contact.law.has_normal_stiffness:
+            closing.append(along[:, contact.paired])
+        if contact.law.has_friction:
+            across = modes - along[:, :, None] * normal
+            sliding.append((across, contact.measure * _bound(contact.values)))
+    near = np.concatenate(closing or [np.zeros((len(wanted), 0))], axis=1)
+
+    def taken(motion: Array) -> tuple[float, Array]:
+        """D and its derivative."""
+        found: Array = np.zeros(1 + len(motion))
+        for across, limit in sliding:
+            slip = np.tensordot(motion, across, axes=1)
+            way = np.linalg.norm(slip, axis=1)
+            direction = slip / np.maximum(way, np.finfo(float).tiny)[:, None]
+            found[0] += limit @ way
+            found[1:] += np.einsum("mqd,qd,q->m", across, direction, limit)
+        found = global_sum(comm, found)
+        return float(found[0]), found[1:]
+
+    # All in units of the load; D ≤ 1 bounds the motion, and the load does on it what it can.
+    rows: list[Array] = []
+    bounds: list[float] = []
+    worst, most = None, 0.0
+    motion: Array = wanted / size
+    for _ in range(_STEPS):
+        borne, slope = taken(motion)
+        rows.append(slope / size)
+        bounds.append(1.0)
+        pressed = motion @ near
+        largest = np.abs(motion).max()
+        deepest = global_max(comm, pressed, empty=0.0)
+        if deepest > _TOUCHES * largest:
+            first = comm.allgather(pressed.size > 0 and pressed.max() == deepest).index(True)
+            row = near[:, np.argmax(pressed)] if comm.rank == first else None
+            rows.append(comm.bcast(row, root=first))
+            bounds.append(0.0)
+        elif wanted @ motion > most * borne:
+            most = float(wanted @ motion) / borne if borne > 0 else np.inf
+            worst = motion / largest
+        limits = [(-_FAR, _FAR)] * len(wanted)
+        made = scipy.optimize.linprog(-wanted / size, A_ub=rows, b_ub=bounds, bounds=limits)
+        status, motion = agreed(comm, (made.status, made.x))
+        if status != 0 or wanted @ motion / size <= max(1.0, most * (1 + _NEAR)):
+            break
+    if worst is None or most <= 1.0:
+        return None
+    named = motions.describe_straight(np.where(np.abs(worst) < _SLIGHT, 0.0, worst))
+    return Overload(named, float(wanted @ worst), taken(worst)[0])

@@ -1,0 +1,124 @@
+"""Loads that friction cannot bear: found by limit analysis, said in words, and nothing else is."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+
+import fenics_contact as fc
+from fenics_contact.checks.overload import find_overload
+from scenes.blocks import TOP, block
+from scenes.comparing import raised_everywhere
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+
+MU = 0.3
+# ∫ r dA over the unit square, r from its middle: (√2 + asinh 1)/6 (polar coordinates).
+LEVER = (np.sqrt(2.0) + np.arcsinh(1.0)) / 6
+# An even load of size 1 along the radius turned by a right angle has this moment: ∫ r² dA.
+TURNED = 1 / 6
+
+
+def twisted(law, n=6, **options):
+    """A cube pressed on the floor by 10, that nothing else holds, and its twisting load."""
+    scene = block("hexahedron", n=n, up=-10.0)
+    twist, x = fem.Constant(scene.mesh, 0.0), ufl.SpatialCoordinate(scene.mesh)
+    v = ufl.TestFunction(scene.u.function_space)
+    around = ufl.as_vector([0.5 - x[1], x[0] - 0.5, 0.0])
+    scene.F -= twist * ufl.dot(around, v) * ufl.ds(scene.mesh, subdomain_data=scene.tags)(TOP)
+    problem, contact = scene.problem(law, [], kinematics=np.inf, **options)
+    return problem, contact, twist
+
+
+def overload(problem):
+    """What is found at the present state under the present load."""
+    problem.motions.check_balance(problem.present_load(), problem.operators)
+    return find_overload(problem.motions, problem.operators)
+
+
+def test_a_twist():
+    """Tresca's limit along a circle at every point: the moment is limit · ∫ r dA.
+
+    Tolerance: 1e-2, of which half is the quadrature of r, that has a kink in the middle.
+    """
+    problem, _, twist = twisted(fc.Tresca(MU, 10.0, k_n=1e5, k_t=1e5))
+    most = MU * 10.0 * LEVER / TURNED
+    twist.value = 0.98 * most
+    assert overload(problem) is None
+    for share in (1.02, 3.0):
+        twist.value = share * most
+        found = overload(problem)
+        assert found.factor == pytest.approx(share, rel=1e-2)
+        assert "rotation about z" in found.in_words()
+
+
+@pytest.mark.parametrize("method", [None, "newton", "lbfgs"])
+def test_it_ends_soon_and_says_why(method):
+    """Tresca's and Coulomb's law, by statics: below the limit solved, above it refused.
+
+    Coulomb's pressure is not even any more where the cube is twisted; its limit is found from it.
+    """
+    for law in (fc.Tresca(MU, 10.0, k_n=1e5, k_t=1e5), fc.Coulomb(MU, k_n=1e5, k_t=1e5)):
+        problem, contact, twist = twisted(law, n=3, method=method)
+        most = MU * 10.0 * LEVER / TURNED
+        problem.solve()
+        problem.commit()
+        twist.value = 0.9 * most
+        problem.solve()
+        problem.commit()
+        assert contact.moment((0.5, 0.5, 0.0))[2] == pytest.approx(-0.9 * most * TURNED, rel=1e-6)
+        twist.value = 1.1 * most
+        failed = []
+
+        def solve(problem=problem, failed=failed):
+            try:
+                problem.solve()
+            except fc.NotConverged as error:
+                failed.append(error)
+                raise
+
+        raised_everywhere(solve, fc.NotConverged, "overload: along the rotation about z")
+        assert failed[0].iterations < 300
+
+
+@pytest.mark.parametrize("method", [None, "lbfgs", "newton", "alternating", "continuation"])
+@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
+def test_loads_that_grow_together_are_none(cell, method):
+    """What pressed before says nothing: both forces grow by a hundred at once."""
+    scene = block(cell, n=4, up=-0.1)
+    law = fc.Coulomb(MU, k_n=1e5, k_t=1e5)
+    problem, contact = scene.problem(law, [], kinematics=np.inf, method=method)
+    problem.solve()
+    problem.commit()
+    scene.load(up=-10.0, side=0.9 * MU * 10.0)
+    problem.solve()
+    found = contact.resultants()
+    assert found.force[0] == pytest.approx(-0.9 * MU * 10.0, rel=1e-6)
+    assert found.normal_force == pytest.approx(10.0, rel=1e-6)
+
+
+def test_the_larger_friction_of_two():
+    """An ellipse bears across its direction what the limit along it would not."""
+    scene = block("hexahedron", n=3, size=(1.0, 1.0, 0.25), up=-10.0)
+    law = fc.Coulomb(MU, 1e5, 1e5, transverse_friction=2 * MU, direction=(0.0, 1.0, 0.0))
+    problem, contact = scene.problem(law, [], kinematics=np.inf)
+    problem.solve()
+    problem.commit()
+    scene.load(up=-10.0, side=1.8 * MU * 10.0)
+    problem.solve()
+    assert overload(problem) is None
+    assert contact.resultants().force[0] == pytest.approx(-1.8 * MU * 10.0, rel=1e-6)
+
+
+def test_polygons_and_where_nothing_is_told():
+    """A polygon's corners count; forces without limit, and supports that turn, are left alone."""
+    for modes, most in ((None, 1.0), (4, np.sqrt(2.0))):
+        scene = block("hexahedron", n=2, size=(1.0, 1.0, 0.25), up=-10.0)
+        law = fc.Tresca(MU, 10.0, 1e5, 1e5, modes=modes, direction=modes and (1.0, 0.0, 0.0))
+        problem, _ = scene.problem(law, [])
+        for share, is_found in ((0.99 * most, False), (1.01 * most, True)):
+            scene.load(up=-10.0, side=share * MU * 10.0)
+            assert (overload(problem) is not None) == is_found
+    scene = block("hexahedron", n=2, up=-10.0, side=50.0)
+    problem, _ = scene.problem(fc.Foundation(1e5, 1e5), [])
+    assert overload(problem) is None
