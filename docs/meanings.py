@@ -124,7 +124,7 @@ GROUPS: list[tuple[str, list[str], str]] = [
     ),
     (
         "Checkpoints",
-        ["histories.checkpoint"],
+        ["histories.checkpoint", "histories.archive", "histories.places"],
         "A file is taken up by the scene that wrote it alone; the text names what differs. "
         '`changed="continue"` goes on with other data (stiffness, laws, supports, conditions, '
         "loads), "

@@ -11,7 +11,8 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
-from fenics_contact import checkpoint, compat
+from fenics_contact import compat
+from fenics_contact.histories.places import node_places, rows_of
 from scenes.comparing import close, gathered, owned, raised_everywhere, shared_folder
 from scenes.elasticity import strain
 from scenes.histories import Press, differences
@@ -48,11 +49,11 @@ def wave(x: np.ndarray, k: float) -> np.ndarray:
 def fill(fields: list[fem.Function], k: float) -> None:
     """Values that follow from the place, the component, the cell beside and ``k``."""
     for i, field in enumerate(fields):
-        places = checkpoint._node_places(field.function_space)
+        places = node_places(field.function_space)
         d = places.shape[1] // 2
         x = np.zeros((len(places), 3))
         x[:, :d] = places[:, :d] + 0.1 * places[:, d:]
-        values = checkpoint._rows(field)
+        values = rows_of(field)
         for j in range(values.shape[1]):
             values[:, j] = wave(x, k + i + 0.3 * j)
         field.x.scatter_forward()

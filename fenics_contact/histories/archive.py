@@ -1,0 +1,137 @@
+"""The file of a checkpoint: an archive of NumPy arrays, its digest, and what is refused of it."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fenics_contact.results import files
+from fenics_contact.types import Array
+
+__all__ = ["FORMAT", "Stored", "check_finite", "read_file", "refuse", "write_file"]
+
+FORMAT = 4
+# The file's end: these words, and the digest of all before them.
+_MARK = b"\nfenics_contact checkpoint, sha256 "
+_REMEDY = "remove it to start anew"
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a file holds, on every rank.
+
+    Attributes:
+        path: The file.
+        scene: The fingerprint in words, and what else is no array.
+        arrays: By name.
+    """
+
+    path: Path
+    scene: dict[str, Any]
+    arrays: dict[str, Array]
+
+    @property
+    def numbers(self) -> list[float]:
+        """The caller's numbers."""
+        return [float(value) for value in self.arrays["numbers"]]
+
+    @property
+    def notes(self) -> Any:
+        """The caller's notes."""
+        return self.scene["notes"]
+
+
+def write_file(path: Path, scene: dict[str, Any], arrays: dict[str, Array]) -> None:
+    """Write the archive, read it back, and put it in place.
+
+    Raises:
+        OSError: It cannot be written, or is not what was written. The file before it stays.
+    """
+    content = _pack(scene, arrays)
+    with files.replacing(path) as temporary:
+        with open(temporary, "wb") as file:
+            file.write(content)
+        # Whether it can be gone on from is better known now than when it is needed.
+        if temporary.read_bytes() != content:
+            raise OSError(f"{path} is not what was written: is the disk full, or damaged?")
+
+
+def _pack(scene: dict[str, Any], arrays: dict[str, Array]) -> bytes:
+    """The archive, and how it ends."""
+    words = np.frombuffer(json.dumps(scene).encode(), dtype=np.uint8)
+    archive = io.BytesIO()
+    np.savez(archive, allow_pickle=False, scene=words, **arrays)
+    content = archive.getvalue()
+    return content + _MARK + hashlib.sha256(content).hexdigest().encode()
+
+
+def read_file(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Scene and arrays of a file.
+
+    Raises:
+        ValueError: It is damaged, or none of this format.
+        OSError: It cannot be read.
+    """
+    content = path.read_bytes()
+    end = len(content) - len(_MARK) - 64
+    if end < 0 or content[end : end + len(_MARK)] != _MARK:
+        raise ValueError(
+            f"{path} is no checkpoint of this version, or is cut short: its end is missing; put a "
+            f"copy in its place, or {_REMEDY}"
+        )
+    if hashlib.sha256(content[:end]).hexdigest().encode() != content[-64:]:
+        raise ValueError(
+            f"{path} is damaged: it is not as it was written; put a copy in its place, or {_REMEDY}"
+        )
+    try:
+        with np.load(io.BytesIO(content[:end]), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        scene = json.loads(arrays.pop("scene").tobytes())
+        found = scene["format"]
+        wanted = {"format", "notes", "contacts", "fixed", "data"}
+        complete = found != FORMAT or (set(scene) == wanted and "numbers" in arrays)
+    except Exception as error:  # whatever the archive's reader makes of it
+        raise ValueError(f"{path} is no checkpoint ({error}); {_REMEDY}") from error
+    if found != FORMAT or not complete:
+        raise ValueError(
+            f"{path} is a checkpoint of format {found!r}, and this version reads {FORMAT}; go on "
+            f"with the version that wrote it, or {_REMEDY}"
+        )
+    for name, array in arrays.items():
+        if array.dtype != np.float64 or array.ndim not in (1, 2):
+            raise ValueError(
+                f"{path}: {name!r} is of type {array.dtype}, with {array.ndim} axes; a checkpoint "
+                f"has tables of float64; {_REMEDY}"
+            )
+        check_finite(name, array, f"{path}, {_REMEDY}")
+    return scene, arrays
+
+
+def check_finite(name: str, array: Array, where: str) -> None:
+    """Refuse values that are not finite, but for those that may be.
+
+    Raises:
+        ValueError: It names the array.
+    """
+    # Where an increment is cut is infinite where none was; what is evaluated may be anything.
+    wrong = np.isnan(array) if name == "numbers" else ~np.isfinite(array)
+    if wrong.any() and not name.startswith("values "):
+        raise ValueError(f"{name!r} has values that are not finite: {where}")
+
+
+def refuse(stored: Stored, differences: Sequence[str], remedy: str = "") -> None:
+    """Refuse a file that differs from what is wanted.
+
+    Raises:
+        ValueError: It lists the differences, if there are any, and the remedy.
+    """
+    if differences:
+        what = "; ".join(differences)
+        raise ValueError(f"{stored.path} is not of this problem: {what}; {_REMEDY}{remedy}")
