@@ -174,8 +174,9 @@ class Inputs:
         if isinstance(value, ufl.core.expr.Expr):
             return value
         try:
-            array = np.asarray(value)
-        except ValueError:  # a ragged list
+            # NumPy has no integers as large as Python's, which are numbers like others.
+            array = np.asarray(float(value) if type(value) is int else value)
+        except (ValueError, OverflowError):  # a ragged list, a number beyond all
             array = np.asarray(None)
         if array.dtype.kind not in "iuf":
             raise TypeError(
