@@ -236,7 +236,7 @@ def test_parameter_of_a_wrong_type(value):
 def test_whole_numbers_of_any_size():
     """Python's integers have no end; 10**30 is 1e30, and what no float can hold is refused."""
     scene = block(n=2, up=-1.0)
-    problem, contact = scene.problem(fc.Frictionless(k_n=10**30), scene.rollers())
+    _, contact = scene.problem(fc.Frictionless(k_n=10**30), scene.rollers())
     assert contact.parameters["k_n"].value == 1e30
     words = "k_n is 1000"
     raised_everywhere(lambda: scene.contact(fc.Frictionless(k_n=10**400)), TypeError, words)
