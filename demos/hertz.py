@@ -159,7 +159,7 @@ def build(
     on_axis = fem.locate_dofs_topological(V.sub(0), 1, tags.find(AXIS))
     bcs = [fem.dirichletbc(PETSc.ScalarType(0.0), on_axis, V.sub(0))]
 
-    # Contact, in four lines.
+    # Contact: a law, where it acts, and on what is pressed.
     stiffness = {n: k for n, k in (("k_n", arguments.k_n), ("k_t", arguments.k_t)) if k}
     law: fc.Coulomb | fc.Frictionless
     if friction > 0:

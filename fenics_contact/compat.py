@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import ctypes
-import logging
-import sys
-import time
 from typing import Any
 
 import basix
 import dolfinx
 import numpy as np
 import numpy.typing as npt
-import ufl
 from dolfinx import fem
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact.types import Array
@@ -23,10 +18,9 @@ __all__ = [
     "LEAST_RESIDUAL",
     "LONGEST_STEP",
     "NOT_FINITE",
-    "Waiting",
+    "adjacency",
     "cell_partitioner",
     "collapsed",
-    "compile_form",
     "contains",
     "create_facet_submesh",
     "geometry_dofmap",
@@ -34,7 +28,6 @@ __all__ = [
     "gmsh_data",
     "interpolation_points",
     "option_was_read",
-    "waiting",
 ]
 
 if tuple(map(int, dolfinx.__version__.split(".")[:2])) < (0, 9):
@@ -43,9 +36,6 @@ if tuple(map(int, dolfinx.__version__.split(".")[:2])) < (0, 9):
         "later one, or use the container (docker/run)"
     )
 
-logger = logging.getLogger("fenics_contact")
-# Seconds: what takes less was in the cache; when a user wonders.
-_FROM_CACHE, _LONG = 0.1, 3.0
 # PETSc's line search for the least residual, renamed in 3.24; bound to Python since 3.23.
 _line_searches = getattr(getattr(PETSc, "SNESLineSearch", None), "Type", None)
 LEAST_RESIDUAL = getattr(_line_searches, "SECANT", "l2")
@@ -99,6 +89,12 @@ def option_was_read(name: str) -> bool:
     return bool(read.value)
 
 
+def adjacency(values: npt.NDArray[Any], offsets: npt.NDArray[np.int32]) -> Any:
+    """Lists of numbers one behind another, as a partitioner has to return them."""
+    lists = dolfinx.graph.adjacencylist(values, offsets)
+    return getattr(lists, "_cpp_object", lists)
+
+
 def cell_partitioner(ghost_mode: dolfinx.mesh.GhostMode) -> Any:
     """What ``dolfinx.mesh.create_mesh`` distributes cells by: a facet has up to two of them."""
     try:
@@ -114,45 +110,6 @@ def collapsed(space: fem.FunctionSpace) -> tuple[fem.FunctionSpace, npt.NDArray[
     """
     own, dofs = space.collapse()
     return own, np.asarray(dofs, dtype=np.int32).ravel()
-
-
-def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:
-    """Compile a UFL form with the entity maps of its submeshes. Collective.
-
-    What has been compiled before, in any run, is in DOLFINx's cache. If all that is not takes more
-    than some seconds, it is said once what the program is doing: at level INFO, or to a terminal.
-    """
-    start = time.perf_counter()
-    compiled = fem.form(form, entity_maps=entity_maps or None)
-    waiting.add(time.perf_counter() - start)
-    return compiled
-
-
-class Waiting:
-    """Time that went into compilation in this process."""
-
-    def __init__(self) -> None:
-        """None so far."""
-        self._seconds, self._said = 0.0, False
-
-    def add(self, seconds: float) -> None:
-        """Count it, and say so if it was not from the cache and has become long."""
-        if seconds > _FROM_CACHE:
-            self._seconds += seconds
-        if self._said or self._seconds < _LONG or MPI.COMM_WORLD.rank:
-            return
-        self._said = True
-        text = (
-            "compiling forms, as every first run with new ones does; later runs find them in "
-            f"{dolfinx.jit.get_options()['cache_dir']}"
-        )
-        if logger.isEnabledFor(logging.INFO):
-            logger.info(text)
-        elif sys.stderr.isatty():
-            print(text, file=sys.stderr)
-
-
-waiting = Waiting()
 
 
 def geometry_element(mesh: dolfinx.mesh.Mesh) -> Any:

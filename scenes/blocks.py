@@ -89,8 +89,7 @@ def layers(cell: str) -> Callable:
         n_cells = cells[0].size // n_vertices
         destination = (np.arange(n_cells) * n_parts // max(n_cells, 1)).astype(np.int32)
         offsets = np.arange(n_cells + 1, dtype=np.int32)
-        adjacency = dolfinx.graph.adjacencylist(destination, offsets)
-        return getattr(adjacency, "_cpp_object", adjacency)
+        return compat.adjacency(destination, offsets)
 
     return partition
 

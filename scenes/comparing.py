@@ -18,7 +18,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from fenics_contact import compat
+from fenics_contact.compiling import compile_form
 
 Array = np.ndarray
 
@@ -28,7 +28,7 @@ Array = np.ndarray
 
 def compiled(form: ufl.Form, contact: fc.Contact | None = None) -> fem.Form:
     """The form as DOLFINx has it, with the entity maps that a contact's own forms take."""
-    return compat.compile_form(form, contact.entity_maps if contact else None)
+    return compile_form(form, contact.entity_maps if contact else None)
 
 
 def assemble_number(form: fem.Form, comm: MPI.Comm) -> float:

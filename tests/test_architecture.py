@@ -13,6 +13,9 @@ import pytest
 pytestmark = pytest.mark.whole
 PACKAGE = Path(__file__).resolve().parent.parent / "fenics_contact"
 MODULES = sorted(PACKAGE.rglob("*.py"))
+ROOT = PACKAGE.parent
+FOLDERS = ("demos", "examples", "scenes", "tests", "benchmarks", "verification", "docs")
+OTHERS = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 # From below upwards; a room may import from itself and from those before it.
 ROOMS = [
     "laws",
@@ -31,10 +34,12 @@ ROOMS = [
 # Modules that stand in no room and know none of them.
 GROUND = {
     *("compat", "parallel", "types", "meshes", "joining", "arguments", "elasticity", "markup"),
-    *("_version", "installation"),
+    *("_version", "compiling", "installation"),
 }
 # DOLFINx names its C++ objects so, and there is no other way to them.
 OF_DOLFINX = {"_cpp_object"}
+# What Matplotlib has drawn in space is known by these alone.
+OF_MATPLOTLIB = {"_segments3d", "_vec", "_faces", "_segslices"}
 # By this name notebooks ask any object how it is shown.
 OF_NOTEBOOKS = {"_repr_html_"}
 # What releases of DOLFINx have by different names or with different arguments.
@@ -91,19 +96,49 @@ def test_no_circle():
         left = {module: needs for module, needs in left.items() if module not in ready}
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name)
+def private(node: ast.AST) -> str:
+    """The private name by which something is asked for, as an attribute or in words; or none."""
+    asked = ""
+    if isinstance(node, ast.Attribute):
+        asked = node.attr
+    elif isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1].endswith("attr"):
+        given = [a.value for a in node.args if isinstance(a, ast.Constant)]
+        asked = next((value for value in given if isinstance(value, str)), "")
+        asked = asked if asked != asked.upper() else ""  # a test may set a module's threshold
+    return asked if re.match("_[A-Za-z]", asked) else ""
+
+
+@pytest.mark.parametrize("path", MODULES + OTHERS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_nobody_touches_private_members_of_another(path):
     """`x._y` is for self, and for another instance in the body of the class that has it."""
     tree = ast.parse(path.read_text())
     classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
     allowed = {node for each in classes for node in ast.walk(each) if is_member(node, each)}
+    foreign = OF_DOLFINX | OF_NOTEBOOKS | (OF_MATPLOTLIB if path in OTHERS else set())
     touched = [
         f"line {node.lineno}: {ast.unparse(node)}"
         for node in ast.walk(tree)
-        if isinstance(node, ast.Attribute) and re.match("_[a-z]", node.attr)
-        if node not in allowed and node.attr not in OF_DOLFINX | OF_NOTEBOOKS
+        if private(node) and node not in allowed and private(node) not in foreign
     ]
     assert not touched
+    imported = [
+        f"line {node.lineno}: {alias.name}"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("fenics_contact")
+        for alias in node.names
+        if re.match("_[A-Za-z]", alias.name)
+    ]
+    assert not imported
+
+
+@pytest.mark.parametrize("path", OTHERS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_scripts_stand_on_packages(path):
+    """None makes others findable but the pages' own, and no test is taken from another."""
+    text = path.read_text()
+    if path.name not in ("conf.py", "test_docs.py", "test_architecture.py"):
+        assert "sys.path" not in text
+    froms = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ImportFrom)]
+    assert not [node.module for node in froms if (node.module or "").startswith("test_")]
 
 
 def is_member(node: ast.AST, of: ast.ClassDef) -> bool:

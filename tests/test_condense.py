@@ -249,7 +249,7 @@ def test_several_contacts_and_loads():
             found.append([r.force for r in step.contacts.values()])
         # Both loads are two fields times numbers: factored once, and solved for once each.
         if condensed:
-            assert len(problem.solver.system.condensation._directions) == 2
+            assert len(problem.solver.system.condensation.directions) == 2
         results.append({"u": owned(scene.u).copy(), "forces": np.array(found)})
     assert_same(*results)
 

@@ -51,7 +51,7 @@ def test_solutions(symmetric):
             b.array[:] = right
             ksp.solve(b, x)
             assert np.allclose(x.array, np.linalg.solve(whole, right), rtol=0, atol=1e-12)
-            left_out.append(ksp.pc.getPythonContext()._out.size)
+            left_out.append(ksp.pc.getPythonContext().outside.size)
     assert max(left_out) > N / 2 and min(left_out) == 0
 
 
@@ -65,8 +65,8 @@ def test_few_changes_are_corrections(size, monkeypatch):
     rng, fixed, matrix, ksp, operator = scene(True)
     made = []
     solver = ksp.pc.getPythonContext()
-    anew = solver._factor_anew
-    monkeypatch.setattr(solver, "_factor_anew", lambda: made.append(1) or anew())
+    anew = solver.factor_anew
+    monkeypatch.setattr(solver, "factor_anew", lambda: made.append(1) or anew())
     diagonal = np.arange(N)
     added = np.where(diagonal < 25, size, 0.0)
     counts = []

@@ -9,7 +9,7 @@ import ufl
 from dolfinx import fem
 
 import fenics_contact as fc
-from fenics_contact import compat
+from fenics_contact.compiling import compile_form
 from fenics_contact.parallel import global_max
 from scenes.blocks import CELLS, wave
 from scenes.comparing import raised_everywhere
@@ -154,9 +154,7 @@ def test_the_boundary_form_is_the_same(cell, shape, enforcement):
     contact = scene.contact(support, fc.Coulomb(0.3, K, K), enforcement=enforcement)
     comm, operator = scene.mesh.comm, fc.ContactOperator(contact)
     maps = contact.entity_maps
-    form, tangent = (
-        compat.compile_form(f, maps) for f in (contact.form(v), contact.tangent(v, du))
-    )
+    form, tangent = (compile_form(f, maps) for f in (contact.form(v), contact.tangent(v, du)))
     for _ in states(scene, contact, shift, angle):
         if contact.multipliers is not None:
             contact.augment()

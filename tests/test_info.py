@@ -16,7 +16,7 @@ from petsc4py import PETSc
 
 import fenics_contact as fc
 from fenics_contact import __main__ as program
-from fenics_contact import compat
+from fenics_contact import compat, compiling
 from fenics_contact.installation import information
 from scenes.comparing import raised_everywhere
 
@@ -91,11 +91,11 @@ def test_what_a_first_run_waits_for_is_said_once(monkeypatch, caplog, capsys):
         caplog.clear()
         times = itertools.count(0.0, seconds)
         monkeypatch.setattr(compat.time, "perf_counter", lambda: next(times))
-        monkeypatch.setattr(compat, "waiting", compat.Waiting())
+        monkeypatch.setattr(compiling, "waiting", compiling.Waiting())
         monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
         with caplog.at_level(level, "fenics_contact"):
             for _ in range(2):
-                compat.compile_form(form)
+                compiling.compile_form(form)
         printed = capsys.readouterr().err
         return caplog.text.count("compiling forms"), printed.count("compiling forms")
 

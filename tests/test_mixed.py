@@ -9,6 +9,7 @@ from dolfinx import fem
 
 import fenics_contact as fc
 from fenics_contact import compat
+from fenics_contact.compiling import compile_form
 from fenics_contact.parallel import global_max
 from scenes.blocks import TOP, wave
 from scenes.comparing import (
@@ -248,7 +249,7 @@ def test_a_problem_without_contacts_finds_its_displacement():
     bcs = [*scene.bcs, fem.dirichletbc(top, dofs, W.sub(0))]
     problem = fc.ContactProblem(scene.F, scene.u, bcs=bcs)
     problem.solve()
-    volume = compat.compile_form(scene.body.J * ufl.dx(scene.mesh))
+    volume = compile_form(scene.body.J * ufl.dx(scene.mesh))
     found = scene.mesh.comm.allreduce(fem.assemble_scalar(volume))
     assert found == pytest.approx(2.0, rel=1e-6)
     assert problem.displacement.u.x.array.size == top.x.array.size

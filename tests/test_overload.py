@@ -52,7 +52,7 @@ def test_a_twist():
         assert "rotation about z" in found.in_words()
 
 
-@pytest.mark.parametrize("method", [None, "newton", "lbfgs"])
+@pytest.mark.parametrize("method", [None, "newton", "lbfgs", "alternating", "continuation"])
 def test_it_ends_soon_and_says_why(method):
     """Tresca's and Coulomb's law, by statics: below the limit solved, above it refused.
 
@@ -119,6 +119,16 @@ def test_polygons_and_where_nothing_is_told():
         for share, is_found in ((0.99 * most, False), (1.01 * most, True)):
             scene.load(up=-10.0, side=share * MU * 10.0)
             assert (overload(problem) is not None) == is_found
-    scene = block("hexahedron", n=2, up=-10.0, side=50.0)
-    problem, _ = scene.problem(fc.Foundation(1e5, 1e5), [])
-    assert overload(problem) is None
+    tresca = fc.Tresca(MU, 10.0, 1e5, 1e5)
+    turned = fc.Rotation(None, (0.5, 0.5, 0.0), axis=(0.0, 0.0, 1.0), moment=1.0)
+    turns = fc.HalfSpace((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), rotation=turned)
+    for law, held, contact in (
+        (fc.Foundation(1e5, 1e5), False, {}),
+        (fc.Foundation(1e5, 1e5, tension=True), False, {}),
+        (tresca, False, {"kinematics": "finite"}),
+        (tresca, True, {"support": turns, "kinematics": "finite"}),
+    ):
+        scene = block("hexahedron", n=2, size=(1.0, 1.0, 0.25), up=-10.0, side=4.0)
+        bcs = [scene.hold(TOP, i) for i in range(3)] if held else []
+        problem, _ = scene.problem(law, bcs, contact=contact)
+        assert overload(problem) is None

@@ -22,6 +22,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from fenics_contact import compat
 from scenes.bodies import Bodies, boxes, graded
 from scenes.processes import command, environment
 from scenes.tags import near
@@ -542,8 +543,7 @@ def lower_block_apart(comm: MPI.Comm, n_parts: int, cell_types: Any, cells: Any)
     upper = np.arange(max(n_cells - n_lower, 0)) * (n_parts - 1) // max(n_cells - n_lower, 1)
     destination = np.concatenate([np.full(min(n_lower, n_cells), n_parts - 1), upper])
     offsets = np.arange(n_cells + 1, dtype=np.int32)
-    adjacency = dolfinx.graph.adjacencylist(destination.astype(np.int32), offsets)
-    return getattr(adjacency, "_cpp_object", adjacency)
+    return compat.adjacency(destination.astype(np.int32), offsets)
 
 
 def ranked(

@@ -363,7 +363,7 @@ class FiniteProblem(reference.Problem):
             with contextlib.suppress(Failed, np.linalg.LinAlgError):
                 v, m = u, motion
                 for share in np.arange(1, parts + 1) / parts:
-                    v, m = self._increment(v, m, self._between(load, share), old, rtol)
+                    v, m = self.increment_of(v, m, self._between(load, share), old, rtol)
                 break
         else:
             v, m = self._stiffened(u, motion, load, old, rtol)
@@ -380,7 +380,7 @@ class FiniteProblem(reference.Problem):
             old = new
             if change <= 1e-8 * scale:
                 break
-            v, m = self._increment(v, m, load, old, rtol)
+            v, m = self.increment_of(v, m, load, old, rtol)
         else:
             if any(c.project is not None for c in self.contacts):
                 raise Failed("multipliers do not settle")
@@ -396,7 +396,7 @@ class FiniteProblem(reference.Problem):
             for factor in _SOFTER:
                 for contact, (k_n, k_t) in zip(self.contacts, whole, strict=True):
                     contact.k_n, contact.k_t = factor * k_n, factor * k_t
-                u, motion = self._increment(u, motion, load, old, rtol)
+                u, motion = self.increment_of(u, motion, load, old, rtol)
         finally:
             for contact, (k_n, k_t) in zip(self.contacts, whole, strict=True):
                 contact.k_n, contact.k_t = k_n, k_t
@@ -423,7 +423,7 @@ class FiniteProblem(reference.Problem):
             angle=angle + share * (load.angle - angle),
         )
 
-    def _increment(
+    def increment_of(
         self, u: Array, motion: Array, load: Any, old: list[Any], rtol: float
     ) -> tuple[Array, Array]:
         """Newton's method with a line search."""

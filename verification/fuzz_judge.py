@@ -440,7 +440,7 @@ class Judge:
     ) -> None:
         """Distance, in forces, from the exact solution of the same equations next to it."""
         try:
-            near, moved = self.problem._increment(u, motion, load, old, 1e-12)
+            near, moved = self.problem.increment_of(u, motion, load, old, 1e-12)
         except reference.Failed as failure:
             self.unjudged.append(f"{name}: nearest: {failure}")
             return

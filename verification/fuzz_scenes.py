@@ -527,7 +527,7 @@ class Made:
     def facets_of(self, body: int, side: str) -> Array:
         """Facets of a side of a body; tops share a tag."""
         facets = self.tags.find(_tag(self.scene, body, side))
-        return facets[np.isin(self._cell_of(facets), np.flatnonzero(self.box == body))]
+        return facets[np.isin(self.cell_of(facets), np.flatnonzero(self.box == body))]
 
     def _bend(self) -> None:
         """Move the nodes of bodies up by a parabola over x."""
@@ -543,7 +543,8 @@ class Made:
             width = body["size"][0] * self.length
             x[nodes, self.d - 1] += rise * width * (2 * (x[nodes, 0] - middle) / width) ** 2
 
-    def _cell_of(self, facets: Array) -> Array:
+    def cell_of(self, facets: Array) -> Array:
+        """One of the cells of every facet."""
         to_cell = self.mesh.topology.connectivity(self.d - 1, self.d)
         return np.array([to_cell.links(f)[0] for f in facets], dtype=int)
 
@@ -551,7 +552,7 @@ class Made:
         mesh, d = self.mesh, self.d
         mesh.topology.create_connectivity(d - 1, d)
         exterior = dolfinx.mesh.exterior_facet_indices(mesh.topology)
-        box = self.box[self._cell_of(exterior)]
+        box = self.box[self.cell_of(exterior)]
         middle = dolfinx.mesh.compute_midpoints(mesh, d - 1, exterior)[:, :d] / self.length
         values = np.zeros(len(exterior), dtype=np.int32)
         for b, body in enumerate(self.scene["bodies"]):
@@ -924,7 +925,7 @@ def body_of(made: Made) -> tuple[reference.Body, Callable[[int], reference.Surfa
 
     def surface(tag: int) -> reference.Surface:
         facets = made.tags.find(tag)
-        cells = made._cell_of(facets)
+        cells = made.cell_of(facets)
         local = [
             int(np.flatnonzero(to_facet.links(c) == f)[0])
             for c, f in zip(cells, facets, strict=False)

@@ -998,9 +998,9 @@ class Problem:
             Failed: Nothing was found.
         """
         if all(c.project is None for c in self.contacts):
-            return *self._increment(u, motion, load, old, rtol), old
+            return *self.increment_of(u, motion, load, old, rtol), old
         for _ in range(3000):
-            u, motion = self._increment(u, motion, load, old, rtol)
+            u, motion = self.increment_of(u, motion, load, old, rtol)
             found = self.respond(u, motion, load, old)
             new = [
                 c.augment(f, o) if c.project is not None else o
@@ -1012,7 +1012,7 @@ class Problem:
                 return u, motion, old
         raise Failed("multipliers do not settle")
 
-    def _increment(
+    def increment_of(
         self, u: Array, motion: Array, load: Load, old: list[State], rtol: float
     ) -> tuple[Array, Array]:
         """Newton's method; where it fails, from where limits of friction have been led to rest."""

@@ -74,6 +74,8 @@ def _bound(values: PointValues) -> Array:
 def find_overload(motions: RigidMotions, operators: Sequence[ContactOperator]) -> Overload | None:
     """The worst motion by which the load outdoes friction at its present limits. Collective.
 
+    Whatever is found does; where the search is not at its end there may be worse.
+
     Args:
         motions: Which of them are free, and what the load checked last does on them.
         operators: Of evaluated contacts, over all unknowns.
@@ -94,17 +96,17 @@ def find_overload(motions: RigidMotions, operators: Sequence[ContactOperator]) -
     finite = all(np.isfinite(c.values.limit).all() for c in rubbing)
     if not comm.allreduce(finite, op=MPI.LAND):  # of a state that has gone astray
         return None
-    sliding, closing = [], []
+    sliding, approaching = [], []
     for operator, contact in zip(operators, contacts, strict=True):
         normal = contact.values.normal
-        modes = motions.straight_at_points(operator)
+        modes = motions.at_points(operator)
         along = np.einsum("mqd,qd->mq", modes, normal)
         if contact.law.has_normal_stiffness:
-            closing.append(along[:, contact.paired])
+            approaching.append(along[:, contact.paired])
         if contact.law.has_friction:
             across = modes - along[:, :, None] * normal
             sliding.append((across, contact.measure * _bound(contact.values)))
-    near = np.concatenate(closing or [np.zeros((len(wanted), 0))], axis=1)
+    closing = np.concatenate(approaching or [np.zeros((len(wanted), 0))], axis=1)
 
     def taken(motion: Array) -> tuple[float, Array]:
         """D and its derivative."""
@@ -127,23 +129,22 @@ def find_overload(motions: RigidMotions, operators: Sequence[ContactOperator]) -
         borne, slope = taken(motion)
         rows.append(slope / size)
         bounds.append(1.0)
-        pressed = motion @ near
+        pressed = motion @ closing
         largest = np.abs(motion).max()
         deepest = global_max(comm, pressed, empty=0.0)
         if deepest > _TOUCHES * largest:
             first = comm.allgather(pressed.size > 0 and pressed.max() == deepest).index(True)
-            row = near[:, np.argmax(pressed)] if comm.rank == first else None
+            row = closing[:, np.argmax(pressed)] if comm.rank == first else None
             rows.append(comm.bcast(row, root=first))
             bounds.append(0.0)
         elif wanted @ motion > most * borne:
             most = float(wanted @ motion) / borne if borne > 0 else np.inf
             worst = motion / largest
-        limits = [(-_FAR, _FAR)] * len(wanted)
-        made = scipy.optimize.linprog(-wanted / size, A_ub=rows, b_ub=bounds, bounds=limits)
+        made = scipy.optimize.linprog(-wanted / size, A_ub=rows, b_ub=bounds, bounds=(-_FAR, _FAR))
         status, motion = agreed(comm, (made.status, made.x))
         if status != 0 or wanted @ motion / size <= max(1.0, most * (1 + _NEAR)):
             break
     if worst is None or most <= 1.0:
         return None
-    named = motions.describe_straight(np.where(np.abs(worst) < _SLIGHT, 0.0, worst))
-    return Overload(named, float(wanted @ worst), taken(worst)[0])
+    named = np.where(np.abs(worst) < _SLIGHT, 0.0, worst) @ motions.free
+    return Overload(motions.describe(named), float(wanted @ worst), taken(worst)[0])

@@ -25,7 +25,7 @@ from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["RigidMotions"]
+__all__ = ["RigidMotions", "unbalanced"]
 
 
 # Relative sizes below which an energy, a work or a share of a mode counts as zero. One clamped dof
@@ -143,7 +143,7 @@ class RigidMotions:
         for vector in (diagonal, work, image):
             vector.destroy()
 
-    def _at_points(self, operator: ContactOperator) -> Array:
+    def at_points(self, operator: ContactOperator) -> Array:
         """Jumps of the free motions at a contact's points: (n_free, n_points, gdim). Collective."""
         if operator not in self._jumps or operator.contact.free_angle is not None:
             gdim, n_points = len(self._centres[0]), operator.contact.quadrature.n_points
@@ -195,7 +195,8 @@ class RigidMotions:
             travels[:, space.mesh.geometry.dim :] = np.nan
         return travels
 
-    def _describe(self, coefficients: Array) -> str:
+    def describe(self, coefficients: Array) -> str:
+        """Name a motion by its share of each of all motions, (n_motions,)."""
         share = np.abs(coefficients) / np.abs(coefficients).max()
         terms = [
             name if s > 1 - 1e-6 else f"{s:.2g} of {name}"
@@ -238,7 +239,7 @@ class RigidMotions:
         """
         loose = self._loose(operators, closed_only=False)
         if loose.size:
-            motions = "; ".join(self._describe(row) for row in loose)
+            motions = "; ".join(self.describe(row) for row in loose)
             finite = any(operator.contact.finite for operator in operators)
             why = "nothing, to first order, holds" if finite else "nothing will ever hold"
             raise ValueError(
@@ -252,7 +253,7 @@ class RigidMotions:
         gram, area = np.zeros((n_free, n_free)), 0.0
         for operator in operators:
             contact, values = operator.contact, operator.contact.values
-            modes = self._at_points(operator)
+            modes = self.at_points(operator)
             along = np.einsum("mqd,qd->mq", modes, values.normal)
             weights = contact.quadrature.weights
             if closed_only:
@@ -276,14 +277,6 @@ class RigidMotions:
     def turning(self) -> bool:
         """Whether some are rotations of supports, whose arms change with the state."""
         return bool(self._turning.any())
-
-    def straight_at_points(self, operator: ContactOperator) -> Array:
-        """Jumps at a contact's points, (n, n_points, gdim), of those without arms. Collective."""
-        return self._at_points(operator)[self._straight()]
-
-    def describe_straight(self, coefficients: Array) -> str:
-        """Name a motion of those without arms by its share of each of them, (n,)."""
-        return self._describe(coefficients @ self.free[self._straight()])
 
     def resultants(self, forces: Array) -> Array:
         """Work of forces at this rank's unknowns on the free motions. Collective.
@@ -314,7 +307,7 @@ class RigidMotions:
         way = np.inf
         for operator in operators:
             values = operator.contact.values
-            jump = np.tensordot(coefficients, self._at_points(operator), axes=1)
+            jump = np.tensordot(coefficients, self.at_points(operator), axes=1)
             closing = np.einsum("qd,qd->q", jump, values.normal)
             nearing = closing > _FELT
             ways = values.opening[nearing] / closing[nearing]
@@ -347,7 +340,7 @@ class RigidMotions:
         for operator, contact in zip(operators, contacts, strict=True):
             if not contact.law.has_normal_stiffness:  # a prescribed normal traction is a load
                 force = -contact.values.parameters["pressure"][:, None] * contact.values.normal
-                modes = self._at_points(operator)[rows]
+                modes = self.at_points(operator)[rows]
                 work = np.einsum("mqd,qd,q->m", modes, force, contact.measure)
                 resultant += global_sum(self.comm, work)
         self.resultant = resultant
@@ -369,19 +362,19 @@ class RigidMotions:
         rays = rays[felt] / length[felt, None]
         rest = np.abs(resultant).max()
         if len(rays):
-            rest *= agreed(self.comm, _unbalanced(rays.T, -resultant / rest))
+            rest *= agreed(self.comm, unbalanced(rays.T, -resultant / rest))
         if rest > _BALANCED * max(size, np.abs(resultant).max()):
             scale = np.abs(resultant).max()
             limits = scale * agreed(self.comm, _borne(rays.T, -resultant / scale))
             size = max(size, scale)
             beyond = [i for i, r in enumerate(resultant) if abs(r) > limits[i] + _BALANCED * size]
             said = [
-                f"({self._describe(named[i])}) is {resultant[i]:.6g}, of which contact can "
+                f"({self.describe(named[i])}) is {resultant[i]:.6g}, of which contact can "
                 f"bear at most {limits[i]:.6g} with the rest as it is"
                 for i in beyond
             ]
             worst = int(np.argmax(np.abs(resultant)))
-            said = said or [f"({self._describe(named[worst])}) is {resultant[worst]:.6g}"]
+            said = said or [f"({self.describe(named[worst])}) is {resultant[worst]:.6g}"]
             raise ValueError(
                 "no contact force can balance the load: its resultant along the free motion "
                 f"{', and along '.join(said)}. Contact can only push along its normals and rub "
@@ -416,7 +409,7 @@ class RigidMotions:
             directions.append(-normal)
         if law.has_tension:
             directions.append(normal)
-        modes = self._at_points(operator)[rows]
+        modes = self.at_points(operator)[rows]
         rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
         return gather_rows(self.comm, np.concatenate(rays).reshape(-1, len(rows)))
 
@@ -425,7 +418,7 @@ def _alike(one: Array, other: Array) -> bool:
     return one.shape == other.shape and np.allclose(one, other, rtol=0.0, atol=1e-12)
 
 
-def _unbalanced(rays: Array, resultant: Array) -> float:
+def unbalanced(rays: Array, resultant: Array) -> float:
     """The least Σ|resultant - rays·x| over x ≥ 0; rays (n_free, n_rays) of unit length.
 
     Least squares without negatives find at once that there is nothing left, but where there is they

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import ufl
 
-from fenics_contact import compat
 from fenics_contact.checks.verdict import Balance
+from fenics_contact.compiling import compile_form
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.surface.mass import assembled
@@ -70,5 +70,5 @@ class SecondRoute:
         if contact.name not in self._forms:
             displacement = contact.u if contact.rigid and not contact.motions else opposite.felt
             form = contact.form_at(displacement, ufl.TestFunction(contact.u.function_space))
-            self._forms[contact.name] = compat.compile_form(-form, contact.entity_maps)
+            self._forms[contact.name] = compile_form(-form, contact.entity_maps)
         return by_points, assembled(self._forms[contact.name])[: by_points.size].copy()

@@ -17,8 +17,8 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from fenics_contact import compat
 from fenics_contact.checks.kinematics import Deviation, LinearSprings
+from fenics_contact.compiling import compile_form
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.markup import shown
@@ -342,7 +342,7 @@ class _Smoothed:
         n = mesh.topology.index_map(mesh.topology.dim).size_local
         # Every cell has one value, by its own number.
         self.squares, energies = (
-            fem.assemble_vector(compat.compile_form(form)).array[:n].copy() for form in both
+            fem.assemble_vector(compile_form(form)).array[:n].copy() for form in both
         )
         total, self.twice_energy = global_sum(mesh.comm, [self.squares.sum(), energies.sum()])
         self.share = abs(total / self.twice_energy) if self.twice_energy else 0.0
@@ -452,12 +452,12 @@ def _projected(
     """
     space = fem.functionspace(mesh, ("Lagrange", degree))
     p, q = ufl.TrialFunction(space), ufl.TestFunction(space)
-    mass = fem.petsc.assemble_matrix(compat.compile_form(weight * p * q * dx))
+    mass = fem.petsc.assemble_matrix(compile_form(weight * p * q * dx))
     mass.assemble()
     all_at_once = fem.functionspace(mesh, ("Lagrange", degree, (len(scalars),)))
     right = fem.Function(all_at_once)
     form = weight * ufl.dot(ufl.as_vector(scalars), ufl.TestFunction(all_at_once)) * dx
-    assembled(compat.compile_form(form), right.x)
+    assembled(compile_form(form), right.x)
     ksp = mass_solver(mass, rtol=1e-8)
     known, found = fem.Function(space), fem.Function(all_at_once)
     for c in range(len(scalars)):

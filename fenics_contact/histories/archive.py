@@ -95,15 +95,17 @@ def read_file(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
             arrays = {name: archive[name] for name in archive.files}
         scene = json.loads(arrays.pop("scene").tobytes())
         found = scene["format"]
-        wanted = {"format", "notes", "contacts", "fixed", "data"}
-        complete = found != FORMAT or (set(scene) == wanted and "numbers" in arrays)
     except Exception as error:  # whatever the archive's reader makes of it
         raise ValueError(f"{path} is no checkpoint ({error}); {_REMEDY}") from error
-    if found != FORMAT or not complete:
+    if found != FORMAT:
         raise ValueError(
             f"{path} is a checkpoint of format {found!r}, and this version reads {FORMAT}; go on "
             f"with the version that wrote it, or {_REMEDY}"
         )
+    missing = sorted({"notes", "contacts", "fixed", "data"} - set(scene))
+    missing += ["numbers"] * ("numbers" not in arrays)
+    if missing:
+        raise ValueError(f"{path} is no checkpoint, it has no {', '.join(missing)}; {_REMEDY}")
     for name, array in arrays.items():
         if array.dtype != np.float64 or array.ndim not in (1, 2):
             raise ValueError(
@@ -115,7 +117,12 @@ def read_file(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
 
 
 def check_finite(name: str, array: Array, where: str) -> None:
-    """Refuse values that are not finite, but for those that may be.
+    """Refuse values that are not finite: of a state all, of results and the caller's some.
+
+    Args:
+        name: Of the array.
+        array: Its values.
+        where: What it is of and what follows, for the message.
 
     Raises:
         ValueError: It names the array.

@@ -29,8 +29,8 @@ from fenics_contact.histories.fingerprint import (
     changed_data,
     data_words,
     fixed_words,
-    other_scene,
     probe,
+    why_another_scene,
 )
 from fenics_contact.histories.places import (
     find,
@@ -253,7 +253,7 @@ def take_up(
     """
     comm = problem.u.function_space.mesh.comm
     check_fields(problem, fields)
-    refuse(stored, other_scene(stored, problem, fields))
+    refuse(stored, why_another_scene(stored, problem, fields))
     size = problem.motions.size
     motions = stored.arrays["motions"]
     rows = np.zeros((len(motions), problem.unknowns.n_dofs))

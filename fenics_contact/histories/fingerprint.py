@@ -1,6 +1,6 @@
 """The fingerprint of a scene: what its equations are written in, by words and by numbers.
 
-With it a state is not taken up by a problem that it is no state of.
+By it a problem refuses the states of another one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from fenics_contact.supports.base import SampledSupport
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.types import Array
 
-__all__ = ["changed_data", "data_words", "fixed_words", "other_scene", "probe"]
+__all__ = ["changed_data", "data_words", "fixed_words", "probe", "why_another_scene"]
 
 # Relative difference up to which data are the same, and, of lengths, relative to the mesh: the gap
 # to a support is a difference of coordinates.
@@ -30,7 +30,7 @@ _EQUAL, _ROUND_OFF = 1e-9, 1e-11
 _LENGTHS = ("initial_gap", "shift", "about")
 
 
-def other_scene(
+def why_another_scene(
     stored: Stored, problem: ContactProblem, fields: Sequence[fem.Function]
 ) -> list[str]:
     """Why no state of a file can be one of this problem, in words; empty: it may. Collective."""
@@ -58,7 +58,7 @@ def changed_data(
 
 
 def fixed_words(problem: ContactProblem, fields: Sequence[fem.Function]) -> dict[str, str]:
-    """What no state can be taken over into another of, in words. Collective."""
+    """What has to be the same for a state to fit at all, in words. Collective."""
     space = problem.displacement.u.function_space
     mesh, words = space.mesh, {}
     n_cells = mesh.topology.index_map(mesh.topology.dim).size_global

@@ -139,7 +139,8 @@ class Equations:
     def friction_needed(self) -> float:
         """How many times the friction by the pressures evaluated last the load needs. Collective.
 
-        1 where it can be borne, infinite where there is no friction at all; see `find_overload`.
+        1 where it can be borne, or nothing can be told; infinite where there is no friction at all;
+        see `find_overload`.
         """
         self.overload = find_overload(self.motions, self.full.operators)
         return self.overload.factor if self.overload else 1.0

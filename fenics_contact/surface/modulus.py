@@ -12,6 +12,7 @@ import ufl
 from dolfinx import fem
 
 from fenics_contact import compat
+from fenics_contact.compiling import compile_form
 from fenics_contact.parallel import global_min
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_cells
@@ -60,7 +61,7 @@ def cell_modulus(
         field = fem.Function(space)
         field.x.array[dofs[1 :: len(u)]] = x[:, direction]
         form += ufl.replace(ufl.Form(cells), {test: q[direction] * field, trial: field})
-    shear, stretch, volume = assembled(compat.compile_form(form)).reshape(-1, 3).T
+    shear, stretch, volume = assembled(compile_form(form)).reshape(-1, 3).T
     shear, stretch = shear / volume, stretch / volume
     isotropic = stretch > 1.2 * shear  # λ > -0.8 G: else no isotropic solid, and E is the stretch's
     modulus = fem.Function(fem.functionspace(space.mesh, ("DG", 0)), name="modulus")
@@ -137,11 +138,11 @@ def _smooth(values: fem.Function, length: fem.Function) -> fem.Function:
     w, v = ufl.TrialFunction(space), ufl.TestFunction(space)
     dx = ufl.dx(mesh)
     form = w * v * dx + length**2 * ufl.dot(ufl.grad(w), ufl.grad(v)) * dx
-    matrix = fem.petsc.assemble_matrix(compat.compile_form(form))
+    matrix = fem.petsc.assemble_matrix(compile_form(form))
     matrix.assemble()
     result = fem.Function(space, name="modulus_over_height")
     rhs = fem.Function(space)
-    assembled(compat.compile_form(values * v * dx), rhs.x)
+    assembled(compile_form(values * v * dx), rhs.x)
     ksp = mass_solver(matrix, rtol=1e-14, max_it=10_000)
     ksp.solve(rhs.x.petsc_vec, result.x.petsc_vec)
     result.x.scatter_forward()

@@ -16,6 +16,7 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.compiling import compile_form
 from fenics_contact.parallel import gather_rows, global_max, global_min
 from fenics_contact.surface.mass import assembled
 from fenics_contact.types import Array
@@ -219,7 +220,7 @@ class SurfaceQuadrature:
     def _weigh(self, measure: ufl.Measure) -> Array:
         """Weight times Jacobian of all points that this rank knows. Collective."""
         space = self.space()
-        form = compat.compile_form(ufl.TestFunction(space) * measure, self.surface.entity_maps)
+        form = compile_form(ufl.TestFunction(space) * measure, self.surface.entity_maps)
         return assembled(form, la.vector(space.dofmap.index_map, 1))
 
     @cached_property
@@ -275,7 +276,7 @@ class SurfaceQuadrature:
         """
         scalar = not space.ufl_element().reference_value_shape
         values = self.space(None if scalar else space.dofmap.bs)
-        form = compat.compile_form(
+        form = compile_form(
             ufl.inner(ufl.TrialFunction(space), ufl.TestFunction(values)) * self.ds,
             self.surface.entity_maps,
         )
@@ -320,7 +321,7 @@ class VertexAreas:
         self._comm = surface.mesh.comm
         space = fem.functionspace(surface.submesh, ("Lagrange", 1))
         self.area = fem.Function(space, name="area")
-        self._form = compat.compile_form(
+        self._form = compile_form(
             weight * ufl.TestFunction(space) * quadrature.ds, surface.entity_maps
         )
         self.update()
@@ -386,7 +387,7 @@ class PointEvaluator:
             measure, self._weights = quadrature.on_submesh
         self.form = ufl.inner(ufl.as_vector(components), test) * measure
         maps = None if by_points else quadrature.surface.entity_maps
-        self._compiled = compat.compile_form(self.form, maps)
+        self._compiled = compile_form(self.form, maps)
         self._vector = la.vector(space.dofmap.index_map, self._size)
         self._n_owned = quadrature.n_points
 

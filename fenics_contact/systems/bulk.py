@@ -19,7 +19,7 @@ from petsc4py import PETSc
 from ufl.algorithms import extract_coefficients
 from ufl.corealg.traversal import unique_pre_traversal
 
-from fenics_contact import compat
+from fenics_contact.compiling import compile_form
 from fenics_contact.parallel import collective_errors, global_max, global_min
 from fenics_contact.surface.dependence import Dependence
 from fenics_contact.surface.displacement import Displacement
@@ -106,7 +106,7 @@ class Bulk:
         kinds = dict.fromkeys(integral.integral_type() for integral in form.integrals())
         parts = (_Part(form, kind, u) for kind in kinds)
         self._parts = [part for part in parts if not part.empty]
-        self._compiled_tangent = compat.compile_form(self.tangent_form)
+        self._compiled_tangent = compile_form(self.tangent_form)
         self.stiffness: PETSc.Mat = fem.petsc.create_matrix(self._compiled_tangent)
         self.symmetric = True
         self.scale = 0.0
@@ -333,8 +333,8 @@ class _Volumes:
         measure = ufl.Measure("dx", mesh, metadata={"quadrature_degree": degree})
         q, gradient = ufl.TestFunction(space), ufl.Identity(len(u)) + ufl.grad(u)
         self._comm = mesh.comm
-        self._form = compat.compile_form(ufl.det(gradient) * q * measure)
-        self._weights = assembled(compat.compile_form(q * measure)).copy()
+        self._form = compile_form(ufl.det(gradient) * q * measure)
+        self._weights = assembled(compile_form(q * measure)).copy()
 
     def least(self) -> float:
         """At the present u, over all ranks; NaN where it is none. Collective."""
@@ -366,7 +366,7 @@ class _Part:
         self.empty = ufl.algorithms.expand_derivatives(mine).empty()  # a load that is 0 in UFL
         still = ufl.replace(mine, {u: ufl.zero(u.ufl_shape)})
         self._vanishes = ufl.algorithms.expand_derivatives(still).empty()
-        self._compiled = compat.compile_form(mine)
+        self._compiled = compile_form(mine)
         self._u = u
         others = [c for c in mine.coefficients() if c is not u]
         self._dependence = Dependence(mine.constants(), others)

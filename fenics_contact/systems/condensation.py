@@ -40,6 +40,7 @@ class Condensation:
         schur: The condensed stiffness, (n_kept, n_kept) on the first rank, Fortran order
             (force/length).
         response: What the load of `set_load` makes of the body with the unknowns kept at rest.
+        directions: Loads that were solved for, scaled, and what they make of it.
     """
 
     def __init__(
@@ -69,7 +70,7 @@ class Condensation:
         outside[unknowns.kept] = False
         self._held = np.flatnonzero(outside & constrained).astype(np.int32)
         self._right, self._left = stiffness.createVecs()
-        self._directions: list[tuple[Array, Response]] = []
+        self.directions: list[tuple[Array, Response]] = []
         self._scale = bulk.scale
         own_stiffness = bulk.own_stiffness()
         own = self._piece = _Piece.of(own_stiffness, bulk.space, unknowns, constrained)
@@ -119,10 +120,10 @@ class Condensation:
         rest: Array = np.concatenate([force, self._scale * state[self._held]])
         size = self._norm(rest)
         shares: list[float] = []
-        for direction, _ in self._directions:
+        for direction, _ in self.directions:
             shares.append(float(global_sum(self._comm, direction @ rest)))
             rest -= shares[-1] * direction
-        responses = [response for _, response in self._directions]
+        responses = [response for _, response in self.directions]
         remainder = self._norm(rest)
         if remainder > _SAME * size:
             known = bool(np.isfinite(remainder))
@@ -130,8 +131,8 @@ class Condensation:
             scaled = np.asarray(rest / shares[-1], dtype=np.float64)
             responses.append(self._respond(scaled))
             if known:
-                self._directions.append((scaled, responses[-1]))
-                del self._directions[:-_DIRECTIONS]
+                self.directions.append((scaled, responses[-1]))
+                del self.directions[:-_DIRECTIONS]
         nothing = Response.none(force.size, self._unknowns.n_local)
         self.response = nothing.plus(shares, responses)
 
@@ -162,7 +163,7 @@ class Condensation:
 
     def forget(self) -> None:
         """Drop the solutions for earlier loads."""
-        self._directions = []
+        self.directions = []
 
     def recover(self, kept: Array, particular: Array) -> Array:
         """All unknowns, (n_local,). Collective.

@@ -82,6 +82,7 @@ class PartlyFactored:
 
     Attributes:
         error: As of `Sum`.
+        outside: The unknowns in O.
     """
 
     def __init__(self, places: Array) -> None:
@@ -99,9 +100,9 @@ class PartlyFactored:
         self._operator = Sum()
         self._fixed = self._operator.fixed
         self._pattern = self._operator.added[:2]
-        # The unknowns in A, in O, and the places in A of those that are there.
+        # The unknowns in A, those in O, and the places in A of those that are there.
         self._in: Index = np.arange(len(places))
-        self._out, self._position = nowhere, self._in
+        self.outside, self._position = nowhere, self._in
         # LU of S_OO; S_AO; S_OO⁻¹ S_OA; and what they leave of S_AA.
         self._factor_out, self._coupling, self._extension = factors, nothing, nothing
         self._reduced = self._fixed
@@ -126,7 +127,7 @@ class PartlyFactored:
 
     def _forget(self) -> None:
         self._in = np.arange(len(self._places))
-        self._out, self._position = np.zeros(0, dtype=np.intp), self._in
+        self.outside, self._position = np.zeros(0, dtype=np.intp), self._in
         self._reduced, self._factored = self._fixed, None
 
     def setUp(self, pc: PETSc.PC) -> None:
@@ -155,13 +156,13 @@ class PartlyFactored:
         self._acted = self._nowhere.copy()
         self._acted[rows[acts]] = self._acted[columns[acts]] = True
         n_acted, n = np.count_nonzero(self._acted), len(self._places)
-        fits = not self._acted[self._out].any()
+        fits = not self._acted[self.outside].any()
         roomy = self._in.size > (1 + _MARGIN) ** 2 * n_acted + 1
         if not fits or (roomy and n_acted < _MOST * n / (1 + _MARGIN)):
             self._divide()
-        return self._correct() or self._factor_anew()
+        return self._correct() or self.factor_anew()
 
-    def _factor_anew(self) -> bool:
+    def factor_anew(self) -> bool:
         """Factor the block of A as it is now; whether it is regular."""
         block = self._reduced.copy(order="F")
         rows, columns, values = self._present()
@@ -227,7 +228,7 @@ class PartlyFactored:
         pivots = np.abs(np.diag(factor[0]))
         if not pivots.min() > _SINGULAR * pivots.max():
             return
-        self._in, self._out, self._factor_out = inside, outside, factor
+        self._in, self.outside, self._factor_out = inside, outside, factor
         self._coupling = self._fixed[np.ix_(inside, outside)]
         right = self._fixed[np.ix_(outside, inside)]
         self._extension = scipy.linalg.lu_solve(factor, right, check_finite=False)
@@ -246,14 +247,14 @@ class PartlyFactored:
     def _apply(self, right: Array, solution: Array) -> None:
         if not len(self._places):
             return
-        if not self._out.size:
+        if not self.outside.size:
             solution[:] = self._solve(right)
             return
-        outside = scipy.linalg.lu_solve(self._factor_out, right[self._out], check_finite=False)
+        outside = scipy.linalg.lu_solve(self._factor_out, right[self.outside], check_finite=False)
         rest = right[self._in] - self._coupling @ outside
         inside = self._solve(rest)
         solution[self._in] = inside
-        solution[self._out] = outside - self._extension @ inside
+        solution[self.outside] = outside - self._extension @ inside
 
     def _solve(self, right: Array) -> Array:
         """Solve with the block of A, and look whether a correction was good enough."""
@@ -266,7 +267,7 @@ class PartlyFactored:
         added = np.bincount(rows, values * solution[columns], minlength=right.size)
         left = right - self._reduced @ solution - added
         if not np.linalg.norm(left) <= _ACCURATE * np.linalg.norm(right):
-            self._factor_anew()
+            self.factor_anew()
             return scipy.linalg.lu_solve(self._factor, right, check_finite=False)
         return solution
 

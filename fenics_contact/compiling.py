@@ -1,0 +1,58 @@
+"""Compiled forms, and a word to who waits for them."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from typing import Any
+
+import dolfinx
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+__all__ = ["Waiting", "compile_form", "waiting"]
+
+logger = logging.getLogger("fenics_contact")
+# Seconds: what takes less was in the cache; when a user wonders.
+_FROM_CACHE, _LONG = 0.1, 3.0
+
+
+def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:
+    """Compile a UFL form with the entity maps of its submeshes. Collective.
+
+    What has been compiled before, in any run, is in DOLFINx's cache. If all that is not takes more
+    than some seconds, it is said once what the program is doing: at level INFO, or to a terminal.
+    """
+    start = time.perf_counter()
+    compiled = fem.form(form, entity_maps=entity_maps or None)
+    waiting.add(time.perf_counter() - start)
+    return compiled
+
+
+class Waiting:
+    """Time that went into compilation in this process."""
+
+    def __init__(self) -> None:
+        """None so far."""
+        self._seconds, self._said = 0.0, False
+
+    def add(self, seconds: float) -> None:
+        """Count it, and say so if it was not from the cache and has become long."""
+        if seconds > _FROM_CACHE:
+            self._seconds += seconds
+        if self._said or self._seconds < _LONG or MPI.COMM_WORLD.rank:
+            return
+        self._said = True
+        text = (
+            "compiling forms, as every first run with new ones does; later runs find them in "
+            f"{dolfinx.jit.get_options()['cache_dir']}"
+        )
+        if logger.isEnabledFor(logging.INFO):
+            logger.info(text)
+        elif sys.stderr.isatty():
+            print(text, file=sys.stderr)
+
+
+waiting = Waiting()
