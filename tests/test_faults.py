@@ -141,7 +141,7 @@ def test_snes_is_stopped(method, monkeypatch):
 @pytest.mark.parametrize(
     ("kind", "name"),
     [
-        (dense.PartlyFactored, "_factor_anew"),
+        (dense.PartlyFactored, "factor_anew"),
         (dense.PartlyFactored, "_solve"),
     ],
 )

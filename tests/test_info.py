@@ -16,7 +16,7 @@ from petsc4py import PETSc
 
 import fenics_contact as fc
 from fenics_contact import __main__ as program
-from fenics_contact import compat, compiling
+from fenics_contact import compiling
 from fenics_contact.installation import information
 from scenes.comparing import raised_everywhere
 
@@ -90,7 +90,7 @@ def test_what_a_first_run_waits_for_is_said_once(monkeypatch, caplog, capsys):
         """How often two forms that take so long are told of, in the log and on the terminal."""
         caplog.clear()
         times = itertools.count(0.0, seconds)
-        monkeypatch.setattr(compat.time, "perf_counter", lambda: next(times))
+        monkeypatch.setattr(compiling.time, "perf_counter", lambda: next(times))
         monkeypatch.setattr(compiling, "waiting", compiling.Waiting())
         monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
         with caplog.at_level(level, "fenics_contact"):
