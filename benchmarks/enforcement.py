@@ -31,6 +31,7 @@ from petsc4py import PETSc
 import fenics_contact as fc
 from benchmarks import timing
 from fenics_contact.surface.surface import PointEvaluator
+from fenics_contact.types import Array
 from scenes import problems
 from scenes.problems import Body
 
@@ -43,7 +44,6 @@ NITSCHE = {
 YARDSTICK = "penalty 10"
 # Runs that take longer are not repeated (s).
 ONCE = 5.0
-Array = np.ndarray
 
 
 @dataclass

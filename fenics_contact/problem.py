@@ -35,6 +35,7 @@ from fenics_contact.parallel import fail_together, global_max
 from fenics_contact.surface.modulus import cell_modulus
 from fenics_contact.systems import linear
 from fenics_contact.systems.bulk import Bulk
+from fenics_contact.systems.committed import CommittedState
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
@@ -671,16 +672,10 @@ class ContactProblem:
 
     # ---- going on in another run -----------------------------------------------------------------
 
-    def committed_state(self) -> tuple[Array, Array]:
+    def committed_state(self) -> CommittedState:
         """What another run needs of the last commit to go on from it. Collective.
 
         u is completed, if it is behind.
-
-        Returns:
-            Rows over this rank's unknowns, (6, n_local): their values, by how much the last
-            increment moved them, internal and external forces at them (force), and masks of those
-            kept when condensed and of those with Dirichlet conditions; and numbers: of increments,
-            how many of them were expected, and of each contact whether pairs are found anew.
 
         Raises:
             ValueError: The state is not that of the last commit.
@@ -696,14 +691,20 @@ class ContactProblem:
             )
         self.complete()
         forces = self._then.energy.forces[self.full.mark]
-        kept = np.zeros(self.unknowns.n_local)
+        kept = np.zeros(self.unknowns.n_local, dtype=bool)
         if self.solver.condensed:
-            kept[self.solver.system.unknowns.kept] = 1.0
-        rate = np.zeros_like(kept) if self._rate is None else self._rate
-        rows = (self._committed, rate, forces.internal, forces.external, kept, self.constrained)
-        anew = [contact.opposite.pairs_anew for contact in self.contacts]
-        numbers = np.array([self.increment, self.solver.expected, *anew], dtype=np.float64)
-        return np.stack(rows).astype(np.float64), numbers
+            kept[self.solver.system.unknowns.kept] = True
+        return CommittedState(
+            state=self._committed,
+            rate=np.zeros(kept.size) if self._rate is None else self._rate,
+            internal=forces.internal,
+            external=forces.external,
+            kept=kept,
+            constrained=self.constrained,
+            increment=self.increment,
+            expected=self.solver.expected,
+            pairs_anew=tuple(contact.opposite.pairs_anew for contact in self.contacts),
+        )
 
     @contextmanager
     def at_state(self, state: Array) -> Iterator[None]:
@@ -728,31 +729,29 @@ class ContactProblem:
         return self.unknowns.joined(values, np.zeros(self.unknowns.n_motions))
 
     def set_committed(
-        self,
-        rows: Array,
-        numbers: Array,
-        points: Sequence[tuple[Array, Mapping[str, Array]]],
+        self, taken: CommittedState, points: Sequence[tuple[Array, Mapping[str, Array]]]
     ) -> None:
         """Take up what `committed_state` gave in another run, under its loads. Collective.
 
         Args:
-            rows: What it gave.
-            numbers: Likewise.
+            taken: What it gave.
             points: Of every contact what `Contact.take_up` takes.
         """
-        state, rate, internal, external, kept, _ = rows
-        increment, expected, *anew = (int(value) for value in numbers)
-        self.expect(expected)
+        self.expect(taken.expected)
         self._fresh, self._solved = False, None
-        self.solver.keep(np.flatnonzero(kept).astype(np.int32))
-        self.increment = increment
-        self._committed, self._rate = state.copy(), rate.copy() if increment else None
-        self.full.set_state(state)
+        self.solver.keep(np.flatnonzero(taken.kept).astype(np.int32))
+        self.increment = taken.increment
+        self._committed = taken.state.copy()
+        self._rate = taken.rate.copy() if taken.increment else None
+        self.full.set_state(taken.state)
         load = self.present_load()
         self.full.begin(load)
-        for contact, (history, values), found in zip(self.contacts, points, anew, strict=True):
-            contact.take_up(history, values, anew=bool(found))
-        forces: dict[object, Forces] = {self.full.mark: Forces(state, internal, external)}
+        for contact, (history, values), anew in zip(
+            self.contacts, points, taken.pairs_anew, strict=True
+        ):
+            contact.take_up(history, values, anew=anew)
+        found = Forces(taken.state, taken.internal, taken.external)
+        forces: dict[object, Forces] = {self.full.mark: found}
         energy = EnergyState.at(forces, self.contacts)
         energy = energy.between([c.opposite.committed_jump for c in self.contacts])
         self._now = self._then = _Balance(load, energy)

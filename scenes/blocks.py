@@ -16,6 +16,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import compat
+from fenics_contact.types import Array
 from scenes.elasticity import displacement_space, hold, strain, stress
 from scenes.meshes import mesh_of
 from scenes.tags import sides
@@ -23,9 +24,6 @@ from scenes.tags import sides
 CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 GRID = [(cell, degree) for cell in CELLS for degree in (1, 2)]
 BOTTOM, TOP, LEFT, RIGHT, FRONT, BACK = 1, 2, 3, 4, 5, 6
-
-Array = np.ndarray
-
 
 # ---- meshes --------------------------------------------------------------------------------------
 

@@ -12,11 +12,11 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from fenics_contact.types import Array
 from scenes.elasticity import displacement_space, hold, strain, stress
 from scenes.meshes import mesh_of
 from scenes.tags import Where, tagged
 
-Array = np.ndarray
 COMM = MPI.COMM_WORLD
 
 

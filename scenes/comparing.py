@@ -19,9 +19,7 @@ from petsc4py import PETSc
 
 import fenics_contact as fc
 from fenics_contact.compiling import compile_form
-
-Array = np.ndarray
-
+from fenics_contact.types import Array
 
 # ---- assembly ------------------------------------------------------------------------------------
 

@@ -13,13 +13,12 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import compat
+from fenics_contact.types import Array
 from scenes.blocks import dimension
 from scenes.elasticity import displacement_space, hold, residual
 from scenes.histories import History
 from scenes.meshes import mesh_of
 from scenes.tags import near, tagged
-
-Array = np.ndarray
 
 BASE, TOP, ROUND, LID, SIDE = 1, 2, 3, 4, 5
 E, NU, RADIUS, DEEP = 1000.0, 0.3, 4.0, 0.01

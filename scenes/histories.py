@@ -12,14 +12,13 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from fenics_contact.types import Array
 from scenes.blocks import RIGHT, TOP, block
 from scenes.comparing import at_points, close, nodal, owned
 from scenes.elasticity import strain
 from scenes.two_blocks import Slider
 
 COMM = MPI.COMM_WORLD
-Array = np.ndarray
-
 
 # ---- scenes --------------------------------------------------------------------------------------
 
@@ -143,13 +142,12 @@ def picture(made: History) -> dict[str, Array]:
     problem = made.problem
     found = {"u": _nodal(problem, problem.u), "increment": np.array([problem.increment])}
     field = fem.Function(problem.u.function_space)
-    rows, _ = problem.committed_state()
-    names = ("committed", "rate", "forces internal", "forces external")
-    for name, values in zip(names, rows[:4], strict=True):
-        owned(field)[:] = values[: problem.unknowns.n_dofs]
-        found[name] = _nodal(problem, field)
-    for name, values in zip(names[:2], rows[:2], strict=True):
-        found[f"{name} of supports"] = problem.unknowns.motions(values)
+    committed = problem.committed_state()
+    for name in ("state", "rate", "internal", "external"):
+        owned(field)[:] = getattr(committed, name)[: problem.unknowns.n_dofs]
+        found[f"committed {name}"] = _nodal(problem, field)
+    for name in ("state", "rate"):
+        found[f"{name} of supports"] = problem.unknowns.motions(getattr(committed, name))
     energy = problem.committed_energy
     found["springs"] = np.array([COMM.allreduce(energy.springs)])
     if problem.solver.condensed:
@@ -184,7 +182,7 @@ def differences(a: History, b: History, tolerance: float) -> list[str]:
     if tolerance == 0.0:
         return [n for n in one if not np.array_equal(one[n], other[n], equal_nan=True)]
     # Tractions, forces and energies, by the largest of their kind; statuses may hang on a digit.
-    compared = [n for n in one if n.split()[-1] in ("u", "committed", "history", "jump", "forces")]
+    compared = [n for n in one if n.split()[-1] in ("u", "state", "history", "jump", "forces")]
     return [n for n in compared if not close(one[n], other[n], tolerance)]
 
 

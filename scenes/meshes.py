@@ -10,7 +10,7 @@ import numpy as np
 import ufl
 from mpi4py import MPI
 
-Array = np.ndarray
+from fenics_contact.types import Array
 
 
 def mesh_of(

@@ -14,13 +14,12 @@ from dolfinx import fem
 
 import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic, NeoHookean
+from fenics_contact.types import Array
 from scenes.blocks import BOTTOM, TOP, block_mesh, dimension
 from scenes.comparing import at_points
 from scenes.elasticity import displacement_space, strain
 from scenes.histories import History
 from scenes.surfaces import ball, circle, ring
-
-Array = np.ndarray
 
 # So that results are compared, and not what the solver leaves.
 TIGHT = {"snes_rtol": 1e-13}

@@ -10,11 +10,12 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from fenics_contact.types import Array
 from scenes.blocks import TOP, Block, block, dimension
 from scenes.comparing import at_points, close, nodal
 
 COMM = MPI.COMM_WORLD
-Array = np.ndarray
+
 # On several ranks MUMPS adds in the order in which messages come: no two runs agree in the last
 # bit, and two solutions within the tolerance of 1e-9 on the residual are compared.
 SAME = 0.0 if COMM.size == 1 else 1e-7

@@ -10,6 +10,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from fenics_contact.types import Array
 from scenes.bodies import Bodies, boxes
 from scenes.comparing import close, gathered
 from scenes.tags import Where, between, either, near
@@ -17,8 +18,6 @@ from scenes.tags import Where, between, either, near
 COMM = MPI.COMM_WORLD
 FLOOR, ROOF, LOWER, UPPER, WALL, SIDES, OUTSIDE = 1, 2, 3, 4, 5, 6, 9
 E = 1e6
-Array = np.ndarray
-
 
 # ---- blocks --------------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-Array = np.ndarray
+from fenics_contact.types import Array
 
 
 def circle(n: int, radius: float = 1.0, centre: Sequence[float] = (0.0, 0.0)) -> Array:

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 import dolfinx
 import numpy as np
 
-Array = np.ndarray
+from fenics_contact.types import Array
+
 # Which ones of facets: of their midpoints and of those of the cells that they bound, both (n, d).
 Where = Callable[[Array, Array], Array]
 

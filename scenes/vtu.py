@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-Array = np.ndarray
+from fenics_contact.types import Array
 
 
 @dataclass

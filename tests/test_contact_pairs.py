@@ -21,6 +21,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import compat
+from fenics_contact.types import Array
 from scenes.blocks import dimension
 from scenes.comparing import gathered, raised_everywhere
 from scenes.elasticity import displacement_space, hold
@@ -30,8 +31,6 @@ from scenes.tags import either, near, tagged
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 FLOOR, ROOF, WEST, SOUTH = 1, 2, 3, 4
-Array = np.ndarray
-
 
 # ---- scenes --------------------------------------------------------------------------------------
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 from mpi4py import MPI
-from running import run_demo
+
+from scenes.processes import run_demo
 
 pytestmark = [
     pytest.mark.demo,

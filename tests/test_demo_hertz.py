@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 from mpi4py import MPI
-from running import run_demo
+
+from scenes.processes import run_demo
 
 pytestmark = [
     pytest.mark.demo,

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 from mpi4py import MPI
-from running import run_demo, values
+
+from scenes.processes import run_demo, values
 
 pytestmark = [
     pytest.mark.demo,

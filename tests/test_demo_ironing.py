@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
-from running import run_demo, values
+
+from scenes.processes import run_demo, values
 
 pytestmark = [
     pytest.mark.demo,

@@ -11,9 +11,9 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from running import ROOT
 
 import fenics_contact
+from scenes.processes import ROOT
 
 tomllib = pytest.importorskip("tomllib", reason="of Python 3.11 and later")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

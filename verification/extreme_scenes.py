@@ -23,13 +23,14 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import compat
+from fenics_contact.types import Array
 from scenes.bodies import Bodies, boxes, graded
 from scenes.processes import command, environment
 from scenes.tags import near
 
 BOTTOM, TOP, LEFT, FRONT, OPPOSITE = 1, 2, 3, 4, 5
 E, NU, PRESSURE = 1000.0, 0.3, 1.0
-Array = np.ndarray
+
 Solve = Callable[[str], tuple[list[fc.Step], float | None]]
 
 

@@ -16,12 +16,11 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.elasticity import NeoHookean
+from fenics_contact.types import Array
 from scenes.surfaces import ball, box, ring
 from verification.fuzz_scenes import TOP, Made, Scene, dice, element, frictions
 
 __all__ = ["DEGREE", "KINDS", "FiniteMade", "draw", "pieces", "place_of"]
-
-Array = np.ndarray
 
 KINDS = (
     *("halfspace", "ball", "cylinder", "ball inside", "cylinder inside"),

@@ -24,6 +24,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import compat
+from fenics_contact.types import Array
 from verification import reference_solver as reference
 
 __all__ = [
@@ -39,7 +40,6 @@ __all__ = [
     "path",
 ]
 
-Array = np.ndarray
 Scene = dict[str, Any]
 
 CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")

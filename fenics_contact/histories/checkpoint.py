@@ -45,7 +45,7 @@ from fenics_contact.histories.places import (
 )
 from fenics_contact.parallel import collective_errors, fail_together
 from fenics_contact.problem import ContactProblem
-from fenics_contact.types import Array
+from fenics_contact.systems.committed import CommittedState
 
 __all__ = [
     "Stored",
@@ -100,17 +100,17 @@ def save(
     """
     comm = problem.u.function_space.mesh.comm
     check_fields(problem, fields)
-    unknowns, state = problem.committed_state()
+    committed = problem.committed_state()
+    rows = committed.rows(problem.unknowns, problem.bulk)
     arrays = {
         "numbers": np.array(numbers, dtype=np.float64),
-        "state": state,
-        "motions": np.stack([problem.unknowns.motions(row) for row in unknowns]),
+        "state": committed.numbers,
+        "motions": np.stack([problem.unknowns.motions(row) for row in rows]),
         **probe(problem),
     }
-    physical = _physical(problem, unknowns)
     for part in parts_of(problem):
-        rows = physical[:, part.dofs].reshape(len(physical), -1, part.space.dofmap.bs)
-        arrays[part.name] = gather(comm, node_places(part.space), *rows)
+        nodes = rows[:, part.dofs].reshape(len(rows), -1, part.space.dofmap.bs)
+        arrays[part.name] = gather(comm, node_places(part.space), *nodes)
     scene: dict[str, Any] = {"format": FORMAT, "notes": notes, "contacts": {}}
     scene["fixed"], scene["data"] = fixed_words(problem, fields), data_words(problem)
     for contact in problem.contacts:
@@ -264,8 +264,9 @@ def take_up(
         by_row = nodes.reshape(len(nodes), len(motions), width).swapaxes(0, 1)
         rows[:, part.dofs] = by_row.reshape(len(motions), len(nodes) * width)
     joined = (problem.unknowns.joined(row, motions[i]) for i, row in enumerate(rows))
-    unknowns = np.stack(list(joined))
-    unknowns = _physical(problem, unknowns, back=True)
+    committed = CommittedState.from_rows(
+        np.stack(list(joined)), stored.arrays["state"], problem.unknowns, problem.bulk
+    )
     points, given = [], []
     for contact in problem.contacts:
         places, (data, layout) = point_places(contact), stored.scene["contacts"][contact.name]
@@ -284,8 +285,8 @@ def take_up(
             loads()
         for field, row in zip(fields, own, strict=True):
             set_rows(field, row)
-        with problem.at_state(unknowns[0]):
-            differences = changed_data(stored, problem, unknowns, given)
+        with problem.at_state(committed.state):
+            differences = changed_data(stored, problem, committed, given)
         if changed == "refuse":
             refuse(stored, differences, ', or give changed="continue" to go on with what is here')
     except BaseException as error:
@@ -297,13 +298,4 @@ def take_up(
         logger.warning(
             "going on from %s with changed data: %s", stored.path, "; ".join(differences)
         )
-    problem.set_committed(unknowns, stored.arrays["state"], points)
-
-
-def _physical(problem: ContactProblem, rows: Array, *, back: bool = False) -> Array:
-    """States and forces of `committed_state` in the user's units, or ``back``. Collective."""
-    n, bulk, found = problem.unknowns.n_dofs, problem.bulk, rows.copy()
-    convert = (bulk.in_units, bulk.from_units)
-    for i in range(4):  # two states and two forces
-        found[i, :n] = convert[(i < 2) != back](rows[i, :n])
-    return found
+    problem.set_committed(committed, points)

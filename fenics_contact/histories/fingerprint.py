@@ -20,6 +20,7 @@ from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.problem import ContactProblem
 from fenics_contact.supports.base import SampledSupport
 from fenics_contact.supports.deformable import DeformableBody
+from fenics_contact.systems.committed import CommittedState
 from fenics_contact.types import Array
 
 __all__ = ["changed_data", "data_words", "fixed_words", "probe", "why_another_scene"]
@@ -39,19 +40,22 @@ def why_another_scene(
 
 
 def changed_data(
-    stored: Stored, problem: ContactProblem, unknowns: Array, given: Sequence[dict[str, Array]]
+    stored: Stored,
+    problem: ContactProblem,
+    committed: CommittedState,
+    given: Sequence[dict[str, Array]],
 ) -> list[str]:
     """What of the data is not as in a file, in words. Collective.
 
     Args:
         stored: What was read.
         problem: At the state of the file.
-        unknowns: Rows of `ContactProblem.committed_state`.
+        committed: The state of the file.
         given: Data at the points of every contact.
     """
     differences = _compare_words(stored.scene["data"], data_words(problem))
     differences += _compare_probes(problem, stored.arrays)
-    differences += _compare_conditions(problem, unknowns)
+    differences += _compare_conditions(problem, committed)
     for contact, theirs in zip(problem.contacts, given, strict=True):
         differences += _compare_points(contact, theirs, problem.motions.size)
     return differences
@@ -218,9 +222,9 @@ def _compare_probes(problem: ContactProblem, theirs: dict[str, Array]) -> list[s
     return differences
 
 
-def _compare_conditions(problem: ContactProblem, unknowns: Array) -> list[str]:
-    """Which components are prescribed, and their values, at the state of ``unknowns``."""
-    comm, mask = problem.u.function_space.mesh.comm, unknowns[-1] > 0
+def _compare_conditions(problem: ContactProblem, committed: CommittedState) -> list[str]:
+    """Which components are prescribed, and their values, at a state."""
+    comm, mask = problem.u.function_space.mesh.comm, committed.constrained
     differ = int(global_sum(comm, np.count_nonzero(mask != problem.constrained)))
     if differ:
         theirs, ours = global_sum(comm, [mask.sum(), problem.constrained.sum()])
@@ -228,7 +232,7 @@ def _compare_conditions(problem: ContactProblem, unknowns: Array) -> list[str]:
             f"Dirichlet conditions: {theirs:.0f} components of nodes are prescribed in the file "
             f"and {ours:.0f} here, and {differ} of them are not the same"
         ]
-    now, then = problem.prescribed_values(), unknowns[0]
+    now, then = problem.prescribed_values(), committed.state
     # A direct solver leaves its round-off where values are prescribed, too.
     floor = _ROUND_OFF * global_max(comm, np.abs(then))
     return _largest_difference(
