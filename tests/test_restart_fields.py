@@ -137,12 +137,15 @@ def test_fields_that_cannot_be_saved(tmp_path):
     made = Press()
     mesh = made.scene.mesh
     edges = fem.Function(fem.functionspace(mesh, ("RTCE", 1)), name="edges")
+    bubbles = basix.ufl.element("bubble", mesh.basix_cell(), 3)  # four functions a cell
+    bubbles = fem.Function(fem.functionspace(mesh, bubbles), name="bubbles")
     mixed = basix.ufl.mixed_element(
         [basix.ufl.element("Lagrange", mesh.basix_cell(), k) for k in (1, 2)]
     )
     mixed = fem.Function(fem.functionspace(mesh, mixed), name="mixed")
     for field, word in (
         (edges, "edges"),
+        (bubbles, "bubbles"),
         (mixed, "mixed"),
         (mixed.sub(0), "fields[0]"),
         (made.scene.u, "displacement"),

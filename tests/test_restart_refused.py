@@ -7,12 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import ufl
+from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import checkpoint
 from fenics_contact.histories import archive
+from scenes.bodies import boxes
 from scenes.comparing import owned, raised_everywhere, shared_folder
+from scenes.elasticity import displacement_space, hold, residual
 from scenes.histories import Press, differences
 
 COMM = MPI.COMM_WORLD
@@ -333,6 +337,25 @@ def test_a_load_that_fails_leaves_the_problem(saved):
     made.load = failing
     raised_everywhere(lambda: next(made.increments(checkpoint=saved)), ValueError, "no such load")
     assert made.problem.increment == 0 and not np.any(owned(made.scene.u))
+
+
+def test_bodies_that_cover_one_another(tmp_path):
+    """Values at one place in cells of one middle: no file is begun that could not be read."""
+    line = np.linspace(0.0, 1.0, 3)
+    sides = {1: lambda x, _: np.isclose(x[:, 1], 0.0), 2: lambda x, _: np.isclose(x[:, 1], 1.0)}
+    mesh, tags = boxes([[line, line]] * 2, sides)
+    u, top = fem.Function(displacement_space(mesh, 1)), fem.Constant(mesh, -0.01)
+    floor = fc.HalfSpace(point=(0, 0), normal=(0, 1))
+    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, 1), floor, fc.Coulomb(0.3))
+    form = residual(u, ufl.TestFunction(u.function_space), 1000.0, 0.3)
+    conditions = [hold(u, tags, 2, 0), hold(u, tags, 2, 1, top)]
+    problem = fc.ContactProblem(form, u, bcs=conditions, contacts=[contact])
+    path = shared_folder(tmp_path) / "state.npz"
+    call = lambda: fc.increments(problem, top, 0, 1, steps=2, checkpoint=path)  # noqa: E731
+    raised_everywhere(call, ValueError, "9 nodes", "cover one another")
+    raised_everywhere(lambda: checkpoint.save(problem, path), ValueError, "9 nodes")
+    problem.solve()
+    assert contact.resultants().normal_force > 0.0 and not path.exists()
 
 
 # ---- calls that are no use -----------------------------------------------------------------------

@@ -9,6 +9,7 @@ scene (`fingerprint`).
 from __future__ import annotations
 
 import logging
+import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,9 +37,11 @@ from fenics_contact.histories.places import (
     find,
     gather,
     layout_of,
+    n_shared,
     node_places,
     parts_of,
     point_places,
+    positions,
     rows_of,
     set_rows,
     unpack,
@@ -51,6 +54,7 @@ __all__ = [
     "Stored",
     "check_changed",
     "check_fields",
+    "check_places",
     "exists",
     "load",
     "read",
@@ -95,11 +99,12 @@ def save(
 
     Raises:
         ValueError: The problem has a solved increment that is not committed, or a state that is
-            not finite; or see `check_fields`.
+            not finite; or see `check_fields` and `check_places`.
         OSError: It cannot be written; the problem is as before. On all ranks.
     """
     comm = problem.u.function_space.mesh.comm
     check_fields(problem, fields)
+    check_places(problem)
     committed = problem.committed_state()
     rows = committed.rows(problem.unknowns, problem.bulk)
     arrays = {
@@ -202,7 +207,8 @@ def check_fields(problem: ContactProblem, fields: Sequence[fem.Function]) -> Non
             space.tabulate_dof_coordinates()
             whole = field.x.array.size == n_nodes * dofmap.index_map_bs
             pointwise = whole and dofmap.bs == dofmap.index_map_bs
-        except RuntimeError:
+            positions(space)
+        except (RuntimeError, ValueError):
             pointwise = False
         if not pointwise:
             raise ValueError(
@@ -210,6 +216,28 @@ def check_fields(problem: ContactProblem, fields: Sequence[fem.Function]) -> Non
                 "interpolate it to a Lagrange or quadrature space, parts of a mixed one each into "
                 "a function of its own"
             )
+
+
+_told_apart: weakref.WeakSet[ContactProblem] = weakref.WeakSet()
+
+
+def check_places(problem: ContactProblem) -> None:
+    """Refuse a mesh whose nodes cannot be told apart by their places. Collective.
+
+    Raises:
+        ValueError: There are two nodes at one place with the same cells around. On all ranks.
+    """
+    if problem in _told_apart:
+        return
+    comm = problem.u.function_space.mesh.comm
+    shared = n_shared(comm, node_places(parts_of(problem)[0].space), problem.motions.size)
+    if shared:
+        raise ValueError(
+            f"{shared} nodes of the mesh are where others are, in cells that cover one another, so "
+            "that a checkpoint could not tell their values apart; remove the cells that are there "
+            "twice, or go without a checkpoint"
+        )
+    _told_apart.add(problem)
 
 
 def read(problem: ContactProblem, path: str | Path) -> Stored:

@@ -134,6 +134,8 @@ def increments(
         raise ValueError(f"checkpoint is {checkpoint!r}; it must be the name of a file")
     comm, set_load = problem.u.function_space.mesh.comm, _setter(load)
     file = None if checkpoint is None else Path(checkpoint)
+    if file is not None:
+        states.check_places(problem)
     with collective_errors(comm):
         if file is not None and comm.rank == 0 and not file.parent.is_dir():
             raise ValueError(f"checkpoint is {file}, and there is no folder {file.parent}; make it")

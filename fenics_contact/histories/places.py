@@ -28,6 +28,7 @@ __all__ = [
     "find",
     "gather",
     "layout_of",
+    "n_shared",
     "node_places",
     "parts_of",
     "point_places",
@@ -57,7 +58,13 @@ def unpack(rows: Array, layout: Sequence[tuple[str, int]]) -> dict[str, Array]:
 
 
 def gather(comm: MPI.Comm, places: Array, *values: Array | dict[str, Array]) -> Array:
-    """Rows of places and values of all ranks on rank 0, nothing on the others. Collective."""
+    """Rows of places and values of all ranks on rank 0, nothing on the others. Collective.
+
+    Args:
+        comm: Of the ranks.
+        places: Of this rank, (n, width).
+        values: Columns at them, (n, n_values) each, or several by name.
+    """
     columns = [places]
     for part in values:
         columns += part.values() if isinstance(part, dict) else [part]
@@ -66,7 +73,19 @@ def gather(comm: MPI.Comm, places: Array, *values: Array | dict[str, Array]) -> 
 
 
 def find(comm: MPI.Comm, stored: Stored, name: str, places: Array, size: float) -> Array:
-    """The stored values at given places, (n, n_values). Collective."""
+    """The stored values at given places, (n, n_values). Collective.
+
+    Args:
+        comm: Of the ranks.
+        stored: Has rows of places and values under a name, as `gather` gave them.
+        name: The name.
+        places: Those of this rank, (n, width).
+        size: Of the mesh (length).
+
+    Raises:
+        ValueError: The stored places are not those of all ranks, or two of them are the same. On
+            all ranks.
+    """
     table, width = stored.arrays[name], places.shape[1]
     counts = comm.allgather(len(places))
     missing, row = len(places), np.zeros(0, dtype=np.int64)
@@ -86,6 +105,20 @@ def find(comm: MPI.Comm, stored: Stored, name: str, places: Array, size: float) 
     if np.unique(used).size < used.size:
         refuse(stored, [f"{name} has several values at one place, which cannot be told apart"])
     return table[row, width:]
+
+
+def n_shared(comm: MPI.Comm, places: Array, size: float) -> int:
+    """How many places of all ranks are where another one is. Collective.
+
+    Args:
+        comm: Of the ranks.
+        places: Of this rank, (n, width).
+        size: See `find`.
+    """
+    every, found = gather(comm, places), 0
+    if len(every):
+        found = len(scipy.spatial.cKDTree(every).query_pairs(_SAME * size, output_type="ndarray"))
+    return int(comm.bcast(found))
 
 
 class Part(NamedTuple):

@@ -125,9 +125,7 @@ class CondensedSystem(System):
         )
         self.mark = object()
         self.ready = True
-        diagonal = stiffness.getDiagonal()
-        self._full.diagonal = diagonal.array.copy()
-        diagonal.destroy()
+        self._full.take_diagonal(stiffness)
         return 1
 
     @property
@@ -249,7 +247,7 @@ class CondensedSystem(System):
         added = np.bincount(rows[on], values[on], minlength=len(fixed))
         self.diagonal = scale * (np.diag(fixed) + added)
         # For the round-off of contact.
-        self._full.diagonal[self.unknowns.kept] = self.unknowns.scattered(self.diagonal)
+        self._full.change_diagonal(self.unknowns.kept, self.unknowns.scattered(self.diagonal))
         return 0
 
 

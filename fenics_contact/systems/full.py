@@ -17,7 +17,7 @@ from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Unknowns
-from fenics_contact.types import Array, Mask
+from fenics_contact.types import Array, Indices, Mask
 
 __all__ = ["FullSystem"]
 
@@ -200,8 +200,16 @@ class FullSystem(System):
         rows = (start + np.flatnonzero(self.constrained)).astype(PETSc.IntType)
         scale = self.bulk.scale
         matrix.zeroRowsColumns(rows, diag=scale)
+        self.take_diagonal(matrix)
+        matrix.scale(1.0 / scale)
+        return int(self.linear_kind == "direct")
+
+    def take_diagonal(self, matrix: PETSc.Mat) -> None:
+        """Let the diagonal be that of a matrix on all unknowns. Collective."""
         diagonal = matrix.getDiagonal()
         self.diagonal = diagonal.array.copy()
         diagonal.destroy()
-        matrix.scale(1.0 / scale)
-        return int(self.linear_kind == "direct")
+
+    def change_diagonal(self, dofs: Indices, values: Array) -> None:
+        """Let a part of the diagonal be another."""
+        self.diagonal[dofs] = values

@@ -1,0 +1,76 @@
+"""What another run needs of the last commit at a system's unknowns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from fenics_contact.systems.bulk import Bulk
+from fenics_contact.systems.unknowns import Unknowns
+from fenics_contact.types import Array, Mask
+
+__all__ = ["CommittedState"]
+
+# How many of the rows are displacements, and how many are displacements or forces.
+_STATES, _PHYSICAL = 2, 4
+
+
+@dataclass(frozen=True)
+class CommittedState:
+    """A committed state, all arrays over this rank's unknowns, (n_local,).
+
+    Attributes:
+        state: Values of the unknowns.
+        rate: By how much the last increment moved them.
+        internal: Internal forces at them (force).
+        external: External ones.
+        kept: Mask of those kept when condensed.
+        constrained: Mask of those with Dirichlet conditions.
+        increment: Number of increments so far.
+        expected: How many of them were expected.
+        pairs_anew: Of each contact whether its pairs are found anew.
+    """
+
+    state: Array
+    rate: Array
+    internal: Array
+    external: Array
+    kept: Mask
+    constrained: Mask
+    increment: int
+    expected: int
+    pairs_anew: tuple[bool, ...]
+
+    @property
+    def numbers(self) -> Array:
+        """What is not an array, in one of floats, (2 + n_contacts,)."""
+        return np.array([self.increment, self.expected, *self.pairs_anew], dtype=np.float64)
+
+    def rows(self, unknowns: Unknowns, bulk: Bulk) -> Array:
+        """The arrays in the user's units, (6, n_local)."""
+        found = (self.state, self.rate, self.internal, self.external, self.kept, self.constrained)
+        return _converted(np.stack(found).astype(np.float64), unknowns, bulk, back=False)
+
+    @classmethod
+    def from_rows(
+        cls, rows: Array, numbers: Sequence[float] | Array, unknowns: Unknowns, bulk: Bulk
+    ) -> Self:
+        """What gave these `rows` and `numbers`."""
+        increment, expected, *anew = (int(number) for number in numbers)
+        arrays = _converted(rows, unknowns, bulk, back=True)
+        state, rate, internal, external, kept, constrained = arrays
+        masks = kept > 0, constrained > 0
+        pairs = tuple(bool(found) for found in anew)
+        return cls(state, rate, internal, external, *masks, increment, expected, pairs)
+
+
+def _converted(rows: Array, unknowns: Unknowns, bulk: Bulk, *, back: bool) -> Array:
+    """Displacements and forces of the body in the user's units, or ``back`` from them."""
+    n, found = unknowns.n_dofs, rows.copy()
+    convert = (bulk.in_units, bulk.from_units)
+    for i in range(_PHYSICAL):
+        found[i, :n] = convert[(i < _STATES) != back](rows[i, :n])
+    return found
