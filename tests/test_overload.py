@@ -97,6 +97,32 @@ def test_loads_that_grow_together_are_none(cell, method):
     assert found.normal_force == pytest.approx(10.0, rel=1e-6)
 
 
+@pytest.mark.parametrize("method", [None, "lbfgs", "newton", "alternating", "continuation"])
+@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
+@pytest.mark.parametrize("by", ["top", "gap"])
+def test_a_tight_fit_is_none(by, cell, method):
+    """Squeezed by given displacements and pushed at once: soft contact could not bear it.
+
+    Contact that is softened on the way has less pressure, and less friction, than there is. A
+    column of stiffness E / h on the contact's k_n, both of area 1: N = δ / (h / E + 1 / k_n).
+    """
+    modulus, stiffness, depth = 1000.0, 1e5, 1e-3
+    scene = block(cell, E=modulus, nu=0.0, n=4)
+    pressed = scene.hold(TOP, scene.mesh.geometry.dim - 1, -depth if by == "top" else 0.0)
+    law, contact = fc.Coulomb(MU, k_n=stiffness, k_t=stiffness), {}
+    if by == "gap":
+        contact["gap"] = -depth
+    problem, contact = scene.problem(
+        law, [pressed], contact=contact, kinematics=np.inf, method=method
+    )
+    force = depth / (1 / modulus + 1 / stiffness)
+    scene.load(side=0.8 * MU * force)
+    problem.solve()
+    found = contact.resultants()
+    assert found.force[0] == pytest.approx(-0.8 * MU * force, rel=1e-6)
+    assert found.normal_force == pytest.approx(force, rel=1e-6)
+
+
 def test_the_larger_friction_of_two():
     """An ellipse bears across its direction what the limit along it would not."""
     scene = block("hexahedron", n=3, size=(1.0, 1.0, 0.25), up=-10.0)

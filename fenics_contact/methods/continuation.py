@@ -4,7 +4,8 @@ Newton's method finds the solution of soft contact from far away, and that of st
 solution of one that is a little softer: the points that are closed, stick and slip are nearly those
 of the next one, and for a given status the equations are linear, or nearly so. Where a step of the
 stiffness does not succeed, a smaller one may. Where none does, the branch of solutions may end, as
-it can with friction, and the alternation finds another.
+it can with friction, and the alternation finds another. Soft contact that cannot bear the load says
+nothing of stiffer contact, which given displacements squeeze more: it is passed over.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact import compat
-from fenics_contact.methods.method import InnerSnes, OwnMethod, Tools
+from fenics_contact.methods.method import OVERLOADED, InnerSnes, OwnMethod, Tools
 
 __all__ = ["Continuation"]
 
@@ -70,6 +71,7 @@ class Continuation(OwnMethod):
         )
         share = min(1.0, 1.0 / max(equations.hardness(), 1.0))
         iterations, solved, factor, kept = 0, 0.0, _FACTOR, equations.solution.copy()
+        passed_over = False  # whether ``kept`` is no solution at ``solved``
         try:
             while True:
                 self._soften(share)
@@ -78,16 +80,24 @@ class Continuation(OwnMethod):
                 self.by_newton = reason > 0
                 if reason <= 0:
                     kept.copy(equations.solution)
-                    if solved and factor > _LEAST_FACTOR:
+                    if solved and not passed_over and factor > _LEAST_FACTOR:
                         factor = np.sqrt(factor)
                         share = min(1.0, factor * solved)
                         continue
                     factor = _FACTOR
                     share = min(1.0, factor * solved) if solved else share
-                    self._soften(share)
-                    made, reason = self._otherwise.solve()
-                    iterations += made
-                    logger.debug("alternated at %.3g of the stiffness: reason %d", share, reason)
+                    if share == 1.0 or not passed_over:
+                        self._soften(share)
+                        made, reason = self._otherwise.solve()
+                        iterations += made
+                        logger.debug("alternated at %.3g of stiffness: reason %d", share, reason)
+                        passed_over = reason == OVERLOADED and share < 1.0
+                    if passed_over:
+                        kept.copy(equations.solution)
+                        solved = share
+                        share = min(1.0, factor * solved)
+                        continue
+                passed_over = False
                 if reason <= 0 or share == 1.0:
                     return iterations, reason
                 if iterations > _MAX_ITERATIONS:
