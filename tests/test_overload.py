@@ -123,6 +123,36 @@ def test_a_tight_fit_is_none(by, cell, method):
     assert found.normal_force == pytest.approx(force, rel=1e-6)
 
 
+@pytest.mark.parametrize("method", [None, "lbfgs", "newton", "alternating", "continuation"])
+@pytest.mark.parametrize("stiffness", [1e1, 1e3])
+@pytest.mark.parametrize("by", ["top", "gap"])
+def test_a_tight_fit_held_by_soft_multipliers_is_none(by, stiffness, method):
+    """The springs of the first round alone would not bear the push; multipliers do.
+
+    Nothing gives but the column, of stiffness E / h: N = δ E / h, to the multipliers' tolerance.
+    """
+    modulus, depth, tolerance = 1000.0, 1e-3, 1e-6
+    scene = block("quadrilateral", E=modulus, nu=0.0, n=4)
+    pressed = scene.hold(TOP, 1, -depth if by == "top" else 0.0)
+    contact = {"enforcement": "augmented", "tolerance": tolerance}
+    if by == "gap":
+        contact["gap"] = -depth
+    problem, contact = scene.problem(
+        fc.Coulomb(MU, k_n=stiffness, k_t=stiffness),
+        [pressed],
+        contact=contact,
+        kinematics=np.inf,
+        method=method,
+    )
+    force = depth * modulus
+    scene.load(side=0.8 * MU * force)
+    problem.solve()
+    found = contact.resultants()
+    assert contact.stiffness_factor.value == 1.0
+    assert found.force[0] == pytest.approx(-0.8 * MU * force, rel=10 * tolerance)
+    assert found.normal_force == pytest.approx(force, rel=10 * tolerance)
+
+
 def test_the_larger_friction_of_two():
     """An ellipse bears across its direction what the limit along it would not."""
     scene = block("hexahedron", n=3, size=(1.0, 1.0, 0.25), up=-10.0)

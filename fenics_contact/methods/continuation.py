@@ -61,6 +61,7 @@ class Continuation(OwnMethod):
         self.snes = self._newton.snes
         self.by_newton = False
         self._coarse = 0.0
+        self._whole: list[float] = []  # of each contact
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`. Iterations are Newton's, in all."""
@@ -69,6 +70,7 @@ class Continuation(OwnMethod):
         self._newton.attach(
             lambda x, J: this._equations.assemble_tangent(x, J), lambda: this._test()
         )
+        self._whole = [float(c.stiffness_factor.value) for c in equations.contacts]
         share = min(1.0, 1.0 / max(equations.hardness(), 1.0))
         iterations, solved, factor, kept = 0, 0.0, _FACTOR, equations.solution.copy()
         passed_over = False  # whether ``kept`` is no solution at ``solved``
@@ -111,9 +113,9 @@ class Continuation(OwnMethod):
             equations.h0_is_made = False
 
     def _soften(self, share: float) -> None:
-        """Let the contacts have a share of their stiffness."""
-        for contact in self._equations.contacts:
-            contact.stiffness_factor.value = share
+        """Let the contacts have a share of the stiffness they came with."""
+        for contact, whole in zip(self._equations.contacts, self._whole, strict=True):
+            contact.stiffness_factor.value = share * whole
         self._coarse = _COARSE if share < 1.0 else 0.0
 
     def _solve_one(self) -> tuple[int, int]:

@@ -16,6 +16,7 @@ from fenics_contact import compat
 from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.verdict import Attempt
 from fenics_contact.contact.accuracy import Accuracy
+from fenics_contact.contact.contact import Contact
 from fenics_contact.methods.alternating import Alternation
 from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
@@ -42,6 +43,8 @@ _MAX_ROUNDS = 80
 # Residual, relative, to which the first round is solved; share of a round's error to which the next
 # is; and the error, in units of the tolerance, from which on the next may be the last one.
 _FIRST_ROUND, _INNER, _NEARLY = 1e-4, 1e-2, 10.0
+# Stiffness of contact, by that of the bulk, that a true overload is found at at the latest.
+_STIFF = 1e3
 # Iterations that Newton's method gets where it is slow, see `Solver._hurries`.
 _ENOUGH = 15
 # Increments expected where nothing is said.
@@ -432,8 +435,14 @@ class Solver:
         self.equations.round_rtol = _FIRST_ROUND
         try:
             for number in range(1, _MAX_ROUNDS + 1):
+                start = self.system.state()
                 reason, tried = self._iterate(ahead, rate, cold, stiffness_changed)
                 _append(attempts, tried)
+                stiff = reason == OVERLOADED and self._stiffen(augmented)
+                if stiff:
+                    self.system.set_state(start)
+                    reason, tried = self._iterate(ahead, rate, cold, False)
+                    _append(attempts, tried)
                 if reason <= 0:
                     break
                 for contact in augmented:
@@ -441,7 +450,7 @@ class Solver:
                 errors = [c.enforcement_error() for c in augmented]
                 worst = max(e / c.tolerance for e, c in zip(errors, augmented, strict=True))
                 logger.debug("round %d: errors %s", number, errors)
-                if worst <= 1.0 and exact:
+                if worst <= 1.0 and exact and not stiff:
                     break
                 ahead, stiffness_changed = 0.0, False
                 exact = worst <= _NEARLY
@@ -450,9 +459,35 @@ class Solver:
                 if number < _MAX_ROUNDS and worst > 1.0:
                     for contact in augmented:
                         contact.augment()
+                self._soften(augmented)
         finally:
+            self._soften(augmented)
             self.equations.round_rtol = 0.0
         return reason, attempts, number
+
+    def _stiffen(self, augmented: Sequence[Contact]) -> bool:
+        """Let the springs be stiff for one round, if they are not. Collective.
+
+        Given displacements squeeze a body the less the softer the springs are, and there is less
+        friction: it is the multipliers of later rounds that bear what soft springs cannot.
+
+        Returns:
+            Whether they were soft.
+        """
+        factor = _STIFF / self.equations.hardness()
+        if factor <= 1.0:
+            return False
+        for contact in augmented:
+            contact.stiffness_factor.value = factor
+        self.equations.h0_is_made = False
+        return True
+
+    def _soften(self, augmented: Sequence[Contact]) -> None:
+        """Let the springs be what they were before `_stiffen`."""
+        if any(contact.stiffness_factor.value != 1.0 for contact in augmented):
+            for contact in augmented:
+                contact.stiffness_factor.value = 1.0
+            self.equations.h0_is_made = False
 
     def _iterate(
         self, ahead: float, rate: Array | None, cold: bool, stiffness_changed: bool
