@@ -145,6 +145,7 @@ class Multipliers:
     Attributes:
         fields: "pressure" λ_n and, with friction, "traction" λ_t (stress), in the frame of the
             support; where normals turn, "normal" are those it is across.
+        as_displacement: Whether they are functions of the displacement's own degree, which is 1.
     """
 
     def __init__(
@@ -164,9 +165,11 @@ class Multipliers:
         self._vectors = vectors if law.has_friction else []
         gdim = quadrature.surface.mesh.geometry.dim
         self.fields = PointFields(quadrature, {"pressure": 0} | dict.fromkeys(self._vectors, gdim))
+        self.as_displacement = degree == 1
         self._project = TraceProjection(quadrature, degree)
         self._accelerated = _Acceleration(quadrature)
         self._first: tuple[float, float] | None = None  # change and tractions of the first round
+        self._left_out: Array | None = None  # of the next change of λ_t
 
     def _next(self, values: PointValues) -> dict[str, Array]:
         """The multipliers that the tractions of an evaluated contact make."""
@@ -175,7 +178,26 @@ class Multipliers:
             found["pressure"] = self._project(-values.normal_traction)
         if self._law.has_friction:
             found["traction"] = self._project(values.framed_traction)
+            if self._left_out is not None:
+                found["traction"] -= self._left_out
         return found
+
+    def tangential_change(self, values: PointValues) -> Array:
+        """All that the tractions of an evaluated contact change of λ_t. Collective.
+
+        Returns:
+            In the frame of the support, (n_points, gdim) (stress).
+        """
+        self._left_out = None
+        return np.asarray(self._next(values)["traction"] - self.fields.values("traction"))
+
+    def leave_out(self, part: Array) -> None:
+        """Make the next change without a part, until `tangential_change` or `restore` is called.
+
+        Args:
+            part: Of what `tangential_change` gave.
+        """
+        self._left_out = part
 
     def error(self, values: PointValues, history: PointFields, moved: Array) -> float:
         """Largest change that `update` would make, see `Contact.enforcement_error`. Collective.
@@ -237,6 +259,6 @@ class Multipliers:
     def restore(self, history: PointFields) -> None:
         """Take those of the last commit. Collective."""
         self._accelerated.begin()
-        self._first = None
+        self._first = self._left_out = None
         values = {"pressure": history.values("multiplier")}
         self.fields.commit(values | {name: history.values(name) for name in self._vectors})

@@ -27,6 +27,7 @@ from fenics_contact.methods.options import Defaults, take_command_line
 from fenics_contact.methods.quasi_newton import QuasiNewton
 from fenics_contact.methods.starts import Starts
 from fenics_contact.systems import linear
+from fenics_contact.systems.answered import leave_out_unanswered
 from fenics_contact.systems.choice import linear_kind, obstacle_to_condensation
 from fenics_contact.systems.condensed import CondensedSystem
 from fenics_contact.systems.full import FullSystem
@@ -445,8 +446,10 @@ class Solver:
                     _append(attempts, tried)
                 if reason <= 0:
                     break
-                for contact in augmented:
-                    contact.evaluate()
+                for operator in self._full.operators:
+                    if operator.contact in augmented:
+                        operator.contact.evaluate()
+                        leave_out_unanswered(operator, self._full.state(), self._full.constrained)
                 errors = [c.enforcement_error() for c in augmented]
                 worst = max(e / c.tolerance for e, c in zip(errors, augmented, strict=True))
                 logger.debug("round %d: errors %s", number, errors)
