@@ -209,6 +209,7 @@ class ContactProblem:
         self.full.update_stiffness()
         self.bulk.check_elastic()
         self._scaled = [c for c in self.contacts if c.needs_modulus]
+        self._modulus: fem.Function | None = None
         self._measure_modulus()
         supports = [
             (contact.name, motion) for contact in self.contacts for motion in contact.motions
@@ -356,7 +357,12 @@ class ContactProblem:
         """Let stiffnesses that are multiples of E/h follow E of the bulk form. Collective."""
         if self._scaled:
             weight = self._scaled[0].weight
-            modulus = cell_modulus(self.bulk.tangent_form, self.displacement, weight)
+            self._set_modulus(cell_modulus(self.bulk.tangent_form, self.displacement, weight))
+
+    def _set_modulus(self, modulus: fem.Function | None) -> None:
+        """Let these stiffnesses be multiples of a modulus by h. Collective."""
+        self._modulus = modulus
+        if modulus is not None:
             for contact in self._scaled:
                 contact.set_modulus(modulus)
 
@@ -708,13 +714,20 @@ class ContactProblem:
 
     @contextmanager
     def at_state(self, state: Array) -> Iterator[None]:
-        """Let unknowns be the present ones inside of the block. Collective."""
-        before = self.full.state()
+        """Let unknowns be the present ones inside of the block. Collective.
+
+        Where the bulk is linear, stiffnesses that are multiples of E/h are those of its present
+        data there, as `solve` would have them.
+        """
+        before, modulus = self.full.state(), self._modulus
         try:
             self.full.set_state(state)
+            if self.bulk.linear:
+                self._measure_modulus()
             yield
         finally:
             self.full.set_state(before)
+            self._set_modulus(modulus)
 
     def present_load(self) -> Array:
         """External forces as they are now at this rank's unknowns (force). Collective."""

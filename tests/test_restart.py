@@ -15,10 +15,12 @@ import subprocess
 import numpy as np
 import pytest
 import ufl
+from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import checkpoint
+from scenes.blocks import TOP, block
 from scenes.comparing import at_points, close, owned, raised_everywhere, shared_folder
 from scenes.elasticity import strain
 from scenes.histories import Press, Ramp, differences, goes_on
@@ -278,6 +280,30 @@ def test_a_longer_way_and_other_steps_ahead(tmp_path):
     steps = [0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.1]
     rest = [s.load for s in other.increments(4.1, steps=steps, checkpoint=folder / "state.npz")]
     assert rest == [4.1]
+
+
+def test_a_modulus_that_the_load_changes_goes_on(tmp_path):
+    """Springs of 10 E/h follow E in the form: they are those of the load that the file is at."""
+    folder = shared_folder(tmp_path)
+
+    def run(stop, path):
+        scene = block("quadrilateral", n=4)
+        top = fem.Constant(scene.mesh, 0.0)
+        contact = scene.contact(fc.Coulomb(0.3))
+        bcs = [scene.hold(TOP, 0), scene.hold(TOP, 1, top)]
+        problem = fc.ContactProblem(scene.F, scene.u, bcs=bcs, contacts=[contact])
+
+        def load(t):
+            top.value, scene.E.value = -0.01 * t, 1000.0 * (1.0 + 0.3 * t)
+
+        for step in fc.increments(problem, load, 0.0, 1.0, steps=4, checkpoint=path):
+            if step.load >= stop:
+                break
+        return contact.resultants().force
+
+    whole = run(1.0, folder / "whole.npz")
+    run(0.5, folder / "two.npz")
+    assert run(1.0, folder / "two.npz") == pytest.approx(whole, rel=1e-12, abs=1e-12)
 
 
 def test_a_loop_that_was_left_goes_on(tmp_path):
