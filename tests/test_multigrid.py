@@ -2,12 +2,14 @@
 
 import logging
 
+import dolfinx
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
+from scipy.spatial.transform import Rotation
 
 import fenics_contact as fc
 from fenics_contact.systems import linear
@@ -210,6 +212,25 @@ def test_chosen_where_it_is_quicker():
     assert not linear.quicker(100_000, 3, condensed_for=4)
     assert linear.quicker(1_000_000, 3, condensed_for=4)
     assert not linear.quicker(1_000_000, 2)
+    # As many in plates, whose cross-sections have fewer nodes than a cube's.
+    assert not linear.quicker(55_000, 3, slender=3.0)
+    assert linear.quicker(300_000, 3, slender=3.0)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_box_is_as_slender_as_its_sides_say(turned):
+    """a/√(b c), wherever it is and however it is turned.
+
+    The nodes of n cells along an edge are spread as (1 + 2/n) says, which is why it is not exact.
+    """
+    sides, cells = np.array([4.0, 2.0, 1.0]), (24, 12, 6)
+    box = dolfinx.mesh.create_box(COMM, [(0, 0, 0), sides], cells)
+    if turned:
+        turn = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
+        box.geometry.x[:] = box.geometry.x @ turn.T + 1e4
+    found = linear.slenderness(fem.functionspace(box, ("Lagrange", 1, (3,))))
+    spread = sides**2 * (1 + 2 / np.array(cells))
+    assert found == pytest.approx(np.sqrt(spread[0] / np.sqrt(spread[1] * spread[2])), rel=1e-9)
 
 
 def test_chosen_by_the_number_of_increments(monkeypatch):

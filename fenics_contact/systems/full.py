@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -63,6 +64,11 @@ class FullSystem(System):
         self._moves: Mask = unknowns.joined(moves, np.ones(n_motions)) > 0
         self.stiffness: PETSc.Mat | None = None
         self._near_nullspace: PETSc.NullSpace | None = None
+
+    @cached_property
+    def slenderness(self) -> float:
+        """`linear.slenderness` of the mesh; 1 in the plane. Collective when first asked for."""
+        return linear.slenderness(self.displacement.u.function_space) if self.gdim == 3 else 1.0
 
     def update_stiffness(self) -> bool:
         """Assemble the bulk's tangent if it may have changed; True if it did. Collective."""
