@@ -17,7 +17,7 @@ import fenics_contact as fc
 from fenics_contact import compat
 from fenics_contact.elasticity import NeoHookean
 from fenics_contact.systems.operator import ContactOperator
-from scenes.elasticity import displacement_space, hold
+from scenes.elasticity import displacement_space, hold, residual
 from scenes.meshes import mesh_of
 from scenes.tags import near, tagged
 from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, two_blocks
@@ -424,6 +424,23 @@ def test_a_body_touches_itself():
         forces.append(step.contacts["contact"].normal_force)
     assert forces[0] > 5.0
     assert forces[1] == pytest.approx(forces[0], rel=1e-3)
+
+
+def test_where_a_surface_has_no_tangent_plane_there_is_no_residual():
+    """All of Γc drawn together in a line: a line search that comes there steps shorter."""
+    pair = Pair("tetrahedron", LAWS["coulomb"], kinematics="finite")
+    bcs = [hold(pair.u, pair.tags, tag, i) for tag in (BOTTOM, TOP) for i in range(3)]
+    form = residual(pair.u, ufl.TestFunction(pair.u.function_space), 100.0, 0.3)
+    problem = fc.ContactProblem(form, pair.u, bcs=bcs, contacts=[pair.contact])
+    x = pair.nodes
+    line = x.copy()
+    line[np.isclose(x[:, 2], 0.5), 1] = 0.5
+    for places, lost in ((x, False), (line, True), (x, False)):
+        pair.place(places)
+        norm = problem.solver.equations.residual_at(problem.full.state())
+        assert problem.full.is_degenerate() == lost
+        assert np.isnan(norm) == lost
+        assert not problem.full.is_twisted()
 
 
 def test_condensation_is_refused():

@@ -175,9 +175,9 @@ class FollowedOpposite(BodyOpposite):
         return "never"
 
     @property
-    def flat(self) -> bool:
+    def degenerate(self) -> bool:
         """See `Opposite`."""
-        return self._present.flat
+        return self._present.degenerate
 
     @property
     def local_map(self) -> PETSc.Mat | None:

@@ -91,7 +91,7 @@ class Opposite(ABC):
         is_rigid: Whether it is a rigid support, whose reactions are external to the mesh.
         follows: Whether the pairs follow the bodies wherever they go.
         pairs_anew: Whether pairs are found anew, on the deformed bodies, at every commit.
-        flat: Whether Γc has lost its tangent plane somewhere, with pairs that follow the bodies.
+        degenerate: Whether Γc has lost its tangent plane somewhere, where pairs follow the bodies.
         local_map: Sparse map from ``u`` to what derivatives at the points are by, where that is
             another than ``pairs.jump_map``; None: there is none.
     """
@@ -361,7 +361,7 @@ class Opposite(ABC):
         return False
 
     @property
-    def flat(self) -> bool:
+    def degenerate(self) -> bool:
         """See the class."""
         return False
 

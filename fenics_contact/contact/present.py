@@ -99,7 +99,7 @@ class PresentPairs(Pairs):
         told: "jump", the displacement relative to the partner since the last commit (length);
             "foot", nothing; "turn I", rows of R; "committed", R times the committed traction
             (stress).
-        flat: Whether Γc has no tangent plane at some point of any rank: a trial state gone astray.
+        degenerate: Whether Γc has no tangent plane at some point of any rank: a trial state gone astray.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class PresentPairs(Pairs):
         self.felt = PointFields(quadrature, {"gap": 0, "normal": d, "slip": d, "traction": d})
         turns = {f"turn {i}": d for i in range(d)}
         self.told = PointFields(quadrature, {"jump": d, "foot": d, "committed": d} | turns)
-        self.flat = False
+        self.degenerate = False
         self._where: tuple[Array, Array] | None = None
         self._committed: _Committed | None = None
         self._present: _Present | None = None
@@ -150,7 +150,7 @@ class PresentPairs(Pairs):
             self._committed = _Committed(x, normal, _reciprocal(tangents))
         before = self._committed
         _, tangents = here.positions(facet, place, self._u)
-        self.flat = bool(self._mesh.comm.allreduce(int(not _metric(tangents)[1].all())))
+        self.degenerate = bool(self._mesh.comm.allreduce(int(not _metric(tangents)[1].all())))
         normal = here.normals(facet, place, self._u)
         deep = np.maximum(self.search.largest(history.values("penetration")), 0.0)
         hits = self._rays.follow(

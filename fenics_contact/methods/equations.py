@@ -105,7 +105,8 @@ class Equations:
         self.set_state(x)
         contacts = self.system.contact_forces()
         total = sum(contacts, self.system.bulk_force())
-        if self._bulk.is_inverted() or self.system.is_twisted():
+        system = self.system
+        if self._bulk.is_inverted() or system.is_twisted() or system.is_degenerate():
             total[:] = np.nan  # a line search takes a shorter step
         self.norms = self.system.norms(total, contacts, self.start)
         total[self.system.constrained] = 0.0

@@ -211,7 +211,7 @@ class System(ABC):
             motion.set_value(value)
 
     def is_twisted(self) -> bool:
-        """Whether a support that turns freely has turned too far, or Γc is flat.
+        """Whether a support that turns freely has turned too far.
 
         A turn further its points are where they were: to a solution there are others.
         """
@@ -220,8 +220,11 @@ class System(ABC):
             for contact in self.contacts
             if contact.free_angle is not None
         )
-        far = any(not abs(turn) < _TURN for turn in turns)
-        return far or any(contact.opposite.flat for contact in self.contacts)
+        return any(not abs(turn) < _TURN for turn in turns)
+
+    def is_degenerate(self) -> bool:
+        """Whether Γc has lost its tangent plane somewhere; see `Opposite.degenerate`."""
+        return any(contact.opposite.degenerate for contact in self.contacts)
 
     def rolled(self, state: Array) -> Array:
         """A state with supports that turn freely turned to where they slip least. Collective.
