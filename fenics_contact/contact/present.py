@@ -99,7 +99,8 @@ class PresentPairs(Pairs):
         told: "jump", the displacement relative to the partner since the last commit (length);
             "foot", nothing; "turn I", rows of R; "committed", R times the committed traction
             (stress).
-        degenerate: Whether Γc has no tangent plane at some point of any rank: a trial state gone astray.
+        degenerate: Whether Γc has no tangent plane at some point of any rank: a trial state that
+            has gone astray.
     """
 
     def __init__(

@@ -10,7 +10,6 @@ D is constant, but for one column: by the angle of a support that is turned by a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -24,7 +23,7 @@ from fenics_contact.systems.products import PointProduct
 from fenics_contact.systems.unknowns import Selection, Unknowns
 from fenics_contact.types import Array, Indices, Mask
 
-__all__ = ["ContactOperator", "contact_operators"]
+__all__ = ["ContactOperator"]
 
 
 class ContactOperator:
@@ -356,12 +355,3 @@ class ContactOperator:
             ),
             comm=self.contact.surface.mesh.comm,
         )
-
-
-def contact_operators(contacts: Sequence[Contact], unknowns: Unknowns) -> list[ContactOperator]:
-    """One of every contact of a problem, over its unknowns. Collective."""
-    firsts = np.cumsum([0, *(len(contact.motions) for contact in contacts)])
-    return [
-        ContactOperator(contact, unknowns, int(first))
-        for contact, first in zip(contacts, firsts, strict=False)
-    ]

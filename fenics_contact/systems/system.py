@@ -23,7 +23,7 @@ from fenics_contact.parallel import global_max
 from fenics_contact.systems.balance import Norms, Parts, by_body
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.forces import Forces
-from fenics_contact.systems.operator import ContactOperator, contact_operators
+from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array, Mask
 
@@ -83,21 +83,30 @@ class System(ABC):
         self.farthest = np.inf
         self._motions = [motion for contact in contacts for motion in contact.motions]
         self._contact_vector = unknowns.vector()
-        self._operators: tuple[list[int], list[ContactOperator]] | None = None
+        counts = [len(contact.motions) for contact in contacts]
+        self._first_motions = [sum(counts[:i]) for i in range(len(counts))]
+        # Of every contact, with the number of the pairs that it was made for.
+        self._operators: dict[int, tuple[int, ContactOperator]] = {}
         self._parts: tuple[list[int], Parts] | None = None
 
     # ---- contact, and what has to be in balance --------------------------------------------------
 
     @property
     def operators(self) -> list[ContactOperator]:
-        """What the contacts are over these unknowns, with the pairs as they are. Collective."""
+        """What the contacts are over these unknowns, with the pairs as they are. Collective.
+
+        Pairs that follow the bodies are found for the present ``u`` first. A contact whose pairs
+        are others than before gets another operator, and it alone: no operator changes.
+        """
         for contact in self.contacts:
             if contact.opposite.follows:
                 contact.opposite.update()
-        pairings = [c.pairs.number for c in self.contacts]
-        if self._operators is None or self._operators[0] != pairings:
-            self._operators = pairings, contact_operators(self.contacts, self.unknowns)
-        return self._operators[1]
+        for i, contact in enumerate(self.contacts):
+            number = contact.pairs.number
+            if i not in self._operators or self._operators[i][0] != number:
+                operator = ContactOperator(contact, self.unknowns, self._first_motions[i])
+                self._operators[i] = number, operator
+        return [self._operators[i][1] for i in range(len(self.contacts))]
 
     @property
     def parts(self) -> Parts:

@@ -1,0 +1,103 @@
+"""`ContactOperator` does not change, whatever is done to its contact, or over other unknowns.
+
+All comparisons are bit for bit: what is compared are two readings of the same numbers.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.systems.unknowns import Selection, Unknowns
+from scenes.elasticity import displacement_space, hold, residual
+from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, Slider, two_blocks
+
+COMM = MPI.COMM_WORLD
+LAW = fc.Coulomb(0.3, k_n=1e7, k_t=1e6)
+
+
+def read(operator: ContactOperator) -> list[np.ndarray]:
+    """All that it makes of fixed states, tractions and stiffnesses, each by its own numbers."""
+    rng = np.random.default_rng(COMM.rank)
+    unknowns, n = operator.unknowns, operator.contact.quadrature.n_points
+    gdim = operator.contact.surface.mesh.geometry.dim
+    force = unknowns.vector()
+    force.set(0.0)
+    operator.add_force(force, rng.normal(size=(n, gdim)))
+    matrix = operator.springs(rng.normal(size=(n, gdim, gdim)))
+    found = [operator.jump(rng.normal(size=unknowns.n_local)), force.array_r.copy()]
+    found += [operator.touched.copy(), *matrix.getValuesCSR()]
+    for item in (force, matrix):
+        item.destroy()
+    return found
+
+
+def same(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
+    """On all ranks."""
+    here = all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+    return COMM.allreduce(here, op=MPI.LAND)
+
+
+def test_an_operator_does_not_change():
+    """Not by increments, confined laws or other operators; pairs found anew take another."""
+    slider = Slider("triangle", LAW, start=1.0, n=(8, 3))
+    contact, unknowns = slider.contact, slider.problem.unknowns
+    kept = np.arange(0, unknowns.n_dofs, 2, dtype=np.int32)
+    whole = ContactOperator(contact, unknowns)
+    part = ContactOperator(contact, Selection(unknowns, kept))
+    before = read(whole), read(part)
+    slider.step(0.002, 0.0)
+    contact.confine(np.zeros(contact.quadrature.n_points, dtype=bool))
+    assert same(before[0], read(whole)) and same(before[1], read(part))
+    contact.confine()
+    slider.step(0.002, 0.6)  # beyond the facets that were opposite
+    assert contact.opposite.pairs_anew
+    assert same(before[0], read(whole)) and same(before[1], read(part))
+    another = ContactOperator(contact, unknowns)
+    assert not same(before[0], read(another))
+    assert same(before[0], read(whole))
+
+
+def test_operators_over_several_unknowns_do_not_know_of_each_other():
+    """Taken in turn they make what each makes alone: contact has no unknowns of its own."""
+    mesh, tags = two_blocks("triangle", (5, 3))
+    u = fem.Function(displacement_space(mesh, 1))
+    contact = fc.Contact(
+        u, fc.ContactSurface(mesh, tags, UPPER), fc.DeformableBody(tags, LOWER), LAW
+    )
+    unknowns = Unknowns(u.function_space)
+    kept = np.arange(1, unknowns.n_dofs, 3, dtype=np.int32)
+    whole, part = (ContactOperator(contact, over) for over in (unknowns, Selection(unknowns, kept)))
+    alone = read(whole), read(part)
+    u.interpolate(lambda x: np.vstack([0.1 * x[0], -0.2 * x[1]]))
+    contact.evaluate()
+    for _ in range(2):
+        assert same(alone[1], read(part)) and same(alone[0], read(whole))
+
+
+def test_pairs_found_anew_take_another_operator_for_their_contact_alone():
+    """The support on the other side is rigid: its operator is the one that was."""
+    mesh, tags = two_blocks("triangle", (4, 3))
+    u = fem.Function(displacement_space(mesh, 1))
+    pair = fc.Contact(
+        u, fc.ContactSurface(mesh, tags, UPPER), fc.DeformableBody(tags, LOWER), LAW, name="pair"
+    )
+    ground = fc.HalfSpace(point=(0, 0), normal=(0, 1))
+    floor = fc.Contact(u, fc.ContactSurface(mesh, tags, BOTTOM), ground, LAW, name="floor")
+    bcs = [hold(u, tags, TOP, i) for i in range(2)]
+    F = residual(u, ufl.TestFunction(u.function_space), 1e6, 0.3)
+    problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[pair, floor])
+    system = problem.full
+    before = system.operators
+    assert all(a is b for a, b in zip(before, system.operators, strict=True))
+    u.interpolate(lambda x: np.vstack([np.where(x[1] > 0.5, 0.3, 0.0), 0 * x[0]]))
+    old = read(before[0])
+    pair.pair(u)
+    after = system.operators
+    assert after[0] is not before[0] and after[1] is before[1]
+    assert [operator.contact for operator in after] == [pair, floor]
+    assert not same(old, read(after[0])) and same(old, read(before[0]))
