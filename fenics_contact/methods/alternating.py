@@ -144,7 +144,7 @@ class Alternation(OwnMethod):
                 pressure = pressure + relaxation * (self._pressure() - pressure)
             return iterations, int(reasons.DIVERGED_MAX_IT)
         finally:
-            equations.h0_is_made = False
+            equations.forget_h0()
             for contact in equations.contacts:
                 contact.acting.thaw()
 

@@ -110,7 +110,7 @@ class Continuation(OwnMethod):
                 share = min(1.0, factor * solved)
         finally:
             self._soften(1.0)
-            equations.h0_is_made = False
+            equations.forget_h0()
 
     def _soften(self, share: float) -> None:
         """Let the contacts have a share of the stiffness they came with."""

@@ -48,7 +48,6 @@ class Equations:
         solution: The state to start from and, after a method, the one found; dimensionless.
         function: For the residual.
         solvers: Linear solvers for H₀ (False) and the consistent tangent (True).
-        h0_is_made: Whether the matrix of H₀ holds what the method made it of.
         factorisations: Of sparse matrices, counted.
         overload: By what the load outdid friction where `friction_needed` looked last, if it did.
     """
@@ -74,11 +73,11 @@ class Equations:
         self.start = nothing
         self.rtol = self.round_rtol = 0.0
         self.solvers: dict[bool, PETSc.KSP] = {}
-        self.h0_is_made = False
         self.factorisations = 0
         self.overload: Overload | None = None
         self._matrices: dict[bool, PETSc.Mat] = {}
         self._filled: set[bool] = set()
+        self._h0_is_made = False
         self.system: System = full
         self.solution, self.function = full.vector(), full.vector()
 
@@ -170,11 +169,25 @@ class Equations:
         self._matrices, self._filled = {}, set()
         for ksp in self.solvers.values():
             ksp.reset()
-        self.h0_is_made = False
+        self.forget_h0()
 
     def filled(self, consistent: bool) -> bool:
         """Whether H₀ or the consistent tangent holds anything."""
         return consistent in self._filled
+
+    @property
+    def h0_is_made(self) -> bool:
+        """Whether the matrix of H₀ is that of `make_h0`, or of the status since."""
+        return self._h0_is_made
+
+    def make_h0(self) -> None:
+        """K + αK_n + φK_t, all of Γc closed and sticking (section 5). Collective."""
+        self.assemble(self.matrix(False), self.stiffnesses(everywhere=True))
+        self._h0_is_made = True
+
+    def forget_h0(self) -> None:
+        """Let H₀ be made before its next use: stiffness, or what is in its matrix, is another."""
+        self._h0_is_made = False
 
     def assemble(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> None:
         """Bulk tangent plus contact, conditions applied, dimensionless. Collective.

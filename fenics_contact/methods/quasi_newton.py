@@ -74,7 +74,6 @@ class QuasiNewton(SnesMethod):
         idle = self._refreshed and borne < _IDLE * norms.total
         if not equations.h0_is_made or idle:
             self._start()
-            equations.h0_is_made = True
         else:
             self._clear_pairs(consistent=self.consistent)
         iterations = stalls = 0
@@ -105,11 +104,10 @@ class QuasiNewton(SnesMethod):
                 return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
 
     def _start(self) -> None:
-        """H₀ = (K + αK_n + φK_t)⁻¹, all of Γc closed and sticking (section 5). Collective."""
-        equations = self._equations
+        """Begin with H₀ as it is before anything is known of the status. Collective."""
         self._refreshed = False
         self._clear_pairs(consistent=False)
-        equations.assemble(equations.matrix(False), equations.stiffnesses(everywhere=True))
+        self._equations.make_h0()
 
     def _refresh(self) -> bool:
         """Make H₀ anew from the status that the last round reached; False if none. Collective.

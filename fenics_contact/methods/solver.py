@@ -482,7 +482,7 @@ class Solver:
             return False
         for contact in augmented:
             contact.stiffness_factor.value = factor
-        self.equations.h0_is_made = False
+        self.equations.forget_h0()
         return True
 
     def _soften(self, augmented: Sequence[Contact]) -> None:
@@ -490,7 +490,7 @@ class Solver:
         if any(contact.stiffness_factor.value != 1.0 for contact in augmented):
             for contact in augmented:
                 contact.stiffness_factor.value = 1.0
-            self.equations.h0_is_made = False
+            self.equations.forget_h0()
 
     def _iterate(
         self, ahead: float, rate: Array | None, cold: bool, stiffness_changed: bool
@@ -520,7 +520,7 @@ class Solver:
             equations.solution.array[:] = start
             equations.watch.start()
             if stiffness_changed:
-                equations.h0_is_made = False
+                equations.forget_h0()
             iterations, reason = self.methods.get(method, self.main).solve()
             attempts.append(Attempt(method, iterations, self._outcome(reason)))
             if reason > 0:
