@@ -1,5 +1,7 @@
 """Alternation of minimum problems: the direct solution's, and what the direct methods cannot do."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import ufl
@@ -138,6 +140,40 @@ def test_stiff_contact_from_a_cold_start(factor, friction):
         peaks.append(r.normal_force)
     assert close(peaks[1], peaks[0], 1e-2)
     assert r.max_penetration < 1e-1 / factor
+
+
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
+def test_each_cycle_gains_a_constant_factor_in_proportion_to_friction(cell, monkeypatch):
+    """The limit of friction is a multiple of the pressure, which what changes in it changes back.
+
+    The same points stick and slip with all of the coefficients. From cycle to cycle the change of
+    the pressure falls by one factor, to a twentieth of it: minimum problems are solved to a
+    hundredth of the whole law's residual. Twice the coefficient has twice the factor, to a tenth:
+    the pressure itself is a little different.
+    """
+    factors, zones = [], []
+    for friction in (0.1, 0.2, 0.4):
+        law = fc.Coulomb(friction, k_n=2e4, k_t=1e4)
+        n = 6 if cell == "triangle" else 3
+        _, problem, contact = pressed(cell, law, "alternating", n=n, side=0.0)
+        freeze, limits = contact.acting.freeze, []
+
+        def note(pressure, freeze=freeze, limits=limits):
+            limits.append(pressure.copy())
+            freeze(pressure)
+
+        monkeypatch.setattr(contact.acting, "freeze", note)
+        r = problem.solve().contacts["contact"]
+        zones.append((r.stick, r.slip))
+        limits.append(contact.pressure.copy())
+        squares = [contact.measure @ np.diff(pair, axis=0)[0] ** 2 for pair in pairwise(limits)]
+        changes = np.sqrt([COMM.allreduce(float(square)) for square in squares])
+        falls = changes[1:] / changes[:-1]
+        assert falls[-2] == pytest.approx(falls[-1], rel=0.05)
+        factors.append(falls[-1])
+    assert zones[0] == zones[1] == zones[2] and min(zones[0]) > 0
+    assert factors[1] == pytest.approx(2 * factors[0], rel=0.1)
+    assert factors[2] == pytest.approx(2 * factors[1], rel=0.1)
 
 
 def test_rationed_iterations_are_not_exceeded():

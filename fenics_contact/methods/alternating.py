@@ -3,8 +3,8 @@
 Coulomb's law has no potential. Given the pressure that sets the limit of friction, unilateral
 contact with friction has one (Signorini with Tresca or Duvaut-Lions, section 3): Newton's method
 with a line search on the energy solves it however stiff it is. The pressure that comes out sets the
-next limit, until the whole law holds. Each cycle gains a constant factor, the less the larger the
-friction is.
+next limit, until the whole law holds. Each cycle gains a factor, which is constant once no point
+changes its status, and the less the larger the friction is.
 
 The paper's conclusion takes the normal and the tangential reaction apart, one given while the other
 is sought. A body that contact alone holds is loose in either of these problems, and each has to
