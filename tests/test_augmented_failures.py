@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact.methods import solver as module
+from fenics_contact.methods import rounds as module
 from scenes.blocks import RIGHT, TOP, block, bulge
 from scenes.comparing import raised_everywhere
 from scenes.rubber import rubber

@@ -1,4 +1,4 @@
-"""The solution of one increment: system, start, method, rounds with multipliers, fallback."""
+"""The solution of one increment: system, start, method, and what follows where that fails."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ from fenics_contact import compat
 from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.verdict import Attempt
 from fenics_contact.contact.accuracy import Accuracy
-from fenics_contact.contact.contact import Contact
 from fenics_contact.methods.alternating import Alternation
 from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
@@ -25,9 +24,9 @@ from fenics_contact.methods.method import OVERLOADED, Method, Newton, OwnMethod,
 from fenics_contact.methods.neighbourhood import linearised, respond
 from fenics_contact.methods.options import Defaults, take_command_line
 from fenics_contact.methods.quasi_newton import QuasiNewton
+from fenics_contact.methods.rounds import INNER, solve_in_rounds
 from fenics_contact.methods.starts import Starts
 from fenics_contact.systems import linear
-from fenics_contact.systems.answered import leave_out_unanswered
 from fenics_contact.systems.choice import linear_kind, obstacle_to_condensation
 from fenics_contact.systems.condensed import CondensedSystem
 from fenics_contact.systems.full import FullSystem
@@ -39,13 +38,6 @@ __all__ = ["METHODS", "Settings", "Solver"]
 
 logger = logging.getLogger("fenics_contact")
 
-# Rounds with multipliers before it is given up.
-_MAX_ROUNDS = 80
-# Residual, relative, to which the first round is solved; share of a round's error to which the next
-# is; and the error, in units of the tolerance, from which on the next may be the last one.
-_FIRST_ROUND, _INNER, _NEARLY = 1e-4, 1e-2, 10.0
-# Stiffness of contact, by that of the bulk, that a true overload is found at at the latest.
-_STIFF = 1e3
 # Iterations that Newton's method gets where it is slow, see `Solver._hurries`.
 _ENOUGH = 15
 # Increments expected where nothing is said.
@@ -177,7 +169,7 @@ class Solver:
         if settings.accuracy is not None:
             # Residuals as large as what multipliers may miss would make rounds that change nothing.
             augmented = [c for c in self._full.contacts if c.multipliers is not None]
-            least = [_INNER * c.tolerance for c in augmented]
+            least = [INNER * c.tolerance for c in augmented]
             options.set({"snes_rtol": min(settings.accuracy.rtol, *least, 1.0)}, prefix)
             if self._comm.rank == 0:
                 logger.info("accuracy %s", settings.accuracy)
@@ -425,72 +417,12 @@ class Solver:
         Returns:
             Reason of the last solution, what was tried, and how many solutions there were.
         """
-        contacts = self._full.contacts
         self.equations.start = np.zeros_like(self.equations.start)
-        augmented = [c for c in contacts if c.multipliers is not None]
-        if not augmented:
-            return *self._iterate(ahead, rate, cold, stiffness_changed), 1
-        attempts: list[Attempt] = []
-        exact = False
-        # The first solutions need not be better than the multipliers they are found with.
-        self.equations.round_rtol = _FIRST_ROUND
-        try:
-            for number in range(1, _MAX_ROUNDS + 1):
-                start = self.system.state()
-                reason, tried = self._iterate(ahead, rate, cold, stiffness_changed)
-                _append(attempts, tried)
-                stiff = reason == OVERLOADED and self._stiffen(augmented)
-                if stiff:
-                    self.system.set_state(start)
-                    reason, tried = self._iterate(ahead, rate, cold, False)
-                    _append(attempts, tried)
-                if reason <= 0:
-                    break
-                for operator in self._full.operators:
-                    if operator.contact in augmented:
-                        operator.contact.evaluate()
-                        leave_out_unanswered(operator, self._full.state(), self._full.constrained)
-                errors = [c.enforcement_error() for c in augmented]
-                worst = max(e / c.tolerance for e, c in zip(errors, augmented, strict=True))
-                logger.debug("round %d: errors %s", number, errors)
-                if worst <= 1.0 and exact and not stiff:
-                    break
-                ahead, stiffness_changed = 0.0, False
-                exact = worst <= _NEARLY
-                left = min((e for e in errors if e > 0), default=0.0)
-                self.equations.round_rtol = 0.0 if exact else min(_FIRST_ROUND, _INNER * left)
-                if number < _MAX_ROUNDS and worst > 1.0:
-                    for contact in augmented:
-                        contact.augment()
-                self._soften(augmented)
-        finally:
-            self._soften(augmented)
-            self.equations.round_rtol = 0.0
-        return reason, attempts, number
 
-    def _stiffen(self, augmented: Sequence[Contact]) -> bool:
-        """Let the springs be stiff for one round, if they are not. Collective.
+        def iterate(ahead: float, stiffness_changed: bool) -> tuple[int, list[Attempt]]:
+            return self._iterate(ahead, rate, cold, stiffness_changed)
 
-        Given displacements squeeze a body the less the softer the springs are, and there is less
-        friction: it is the multipliers of later rounds that bear what soft springs cannot.
-
-        Returns:
-            Whether they were soft.
-        """
-        factor = _STIFF / self.equations.hardness()
-        if factor <= 1.0:
-            return False
-        for contact in augmented:
-            contact.stiffness_factor.value = factor
-        self.equations.forget_h0()
-        return True
-
-    def _soften(self, augmented: Sequence[Contact]) -> None:
-        """Let the springs be what they were before `_stiffen`."""
-        if any(contact.stiffness_factor.value != 1.0 for contact in augmented):
-            for contact in augmented:
-                contact.stiffness_factor.value = 1.0
-            self.equations.forget_h0()
+        return solve_in_rounds(self.equations, iterate, ahead, stiffness_changed)
 
     def _iterate(
         self, ahead: float, rate: Array | None, cold: bool, stiffness_changed: bool
@@ -602,13 +534,3 @@ class Solver:
         made = self.equations.filled
         consistent = self.main.consistent or made(True) or not made(False)
         return respond(self.equations, springs, tractions, consistent=consistent)
-
-
-def _append(attempts: list[Attempt], tried: Sequence[Attempt]) -> None:
-    """Add what was tried; the same with the same outcome once more counts iterations alone."""
-    for attempt in tried:
-        last = attempts[-1] if attempts else None
-        if last and (last.method, last.outcome) == (attempt.method, attempt.outcome):
-            attempts[-1] = replace(attempt, iterations=last.iterations + attempt.iterations)
-        else:
-            attempts.append(attempt)

@@ -1,0 +1,125 @@
+"""Rounds of multipliers: solutions one after another, between which they take over from springs."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from fenics_contact.checks.verdict import Attempt
+from fenics_contact.contact.contact import Contact
+from fenics_contact.methods.equations import Equations
+from fenics_contact.methods.method import OVERLOADED
+from fenics_contact.systems.answered import leave_out_unanswered
+
+__all__ = ["INNER", "solve_in_rounds"]
+
+logger = logging.getLogger("fenics_contact")
+
+# Rounds before it is given up.
+_MAX_ROUNDS = 80
+# Residual, relative, to which the first round is solved; share of a round's error to which the next
+# is; and the error, in units of the tolerance, from which on the next may be the last one.
+_FIRST_ROUND, INNER, _NEARLY = 1e-4, 1e-2, 10.0
+# Stiffness of contact, by that of the bulk, that a true overload is found at at the latest.
+_STIFF = 1e3
+
+
+def solve_in_rounds(
+    equations: Equations,
+    iterate: Callable[[float, bool], tuple[int, list[Attempt]]],
+    ahead: float,
+    stiffness_changed: bool,
+) -> tuple[int, list[Attempt], int]:
+    """Solve, let multipliers take over what the springs bear, and again. Collective.
+
+    Where no contact has multipliers it is one solution.
+
+    Args:
+        equations: What is solved.
+        iterate: A solution, from a start by how much of an increment is ahead, and by whether the
+            bulk's tangent has changed: its reason as SNES has it, and what was tried.
+        ahead: Size of the increment in units of the last one.
+        stiffness_changed: Whether the bulk's tangent is another one than in the last increment.
+
+    Returns:
+        Reason of the last solution, what was tried, and how many solutions there were.
+    """
+    augmented = [c for c in equations.contacts if c.multipliers is not None]
+    if not augmented:
+        return *iterate(ahead, stiffness_changed), 1
+    attempts: list[Attempt] = []
+    exact = False
+    # The first solutions need not be better than the multipliers they are found with.
+    equations.round_rtol = _FIRST_ROUND
+    try:
+        for number in range(1, _MAX_ROUNDS + 1):
+            start = equations.system.state()
+            reason, tried = iterate(ahead, stiffness_changed)
+            _append(attempts, tried)
+            stiff = reason == OVERLOADED and _stiffen(equations, augmented)
+            if stiff:
+                equations.system.set_state(start)
+                reason, tried = iterate(ahead, False)
+                _append(attempts, tried)
+            if reason <= 0:
+                break
+            for operator in equations.full.operators:
+                if operator.contact in augmented:
+                    operator.contact.evaluate()
+                    leave_out_unanswered(
+                        operator, equations.full.state(), equations.full.constrained
+                    )
+            errors = [c.enforcement_error() for c in augmented]
+            worst = max(e / c.tolerance for e, c in zip(errors, augmented, strict=True))
+            logger.debug("round %d: errors %s", number, errors)
+            if worst <= 1.0 and exact and not stiff:
+                break
+            ahead, stiffness_changed = 0.0, False
+            exact = worst <= _NEARLY
+            left = min((e for e in errors if e > 0), default=0.0)
+            equations.round_rtol = 0.0 if exact else min(_FIRST_ROUND, INNER * left)
+            if number < _MAX_ROUNDS and worst > 1.0:
+                for contact in augmented:
+                    contact.augment()
+            _soften(equations, augmented)
+    finally:
+        _soften(equations, augmented)
+        equations.round_rtol = 0.0
+    return reason, attempts, number
+
+
+def _stiffen(equations: Equations, augmented: Sequence[Contact]) -> bool:
+    """Let the springs be stiff for one round, if they are not. Collective.
+
+    Given displacements squeeze a body the less the softer the springs are, and there is less
+    friction: it is the multipliers of later rounds that bear what soft springs cannot.
+
+    Returns:
+        Whether they were soft.
+    """
+    factor = _STIFF / equations.hardness()
+    if factor <= 1.0:
+        return False
+    for contact in augmented:
+        contact.stiffness_factor.value = factor
+    equations.forget_h0()
+    return True
+
+
+def _soften(equations: Equations, augmented: Sequence[Contact]) -> None:
+    """Let the springs be what they were before `_stiffen`."""
+    if any(contact.stiffness_factor.value != 1.0 for contact in augmented):
+        for contact in augmented:
+            contact.stiffness_factor.value = 1.0
+        equations.forget_h0()
+
+
+def _append(attempts: list[Attempt], tried: Sequence[Attempt]) -> None:
+    """Add what was tried; the same with the same outcome once more counts iterations alone."""
+    for attempt in tried:
+        last = attempts[-1] if attempts else None
+        if last and (last.method, last.outcome) == (attempt.method, attempt.outcome):
+            attempts[-1] = replace(attempt, iterations=last.iterations + attempt.iterations)
+        else:
+            attempts.append(attempt)
