@@ -14,7 +14,16 @@ import pytest
 from mpi4py import MPI
 
 from scenes.processes import ROOT, environment
-from verification import finite_reference, finite_scenes, fuzz, fuzz_scenes, present_scenes
+from verification import (
+    finite_reference,
+    finite_scenes,
+    fuzz,
+    fuzz_models,
+    fuzz_scenes,
+    present_scenes,
+    reference_geometry,
+    reference_laws,
+)
 from verification import reference_solver as reference
 
 COMM = MPI.COMM_WORLD
@@ -416,7 +425,7 @@ def test_a_campaign_goes_on_where_it_was_ended(tmp_path):
 
 def point_spring():
     """One node on unit springs above a floor: a problem with two unknowns."""
-    body = reference.Body(
+    body = reference_geometry.Body(
         cell="triangle",
         degree=1,
         x=np.zeros((1, 2)),
@@ -434,7 +443,7 @@ def point_spring():
         weights=np.ones(1),
         k_n=np.ones(1),
         k_t=np.full(1, 0.5),
-        law=reference.Law("coulomb", friction=0.5),
+        law=reference_laws.Law("coulomb", friction=0.5),
         paired=np.ones(1, dtype=bool),
     )
     return reference.Problem(body, [contact])
@@ -482,7 +491,7 @@ def test_reference_passes_the_patch_test(cell, degree):
         "drive": "force",
         "stages": [{"steps": 1, "normal": 1.0, "side": 0.0, "across": 0.0}],
     }
-    problem, _, loads = fuzz_scenes.model(scene)
+    problem, _, loads = fuzz_models.model(scene)
     load = loads(0, 1.0)
     none = np.zeros(problem.body.places.size)
     u, motion, old = problem.solve(none, np.zeros(0), load, [problem.contacts[0].start()])
@@ -500,7 +509,7 @@ def test_reference_returns_to_the_nearest_point_of_a_polygon(modes):
     # σ is nearest to σ* in a convex set if (σ* - σ)·(v - σ) ≤ 0 for all corners v.
     rng = np.random.default_rng(1)
     trial, limit = rng.normal(size=(200, 2)), rng.uniform(0.1, 2, 200)
-    sigma = reference.nearest_in_polygon(trial, limit, modes)
+    sigma = reference_laws.nearest_in_polygon(trial, limit, modes)
     angles = np.pi * (2 * np.arange(modes) + 1) / modes
     corners = np.column_stack([np.cos(angles), np.sin(angles)]) / np.cos(np.pi / modes)
     for corner in corners:
@@ -513,7 +522,7 @@ def test_reference_returns_to_the_nearest_point_of_a_polygon(modes):
 
 @serial
 def test_reference_derivatives_are_those_of_differences():
-    law = reference.Law("coulomb", friction=0.4, transverse=0.2, direction=(1.0, 0.3, 0.0))
+    law = reference_laws.Law("coulomb", friction=0.4, transverse=0.2, direction=(1.0, 0.3, 0.0))
     rng = np.random.default_rng(3)
     n = 20
     normal = np.tile([0.1, -0.2, -1.0], (n, 1)) / np.linalg.norm([0.1, -0.2, -1.0])

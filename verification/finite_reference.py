@@ -23,8 +23,9 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
-from verification import finite_scenes, fuzz_judge, fuzz_scenes
+from verification import finite_scenes, fuzz_judge, fuzz_models
 from verification import reference_solver as reference
+from verification.reference_geometry import Body
 from verification.reference_solver import Failed
 
 __all__ = [
@@ -560,10 +561,10 @@ def model(
 ) -> tuple[FiniteProblem, Any, Callable[[int, float], FiniteLoad]]:
     """The second problem, and its loads by stage and load parameter. On one rank."""
     made = finite_scenes.FiniteMade(scene, MPI.COMM_SELF, bulk=rubber)
-    body, surface = fuzz_scenes.body_of(made)
+    body, surface = fuzz_models.body_of(made)
     contacts = []
     for i, contact in enumerate(scene["contacts"]):
-        made_contact, _ = fuzz_scenes.contact_of(made, contact, surface(11 + i), FiniteContact)
+        made_contact, _ = fuzz_models.contact_of(made, contact, surface(11 + i), FiniteContact)
         made_contact.shape = shape_of(scene, contact)
         turn = made.turn(contact)
         if turn is not None:
@@ -576,7 +577,7 @@ def model(
     return FiniteProblem(body, contacts, bulk=bulk_of(made, body)), made, loads_of(made)
 
 
-def bulk_of(made: Any, body: reference.Body) -> Callable[[Array], tuple[Array, Array, bool]]:
+def bulk_of(made: Any, body: Body) -> Callable[[Array], tuple[Array, Array, bool]]:
     """Of u: internal forces, their derivative, and whether no cell is turned inside out."""
     d, V = made.d, made.V
     nonlinear = made.scene["bulk"] == "rubber"

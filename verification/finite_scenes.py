@@ -18,7 +18,8 @@ import fenics_contact as fc
 from fenics_contact.elasticity import NeoHookean
 from fenics_contact.types import Array
 from scenes.surfaces import ball, box, ring
-from verification.fuzz_scenes import TOP, Made, Scene, dice, element, frictions
+from verification.fuzz_made import Made
+from verification.fuzz_scenes import TOP, Scene, dice, element, frictions
 
 __all__ = ["DEGREE", "KINDS", "FiniteMade", "draw", "pieces", "place_of"]
 

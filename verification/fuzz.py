@@ -161,14 +161,14 @@ def play(
         scene: The scene.
         comm: Ranks; by default one alone.
         limit: Processor seconds for the package, on one rank.
-        changed: See `fuzz_scenes.history`.
+        changed: See `fuzz_made.history`.
         spoiled: Changes a record before it is judged, to show that the judge sees it.
     """
     from mpi4py import MPI
 
-    from verification import fuzz_judge, fuzz_scenes
+    from verification import fuzz_judge, fuzz_made
 
-    make_scene, make_judge = fuzz_scenes.Made, fuzz_judge.Judge
+    make_scene, make_judge = fuzz_made.Made, fuzz_judge.Judge
     if scene.get("kinematics") == "finite":
         from verification import finite_reference, finite_scenes
 
@@ -184,7 +184,7 @@ def play(
         with warnings.catch_warnings(), _limited(limit if comm.size == 1 else None):
             if comm.size == 1:  # on one rank of several it would leave the others waiting
                 warnings.simplefilter("error", RuntimeWarning)
-            fuzz_scenes.history(scene, comm, records.append, changed, make_scene)
+            fuzz_made.history(scene, comm, records.append, changed, make_scene)
     except _Slow:
         outcome = "slow"
     except Exception as error:

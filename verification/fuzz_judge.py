@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import scipy.spatial
 
-from verification import fuzz_scenes
+from verification import fuzz_models, fuzz_scenes
 from verification import reference_solver as reference
 
 __all__ = ["Judge"]
@@ -82,7 +82,7 @@ class Judge:
 
     @staticmethod
     def _model(scene: dict[str, Any]) -> Any:
-        return fuzz_scenes.model(scene)
+        return fuzz_models.model(scene)
 
     # ---- increments ------------------------------------------------------------------------------
 

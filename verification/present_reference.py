@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from verification import finite_reference, fuzz_scenes, present_scenes
+from verification import finite_reference, fuzz_models, present_scenes
 from verification import reference_solver as reference
 
 __all__ = ["PresentContact", "PresentJudge", "PresentProblem", "model"]
@@ -238,11 +238,11 @@ class PresentProblem(finite_reference.FiniteProblem):
 def model(scene: dict[str, Any]) -> tuple[PresentProblem, Any, Callable[[int, float], Any]]:
     """The second problem, and its loads by stage and load parameter. On one rank."""
     made = present_scenes.PresentMade(scene, MPI.COMM_SELF, bulk=finite_reference.rubber)
-    body, surface = fuzz_scenes.body_of(made)
+    body, surface = fuzz_models.body_of(made)
     contacts = []
     for i, contact in enumerate(scene["contacts"]):
         here, there = surface(11 + i), surface(21 + i)
-        found, (facet, xi) = fuzz_scenes.contact_of(made, contact, here, PresentContact)
+        found, (facet, xi) = fuzz_models.contact_of(made, contact, here, PresentContact)
         found.here, found.there, found.facet, found.xi = here, there, facet, xi
         found.reach = np.maximum.outer(here.heights()[0], there.heights()[0])
         contacts.append(found)

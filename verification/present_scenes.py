@@ -15,7 +15,8 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from verification.finite_scenes import FiniteMade
-from verification.fuzz_scenes import Made, Scene, dice, element
+from verification.fuzz_made import Made
+from verification.fuzz_scenes import Scene, dice, element
 
 __all__ = ["PresentMade", "draw"]
 

@@ -1,0 +1,519 @@
+"""Random scenes as problems of the package, and the history that it makes of them."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import basix.ufl
+import dolfinx
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact import compat
+from fenics_contact.types import Array
+from verification.fuzz_scenes import TOP, Scene, frictions
+
+__all__ = ["Made", "geometry", "history", "tag_of"]
+
+
+def _arrays(scene: Scene) -> tuple[Array, Array, Array]:
+    """Vertices, cells in DOLFINx's order, and the box of every cell."""
+    d = len(scene["bodies"][0]["size"])
+    length = scene["units"][0]
+    points, cells, boxes, first = [], [], [], 0
+    for b, body in enumerate(scene["bodies"]):
+        n = body["n"]
+        lines = [np.linspace(0, 1, k + 1) for k in n]
+        grid = np.stack([g.ravel() for g in np.meshgrid(*lines, indexing="ij")], axis=1)
+        if body["jitter"]:
+            rng = np.random.default_rng(body["jitter"])
+            move = 0.4 * rng.uniform(-1, 1, grid.shape) / np.array(n)
+            grid = grid + np.where((grid > 0) & (grid < 1), move, 0.0)
+        number = np.arange(len(grid)).reshape([k + 1 for k in n])
+        bricks = []
+        for corner in range(2**d):  # the first coordinate runs fastest
+            cut = tuple(slice(corner >> i & 1, n[i] + (corner >> i & 1)) for i in range(d))
+            bricks.append(number[cut].ravel())
+        found = np.column_stack(bricks)
+        if scene["cell"] == "triangle":
+            found = np.concatenate([found[:, [0, 1, 3]], found[:, [0, 3, 2]]])
+        elif scene["cell"] == "tetrahedron":
+            six = [
+                [0, 1, 3, 7],
+                [0, 1, 7, 5],
+                [0, 5, 7, 4],
+                [0, 3, 2, 7],
+                [0, 6, 4, 7],
+                [0, 2, 6, 7],
+            ]
+            found = np.concatenate([found[:, s] for s in six])
+        points.append((np.array(body["origin"]) + grid * body["size"]) * length)
+        cells.append(found + first)
+        boxes.append(np.full(len(found), b))
+        first += len(grid)
+    return np.concatenate(points), np.concatenate(cells).astype(np.int64), np.concatenate(boxes)
+
+
+def _quadratic(cell: str, x: Array, cells: Array, boxes: Array) -> tuple[Array, Array, Array]:
+    """The same mesh with nodes of degree 2."""
+    element = basix.ufl.element("Lagrange", cell, 1, shape=(x.shape[1],))
+    straight = dolfinx.mesh.create_mesh(MPI.COMM_SELF, cells=cells, x=x, e=ufl.Mesh(element))
+    nodes = fem.functionspace(straight, ("Lagrange", 2))
+    places = nodes.tabulate_dof_coordinates()[:, : x.shape[1]]
+    return places, nodes.dofmap.list.astype(np.int64), boxes[straight.topology.original_cell_index]
+
+
+_SIDES = {
+    "bottom": (-1, 0.0),
+    "top": (-1, 1.0),
+    "left": (0, 0.0),
+    "right": (0, 1.0),
+    "front": (1, 0.0),
+}
+
+
+def tag_of(scene: Scene, body: int, side: str) -> int:
+    """Tag of a side: contacts are 11, 12 …; what lies opposite 21, 22 …; loaded tops `TOP`."""
+    for i, contact in enumerate(scene["contacts"]):
+        if (contact["body"], contact["side"]) == (body, side):
+            return 11 + i
+    for i, contact in enumerate(scene["contacts"]):
+        support = contact["support"]
+        if support["kind"] == "body" and (support["body"], support["side"]) == (body, side):
+            return 21 + i
+    return TOP if side == "top" else 100 + 10 * body + list(_SIDES).index(side)
+
+
+class Made:
+    """A scene as mesh, forms and constants, on any number of ranks."""
+
+    def __init__(self, scene: Scene, comm: MPI.Comm) -> None:
+        """Make mesh, bulk form and conditions. Collective."""
+        self.scene, self.comm = scene, comm
+        self.length, self.force = scene["units"]
+        x, cells, boxes = _arrays(scene)
+        self.d = d = x.shape[1]
+        bent = any(scene.get("bend", ()))
+        if bent:
+            x, cells, boxes = _quadratic(scene["cell"], x, cells, boxes)
+        element = basix.ufl.element("Lagrange", scene["cell"], 1 + bent, shape=(d,))
+        element = ufl.Mesh(element)
+        mine = slice(None) if comm.rank == 0 else slice(0, 0)
+        self.mesh = dolfinx.mesh.create_mesh(comm, cells=cells[mine], x=x[mine], e=element)
+        self.box = boxes[self.mesh.topology.original_cell_index]
+        self.tags = self._tagged()
+        if bent:
+            self._bend()
+        self.stress = self.force / self.length ** (d - 1)
+        self.V = fem.functionspace(self.mesh, ("Lagrange", scene["degree"], (d,)))
+        self.u = fem.Function(self.V, name="u")
+        v = ufl.TestFunction(self.V)
+        piecewise = fem.functionspace(self.mesh, ("DG", 0))
+        vectors = fem.functionspace(self.mesh, ("DG", 0, (d,)))
+        self.E = fem.Function(piecewise)
+        n_cells = len(self.box)
+        moduli = np.array([b["E"] for b in scene["bodies"]]) * self.stress
+        self.moduli = moduli
+        self.E.x.array[piecewise.dofmap.list[:n_cells, 0]] = moduli[self.box]
+        self.traction, self.weight = fem.Function(vectors), fem.Function(vectors)
+        self._cells = vectors.dofmap.list[:n_cells, 0]
+        nu = fem.Constant(self.mesh, scene["nu"])
+        strain = ufl.sym(ufl.grad(self.u))
+        lame = self.E * nu / ((1 + nu) * (1 - 2 * nu))
+        stress = self.E / (1 + nu) * strain + lame * ufl.tr(strain) * ufl.Identity(d)
+        ds = ufl.ds(self.mesh, subdomain_data=self.tags)
+        self.thickness = fem.Constant(self.mesh, float(scene.get("thickness", 1.0)))
+        self.F = self.thickness * ufl.inner(stress, ufl.sym(ufl.grad(v))) * ufl.dx(self.mesh)
+        self.F -= self.thickness * ufl.dot(self.traction, v) * ds(TOP)
+        self.F -= self.thickness * ufl.dot(self.weight, v) * ufl.dx(self.mesh)
+        self.bcs: list[fem.DirichletBC] = []
+        self.moved: list[fem.Constant] = []
+        for body, side, components, how in scene["holds"]:
+            facets = self.facets_of(body, side)
+            for i in components:
+                value = fem.Constant(self.mesh, 0.0)
+                space = self.V.sub(i)
+                dofs = fem.locate_dofs_topological(space, d - 1, facets)
+                self.bcs.append(fem.dirichletbc(value, dofs, space))
+                if how == "moved":
+                    self.moved.append((body, i, value))
+        self.contacts: list[fc.Contact] = []
+        self.shift = fem.Constant(self.mesh, np.zeros(d))
+        self.push = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
+        self.pull = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
+
+    def outside(self) -> fem.Form:
+        """Forces of the loads: what of -F is left without displacements."""
+        return fem.form(-ufl.replace(self.F, {self.u: fem.Function(self.V)}))
+
+    def facets_of(self, body: int, side: str) -> Array:
+        """Facets of a side of a body; tops share a tag."""
+        facets = self.tags.find(tag_of(self.scene, body, side))
+        return facets[np.isin(self.cell_of(facets), np.flatnonzero(self.box == body))]
+
+    def _bend(self) -> None:
+        """Move the nodes of bodies up by a parabola over x."""
+        x = self.mesh.geometry.x
+        done = np.zeros(len(x), dtype=bool)
+        for b, (body, rise) in enumerate(
+            zip(self.scene["bodies"], self.scene["bend"], strict=True)
+        ):
+            nodes = np.unique(compat.geometry_dofmap(self.mesh)[self.box == b])
+            nodes = nodes[~done[nodes]]
+            done[nodes] = True
+            middle = (body["origin"][0] + 0.5 * body["size"][0]) * self.length
+            width = body["size"][0] * self.length
+            x[nodes, self.d - 1] += rise * width * (2 * (x[nodes, 0] - middle) / width) ** 2
+
+    def cell_of(self, facets: Array) -> Array:
+        """One of the cells of every facet."""
+        to_cell = self.mesh.topology.connectivity(self.d - 1, self.d)
+        return np.array([to_cell.links(f)[0] for f in facets], dtype=int)
+
+    def _tagged(self) -> dolfinx.mesh.MeshTags:
+        mesh, d = self.mesh, self.d
+        mesh.topology.create_connectivity(d - 1, d)
+        exterior = dolfinx.mesh.exterior_facet_indices(mesh.topology)
+        box = self.box[self.cell_of(exterior)]
+        middle = dolfinx.mesh.compute_midpoints(mesh, d - 1, exterior)[:, :d] / self.length
+        values = np.zeros(len(exterior), dtype=np.int32)
+        for b, body in enumerate(self.scene["bodies"]):
+            for side, (axis, end) in _SIDES.items():
+                if d == 2 and side == "front":
+                    continue
+                at = body["origin"][axis] + end * body["size"][axis]
+                here = (box == b) & (np.abs(middle[:, axis] - at) < 1e-8)
+                values[here] = tag_of(self.scene, b, side)
+        kept = values > 0
+        return dolfinx.mesh.meshtags(mesh, d - 1, exterior[kept], values[kept])
+
+    # ---- loads -------------------------------------------------------------------------------
+
+    def drives(self, stage: int, t: float) -> dict[str, float]:
+        """Normal, side and across at a value of the load parameter within a stage."""
+        stages = self.scene["stages"]
+        zero = {"normal": 0.0, "side": 0.0, "across": 0.0}
+        before = stages[stage - 1] if stage else zero
+        return {n: before[n] + t * (stages[stage][n] - before[n]) for n in zero}
+
+    def apply(self, stage: int, t: float) -> None:
+        """Set all loads."""
+        scene, d = self.scene, self.d
+        for contact, friction in zip(self.contacts, frictions(scene, stage), strict=False):
+            if friction is not None:
+                contact.parameters["friction"].value = friction
+        now = self.drives(stage, t)
+        way = np.zeros(d)
+        way[0], way[-1] = now["side"], -now["normal"]
+        if d == 3:
+            way[1] = now["across"]
+        strain, driven = scene["strain"], self.driven()
+        tractions = np.zeros((len(scene["bodies"]), d))
+        pulled = scene["drive"] == "force"
+        for k, b in enumerate(driven):
+            share = scene["share"] if k else 1.0
+            if pulled:
+                tractions[b] = way * strain * self.moduli[b] * share
+        self.traction.x.array.reshape(-1, d)[self._cells] = tractions[self.box]
+        heavy = np.zeros(d)
+        heavy[-1] = -scene.get("weight", 0.0) * strain * self.stress / self.length
+        self.weight.x.array.reshape(-1, d)[self._cells] = heavy * (t if stage == 0 else 1.0)
+        for body, i, value in self.moved:
+            share = scene["share"] if driven.index(body) else 1.0
+            size = scene["bodies"][body]["size"][-1] * self.length
+            value.value = way[i] * strain * size * share
+        if scene["drive"] == "support":
+            size = scene["bodies"][0]["size"][-1] * self.length
+            self.shift.value[:] = -way * strain * size
+            area = np.prod(scene["bodies"][0]["size"][:-1]) * self.length ** (d - 1)
+            for i in range(d):
+                self.push[i].value = -way[i] * strain * self.moduli[0] * area
+                self.pull[i].value = -way[i] * strain * size
+
+    def driven(self) -> list[int]:
+        """Numbers of the bodies that the loads act on."""
+        return [0, 1] if self.scene["layout"] == "apart" else [len(self.scene["bodies"]) - 1]
+
+    # ---- the package -------------------------------------------------------------------------
+
+    def surfaces(self) -> list[fc.ContactSurface]:
+        """Γc of every contact."""
+        return [
+            fc.ContactSurface(
+                self.mesh,
+                self.tags,
+                11 + i,
+                quadrature_degree=c.get("quadrature"),
+                quadrature_scheme=c.get("scheme"),
+            )
+            for i, c in enumerate(self.scene["contacts"])
+        ]
+
+    def law(self, contact: Scene) -> Any:
+        """The package's law."""
+        law, unit = contact["law"], self.stress / self.length
+        body = self.scene["bodies"][contact["body"]]
+
+        def stiffness(given: Any) -> Any:
+            kind, value = given
+            if kind == "scaled":
+                return fc.Scaled(value)
+            if kind == "springs":
+                return fc.Springs(value * body["E"] * self.stress * self.length ** (self.d - 2))
+            return value * body["E"] * unit
+
+        k = {n: stiffness(law[n]) for n in ("k_n", "k_t") if law.get(n)}
+        kind = law["kind"]
+        if kind == "frictionless":
+            return fc.Frictionless(**k)
+        if kind in ("foundation", "tension"):
+            return fc.Foundation(**k, tension=kind == "tension")
+        shape = {n: law[m] for n, m in _SHAPE.items() if m in law}
+        if kind in ("tresca", "prescribed"):
+            pressure = law["pressure"] * body["E"] * self.stress
+            return fc.Tresca(law["friction"], pressure, **k, unilateral=kind == "tresca")
+        return fc.Coulomb(law["friction"], **k, **shape)
+
+    def support(self, contact: Scene) -> Any:
+        """The package's support."""
+        given = contact["support"]
+        if given["kind"] == "body":
+            tag = tag_of(self.scene, given["body"], given["side"])
+            return fc.DeformableBody(self.tags, tag, update=given["update"])
+        where = geometry(self.scene, contact)
+        shift = None
+        if given.get("moving") == "displacement":
+            shift = self.shift
+        elif given.get("moving") == "force":
+            free = given["free"]
+            shift = fc.Motion(
+                force=[self.push[i] if i in free else None for i in range(self.d)],
+                displacement=[None if i in free else self.pull[i] for i in range(self.d)],
+            )
+        kind = given["kind"].split()[0]
+        if kind == "halfspace":
+            return fc.HalfSpace(where["point"], where["normal"], displacement=shift)
+        if kind == "obstacle":
+            x = ufl.SpatialCoordinate(self.mesh)
+            numbers = (fem.Constant(self.mesh, float(where[n])) for n in ("gap", "curve", "middle"))
+            gap, curve, middle = numbers
+            direction = fem.Constant(self.mesh, -np.asarray(where["normal"]))
+            return fc.Obstacle(gap + curve * (x[0] - middle) ** 2, direction, displacement=shift)
+        inside = given["kind"].endswith("inside")
+        if kind == "ball":
+            return fc.Ball(where["center"], where["radius"], inside=inside, displacement=shift)
+        axis = None if self.d == 2 else (0.0, 1.0, 0.0)
+        return fc.Cylinder(
+            where["center"], where["radius"], axis, inside=inside, displacement=shift
+        )
+
+    def options(self, contact: Scene) -> dict[str, Any]:
+        """More arguments of a contact."""
+        return {}
+
+    def problem(self) -> fc.ContactProblem:
+        """The package's problem. Collective."""
+        contacts = []
+        for i, (c, surface) in enumerate(zip(self.scene["contacts"], self.surfaces(), strict=True)):
+            gap = c.get("gap")
+            contacts.append(
+                fc.Contact(
+                    self.u,
+                    surface,
+                    self.support(c),
+                    self.law(c),
+                    gap=None if gap is None else gap * self.length,
+                    enforcement=c.get("enforcement"),
+                    accuracy=c.get("accuracy"),
+                    weight=self.thickness,
+                    name=f"contact {i}",
+                    **self.options(c),
+                )
+            )
+        self.contacts = contacts
+        options, scene = {}, self.scene
+        if "ration" in scene:
+            options["snes_max_it"] = scene["ration"]
+        return fc.ContactProblem(
+            self.F,
+            self.u,
+            bcs=self.bcs,
+            contacts=contacts,
+            method=scene.get("method"),
+            condensation=scene.get("condensation"),
+            petsc_options=options,
+            fallback="ration" not in scene,
+        )
+
+
+_SHAPE = {"modes": "modes", "transverse_friction": "transverse", "direction": "direction"}
+
+
+def geometry(scene: Scene, contact: Scene) -> dict[str, Any]:
+    """Numbers of a rigid support, in units of length."""
+    body, given = scene["bodies"][contact["body"]], contact["support"]
+    length, d = scene["units"][0], len(body["size"])
+    low = np.array(body["origin"], dtype=float)
+    size = np.array(body["size"], dtype=float)
+    if contact["side"] == "right":
+        point = low + size * np.eye(d)[0] + given["clearance"] * np.eye(d)[0]
+        return {"point": point * length, "normal": -np.eye(d)[0]}
+    up, middle = np.eye(d)[-1], low + 0.5 * size
+    middle[-1] = low[-1]
+    clearance = given["clearance"]
+    if given["kind"] == "halfspace":
+        slope = given.get("slope", 0.0)
+        normal = up - slope * np.eye(d)[0]
+        normal /= np.linalg.norm(normal)
+        # The plane touches the lower corner of the bottom.
+        corner = low + (size[0] * np.eye(d)[0] if slope > 0 else 0.0)
+        return {"point": (corner - clearance * normal) * length, "normal": normal}
+    if given["kind"] == "obstacle":
+        return {
+            "gap": clearance * length,
+            "curve": given["curve"] / length,
+            "middle": middle[0] * length,
+            "normal": up,
+        }
+    radius = given["radius"] * max(size[:-1])
+    if not given["kind"].endswith("inside"):
+        return {"center": (middle - (radius + clearance) * up) * length, "radius": radius * length}
+    # The corners of the bottom touch the wall of the cavity.
+    across = size[:-1] if given["kind"].startswith("ball") else size[:1]
+    reach = 0.5 * float(np.linalg.norm(across))
+    radius = max(radius, 1.2 * reach)
+    height = np.sqrt(radius**2 - reach**2) - clearance
+    return {"center": (middle + height * up) * length, "radius": radius * length}
+
+
+# ---- what the package makes of it ----------------------------------------------------------------
+
+
+def gathered(comm: MPI.Comm, rows: Array) -> Array:
+    """Rows of all ranks on all ranks."""
+    return np.concatenate(comm.allgather(np.asarray(rows)))
+
+
+def _nodes(made: Made) -> tuple[Array, Array]:
+    """Box and place of the owned displacement nodes."""
+    dofmap = made.V.dofmap
+    n = dofmap.index_map.size_local
+    box = np.full(n + dofmap.index_map.num_ghosts, -1)
+    box[dofmap.list[: len(made.box)]] = made.box[:, None]
+    return box[:n], made.V.tabulate_dof_coordinates()[:n, : made.d]
+
+
+def _record(
+    made: Made, problem: fc.ContactProblem, step: Any, stage: int, t: float
+) -> dict[str, Any]:
+    """What of a committed step is judged. Collective."""
+    comm, d = made.comm, made.d
+    box, x = _nodes(made)
+    n = len(box)
+    u = gathered(comm, np.column_stack([box, x, made.u.x.array.reshape(-1, d)[:n]]))
+    contacts = []
+    for contact in problem.contacts:
+        columns = [contact.points, contact.measure, contact.pressure, contact.tangential_traction]
+        if contact.multipliers is not None:
+            columns.append(contact.multipliers.fields.values("pressure"))
+            if contact.law.has_friction:
+                columns.append(contact.multipliers.fields.values("traction"))
+                if "normal" in contact.multipliers.fields:
+                    columns.append(contact.multipliers.fields.values("normal"))
+        rows = gathered(comm, np.column_stack(columns))
+        r = step.contacts[contact.name]
+        contacts.append(
+            {
+                "points": rows[:, :d],
+                "measure": rows[:, d],
+                "pressure": rows[:, d + 1],
+                "tangential": rows[:, d + 2 : 2 * d + 2],
+                "lambda_n": rows[:, 2 * d + 2] if contact.multipliers is not None else None,
+                "lambda_t": rows[:, 2 * d + 3 : 3 * d + 3]
+                if contact.multipliers is not None
+                else None,
+                "lambda_at": rows[:, 3 * d + 3 :],
+                "tolerance": contact.tolerance,
+                "force": np.array(r.force),
+                "normal_force": r.normal_force,
+                "tangential_force": r.tangential_force,
+                "area": r.area,
+                "motion": {i: float(c.value) for i, c in contact.free_motion.items()},
+                "unpaired": contact.n_unpaired,
+                "error": contact.accuracy.error if contact.accuracy else None,
+            }
+        )
+    return {
+        "stage": stage,
+        "load": t,
+        "u": u,
+        "contacts": contacts,
+        "energy": step.energy,
+        "rtol": problem.accuracy.rtol if problem.accuracy else 1e-9,
+        "attempts": [str(r) for r in step.attempts],
+        "method": step.method,
+        "iterations": step.iterations,
+        "summary": step.summary() if step.verdict.force > 0 else "",
+    }
+
+
+def history(
+    scene: Scene,
+    comm: MPI.Comm,
+    done: Callable[[dict[str, Any]], None],
+    changed: Any = None,
+    make: type[Made] = Made,
+) -> None:
+    """Solve a scene by the package; ``done`` gets every committed increment. Collective.
+
+    Args:
+        scene: The scene.
+        comm: Ranks.
+        done: Called on all of them.
+        changed: Function of the `Made` scene and its problem, to spoil them (tests).
+        make: What makes the scene.
+    """
+    made = make(scene, comm)
+    problem = made.problem()
+    if changed is not None:
+        changed(made, problem)
+    stop, number = scene.get("restart"), 0
+    with tempfile.TemporaryDirectory() as folder:
+        folder = comm.bcast(folder)
+        for stage, what in enumerate(scene["stages"]):
+            file = Path(folder) / f"stage{stage}.npz"
+
+            def steps(
+                made: Made,
+                problem: Any,
+                stage: int = stage,
+                n: int = what["steps"],
+                file: Any = file,
+            ) -> Any:
+                return fc.increments(
+                    problem,
+                    lambda t: made.apply(stage, t),
+                    steps=n,
+                    max_cuts=scene.get("cuts", 1),
+                    checkpoint=file if stop is not None else None,
+                )
+
+            run = steps(made, problem)
+            while True:
+                step = next(run, None)
+                if step is None:
+                    break
+                done(_record(made, problem, step, stage, step.load))
+                number += 1
+                if number == stop:
+                    run.close()
+                    made = make(scene, comm)
+                    problem = made.problem()
+                    run = steps(made, problem)
+        comm.barrier()

@@ -1,0 +1,418 @@
+"""Bodies, surfaces and pairs of the second solution: points, weights and normals, by brute force.
+
+See `reference_solver`. Numbers of nodes are those of the displacement element.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import basix
+import numpy as np
+
+__all__ = ["Body", "Surface", "pair", "penetration", "smooth_modulus"]
+
+Array = np.ndarray
+# Facets are covered if no more than this share of them is not.
+_COVERED = 1e-6
+_OVERLAP = 1e-6
+
+
+@dataclass(eq=False)
+class Body:
+    """Mesh, element and stiffness as arrays.
+
+    Attributes:
+        cell: Name of the cells.
+        degree: Of the displacement.
+        x: Geometry nodes of the mesh, the vertices among them, (n_vertices, d) (length).
+        vertices: Of every cell, in DOLFINx's order, (n_cells, n).
+        bent: Degree of the cells' geometry, 1 or 2.
+        nodes: Displacement nodes of every cell, (n_cells, m).
+        places: Coordinates of the displacement nodes, (n_nodes, d) (length).
+        parts: Number of the connected part that every node is in, (n_nodes,).
+        stiffness: K, (d n_nodes, d n_nodes) (force/length).
+    """
+
+    cell: str
+    degree: int
+    x: Array
+    vertices: Array
+    nodes: Array
+    places: Array
+    parts: Array
+    stiffness: Array
+    bent: int = 1
+
+    @property
+    def d(self) -> int:
+        """Dimension."""
+        return int(self.x.shape[1])
+
+
+class Surface:
+    """Facets with straight edges, each by its cell and its number there."""
+
+    def __init__(self, body: Body, facets: Sequence[tuple[int, int]]) -> None:
+        """Take facets of a body."""
+        self.body, self.d = body, body.d
+        self.facets = list(facets)
+        kind = basix.CellType[body.cell]
+        self.simplex = body.cell in ("triangle", "tetrahedron")
+        corners, topology = basix.geometry(kind), basix.topology(kind)[self.d - 1]
+        self.cells = np.array([c for c, _ in self.facets], dtype=int)
+        local = [topology[i] for _, i in self.facets]
+        self.corner_vertices = np.array(
+            [body.vertices[c][v] for c, v in zip(self.cells, local, strict=False)]
+        )
+        self._origin = np.array([corners[v[0]] for v in local])
+        self._axes = np.array(
+            [[corners[v[k]] - corners[v[0]] for k in range(1, self.d)] for v in local]
+        )
+        family = basix.ElementFamily.P
+        variant = basix.LagrangeVariant.gll_warped
+        self._map = basix.create_element(family, kind, body.bent, variant)
+        self._element = basix.create_element(family, kind, body.degree, variant)
+        middle = body.x[body.vertices[self.cells]].mean(axis=1)
+        centre = self.place(*self.middles())[0]
+        normal = self._across(*self.middles())
+        self._sign = np.sign(np.sum(normal * (centre - middle), axis=1))
+
+    def middles(self) -> tuple[Array, Array]:
+        """Every facet, and the reference coordinates of its middle."""
+        at = 1 / self.d if self.simplex else 0.5
+        return np.arange(len(self.facets)), np.full((len(self.facets), self.d - 1), at)
+
+    def _in_cell(self, facet: Array, xi: Array) -> Array:
+        return self._origin[facet] + np.einsum("pk,pkd->pd", xi, self._axes[facet])
+
+    def place(self, facet: Array, xi: Array, u: Array | None = None) -> tuple[Array, Array]:
+        """Coordinates, (n, d), and tangents, (n, d - 1, d), of places, displaced by u.
+
+        That is of all dofs, or has the displacements of the cells' nodes, (n, m, d).
+        """
+        inside = self._in_cell(facet, xi)
+        table = _tabulate(self._map, 1, inside)
+        corners = self.body.x[self.body.vertices[self.cells[facet]]]
+        x = np.einsum("pk,pkd->pd", table[0], corners)
+        slope = np.einsum("jpk,pkd->pjd", table[1:], corners)
+        if u is not None:
+            table = _tabulate(self._element, 1, inside)
+            moved = u if u.ndim == 3 else self.local(facet, u)
+            x = x + np.einsum("pk,pkd->pd", table[0], moved)
+            slope = slope + np.einsum("jpk,pkd->pjd", table[1:], moved)
+        return x, np.einsum("pkj,pjd->pkd", self._axes[facet], slope)
+
+    def local(self, facet: Array, u: Array) -> Array:
+        """Displacements of the nodes of the facets' cells, (n, m, d)."""
+        return u.reshape(-1, self.d)[self.body.nodes[self.cells[facet]]]
+
+    def shapes(self, facet: Array, xi: Array) -> Array:
+        """Values of the shape functions of these nodes at places, (n, m)."""
+        return _tabulate(self._element, 0, self._in_cell(facet, xi))[0]
+
+    def _across(self, facet: Array, xi: Array, u: Array | None = None) -> Array:
+        tangents = self.place(facet, xi, u)[1]
+        if self.d == 2:
+            return np.column_stack([tangents[:, 0, 1], -tangents[:, 0, 0]])
+        return np.cross(tangents[:, 0], tangents[:, 1])
+
+    def normal(self, facet: Array, xi: Array, u: Array | None = None) -> Array:
+        """Outward unit normals, (n, d)."""
+        across = self._across(facet, xi, u) * self._sign[facet][:, None]
+        return across / np.linalg.norm(across, axis=1, keepdims=True)
+
+    def interpolation(self, facet: Array, xi: Array) -> Array:
+        """From values at the nodes to those at places: (n, n_nodes)."""
+        table = self.shapes(facet, xi)
+        matrix = np.zeros((len(facet), len(self.body.places)))
+        for row, (f, values) in enumerate(zip(facet, table, strict=False)):
+            matrix[row, self.body.nodes[self.cells[f]]] += values
+        return matrix
+
+    def corners(self, u: Array | None = None) -> Array:
+        """Corners in cyclic order, (n_facets, n_corners, d)."""
+        at = np.vstack([np.zeros(self.d - 1), np.eye(self.d - 1)])
+        if self.d == 3 and not self.simplex:
+            at = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+        every = np.arange(len(self.facets))
+        places = [self.place(every, np.tile(p, (len(every), 1)), u)[0] for p in at]
+        return np.stack(places, axis=1)
+
+    def rule(self, degree: int, scheme: str) -> tuple[Array, Array, Array]:
+        """Facet, reference coordinates and weight (length^(d-1)) of every point of Γc."""
+        kind = {2: "interval", 3: "triangle" if self.simplex else "quadrilateral"}[self.d]
+        if scheme == "vertex":
+            points = basix.geometry(basix.CellType[kind])
+            volume = {"interval": 1.0, "triangle": 0.5, "quadrilateral": 1.0}[kind]
+            weights = np.full(len(points), volume / len(points))
+        else:
+            points, weights = basix.make_quadrature(basix.CellType[kind], degree)
+        facet = np.repeat(np.arange(len(self.facets)), len(points))
+        xi = np.tile(points, (len(self.facets), 1))
+        size = np.linalg.norm(self._across(facet, xi), axis=1)
+        return facet, xi, np.tile(weights, len(self.facets)) * size
+
+    def heights(self) -> tuple[Array, Array]:
+        """Height of the cell over every facet, and the facet's size."""
+        kind = basix.CellType[self.body.cell]
+        middle = basix.geometry(kind).mean(axis=0, keepdims=True)
+        slope = self._map.tabulate(1, middle)[1:, 0, :, 0]
+        volume = []
+        for c in self.cells:
+            jacobian = slope @ self.body.x[self.body.vertices[c]]
+            volume.append(abs(np.linalg.det(jacobian)) * basix.cell.volume(kind))
+        size = np.linalg.norm(self._across(*self.middles()), axis=1)
+        size = size * (0.5 if self.d == 3 and self.simplex else 1.0)
+        return (self.d if self.simplex else 1) * np.array(volume) / size, size
+
+    def meet(
+        self, facet: Array, start: Array, ray: Array, u: Array | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Where rays meet facets, pair by pair: coordinates, signed distance, whether they do."""
+        xi = self.middles()[1][facet]
+        distance, bad = np.zeros(len(facet)), np.zeros(len(facet), dtype=bool)
+        moving = np.arange(len(facet))
+        for _ in range(30):
+            moved = u if u is None or u.ndim < 3 else u[moving]
+            x, tangents = self.place(facet[moving], xi[moving], moved)
+            way = ray[moving]
+            system = np.concatenate([np.swapaxes(tangents, 1, 2), -way[:, :, None]], axis=2)
+            rest = x - start[moving] - distance[moving, None] * way
+            size = np.prod(np.linalg.norm(system, axis=1), axis=1)
+            flat = np.abs(np.linalg.det(system)) < 1e-12 * size
+            bad[moving[flat]] = True
+            system[flat], rest[flat] = np.eye(self.d), 0.0
+            step = np.linalg.solve(system, -rest[..., None])[..., 0]
+            now = np.clip(xi[moving] + step[:, :-1], -3, 4)
+            change = np.abs(now - xi[moving]).max(axis=1, initial=0.0)
+            xi[moving] = now
+            distance[moving] += step[:, -1]
+            moving = moving[(change >= 1e-14) & ~flat]
+            if not len(moving):
+                break
+        x, tangents = self.place(facet, xi, u)
+        size = np.linalg.norm(tangents, axis=2).max(axis=1)
+        met = ~bad & (np.linalg.norm(x - start - distance[:, None] * ray, axis=1) < 1e-9 * size)
+        met &= np.all(xi >= -_OVERLAP, axis=1)
+        met &= (xi.sum(axis=1) if self.simplex else xi.max(axis=1)) <= 1 + _OVERLAP
+        return xi, distance, met
+
+    def nearest(
+        self, start: Array, ray: Array, reach: float, u: Array | None
+    ) -> tuple[Array, Array]:
+        """The nearest facet that looks back along each ray, -1 without; coordinates on it."""
+        n, m = len(start), len(self.facets)
+        facet = np.tile(np.arange(m), n)
+        xi, distance, met = self.meet(facet, np.repeat(start, m, 0), np.repeat(ray, m, 0), u)
+        looks = np.sum(self.normal_moved(facet, xi, u) * np.repeat(ray, m, 0), axis=1) < 0
+        far = np.where(met & looks & (np.abs(distance) <= reach), np.abs(distance), np.inf)
+        best = far.reshape(n, m).argmin(axis=1)
+        row = np.arange(n) * m + best
+        return np.where(np.isfinite(far[row]), best, -1), xi[row]
+
+    def normal_moved(self, facet: Array, xi: Array, u: Array | None) -> Array:
+        """Outward normals of the displaced facets, not of unit length."""
+        return self._across(facet, xi, u) * self._sign[facet][:, None]
+
+
+def _tabulate(element: Any, derivatives: int, points: Array) -> Array:
+    """Tabulate, also at no points at all, where basix aborts: (n_tables, n_points, dim)."""
+    if len(points):
+        return element.tabulate(derivatives, points)[..., 0]
+    return np.zeros((1 + derivatives * points.shape[1], 0, element.dim))
+
+
+def smooth_modulus(surface: Surface, modulus: Array, facet: Array, xi: Array) -> Array:
+    """E/h at points of Γc, smoothed over four facets; see `accuracy.modulus_over_height`.
+
+    Args:
+        surface: Γc.
+        modulus: Young's modulus of the cell behind every facet (stress).
+        facet: Facet of every point.
+        xi: Reference coordinates of every point.
+
+    Returns:
+        (n_points,) (stress/length).
+    """
+    height, size = surface.heights()
+    d = surface.d
+    kind = {2: "interval", 3: "triangle" if surface.simplex else "quadrilateral"}[d]
+    element = basix.create_element(basix.ElementFamily.P, basix.CellType[kind], 1)
+    vertices, numbered = np.unique(surface.corner_vertices, return_inverse=True)
+    numbered = numbered.reshape(surface.corner_vertices.shape)
+    points, weights = basix.make_quadrature(basix.CellType[kind], 6)
+    table = element.tabulate(1, points)[..., 0]
+    left, right = np.zeros((len(vertices),) * 2), np.zeros(len(vertices))
+    for f, own in enumerate(numbered):
+        length = 4.0 * size[f] ** (1 / (d - 1))
+        every = np.full(len(points), f)
+        tangents = surface.place(every, points)[1]
+        for q, weight in enumerate(weights):
+            metric = tangents[q] @ tangents[q].T
+            area = weight * np.sqrt(np.linalg.det(metric))
+            slope = table[1:, q]
+            value = table[0, q]
+            stiff = length**2 * slope.T @ np.linalg.solve(metric, slope)
+            left[np.ix_(own, own)] += area * (np.outer(value, value) + stiff)
+            right[own] += area * value * np.log(modulus[f] / height[f])
+    smooth = np.exp(np.linalg.solve(left, right))
+    at = element.tabulate(0, xi)[0, :, :, 0]
+    return np.einsum("qk,qk->q", at, smooth[numbered[facet]])
+
+
+# ---- pairs of surfaces ---------------------------------------------------------------------------
+
+
+def pair(
+    here: Surface,
+    there: Surface,
+    points: tuple[Array, Array],
+    *,
+    reach: float = np.inf,
+    u: Array | None = None,
+) -> tuple[Array, Array, Array]:
+    """What lies opposite the points of Γc; see the docstring of the package's ``pairing``.
+
+    Args:
+        here: Γc.
+        there: The opposite surface.
+        points: Facet and reference coordinates of every point.
+        reach: Largest distance.
+        u: Displacement at which to pair; none: undeformed.
+
+    Returns:
+        Interpolation of the opposite displacement, (n_points, n_nodes); the distance in the
+        undeformed bodies, (n_points,); whether there is an opposite, (n_points,).
+    """
+    facet, xi = points
+    normal = here.normal(facet, xi)
+    hit, where = there.nearest(here.place(facet, xi, u)[0], normal, reach, u)
+    paired = hit >= 0
+    gap = np.zeros(len(facet))
+    gap[paired] = np.sum(
+        (there.place(hit[paired], where[paired])[0] - here.place(facet, xi)[0][paired])
+        * normal[paired],
+        axis=1,
+    )
+    matrix = np.zeros((len(facet), len(here.body.places)))
+    matrix[paired] = there.interpolation(hit[paired], where[paired])
+    for f in range(len(here.facets)):
+        own = np.flatnonzero(facet == f)
+        if not paired[own].all():
+            continue
+        pieces, weights = _pieces(here, there, f, u)
+        if not len(pieces):
+            continue
+        f_pieces = np.full(len(pieces), f)
+        ray = here.normal(f_pieces, pieces)
+        met, at = there.nearest(here.place(f_pieces, pieces, u)[0], ray, reach, u)
+        if np.any(met < 0):
+            continue
+        basis = _polynomials(here, len(own))
+        left, at_points = basis(pieces), basis(xi[own])
+        gram = left.T @ (weights[:, None] * left)
+        project = at_points @ np.linalg.solve(gram, left.T * weights)
+        matrix[own] = project @ there.interpolation(met, at)
+    return matrix, gap, paired
+
+
+def penetration(here: Surface, there: Surface, u: Array, weight: float) -> float:
+    """∫ of the penetration of ``here``, seen from it, by rays from many points."""
+    facet, xi, weights = here.rule(8, "default")
+    normal = here.normal(facet, xi)
+    hit, where = there.nearest(here.place(facet, xi)[0], normal, np.inf, None)
+    met = hit >= 0
+    facet, xi, normal, weights = facet[met], xi[met], normal[met], weights[met]
+    ends = there.place(hit[met], where[met])[0] - here.place(facet, xi)[0]
+    moved = there.place(hit[met], where[met], u)[0] - here.place(facet, xi, u)[0]
+    gap = np.sum(ends * normal, axis=1)
+    # What lies behind from the start is another surface.
+    near = gap > -0.3 * np.ptp(here.body.x, axis=0).max()
+    return float(weight * weights[near] @ np.maximum(-np.sum(moved * normal, axis=1)[near], 0.0))
+
+
+def _polynomials(surface: Surface, n_points: int) -> Any:
+    """Monomials of the largest complete space of polynomials that so many points carry."""
+    d = surface.d
+    if d == 2:
+        return lambda s: s[:, :1] ** np.arange(n_points)
+    k = 0
+    if surface.simplex:
+        while (k + 2) * (k + 3) // 2 <= n_points:
+            k += 1
+        powers = [(i, j) for i in range(k + 1) for j in range(k + 1 - i)]
+    else:
+        while (k + 2) ** 2 <= n_points:
+            k += 1
+        powers = [(i, j) for i in range(k + 1) for j in range(k + 1)]
+    return lambda s: np.stack([s[:, 0] ** i * s[:, 1] ** j for i, j in powers], axis=1)
+
+
+def _pieces(here: Surface, there: Surface, f: int, u: Array | None) -> tuple[Array, Array]:
+    """Places on facet f, and weights, on the pieces into which the opposite facets cut it."""
+    corners, others = here.corners(u)[f], there.corners(u)
+    mean = here.normal(*here.middles())[f]
+    looks = there.normal(*there.middles()) @ mean < 0
+    points, weights = [], []
+    if here.d == 2:
+        rule, shares = basix.make_quadrature(basix.CellType.interval, 12)
+        origin, edge = corners[0], corners[1] - corners[0]
+        covered = 0.0
+        for other in others[looks]:
+            ends = np.clip((other - origin) @ edge / (edge @ edge), 0, 1)
+            low, high = ends.min(), ends.max()
+            if high - low > 1e-9:
+                covered += high - low
+                points.append(origin + (low + (high - low) * rule) * edge)
+                weights.append((high - low) * shares)
+    else:
+        rule, shares = basix.make_quadrature(basix.CellType.triangle, 12)
+        first = corners[1] - corners[0]
+        first = first - (first @ mean) * mean
+        first /= np.linalg.norm(first)
+        plane = np.column_stack([first, np.cross(mean, first)])
+        window = _anticlockwise((corners - corners[0]) @ plane)
+        size, covered = _area(window), 0.0
+        for other in others[looks]:
+            ring = _clip(_anticlockwise((other - corners[0]) @ plane), window)
+            for i in range(1, len(ring) - 1):
+                edges = np.array([ring[i] - ring[0], ring[i + 1] - ring[0]])
+                twice = np.linalg.det(edges)
+                covered += 0.5 * twice / size
+                if twice > 1e-9 * size:
+                    points.append(corners[0] + (ring[0] + rule @ edges) @ plane.T)
+                    weights.append(twice * shares)
+    if abs(covered - 1) > _COVERED or not points:
+        return np.zeros((0, here.d - 1)), np.zeros(0)
+    flat = np.concatenate(points)
+    xi, _, _ = here.meet(np.full(len(flat), f), flat, np.tile(mean, (len(flat), 1)), u)
+    return xi, np.concatenate(weights)
+
+
+def _area(ring: Array) -> float:
+    x, y = ring.T
+    return float(0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
+
+
+def _anticlockwise(ring: Array) -> Array:
+    return ring if _area(ring) > 0 else ring[::-1]
+
+
+def _clip(ring: Array, window: Array) -> Array:
+    """Intersection of two convex polygons."""
+    for start, end in zip(window, np.roll(window, -1, axis=0), strict=False):
+        along, found = end - start, []
+        side = [along[0] * (p[1] - start[1]) - along[1] * (p[0] - start[0]) for p in ring]
+        for i, p in enumerate(ring):
+            j = (i + 1) % len(ring)
+            if side[i] >= 0:
+                found.append(p)
+            if (side[i] >= 0) != (side[j] >= 0):
+                found.append(p + side[i] / (side[i] - side[j]) * (ring[j] - p))
+        ring = np.array(found)
+        if not len(ring):
+            break
+    return ring
