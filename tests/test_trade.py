@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from benchmarks import trade
+from benchmarks import trade, trade_page, trade_scenes
 from fenics_contact.contact.accuracy import PRESETS
 from scenes.processes import ROOT, environment
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="of one process"
 STUDY = ROOT / "docs" / "trade.csv"
 
 
-@pytest.mark.parametrize("name", trade.all_scenes())
+@pytest.mark.parametrize("name", trade_scenes.all_scenes())
 def test_references_meet_published_values(name: str) -> None:
     """Those the errors are against, to what the demos ask of the same values.
 
@@ -33,7 +33,7 @@ def test_references_meet_published_values(name: str) -> None:
         "GRECO block": 0.003,
         "ball on block": 0.02,
     }
-    scene = trade.all_scenes()[name]
+    scene = trade_scenes.all_scenes()[name]
     rows = [r for r in trade.read(STUDY) if r["scene"] == name and r["role"] == "reference"]
     assert len(rows) == (1 if name in tolerance else 0)
     for row in rows:
@@ -41,7 +41,7 @@ def test_references_meet_published_values(name: str) -> None:
             assert float(row[quantity]) == pytest.approx(value, rel=tolerance[name], abs=1e-9)
 
 
-@pytest.mark.parametrize("name", trade.all_scenes())
+@pytest.mark.parametrize("name", trade_scenes.all_scenes())
 @pytest.mark.parametrize("preset", PRESETS)
 def test_no_preset_is_dominated(preset: str, name: str) -> None:
     """Nothing measured on the same mesh has both less error and less time.
@@ -51,27 +51,27 @@ def test_no_preset_is_dominated(preset: str, name: str) -> None:
     """
     rows = trade.read(STUDY)
     row = next(r for r in rows if r["scene"] == name and r["accuracy"] == preset)
-    assert trade.solved(row), row["failure"]
-    others = trade.comparable(row, rows)
+    assert trade_page.solved(row), row["failure"]
+    others = trade_page.comparable(row, rows)
     assert len(others) > 30
-    better = trade.dominating(row, others)
-    base = trade.all_scenes()[name].base
-    assert not better, [(trade.describe(r, base), r["error"], r["time"]) for r in better]
+    better = trade_page.dominating(row, others)
+    base = trade_scenes.all_scenes()[name].base
+    assert not better, [(trade_page.describe(r, base), r["error"], r["time"]) for r in better]
     assert float(row["error"]) <= PRESETS[preset]
 
 
 def test_dominance() -> None:
     """Both by the margin; a row does not dominate itself, and the front is what nothing beats."""
     rows = [{"error": e, "time": t} for e, t in ((1.0, 1.0), (0.5, 2.0), (0.6, 3.0), (0.4, 3.0))]
-    assert trade.dominating(rows[2], rows) == [rows[1]]
-    assert not any(trade.dominating(rows[i], rows) for i in (0, 1, 3))
-    assert trade.front(rows) == [rows[0], rows[1], rows[3]]
+    assert trade_page.dominating(rows[2], rows) == [rows[1]]
+    assert not any(trade_page.dominating(rows[i], rows) for i in (0, 1, 3))
+    assert trade_page.front(rows) == [rows[0], rows[1], rows[3]]
 
 
 def test_rows_survive_a_kill(tmp_path: Path) -> None:
     """Whole lines are found again, with all their digits; a line cut off is dropped, not read."""
     path = tmp_path / "rows.csv"
-    one, other = (trade.Setting("a scene", h) for h in (0.1, 0.2))
+    one, other = (trade_scenes.Setting("a scene", h) for h in (0.1, 0.2))
     trade.Store(path).add("sweep", one, {"error": 1 / 3, "failure": 'NotConverged: a, "b"'})
     whole = path.read_bytes()
     trade.Store(path).add("sweep", other, {"error": 0.5})
@@ -96,7 +96,7 @@ def test_presets_solve_the_block(preset: str) -> None:
     N = 2000 N/mm is equilibrium, held to ten times the residual allowed; T = 1405.36 is that of
     converged meshes, met here within 3 % (the mesh's own error is 1.2 %).
     """
-    scene = trade.all_scenes()["GRECO block"]
+    scene = trade_scenes.all_scenes()["GRECO block"]
     found = trade.solve(scene.make(5.0), trade.replace(scene.base, h=5.0, accuracy=preset))
     assert "failure" not in found, found["failure"]
     assert found["normal force"] == pytest.approx(2000.0, rel=1e-3)
