@@ -426,6 +426,24 @@ def test_a_body_touches_itself():
     assert forces[1] == pytest.approx(forces[0], rel=1e-3)
 
 
+def test_round_off_is_allowed_for_wherever_a_body_comes_to_be_touched():
+    """A place of size 1 has the round-off of 1: at new partners, too, once the body has slid."""
+    pair = Pair("triangle", LAWS["coulomb"], kinematics="finite")
+    bcs = [hold(pair.u, pair.tags, tag, i) for tag in (BOTTOM, TOP) for i in range(2)]
+    form = residual(pair.u, ufl.TestFunction(pair.u.function_space), 100.0, 0.3)
+    problem = fc.ContactProblem(form, pair.u, bcs=bcs, contacts=[pair.contact])
+    system, at_rest = problem.full, np.zeros(problem.unknowns.n_local)
+    touched = []
+    for along in (0.0, 0.2):
+        pair.place(pair.pressed(pair.nodes, 0.01, along))
+        system.diagonal[:] = 1.0
+        (operator,) = system.operators
+        touched.append(operator.touched)
+        assert (system.terms(at_rest)[operator.touched] > 0.5).all()
+    new = np.setdiff1d(touched[1], touched[0]).size
+    assert system.unknowns.comm.allreduce(new) > 0
+
+
 def test_where_a_surface_has_no_tangent_plane_there_is_no_residual():
     """All of Γc drawn together in a line: a line search that comes there steps shorter."""
     pair = Pair("tetrahedron", LAWS["coulomb"], kinematics="finite")

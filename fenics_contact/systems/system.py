@@ -10,7 +10,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -88,6 +87,7 @@ class System(ABC):
         # Of every contact, with the number of the pairs that it was made for.
         self._operators: dict[int, tuple[int, ContactOperator]] = {}
         self._parts: tuple[list[int], Parts] | None = None
+        self._touched: tuple[list[int], Array] | None = None
 
     # ---- contact, and what has to be in balance --------------------------------------------------
 
@@ -194,17 +194,19 @@ class System(ABC):
         With finite kinematics contact sums up places in the place of displacements. Collective.
         """
         moved = np.abs(np.clip(state, -self.farthest, self.farthest))
-        return np.asarray(self.diagonal * (moved + self._coordinates))
+        return np.asarray(self.diagonal * (moved + self._coordinates()))
 
-    @cached_property
     def _coordinates(self) -> Array:
         """Largest coordinate of a finite contact at what it touches, 0 elsewhere. Collective."""
-        found = np.zeros(self.unknowns.n_local)
-        for operator in self.operators:
-            if operator.contact.finite:
-                points = np.abs(operator.contact.points)
-                found[operator.touched] = global_max(self.unknowns.comm, points)
-        return found
+        pairings = [c.pairs.number for c in self.contacts]
+        if self._touched is None or self._touched[0] != pairings:
+            found = np.zeros(self.unknowns.n_local)
+            for operator in self.operators:
+                if operator.contact.finite:
+                    points = np.abs(operator.contact.points)
+                    found[operator.touched] = global_max(self.unknowns.comm, points)
+            self._touched = [c.pairs.number for c in self.contacts], found
+        return self._touched[1]
 
     def by_body(self, *vectors: Array) -> Array:
         """Norms of vectors over the unknowns, (n_vectors, n_bodies). Collective."""
