@@ -86,6 +86,7 @@ def test_who_wins(command_line) -> None:
     assert usual == Rub().problem.snes.getTolerances()[3] != 9
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("said", ["command line", "petsc_options"])
 @pytest.mark.parametrize(
     ("name", "value", "why"),
@@ -94,6 +95,7 @@ def test_who_wins(command_line) -> None:
         ("snes_rtol", "-3", "must be non-negative"),
         ("tangent_ksp_type", "gmresss", "KSP type gmresss"),
         ("continuation_snes_max_it", "-5", "must be non-negative"),
+        ("snes_qn_m", "-1", "must be a non-negative integer"),  # looked at when it is set up
     ],
 )
 def test_values_that_petsc_refuses(command_line, said, name, value, why) -> None:
@@ -102,7 +104,8 @@ def test_values_that_petsc_refuses(command_line, said, name, value, why) -> None
     if not options:
         command_line(f"-contact_{name}", value)
     words = "PETSc refuses an option of prefix", why, f"-contact_{name} {value}"
-    raised_everywhere(lambda: Rub(method="newton", **options), ValueError, *words)
+    method = "lbfgs" if "_qn_" in name else "newton"
+    raised_everywhere(lambda: Rub(method=method, **options), ValueError, *words)
 
 
 def test_one_command_line_for_all_ranks(command_line) -> None:

@@ -12,7 +12,7 @@ from fenics_contact.methods.method import InnerSnes, OwnMethod, Tools
 from fenics_contact.methods.solver import METHODS
 from scenes.blocks import TOP
 from scenes.comparing import at_points, close, gathered, nodal, raised_everywhere
-from scenes.rubbing import PATH, Rub, pressed
+from scenes.rubbing import PATH, Rub, pressed, same_states, walk
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
@@ -177,7 +177,25 @@ def test_a_solver_of_ones_own(cell, degree):
         thing.destroy()
 
 
-@pytest.mark.parametrize("kind", ["vinewtonrsls", "fas", "newton"])
+@pytest.mark.whole
+@pytest.mark.parametrize("condensation", [None, False])
+@pytest.mark.parametrize("kind", ["newtontr", "newtontrdc", "ngmres", "anderson", "ncg"])
+def test_types_of_snes_that_work(kind, condensation):
+    """Three increments, begun where the last one ended: the state of the package's own choice.
+
+    Both to 1e-9 of the forces: states agree to 1e-6.
+    """
+    made, usual = (
+        Rub(method="newton", condensation=condensation, petsc_options=options)
+        for options in ({"snes_type": kind}, {})
+    )
+    for one in (made, usual):
+        walk(one, path=PATH[:3])
+    assert made.problem.snes.getType() == kind
+    assert same_states(made, usual, 1e-6)
+
+
+@pytest.mark.parametrize("kind", ["vinewtonrsls", "fas", "newton", "ksponly"])
 def test_types_of_snes_that_cannot_work(kind):
     """Some want bounds or a hierarchy, and without them end the program: refused by name."""
     raised_everywhere(

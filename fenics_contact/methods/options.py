@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -76,7 +76,8 @@ class Defaults:
     def __init__(self) -> None:
         """None yet."""
         self._values: dict[str, Any] = {}
-        self._given: set[str] = set()
+        self._given: set[str] = set()  # by the caller
+        self._unread: set[str] = set()  # of those
         self._told = False
 
     def set(self, options: Mapping[str, Any], prefix: str) -> None:
@@ -90,14 +91,16 @@ class Defaults:
     def give(self, options: Mapping[str, Any], prefix: str) -> None:
         """`set` what the caller says, who is told if nothing reads it."""
         self.set(options, prefix)
-        self._given |= {prefix + name for name in options}
+        names = {prefix + name for name in options}
+        self._given |= names
+        self._unread |= names
 
     def warn_of_unread(self, prefix: str) -> None:
         """Name, once, the options that the caller or the database has and no solver has read."""
         if self._told or not prefix:
             return
         self._told = True
-        unread = set(self._given)
+        unread = set(self._unread)
         for name in PETSc.Options().getAll():
             if name.startswith(prefix):
                 unread.discard(name)
@@ -140,9 +143,20 @@ class Defaults:
         Raises:
             ValueError: PETSc refuses one of them; the text has all that were given.
         """
+        self._read(solver, solver.setFromOptions)
+
+    def set_up(self, snes: PETSc.SNES) -> None:
+        """Set up a solver that has read its options; some are looked at only then. Collective.
+
+        Raises:
+            ValueError: As in `let_read`.
+        """
+        self._read(snes, snes.setUp)
+
+    def _read(self, solver: PETSc.SNES | PETSc.KSP, read: Callable[[], None]) -> None:
         with self.present():
             try:
-                solver.setFromOptions()
+                read()
             except PETSc.Error as error:
                 prefix = solver.getOptionsPrefix() or ""
                 here = PETSc.Options().getAll().items()
@@ -165,6 +179,6 @@ class Defaults:
             yield
         finally:
             for key in added:
-                if key in self._given and compat.option_was_read(key):
-                    self._given.remove(key)
+                if key in self._unread and compat.option_was_read(key):
+                    self._unread.remove(key)
                 database.delValue(key)

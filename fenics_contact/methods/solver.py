@@ -43,11 +43,10 @@ _ENOUGH = 15
 # Increments expected where nothing is said.
 _EXPECTED = 4
 
-# Others want bounds, a hierarchy or a partition of the unknowns, and end the program without them.
-_SNES_TYPES = (
-    *("newtonls", "newtontr", "newtontrdc", "qn", "nrichardson"),
-    *("ngmres", "ncg", "anderson", "ksponly"),
-)
+# Others want bounds, a hierarchy or a partition of the unknowns, and end the program without them,
+# or solve one linear system. The first ones factor the consistent tangent.
+_NEWTONS = ("newtonls", "newtontr", "newtontrdc")
+_SNES_TYPES = (*_NEWTONS, "qn", "nrichardson", "ngmres", "ncg", "anderson")
 _REASONS = PETSc.SNES.ConvergedReason
 _OUTCOMES = {
     int(_REASONS.DIVERGED_LINEAR_SOLVE): "the matrix is singular",
@@ -147,7 +146,7 @@ class Solver:
         self._automatic = settings.method is None
         self.method = settings.method or "lbfgs"
         self.methods: dict[str, OwnMethod] = {}
-        self._quasi_newton = True
+        self._quasi_newton, self._factors = True, False
         self.snes: PETSc.SNES
         self.main: SnesMethod
         take_command_line(settings.prefix, self._comm)
@@ -210,12 +209,11 @@ class Solver:
         this: Solver = weakref.proxy(self)  # SNES would keep what keeps it
         main = QuasiNewton if quasi_newton else Newton
         self.main = main(equations, snes, lambda: this.may_go_on())
-        self._quasi_newton = quasi_newton
+        self._quasi_newton, self._factors = quasi_newton, snes_type in _NEWTONS
         self._forget_matrices()
         self.main.attach(consistent=not quasi_newton)
         options.let_read(snes)
-        with options.present():
-            snes.setUp()
+        options.set_up(snes)
 
         def newton_solver(symmetric: bool) -> dict[str, Any]:
             """Options of one for Newton's method; none where that of H₀ or the tangent is one."""
@@ -469,7 +467,7 @@ class Solver:
         # With a linear bulk a start by the tangent comes first even where it is far off, which a
         # load that falls to nothing does not forgive after continuation.
         own = self.methods.get(method)
-        by_newton = own is None or (own.by_newton and not self._full.bulk.linear)
+        by_newton = self._factors if own is None else own.by_newton and not self._full.bulk.linear
         newton = by_newton and not self._quasi_newton
         made = sum(attempt.iterations for attempt in attempts[-1:])
         self.starts.predict = reason > 0 and newton and (factored or made > 0)

@@ -60,16 +60,29 @@ class Sum:
 
     def mult(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Multiply; into what is no number if that fails."""
+        self._multiply(self.fixed, *self.added, x, y)
+
+    def multTranspose(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Multiply by the transpose, as SNES of trust regions does; likewise."""
+        rows, columns, values = self.added
+        self._multiply(self.fixed.T, columns, rows, values, x, y)
+
+    def _multiply(
+        self,
+        fixed: Array,
+        rows: Index,
+        columns: Index,
+        values: Array,
+        x: PETSc.Vec,
+        y: PETSc.Vec,
+    ) -> None:
         try:
-            y.array[:] = self._product(x.array_r)
+            state = x.array_r
+            added = np.bincount(rows, values * state[columns], minlength=state.size)
+            y.array[:] = fixed @ state + added
         except BaseException as error:
             self.error = self.error or error
             y.set(np.nan)
-
-    def _product(self, state: Array) -> Array:
-        rows, columns, values = self.added
-        added = np.bincount(rows, values * state[columns], minlength=state.size)
-        return np.asarray(self.fixed @ state + added)
 
 
 class PartlyFactored:
