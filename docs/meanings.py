@@ -63,6 +63,7 @@ GROUPS: list[tuple[str, list[str], str]] = [
             "contact.choices",
             "contact.inputs",
             "contact.opposite",
+            "contact.point_data",
             "contact.rigid",
             "contact.finite",
             "contact.general",

@@ -1,5 +1,6 @@
 """Bad parameters of laws, gaps, normals and weights: an error that names them, on every rank."""
 
+import basix.ufl
 import numpy as np
 import pytest
 import ufl
@@ -8,7 +9,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.blocks import Block, block
-from scenes.comparing import raised_everywhere
+from scenes.comparing import close, raised_everywhere
 from scenes.sound import build_and_solve, coulomb, pressed
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
@@ -294,6 +295,22 @@ def test_negative_weight():
     )
 
 
+@pytest.mark.parametrize("kind", ["number", "constant", "ufl"])
+def test_weight_of_zero(kind):
+    """A contact without any thickness would let the body through, without a word."""
+    scene = pressed()
+    weight = {
+        "number": 0.0,
+        "constant": fem.Constant(scene.mesh, 0.0),
+        "ufl": ufl.SpatialCoordinate(scene.mesh)[1],  # the height of the bottom
+    }[kind]
+    raised_everywhere(
+        lambda: scene.problem(coulomb(), scene.rollers(), contact={"weight": weight}),
+        ValueError,
+        "weight is zero at every point",
+    )
+
+
 @pytest.mark.parametrize("support", ["obstacle", "half-space"])
 def test_normal_of_length_zero_at_a_point(support):
     """A normal by UFL that vanishes over one half of Γc: refused, as a normal of length zero."""
@@ -391,3 +408,60 @@ def test_data_of_another_mesh_or_form():
     raised_everywhere(lambda: scene.contact(far), ValueError, "friction", "another mesh")
     v = ufl.TestFunction(scene.u.function_space)
     raised_everywhere(lambda: scene.contact(coulomb(friction=v[0])), ValueError, "friction", "test")
+
+
+DATA = ["friction", "gap", "weight"]
+
+
+def with_data(scene, what, value):
+    """A contact with one of its data given so."""
+    contact = {} if what == "friction" else {what: value}
+    return scene.contact(coulomb(friction=value if what == "friction" else 0.3), **contact)
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("what", DATA)
+def test_data_in_single_precision(what):
+    """A constant of np.float32 cannot stand in a form of doubles."""
+    scene = pressed()
+    value = fem.Constant(scene.mesh, np.float32(0.3))
+    raised_everywhere(lambda: with_data(scene, what, value), ValueError, what, "float32", "double")
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("what", DATA)
+def test_data_at_other_points(what):
+    """Values at quadrature points of cells, or of Γc by another rule, are none at those of Γc.
+
+    Those of its own rule are, and give the force of the same number.
+    """
+    scene = pressed()
+
+    def at_points(mesh, cell, degree):
+        element = basix.ufl.quadrature_element(cell, degree=degree)
+        value = fem.Function(fem.functionspace(mesh, element))
+        value.x.array[:] = 0.2
+        return value
+
+    facets = scene.surface.submesh
+    for value in (at_points(scene.mesh, "quadrilateral", 2), at_points(facets, "interval", 4)):
+        refused = ValueError, what, "quadrature element", "DG"
+        raised_everywhere(lambda value=value: with_data(scene, what, value), *refused)
+    forces = []
+    for value in (at_points(facets, "interval", 2), 0.2):
+        contact = with_data(scene, what, value)
+        problem = fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=[contact])
+        problem.solve()
+        forces.append(contact.resultants().force)
+        scene.u.x.array[:] = 0.0
+    assert close(*forces, 1e-12)
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("what", DATA)
+def test_data_that_cannot_be_compiled(what):
+    """Areas of facets of quadrilaterals are known to no form compiler: said of what, and why."""
+    scene = pressed()
+    value = 0.1 * ufl.FacetArea(scene.mesh)
+    words = what, "cannot be compiled", "FacetArea", "fem.Function"
+    raised_everywhere(lambda: with_data(scene, what, value), ValueError, *words)

@@ -23,7 +23,7 @@ from fenics_contact.parallel import global_max, global_min
 from fenics_contact.supports.base import Motion, Rotation, Support, as_vector, nonzero_vector
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.modulus import modulus_over_height
-from fenics_contact.surface.surface import ContactSurface, SurfaceQuadrature, VertexAreas
+from fenics_contact.surface.surface import SurfaceQuadrature, VertexAreas
 from fenics_contact.types import Array
 
 __all__ = ["FreeMotion", "Inputs", "check_given", "varies"]
@@ -359,6 +359,11 @@ class Inputs:
         least = global_min(comm, weight)
         if least < 0:
             raise ValueError(f"{self._name}: weight is negative at a point of Γc")
+        if global_max(comm, weight) == 0.0:
+            raise ValueError(
+                f"{self._name}: weight is zero at every point of Γc, which would bear nothing; it "
+                "is a thickness, or 2πr; leave the contact out where there is none"
+            )
         if self._quadrature.at_vertices and least <= _NOTHING * global_max(comm, weight):
             raise ValueError(
                 f"{self._name}: weight is {least:g} at a vertex of Γc, as 2πr is on the axis, and "
@@ -418,7 +423,7 @@ def varies(value: Any) -> bool:
 def check_given(
     name: str,
     given: Mapping[str, Any],
-    surface: ContactSurface,
+    quadrature: SurfaceQuadrature,
     displacement: Displacement,
 ) -> None:
     """Refuse data that are none at the points of Γc while an increment is solved.
@@ -426,13 +431,12 @@ def check_given(
     Args:
         name: Of the contact.
         given: Expressions by name.
-        surface: Γc.
+        quadrature: The points.
         displacement: What is solved for, on which data cannot depend: points see numbers.
 
     Raises:
         ValueError: It names what depends on what.
     """
-    meshes = (surface.mesh, surface.submesh)
     solved_for = displacement.whole.x.array, displacement.u.x.array
     for what, expression in given.items():
         for item in traverse_unique_terminals(ufl.as_ufl(expression)):
@@ -441,14 +445,14 @@ def check_given(
                     f"{name}: {what} has a test or trial function; give what has a value at every "
                     "point of Γc"
                 )
+            if isinstance(item, fem.Constant | fem.Function) and item.dtype != np.float64:
+                raise ValueError(
+                    f"{name}: {what} has a {type(item).__name__} of type {item.dtype}; all of a "
+                    "problem is in double precision: make it of np.float64"
+                )
             if not isinstance(item, fem.Function):
                 continue
-            if not any(
-                item.function_space.mesh is m or item.function_space.mesh == m for m in meshes
-            ):
-                raise ValueError(
-                    f"{name}: {what} has a function, {item.name!r}, on another mesh than Γc"
-                )
+            _check_space(f"{name}: {what}", item, quadrature)
             if any(np.shares_memory(item.x.array, array) for array in solved_for):
                 raise ValueError(
                     f"{name}: {what} depends on what is solved for, {item.name!r}; data are "
@@ -456,6 +460,24 @@ def check_given(
                     "values you set between increments, or a law of your own, whose response is a "
                     "function of gap and slip"
                 )
+
+
+def _check_space(what: str, function: fem.Function, quadrature: SurfaceQuadrature) -> None:
+    """Refuse a function that has no value at the points."""
+    surface = quadrature.surface
+    mesh, element = function.function_space.mesh, function.function_space.ufl_element()
+    on_surface = mesh is surface.submesh or mesh == surface.submesh
+    if not (on_surface or mesh is surface.mesh or mesh == surface.mesh):
+        raise ValueError(f"{what} has a function, {function.name!r}, on another mesh than Γc")
+    if not element.has_custom_quadrature:
+        return
+    own = quadrature.space().ufl_element().custom_quadrature()[0]
+    points = element.custom_quadrature()[0]
+    if not (on_surface and points.shape == own.shape and np.array_equal(points, own)):
+        raise ValueError(
+            f"{what} has a function, {function.name!r}, on a quadrature element, whose values are "
+            "at other points than those of Γc; give one of a Lagrange or DG space"
+        )
 
 
 def _range_error(contact: str, name: str, value: float, positive: bool) -> str:

@@ -167,7 +167,7 @@ class Opposite(ABC):
         own |= {n: expressions[n] for n in ("angle", "about") if n in expressions}
         own |= {"gap": given.gap, "normal": direction}
         parts = self._parts
-        check_given(parts.name, own, parts.quadrature.surface, parts.displacement)
+        check_given(parts.name, own, parts.quadrature, parts.displacement)
         seen = ["initial_gap", "normal", *(f"parameter {n}" for n in given.parameters)]
         if given.shift is not None:
             expressions["support"] = given.shift
@@ -175,7 +175,7 @@ class Opposite(ABC):
         for i, free in inputs.free_shift.items():
             expressions |= {f"gap by {i}": ufl.diff(given.gap, free)}
             expressions |= {f"normal by {i}": ufl.diff(given.normal, free)}
-        data = PointData(self._parts.quadrature, expressions, seen)
+        data = PointData(parts.name, parts.quadrature, expressions, seen)
         sampled = Seen(
             data.ufl("initial_gap"),
             data.ufl("normal"),

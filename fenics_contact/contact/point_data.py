@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 
 import ufl
 
+from fenics_contact.parallel import fail_together
 from fenics_contact.surface.dependence import Dependence
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
@@ -28,6 +29,7 @@ class PointData:
 
     def __init__(
         self,
+        name: str,
         quadrature: SurfaceQuadrature,
         expressions: Mapping[str, ufl.core.expr.Expr],
         seen: Iterable[str],
@@ -35,12 +37,23 @@ class PointData:
         """Compile. Collective.
 
         Args:
+            name: Of the contact, in messages.
             quadrature: The points.
             expressions: Scalars and vectors by name.
             seen: Names of those that laws see.
+
+        Raises:
+            ValueError: One of them cannot be compiled; it says which. On all ranks.
         """
         self._comm = quadrature.surface.mesh.comm
-        self._evaluate = PointEvaluator(quadrature, expressions)
+        try:
+            self._evaluate = PointEvaluator(quadrature, expressions)
+        except Exception as error:
+            fail_together(self._comm, error)
+            refused = _refused(quadrature, expressions)
+            if refused is None:
+                raise
+            raise ValueError(f"{name}: {refused}") from error
         form = self._evaluate.form
         self._dependence = Dependence(form.constants(), form.coefficients())
         shapes = {name: ufl.as_ufl(expressions[name]).ufl_shape for name in seen}
@@ -62,3 +75,24 @@ class PointData:
             self.values = self._evaluate()
             self._fields.commit(self.values)
             self._dependence.note()
+
+
+def _refused(
+    quadrature: SurfaceQuadrature, expressions: Mapping[str, ufl.core.expr.Expr]
+) -> str | None:
+    """The first expression that does not compile, and why; None: nothing does. Collective."""
+    comm = quadrature.surface.mesh.comm
+    for name, expression in {"": ufl.as_ufl(1.0), **expressions}.items():
+        try:
+            PointEvaluator(quadrature, {name: expression})
+        except Exception as error:
+            fail_together(comm, error)
+            if not name:
+                return None
+            what = {"initial_gap": "gap"}.get(name, name.removeprefix("parameter "))
+            why = comm.bcast(str(error))
+            return (
+                f"{what} cannot be compiled for the points of Γc ({why}); give a number, a "
+                "fem.Constant, or a fem.Function that has its values"
+            )
+    return None
