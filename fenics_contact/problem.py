@@ -511,7 +511,15 @@ class ContactProblem:
     def _not_converged(
         self, reason: int, verdict: Verdict, attempts: Sequence[Attempt]
     ) -> NotConverged:
-        return NotConverged(self.increment + 1, reason, verdict, attempts, prefix=self.prefix)
+        told = {name for contact in self.contacts for name in contact.law.parameters()}
+        return NotConverged(
+            self.increment + 1,
+            reason,
+            verdict,
+            attempts,
+            prefix=self.prefix,
+            stiffnesses=[name for name in ("k_t", "k_n") if name in told],
+        )
 
     def _may_lag(self) -> bool:
         """Whether u can stay behind: energies and pairs must be found without it. Collective."""
@@ -593,7 +601,11 @@ class ContactProblem:
         load = self.present_load()
         size = global_max(self._comm, np.abs(load))
         if not np.isfinite(size):
-            raise ValueError("the external load is not finite (NaN or inf) at some dof")
+            raise ValueError(
+                "the external load, which is F at u = 0, is not finite (NaN or inf) at some dof: "
+                "check the loads, and what is divided by in F (λ = E ν/((1 + ν)(1 - 2ν)) is "
+                "infinite at ν = 0.5)"
+            )
         check_values(self._bcs, self.u)
         if self.bulk.linear:
             self.motions.check_balance(load, self.operators)

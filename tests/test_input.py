@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import parallel
-from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block
+from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block, block_mesh
 from scenes.comparing import raised_everywhere
 from scenes.elasticity import strain, stress
 from scenes.sound import MESH, build_and_solve, coulomb, pressed
@@ -70,6 +70,40 @@ def test_constants_not_finite(name, value):
     # Once it is mended the problem goes on.
     constant.value = good
     problem.solve()
+
+
+def test_a_stiffness_without_bound():
+    """ν = 0.5, set between increments, makes λ infinite: the message says where to look."""
+    scene = pressed()
+    problem, _ = scene.problem(coulomb(), scene.rollers())
+    problem.solve()
+    problem.commit()
+    scene.nu.value = 0.5
+    raised_everywhere(problem.solve, ValueError, "F at u = 0", "not finite", "ν = 0.5")
+
+
+@pytest.mark.parametrize("way", [1e8, 1e9])
+def test_a_mesh_far_from_the_origin(way):
+    """Where coordinates are round-off the mesh is refused; nearer the load is borne.
+
+    Coordinates have 1e-8 of the mesh there; forces are in balance to 1e-8 of the load.
+    """
+    mesh, tags = block_mesh("quadrilateral", **MESH)
+    mesh.geometry.x[:, :2] += way
+    u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (2,))))
+    v = ufl.TestFunction(u.function_space)
+    F = ufl.inner(stress(u, 1000.0, 0.3), strain(v)) * ufl.dx
+    F += v[1] * ufl.ds(mesh, subdomain_data=tags)(TOP)
+    support = fc.HalfSpace((way, way), (0, 1))
+    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, BOTTOM), support, coulomb())
+
+    def call():
+        return fc.ContactProblem(F, u, contacts=[contact]).solve()
+
+    if way > 1e8:
+        raised_everywhere(call, ValueError, "contact", "origin", "1e+09")
+    else:
+        assert call().contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
 
 
 @pytest.mark.parametrize("what", ["load", "modulus"])

@@ -223,8 +223,24 @@ def test_a_limit_of_another_law():
             return super().response(kinematics, more)
 
     _, problem, _ = dragged(Wrong(0.5, 4.0, fc.Scaled(), fc.Scaled()))
-    with pytest.raises(fc.NotConverged, match="limit violated by"):
+    with pytest.raises(fc.NotConverged, match="limit violated by") as caught:
         problem.solve()
+    # Smaller increments would not mend it.
+    assert "response, limit and normal_potential" in str(caught.value)
+    assert "smaller increments" not in str(caught.value)
+
+
+def test_what_to_try_is_what_the_law_has():
+    """No lower k_n of a law that has none; of the package's own there are both."""
+    for law, words in (
+        (Asperities(0.3, P0, H, fc.Scaled()), "Try smaller increments, then a lower k_t;"),
+        (Overclosure(P0, H), "Try smaller increments;"),
+        (fc.Coulomb(0.3), "Try smaller increments, a lower k_t, then a lower k_n;"),
+    ):
+        _, problem, _ = dragged(law, petsc_options={"snes_max_it": 1})
+        with pytest.raises(fc.NotConverged) as caught:
+            problem.solve()
+        assert words in str(caught.value)
 
 
 def test_a_parameter_with_a_name_of_the_contact():

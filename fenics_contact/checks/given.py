@@ -31,6 +31,8 @@ logger = logging.getLogger("fenics_contact")
 
 # Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
 _TOUCHING = 1e-12
+# Round-off of coordinates that leaves too little of what is next to them, relative to the mesh.
+_LOST = 1e-7
 # How parts of a mixed function are prescribed.
 _OF_A_PART = (
     "; on a part of a mixed one it is dirichletbc(value, dofs, W.sub(0)), where dofs are those of "
@@ -182,6 +184,13 @@ def check_start(contacts: Sequence[Contact], size: float) -> float:
     worst = 0.0
     for contact in contacts:
         comm = contact.surface.mesh.comm
+        far = global_max(comm, np.abs(contact.surface.mesh.geometry.x))
+        if not far * np.finfo(np.float64).eps <= _LOST * size:
+            raise ValueError(
+                f"{contact.name}: a mesh of size {size:.3g} is as far from the origin as "
+                f"{far:.3g}, where coordinates are round-off; move mesh and supports next to the "
+                "origin"
+            )
         contact.check_input()
         contact.inputs.check_side(contact.values, gap_prescribed=contact.gap_prescribed)
         gap = global_min(comm, contact.values.initial_gap)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -149,6 +149,11 @@ class Verdict:
         failures = self.failures
         title = "Verdict: " + ("does not hold" if failures else "holds")
         return shown(title, ("check", "left", "passes"), rows, failures)
+
+    @property
+    def only_laws_fail(self) -> bool:
+        """Whether all but laws holds, and some of these do not."""
+        return bool(self.failures) and not replace(self, laws={}).failures
 
     @property
     def failures(self) -> list[str]:
@@ -369,6 +374,7 @@ class NotConverged(RuntimeError):
         attempts: Sequence[Attempt] = (),
         *,
         prefix: str = "contact_",
+        stiffnesses: Sequence[str] = ("k_t", "k_n"),
     ) -> None:
         """Compose the message: what happened, the numbers, and what to try.
 
@@ -378,6 +384,7 @@ class NotConverged(RuntimeError):
             verdict: See the attributes.
             attempts: See the attributes.
             prefix: Of the problem's options.
+            stiffnesses: Parameters of the laws that may be lowered, what to try first.
         """
         self.increment, self.reason, self.verdict = increment, reason, verdict
         self.attempts = tuple(attempts)
@@ -386,7 +393,20 @@ class NotConverged(RuntimeError):
         tried = ". ".join(str(attempt) for attempt in attempts)
         super().__init__(
             f"increment {increment} did not converge: SNES reason {reason} after {self.iterations} "
-            f"iterations; {what}; forces are of size {verdict.force:.3e}. Tried: {tried}. Try "
-            f"smaller increments, a lower k_t, then a lower k_n; -{prefix}snes_monitor shows the "
-            "iterations"
+            f"iterations; {what}; forces are of size {verdict.force:.3e}. Tried: {tried}. "
+            + (_OF_A_LAW if reason > 0 and verdict.only_laws_fail else _smaller(stiffnesses))
+            + f"; -{prefix}snes_monitor shows the iterations"
         )
+
+
+# Of what no increment mends.
+_OF_A_LAW = (
+    "The law itself does not hold where the equations do: of a law of your own look whether its "
+    "response, limit and normal_potential belong together"
+)
+
+
+def _smaller(stiffnesses: Sequence[str]) -> str:
+    """What to try where iterations found nothing."""
+    lower = [f"a lower {name}" for name in stiffnesses]
+    return "Try " + ", then ".join([", ".join(["smaller increments", *lower[:-1]]), *lower[-1:]])
