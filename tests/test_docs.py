@@ -105,6 +105,17 @@ def test_files_that_are_named_exist(page: Path) -> None:
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_tests_that_are_named_exist(page: Path) -> None:
+    """What a page says that a test holds: the file is there, and in it the test, where named."""
+    missing = []
+    for file, name in re.findall(r"`(?:tests/)?(test_\w+\.py)(?:::(\w+))?`", page.read_text()):
+        path = ROOT / "tests" / file
+        if not path.exists() or (name and f"def {name}(" not in path.read_text()):
+            missing.append(f"{file}::{name}")
+    assert missing == []
+
+
 @pytest.mark.parametrize("picture", sorted(DOCS.glob("*.png")), ids=lambda path: path.stem)
 def test_every_picture_has_its_command(picture: Path) -> None:
     """It is on a page, which names a script: that it draws the picture nobody can see here."""
