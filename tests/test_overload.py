@@ -77,7 +77,8 @@ def test_it_ends_soon_and_says_why(method):
                 failed.append(error)
                 raise
 
-        raised_everywhere(solve, fc.NotConverged, "overload: along the rotation about z")
+        words = "overload: along the rotation about z", "Try less load, more friction"
+        raised_everywhere(solve, fc.NotConverged, *words)
         assert failed[0].iterations < 300
 
 

@@ -394,19 +394,27 @@ class NotConverged(RuntimeError):
         super().__init__(
             f"increment {increment} did not converge: SNES reason {reason} after {self.iterations} "
             f"iterations; {what}; forces are of size {verdict.force:.3e}. Tried: {tried}. "
-            + (_OF_A_LAW if reason > 0 and verdict.only_laws_fail else _smaller(stiffnesses))
+            + _advice(reason, verdict, attempts, stiffnesses)
             + f"; -{prefix}snes_monitor shows the iterations"
         )
 
 
-# Of what no increment mends.
+# How `Overload.in_words` begins, and what no increment mends.
+_OVERLOAD = "overload:"
 _OF_A_LAW = (
     "The law itself does not hold where the equations do: of a law of your own look whether its "
     "response, limit and normal_potential belong together"
 )
+_OF_OVERLOAD = "Try less load, more friction, or a condition that holds the body along this motion"
 
 
-def _smaller(stiffnesses: Sequence[str]) -> str:
-    """What to try where iterations found nothing."""
+def _advice(
+    reason: int, verdict: Verdict, attempts: Sequence[Attempt], stiffnesses: Sequence[str]
+) -> str:
+    """What to try, by what went wrong."""
+    if reason > 0 and verdict.only_laws_fail:
+        return _OF_A_LAW
+    if attempts and attempts[-1].outcome.startswith(_OVERLOAD):
+        return _OF_OVERLOAD
     lower = [f"a lower {name}" for name in stiffnesses]
     return "Try " + ", then ".join([", ".join(["smaller increments", *lower[:-1]]), *lower[-1:]])
