@@ -1,4 +1,4 @@
-"""What `docker/run` refuses before it does anything, in words."""
+"""Where `docker/run` runs a command, and what it refuses before it does anything, in words."""
 
 from __future__ import annotations
 
@@ -10,9 +10,77 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-RUN = Path(__file__).parents[1] / "docker" / "run"
+from scenes.processes import ROOT
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts a process of its own")
+
+RUN = ROOT / "docker" / "run"
+
+# Notes what it is asked for.
+DOCKER = """#!/bin/sh
+echo "$@" >>"${0%/*}/asked"
+[ "$1" != info ] || echo 99
+"""
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Call docker/run in a given environment, with an engine that has every image.
+
+    Gives the process, and what it asked that engine for, line by line.
+    """
+    engine = tmp_path / "docker"
+    engine.write_text(DOCKER)
+    engine.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for name in ("FENICS_CONTACT_BASE", "FENICS_CONTACT_SUITE"):
+        monkeypatch.delenv(name, raising=False)
+
+    def call(**environment: str) -> tuple[subprocess.CompletedProcess[str], list[str]]:
+        asked = tmp_path / "asked"
+        asked.write_text("")
+        command = [str(RUN), "echo", "here"]
+        process = subprocess.run(
+            command, env=os.environ | environment, capture_output=True, text=True, timeout=60
+        )
+        return process, asked.read_text().splitlines()
+
+    return call
+
+
+def test_a_command_runs_here_where_dolfinx_is(run) -> None:
+    """As it is where the tests run: its own output, and no engine is asked for anything."""
+    process, asked = run()
+    assert (process.returncode, process.stdout, asked) == (0, "here\n", [])
+
+
+def test_a_suite_has_a_container_and_an_image_of_its_own(run) -> None:
+    """Although DOLFINx is here. The command comes last, and a script in there finds DOLFINx."""
+    images = set()
+    for suite in ("unstable", "forky"):
+        process, asked = run(FENICS_CONTACT_SUITE=suite, FENICS_CONTACT_OTHER="1")
+        assert process.returncode == 0
+        words = asked[-1].split()
+        assert words[0] == "run" and words[-2:] == ["echo", "here"]
+        assert "--env=FENICS_CONTACT_OTHER" in words
+        assert "--env=FENICS_CONTACT_SUITE" not in words
+        images.add(words[-3])
+    assert len(images) == 2
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("suite", ["Debian 13", "../unstable", "-x"])
+def test_what_is_no_suite_is_refused(run, suite: str) -> None:
+    process, asked = run(FENICS_CONTACT_SUITE=suite)
+    assert process.returncode == 1 and asked == []
+    assert f"FENICS_CONTACT_SUITE is '{suite}'; it must be a suite of Debian" in process.stderr
+
+
+def test_a_suite_and_an_image_at_once_are_refused(run) -> None:
+    process, asked = run(FENICS_CONTACT_SUITE="unstable", FENICS_CONTACT_BASE="debian:trixie")
+    assert process.returncode == 1 and asked == []
+    assert "both say what to start from: unset one" in process.stderr
 
 
 def refusal(run: Path, tools: Path, **environment: str) -> str:
