@@ -30,6 +30,21 @@ def test_inside_and_outside_of_a_cone(m):
         assert unbalanced(rays, outside) >= 0.99 * (w @ outside) / np.abs(w).max()
 
 
+@pytest.mark.parametrize("needed", range(7))
+def test_one_ray_of_many_balances(needed):
+    """Some of many rays are tried first; the only one that makes the force may be any of them.
+
+    Without it there is nothing along the third axis, of which all is left.
+    """
+    rng = np.random.default_rng(needed)
+    rays = np.vstack([rng.normal(size=(2, 50_001)), np.zeros(50_001)])
+    rays /= np.linalg.norm(rays, axis=0)
+    force = np.array([0.0, 0.0, 1.0])
+    assert unbalanced(rays, force) == pytest.approx(1.0)
+    rays[:, -1 - needed] = force
+    assert unbalanced(rays, force) == 0.0
+
+
 @pytest.mark.parametrize("n", [3, 5, 12])
 @pytest.mark.parametrize("above", [0.9, 1.01])
 def test_a_block_beside_its_friction_angle(n, above):
