@@ -25,8 +25,14 @@ COMM = MPI.COMM_WORLD
 pytestmark = pytest.mark.mpi
 
 
+def area():
+    """A form that compiles fast."""
+    return fem.Constant(dolfinx.mesh.create_unit_square(COMM, 1, 1), 1.0) * ufl.dx
+
+
 def test_what_is_there():
     """Versions of what is imported; numbers of this run."""
+    compiling.compile_form(area())
     found = information()
     assert found["fenics_contact"] == fc.__version__
     assert found["DOLFINx"] == dolfinx.__version__ and found["numpy"] == np.__version__
@@ -37,7 +43,7 @@ def test_what_is_there():
     for name in ("ufl", "basix", "ffcx", "scipy", "mpi4py", "petsc4py", "PETSc"):
         assert found[name][0].isdigit(), found[name]
     folder = Path(found["compiled forms"].split(" (")[0])
-    assert folder.is_dir() and any(folder.glob("*.so"))  # the scenes' forms
+    assert folder.is_dir() and any(folder.glob("*.so"))
     for path in found["BLAS"].split("; ")[0].split(", "):
         assert Path(path).exists()
 
@@ -82,9 +88,8 @@ def exits(words):
 
 def test_what_a_first_run_waits_for_is_said_once(monkeypatch, caplog, capsys):
     """In the log, or to a terminal; nothing where neither looks, nor of forms from the cache."""
-    mesh = dolfinx.mesh.create_unit_square(MPI.COMM_WORLD, 1, 1)
-    form = fem.Constant(mesh, 1.0) * ufl.dx
-    first = MPI.COMM_WORLD.rank == 0
+    form = area()
+    first = COMM.rank == 0
 
     def said(level, *, terminal, seconds):
         """How often two forms that take so long are told of, in the log and on the terminal."""
