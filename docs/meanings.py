@@ -140,6 +140,7 @@ GROUPS: list[tuple[str, list[str], str]] = [
     (
         "Results",
         [
+            "results.files",
             "results.output",
             "results.vtu",
             "results.writer",

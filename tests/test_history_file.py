@@ -11,6 +11,7 @@ import pytest
 from mpi4py import MPI
 
 import fenics_contact as fc
+from fenics_contact.results import files
 from scenes.comparing import close, raised_everywhere, shared_folder
 from scenes.histories import Press
 from scenes.rubber import Tool
@@ -196,6 +197,29 @@ def test_wrong_input(tmp_path):
         iter(fc.increments(made.problem, made.load, 0.5, 1.0, history=path))
     )
     raised_everywhere(again, ValueError, "damaged in line 3")
+
+
+def test_what_is_no_file_is_refused_and_stays(tmp_path):
+    """As a table /dev/zero was read without end, and as root a file took the place of /dev/null.
+
+    A pipe stands for them: a checkpoint waited for whoever would write to it.
+    """
+    folder = shared_folder(tmp_path)
+    pipe = folder / "pipe"
+    made = Rub()
+    if COMM.rank == 0:
+        os.mkfifo(pipe)
+    COMM.barrier()
+
+    def call(**options):
+        return lambda: next(iter(fc.increments(made.problem, made.load, **options)))
+
+    for options in ({"history": pipe}, {"checkpoint": pipe}):
+        raised_everywhere(call(**options), ValueError, "pipe", "give the name of a file")
+    with pytest.raises(ValueError, match="would take its place"), files.replacing(pipe) as path:
+        path.write_bytes(b"")
+    assert pipe.is_fifo() and os.listdir(folder) == ["pipe"]
+    assert made.problem.increment == 0
 
 
 def test_a_row_that_cannot_be_written(tmp_path, monkeypatch):

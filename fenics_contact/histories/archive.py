@@ -76,9 +76,10 @@ def read_file(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
     """Scene and arrays of a file.
 
     Raises:
-        ValueError: It is damaged, or none of this format.
+        ValueError: It is damaged, or none of this format, or no file at all.
         OSError: It cannot be read.
     """
+    files.check_file(path)
     content = path.read_bytes()
     end = len(content) - len(_MARK) - 64
     if end < 0 or content[end : end + len(_MARK)] != _MARK:

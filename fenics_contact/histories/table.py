@@ -24,6 +24,7 @@ STATES = ("contact", "stick", "slip")
 ENERGIES = ("work", "elastic", "springs", "dissipation", "remainder")
 # How every table begins: a file that begins otherwise is not overwritten.
 _FIRST = ("increment", "load")
+_BEGINS = ",".join(_FIRST)
 
 
 class Table:
@@ -60,16 +61,17 @@ class Table:
             raise ValueError(
                 f"history is {self._path}, and there is no folder {self._path.parent}; make it"
             )
+        files.check_file(self._path)
         there = self._path.exists()
         with open(self._path, "a+", newline="", encoding="utf-8") as file:
             file.seek(0)
             try:
-                first = file.readline()
+                first = file.read(len(_BEGINS))  # whatever else it is may have no lines
             except UnicodeDecodeError:
                 first = "no text"
         if not there:
             self._path.unlink()
-        if first and not first.startswith(",".join(_FIRST)):
+        if first and first != _BEGINS:
             raise ValueError(
                 f"history is {self._path}, which is there and is no table of a history; it would "
                 "be overwritten: give another name, or remove it"

@@ -7,7 +7,23 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["replacing"]
+__all__ = ["check_file", "replacing"]
+
+
+def check_file(path: Path) -> None:
+    """Refuse what is there and is no file, such as /dev/null. On the calling rank only.
+
+    A device may be read without end, a pipe waits for another program, and either would be gone
+    where a file took its place. A folder has an error of its own where it is opened.
+
+    Raises:
+        ValueError: It is a device, a pipe or a socket.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise ValueError(
+            f"{path} is a device, a pipe or a socket, and a file would take its place; give the "
+            "name of a file"
+        )
 
 
 @contextmanager
@@ -15,8 +31,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A name to write to, which takes the place of ``path`` once the block has ended well.
 
     Else ``path`` is as before. On the calling rank only.
+
+    Raises:
+        ValueError: ``path`` is a device, a pipe or a socket.
     """
     path = Path(path)
+    check_file(path)
     # The ending stays: it may tell the format.
     temporary = path.with_name(f".{os.getpid()}.part.{path.name}")
     try:
