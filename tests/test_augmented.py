@@ -457,3 +457,25 @@ def test_rounds_end_next_to_a_held_side(shape):
     assert step.rounds < 20
     force = contact.resultants().normal_force
     assert force == pytest.approx(np.pi if turned else 1.0, rel=1e-8)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_a_free_body_is_loaded_again_once_all_load_was_off(cell):
+    """Round-off of multipliers at points that just touched closed them, and nothing was found.
+
+    The load is carried, by statics. Pressures are those of the first increment, within what the
+    tolerance of 1e-5 leaves of where points stick.
+    """
+    scene = block(cell, 2, n=4)
+    contact = scene.contact(fc.Coulomb(0.5), kinematics="finite", **AUGMENTED)
+    problem = fc.ContactProblem(scene.F, scene.u, contacts=[contact])
+    found = []
+    for up in (-10.0, 0.0, -10.0):
+        scene.load(up=up)
+        problem.solve()
+        problem.commit()
+        force = contact.resultants().force
+        assert close(force, scene.vector(up=-up), 1e-9, scale=10.0)
+        found.append(values(contact, "normal_traction"))
+    assert not found[1].any()
+    assert close(found[2], found[0], 1e-4)
