@@ -190,7 +190,8 @@ def estimate_errors(
         increment_error: Errors by the size of the increments, ``Step.increment_error``.
 
     Raises:
-        ValueError: Shapes that do not fit.
+        ValueError: Shapes that do not fit; or a body, or a support that moves freely, that nothing
+            holds at this state.
     """
     problem.complete()
     displacement = problem.displacement

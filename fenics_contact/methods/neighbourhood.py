@@ -10,7 +10,7 @@ from petsc4py import PETSc
 
 from fenics_contact.methods.callbacks import interrupts_held
 from fenics_contact.methods.equations import Equations
-from fenics_contact.systems import dense
+from fenics_contact.systems import dense, linear
 from fenics_contact.types import Array
 
 __all__ = ["linearised", "respond"]
@@ -54,6 +54,12 @@ def linearised(
         with interrupts_held():
             ksp.solve(right, left)
         dense.raise_kept(ksp)
+        if ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
+            raise ValueError(
+                "the equations have no unique solution near this state: nothing holds a body or a "
+                "support that moves freely there, as before anything was solved or where contact "
+                "is open; take a state in which contact bears"
+            )
         if ksp.getConvergedReason() < 0:
             raise RuntimeError(
                 "the linearised problem at the solution was not solved (KSP reason "
@@ -72,6 +78,7 @@ def linearised(
         ksp.setTolerances(rtol=1e-8, max_it=1000)
         yield solve
     finally:
+        linear.forget_failure(equations.solvers[True].getPC())
         for item in (ksp, right, left):
             item.destroy()
 
