@@ -56,6 +56,9 @@ def test_ends_of_increments_as_given():
         (None, [0.5, 0.25, 1.0], "rising or"),
         (None, [0.5], "end"),
         (None, [], "end"),
+        (None, [[0.5, 1.0]], "ends of increments"),
+        (None, [[0.5], [0.7, 1.0]], "ends of increments"),
+        (None, ["half", 1.0], "ends of increments"),
     ],
 )
 def test_wrong_histories(load, steps, word):

@@ -541,9 +541,13 @@ def _ends(start: float, end: float, steps: int | Sequence[float]) -> list[float]
                 "load parameter run from 0 to 1 and scale it in a function load"
             )
         return ends
-    if not np.ndim(steps):
+    try:
+        flat = np.ndim(steps) == 1
+        ends = [float(value) for value in steps] if flat else []
+    except (TypeError, ValueError):  # words, or rows of unequal length
+        flat = False
+    if not flat:
         raise ValueError(f"steps is {steps!r}; it must be a whole number, or ends of increments")
-    ends = [float(value) for value in steps]
     ways = np.diff([start, *ends])
     if not ends or ends[-1] != end or not (np.all(ways > 0) or np.all(ways < 0)):
         raise ValueError(
