@@ -182,7 +182,8 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         ),
         "violated by": (
             "A law does not hold at a point: complementarity, stiffness, cone, slip, dissipation.",
-            "With a law of your own: its `response` and its limit contradict each other.",
+            "With a law of your own: its `response` and its limit contradict each other, or it "
+            "pulls where the gap is open, and its `has_tension` does not say so.",
         ),
         "penetration or elastic slip left": (
             "Multipliers have not settled within their rounds.",
