@@ -464,7 +464,11 @@ class ContactProblem:
         solver.system.begin(load)
         with solver.system.acting():
             reason, attempts, rounds = solver.solve(
-                ahead=ahead, rate=self._rate, cold=cold, stiffness_changed=stiffness_changed
+                ahead=ahead,
+                rate=self._rate,
+                cold=cold,
+                stiffness_changed=stiffness_changed,
+                load_before=self._then.load,
             )
         # Points outside of what is kept have to be looked at, and it takes all of u to do so.
         lags = not field and not solver.system.confined and self._may_lag()

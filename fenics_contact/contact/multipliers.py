@@ -234,6 +234,11 @@ class Multipliers:
             return 0.0
         return change / scale if scale > 0 else np.inf
 
+    def shrink(self, share: float) -> None:
+        """Begin the rounds with a share of λ_n; λ_t, which friction has come to, stays."""
+        values = {name: self.fields.values(name) for name in ("pressure", *self._vectors)}
+        self.fields.commit(values | {"pressure": share * values["pressure"]})
+
     def update(self, values: PointValues) -> None:
         """Make the tractions of an evaluated contact the multipliers, and go on. Collective."""
         found = self._next(values)

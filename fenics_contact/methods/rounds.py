@@ -6,11 +6,15 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from fenics_contact.checks.verdict import Attempt
 from fenics_contact.contact.contact import Contact
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.method import OVERLOADED
+from fenics_contact.parallel import global_sum
 from fenics_contact.systems.answered import leave_out_unanswered
+from fenics_contact.types import Array
 
 __all__ = ["INNER", "solve_in_rounds"]
 
@@ -21,6 +25,8 @@ _MAX_ROUNDS = 80
 # Residual, relative, to which the first round is solved; share of a round's error to which the next
 # is; and the error, in units of the tolerance, from which on the next may be the last one.
 _FIRST_ROUND, INNER, _NEARLY = 1e-4, 1e-2, 10.0
+# Multipliers begin smaller where the load has fallen to less than this share.
+_FELL = 0.2
 # Stiffness of contact, by that of the bulk, that a true overload is found at at the latest.
 _STIFF = 1e3
 
@@ -30,6 +36,7 @@ def solve_in_rounds(
     iterate: Callable[[float, bool], tuple[int, list[Attempt]]],
     ahead: float,
     stiffness_changed: bool,
+    load_before: Array,
 ) -> tuple[int, list[Attempt], int]:
     """Solve, let multipliers take over what the springs bear, and again. Collective.
 
@@ -41,6 +48,7 @@ def solve_in_rounds(
             bulk's tangent has changed: its reason as SNES has it, and what was tried.
         ahead: Size of the increment in units of the last one.
         stiffness_changed: Whether the bulk's tangent is another one than in the last increment.
+        load_before: External forces at this rank's unknowns in the committed state (force).
 
     Returns:
         Reason of the last solution, what was tried, and how many solutions there were.
@@ -48,6 +56,7 @@ def solve_in_rounds(
     augmented = [c for c in equations.contacts if c.multipliers is not None]
     if not augmented:
         return *iterate(ahead, stiffness_changed), 1
+    _shrink(equations, load_before)
     attempts: list[Attempt] = []
     exact = False
     # The first solutions need not be better than the multipliers they are found with.
@@ -87,6 +96,29 @@ def solve_in_rounds(
         _soften(equations, augmented)
         equations.round_rtol = 0.0
     return reason, attempts, number
+
+
+def _shrink(equations: Equations, load_before: Array) -> None:
+    """Let λ_n begin with its share of a load that has fallen far. Collective.
+
+    Multipliers of a load that was ten times as large leave contact to those few points where they
+    are largest, and the rounds begin far from where they end, or nowhere. They are where rounds
+    begin, and no part of the history.
+    """
+    full = equations.full
+    sizes = full.by_body(full.load, load_before)
+    for operator in full.operators:
+        if operator.contact.multipliers is None:
+            continue
+        touched = np.zeros(full.n_bodies)
+        touched[full.label[operator.touched]] = 1.0
+        mine = global_sum(full.unknowns.comm, touched) > 0.0
+        if not sizes[1, mine].any():  # bodies between others have no load of their own
+            mine[:] = True
+        now, before = (float(np.linalg.norm(size[mine])) for size in sizes)
+        if now < _FELL * before:
+            operator.contact.multipliers.shrink(now / before)
+            operator.contact.forget()
 
 
 def _stiffen(equations: Equations, augmented: Sequence[Contact]) -> bool:

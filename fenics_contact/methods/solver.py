@@ -402,7 +402,13 @@ class Solver:
     # ---- solving ---------------------------------------------------------------------------------
 
     def solve(
-        self, *, ahead: float, rate: Array | None, cold: bool, stiffness_changed: bool
+        self,
+        *,
+        ahead: float,
+        rate: Array | None,
+        cold: bool,
+        stiffness_changed: bool,
+        load_before: Array,
     ) -> tuple[int, list[Attempt], int]:
         """Solve, let multipliers take over what the springs bear, and again. Collective.
 
@@ -411,6 +417,7 @@ class Solver:
             rate: By how much that moved all unknowns; None: there was none.
             cold: Whether nothing was borne before.
             stiffness_changed: Whether the bulk's tangent is another one than in the last increment.
+            load_before: External forces at this rank's unknowns in the committed state (force).
 
         Returns:
             Reason of the last solution, what was tried, and how many solutions there were.
@@ -420,7 +427,7 @@ class Solver:
         def iterate(ahead: float, stiffness_changed: bool) -> tuple[int, list[Attempt]]:
             return self._iterate(ahead, rate, cold, stiffness_changed)
 
-        return solve_in_rounds(self.equations, iterate, ahead, stiffness_changed)
+        return solve_in_rounds(self.equations, iterate, ahead, stiffness_changed, load_before)
 
     def _iterate(
         self, ahead: float, rate: Array | None, cold: bool, stiffness_changed: bool

@@ -1,0 +1,79 @@
+"""Multipliers of a load that falls to a small share of what it was."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import fenics_contact as fc
+from scenes.blocks import block
+from scenes.bodies import Bodies, boxes
+from scenes.comparing import close, nodal
+
+HEAVY, LIGHT, TOP, LIGHT_TOP = 1, 2, 3, 4
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+
+
+@pytest.mark.parametrize(
+    ("friction", "share"), [(0.0, 1e-1), (0.0, 1e-6), (0.5, 1e-3), (0.5, 1e-6)]
+)
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_a_load_that_falls_takes_no_more_than_one_that_rises(cell, friction, share):
+    """One increment, and no more than twice the iterations that the whole load takes from nothing.
+
+    With multipliers of the load before it takes up to a hundred times that, or is refused. The force is
+    the load, by statics; without friction the way is forgotten, and u is what the small load alone
+    makes, to what the tolerance of 1e-5 leaves.
+    """
+    law = fc.Coulomb(friction) if friction else fc.Frictionless()
+
+    def found(*loads):
+        scene = block(cell, 1, n=4)
+        contact = scene.contact(law, enforcement="augmented")
+        problem = fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=[contact])
+        iterations = []
+        for load in loads:
+            scene.load(up=-load)
+            iterations.append(problem.solve().iterations)
+            problem.commit()
+        assert contact.resultants().force[-1] == pytest.approx(loads[-1], rel=1e-8)
+        return iterations, nodal(scene.u)
+
+    (rise, fall), u = found(10.0, 10.0 * share)
+    assert fall <= 2 * rise
+    if not friction:
+        assert close(u, found(10.0 * share)[1], 1e-4)
+
+
+def test_the_load_of_another_body_stays():
+    """Multipliers begin smaller where the load has fallen, whatever a body beside bears.
+
+    Two boxes on two floors, one pressed by 1000 all the time, the other by 10, then by 1e-5. By
+    statics the floors bear just that; the second increment takes no more than twice the iterations
+    of the first.
+    """
+    sides = {
+        HEAVY: lambda x, c: (np.abs(x[:, 1]) < 1e-9) & (c[:, 0] < 1.5),
+        TOP: lambda x, c: (np.abs(x[:, 1] - 1) < 1e-9) & (c[:, 0] < 1.5),
+        LIGHT: lambda x, c: (np.abs(x[:, 1]) < 1e-9) & (c[:, 0] > 1.5),
+        LIGHT_TOP: lambda x, c: (np.abs(x[:, 1] - 1) < 1e-9) & (c[:, 0] > 1.5),
+    }
+    lines = np.linspace(0, 1, 5)
+    body = Bodies(boxes([[lines, lines], [lines + 2, lines]], sides), 1e3, 0.3)
+    loads = [body.constant(1000.0), body.constant(10.0)]
+    for load, tag in zip(loads, (TOP, LIGHT_TOP), strict=True):
+        body.F += load * body.v[1] * body.ds(tag)
+    floor = fc.HalfSpace((0, 0), (0, 1))
+    contacts = [
+        body.contact(tag, floor, fc.Coulomb(0.3), name=f"floor {tag}", enforcement="augmented")
+        for tag in (HEAVY, LIGHT)
+    ]
+    problem = body.problem(*contacts)
+    iterations = []
+    for load in (10.0, 1e-5):
+        loads[1].value = load
+        iterations.append(problem.solve().iterations)
+        problem.commit()
+        for contact, wanted in zip(contacts, (1000.0, load), strict=True):
+            assert contact.resultants().force[1] == pytest.approx(wanted, rel=1e-8)
+    assert iterations[1] <= 2 * iterations[0]
