@@ -14,7 +14,7 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact.arguments import check_instance, is_number, listed
+from fenics_contact.arguments import is_number, listed
 from fenics_contact.checks.energy import EnergyState
 from fenics_contact.checks.given import (
     check_contacts,
@@ -30,12 +30,12 @@ from fenics_contact.checks.verdict import Attempt, NotConverged, Verdict
 from fenics_contact.contact.contact import Contact, Found
 from fenics_contact.methods.approach import Approach
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
-from fenics_contact.methods.solver import METHODS, Settings, Solver
+from fenics_contact.methods.solver import Settings, Solver
 from fenics_contact.parallel import fail_together, global_max
-from fenics_contact.surface.modulus import cell_modulus
 from fenics_contact.systems import linear
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.committed import CommittedState
+from fenics_contact.systems.followed import FollowedModulus
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
@@ -164,33 +164,31 @@ class ContactProblem:
         Raises:
             ValueError: Input that has no sense; the text says what and what to do. On all ranks.
         """
-        if method not in (None, *METHODS):
-            raise ValueError(f"method is {method!r}; use one of {sorted(METHODS)}")
-        if linear_solver not in (None, *linear.KINDS):
-            raise ValueError(
-                f"linear_solver is {linear_solver!r}; use one of {sorted(linear.KINDS)}, or None "
-                "for the one that suits the size of the problem"
-            )
-        for name, share in (("alpha", alpha), ("phi", phi)):
-            if not (is_number(share) and 0.0 <= share <= 1.0):
-                raise ValueError(f"{name} is {share!r}; it must lie between 0 and 1")
         if not (is_number(kinematics) and kinematics > 0):
             raise ValueError(
                 f"kinematics is {kinematics!r}; it must be a positive share, such as 0.2, or "
                 "infinite, so that no increment fails by it"
             )
-        check_instance("prefix", prefix, str)
-        if petsc_options is not None:
-            check_instance("petsc_options", petsc_options, Mapping)
         self.contacts = listed("contacts", contacts, Contact)
         self._bcs = listed("bcs", bcs, fem.DirichletBC)
+        said = [c.accuracy for c in self.contacts if c.accuracy is not None]
+        all_say = bool(said) and len(said) == len(self.contacts)
+        self.accuracy = min(said, key=lambda a: a.error) if all_say else None
+        settings = Settings(
+            method=method,
+            alpha=alpha,
+            phi=phi,
+            fallback=fallback,
+            condensation=condensation,
+            linear_solver=linear_solver,
+            petsc_options={} if petsc_options is None else petsc_options,
+            prefix=prefix,
+            accuracy=self.accuracy,
+        )
         linear.warn_of_slow_blas()
         self.displacement = find_displacement(u, self.contacts)
         self.u = u
         self.bulk = Bulk(F, self.displacement)
-        said = [c.accuracy for c in self.contacts if c.accuracy is not None]
-        all_say = bool(said) and len(said) == len(self.contacts)
-        self.accuracy = min(said, key=lambda a: a.error) if all_say else None
         self.increment = 0
         self.prefix = prefix
         self._comm = u.function_space.mesh.comm
@@ -208,9 +206,7 @@ class ContactProblem:
         self.bulk.check_finite()
         self.full.update_stiffness()
         self.bulk.check_elastic()
-        self._scaled = [c for c in self.contacts if c.needs_modulus]
-        self._modulus: fem.Function | None = None
-        self._measure_modulus()
+        self._modulus = FollowedModulus(self.bulk, self.displacement, self.contacts)
         supports = [
             (contact.name, motion) for contact in self.contacts for motion in contact.motions
         ]
@@ -226,21 +222,7 @@ class ContactProblem:
         self._judge = Judge(
             self.full, self.motions, kinematics=kinematics, second_route=second_route
         )
-        self.solver = Solver(
-            self.full,
-            self.motions,
-            Settings(
-                method=method,
-                fallback=fallback,
-                condensation=condensation,
-                linear_solver=linear_solver,
-                petsc_options=dict(petsc_options or {}),
-                prefix=prefix,
-                accuracy=self.accuracy,
-            ),
-            alpha=alpha,
-            phi=phi,
-        )
+        self.solver = Solver(self.full, self.motions, settings)
 
         # The present state, and the committed one: unknowns (the present ones are those of u), what
         # goes with them, and how far the last increment moved them.
@@ -353,19 +335,6 @@ class ContactProblem:
         with self.solver.linearised(springs, self._now.load) as solve:
             yield solve
 
-    def _measure_modulus(self) -> None:
-        """Let stiffnesses that are multiples of E/h follow E of the bulk form. Collective."""
-        if self._scaled:
-            weight = self._scaled[0].weight
-            self._set_modulus(cell_modulus(self.bulk.tangent_form, self.displacement, weight))
-
-    def _set_modulus(self, modulus: fem.Function | None) -> None:
-        """Let these stiffnesses be multiples of a modulus by h. Collective."""
-        self._modulus = modulus
-        if modulus is not None:
-            for contact in self._scaled:
-                contact.set_modulus(modulus)
-
     # ---- solving ---------------------------------------------------------------------------------
 
     @interrupts_held()
@@ -397,7 +366,7 @@ class ContactProblem:
             for contact in self.contacts:
                 contact.begin()
             if not self.bulk.linear:  # whose tangent is that of u, and E may be another by now
-                self._measure_modulus()
+                self._modulus.measure()
         behind = self._now.pending is not None or self._then.pending is not None
         if behind and not self.solver.is_current():
             self._complete_all()  # what it takes is about to go
@@ -455,7 +424,7 @@ class ContactProblem:
         solver.follow(before)
         stiffness_changed = self.full.update_stiffness()
         if stiffness_changed and self.bulk.linear:
-            self._measure_modulus()
+            self._modulus.measure()
         cold = self._approach.lead(load, first=self.increment == 0)
         if solver.chooses():
             return None
@@ -735,15 +704,15 @@ class ContactProblem:
         Where the bulk is linear, stiffnesses that are multiples of E/h are those of its present
         data there, as `solve` would have them.
         """
-        before, modulus = self.full.state(), self._modulus
+        before, modulus = self.full.state(), self._modulus.present
         try:
             self.full.set_state(state)
             if self.bulk.linear:
-                self._measure_modulus()
+                self._modulus.measure()
             yield
         finally:
             self.full.set_state(before)
-            self._set_modulus(modulus)
+            self._modulus.put_back(modulus)
 
     def present_load(self) -> Array:
         """External forces as they are now at this rank's unknowns (force). Collective."""

@@ -6,13 +6,14 @@ import logging
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact import compat
+from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.verdict import Attempt
 from fenics_contact.contact.accuracy import Accuracy
@@ -87,15 +88,36 @@ _LAST_RESORT = "continuation"
 
 @dataclass(frozen=True)
 class Settings:
-    """What the caller of `ContactProblem` says of the solution; see its arguments."""
+    """What the caller of `ContactProblem` says of the solution; see its arguments.
+
+    Raises:
+        ValueError: One of them has no sense.
+    """
 
     method: str | None
+    alpha: float
+    phi: float
     fallback: bool
     condensation: bool | None
     linear_solver: str | None
     petsc_options: Mapping[str, Any]
     prefix: str
     accuracy: Accuracy | None
+
+    def __post_init__(self) -> None:
+        """Refuse what has no sense."""
+        if self.method not in (None, *METHODS):
+            raise ValueError(f"method is {self.method!r}; use one of {sorted(METHODS)}")
+        if self.linear_solver not in (None, *linear.KINDS):
+            raise ValueError(
+                f"linear_solver is {self.linear_solver!r}; use one of {sorted(linear.KINDS)}, or "
+                "None for the one that suits the size of the problem"
+            )
+        for name, share in (("alpha", self.alpha), ("phi", self.phi)):
+            if not (is_number(share) and 0.0 <= share <= 1.0):
+                raise ValueError(f"{name} is {share!r}; it must lie between 0 and 1")
+        check_instance("prefix", self.prefix, str)
+        check_instance("petsc_options", self.petsc_options, Mapping)
 
 
 class Solver:
@@ -113,28 +135,20 @@ class Solver:
         starts: Where the iteration starts from.
     """
 
-    def __init__(
-        self,
-        full: FullSystem,
-        motions: RigidMotions,
-        settings: Settings,
-        *,
-        alpha: float,
-        phi: float,
-    ) -> None:
+    def __init__(self, full: FullSystem, motions: RigidMotions, settings: Settings) -> None:
         """Choose system and method. Collective.
 
         Args:
             full: The system on all unknowns.
             motions: Rigid motions of the bodies.
             settings: What the caller says.
-            alpha: See `Equations`.
-            phi: Likewise.
         """
-        self.equations = Equations(full, motions, alpha=alpha, phi=phi)
+        self.equations = Equations(full, motions, alpha=settings.alpha, phi=settings.phi)
         self.expected = _EXPECTED
         self.starts = Starts(self.equations)
-        self._full, self._settings = full, settings
+        self._full = full
+        # Which the caller may change later.
+        self._settings = replace(settings, petsc_options=dict(settings.petsc_options))
         self._comm = full.unknowns.comm
         self._obstacle: str | None = None  # to condensation, as last said
         self._pairings = self._present_pairings()  # those of the system

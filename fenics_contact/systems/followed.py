@@ -1,0 +1,48 @@
+"""Young's modulus of a bulk form, for contacts whose stiffness is a multiple of E/h."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from dolfinx import fem
+
+from fenics_contact.contact.contact import Contact
+from fenics_contact.surface.displacement import Displacement
+from fenics_contact.surface.modulus import cell_modulus
+from fenics_contact.systems.bulk import Bulk
+
+__all__ = ["FollowedModulus"]
+
+
+class FollowedModulus:
+    """E as it was measured last; contacts to which it was given by their caller are left alone.
+
+    Attributes:
+        present: One value per cell (stress); None: no contact asks for it.
+    """
+
+    def __init__(self, bulk: Bulk, displacement: Displacement, contacts: Sequence[Contact]) -> None:
+        """Measure it. Collective.
+
+        Args:
+            bulk: The bulk form.
+            displacement: In it.
+            contacts: Of the problem.
+        """
+        self._bulk, self._displacement = bulk, displacement
+        self._contacts = [c for c in contacts if c.needs_modulus]
+        self.present: fem.Function | None = None
+        self.measure()
+
+    def measure(self) -> None:
+        """Let stiffnesses follow E of the bulk form as it is now. Collective."""
+        if self._contacts:
+            weight = self._contacts[0].weight
+            self.put_back(cell_modulus(self._bulk.tangent_form, self._displacement, weight))
+
+    def put_back(self, modulus: fem.Function | None) -> None:
+        """Let them be multiples of what ``present`` was before. Collective."""
+        self.present = modulus
+        if modulus is not None:
+            for contact in self._contacts:
+                contact.set_modulus(modulus)
