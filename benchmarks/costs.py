@@ -135,6 +135,20 @@ def linear_solve(body: problems.Body, degree: int, kind: str = "direct") -> Row:
     if body.pressed:
         residual -= body.pressed(ufl.TestFunction(u.function_space), body.ds)
     bcs += [hold(u, body.tags, tag, i) for tag in body.glued for i in range(len(u))]
+    return solve_once(u, residual, bcs, kind)
+
+
+def solve_once(
+    u: fem.Function, residual: ufl.Form, bcs: Sequence[fem.DirichletBC], kind: str = "direct"
+) -> Row:
+    """Assemble and solve what is linear in u, which gets the solution. Collective.
+
+    Args:
+        u: Displacement.
+        residual: F.
+        bcs: Conditions.
+        kind: See `linear_solve`.
+    """
     bilinear = fem.form(ufl.derivative(residual, u))
     matrix = fem.petsc.assemble_matrix(bilinear, bcs)
     matrix.assemble()

@@ -80,6 +80,21 @@ def speed_up(run: str, size: int) -> Callable[[Rows], tuple[float, str]]:
     return measure
 
 
+def worst(ranks: int) -> Callable[[Rows], tuple[float, str]]:
+    """Most linear solves of an increment that has a solution, on a number of ranks."""
+
+    def measure(rows: Rows) -> tuple[float, str]:
+        mine = [row for row in rows if int(row["ranks"]) == ranks]
+        found = [row for row in mine if not row["way"].startswith("refused")]
+        if not found:
+            raise LookupError(ranks)
+        most = max(found, key=lambda row: float(row["linear solves"]))
+        note = f"{most['dofs']} dofs, {most['increment']}, {most['iterations']} iterations"
+        return float(most["linear solves"]), note
+
+    return measure
+
+
 def _find(rows: Rows, run: str, size: int, ranks: int = 1) -> dict[str, str]:
     for row in rows:
         if row["run"] == run and int(row.get("ranks") or 1) == ranks:
@@ -110,6 +125,10 @@ def _all() -> list[Target]:
     tagged = ratio("10 increments", solve)
     scene = "ball on a block, all of its top tagged, 10 increments"
     found.append(Target(scene, "time / linear solve", "tagged/tagged.csv", tagged, 2.5))
+    for ranks in (1, 2):
+        scene = f"plates under a bolt, each increment, {ranks} rank{'s' * (ranks > 1)}"
+        joint = "bolted_joint/bolted_joint.csv"
+        found.append(Target(scene, "time / linear solve", joint, worst(ranks), 3.0))
     large, million = "large/large.csv", 1_000_000
     scene = "ball on a block, a million dofs"
     one = ratio("contact", "linear, multigrid", million)

@@ -83,6 +83,7 @@ class BoltedJoint(History):
 
     Attributes:
         u: Displacement.
+        tags: Of the sides.
         contacts: Of plates, head and nut.
         tight: Interference under the head (length).
         pull: On the end of the upper plate (force).
@@ -106,6 +107,7 @@ class BoltedJoint(History):
             options: Those of the problem.
         """
         mesh, tags = joint_mesh(size)
+        self.tags = tags
         space = displacement_space(mesh, degree)
         self.u, v = fem.Function(space, name="displacement"), ufl.TestFunction(space)
         self.tight, self.pull = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)

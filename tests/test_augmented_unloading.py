@@ -21,9 +21,9 @@ pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 def test_a_load_that_falls_takes_no_more_than_one_that_rises(cell, friction, share):
     """One increment, and no more than twice the iterations that the whole load takes from nothing.
 
-    With multipliers of the load before it takes up to a hundred times that, or is refused. The force is
-    the load, by statics; without friction the way is forgotten, and u is what the small load alone
-    makes, to what the tolerance of 1e-5 leaves.
+    With multipliers of the load before it takes up to a hundred times that, or is refused. The
+    force is the load, by statics; without friction the way is forgotten, and u is what the small
+    load alone makes, to what the tolerance of 1e-5 leaves.
     """
     law = fc.Coulomb(friction) if friction else fc.Frictionless()
 

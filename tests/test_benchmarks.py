@@ -88,8 +88,14 @@ def made_up(folder: Path, slower: float) -> None:
         {"run": "one linear solve", "iterations": 1, "seconds": 10.0},
         {"run": "10 increments", "iterations": 66, "seconds": 18.0 * slower},
     ]
+    common = {"dofs": 54_951, "iterations": 50}
+    joint = [
+        {"increment": "pulled", "way": way, "ranks": p, "linear solves": many} | common
+        for p, most in ((1, 2.5 * slower), (2, 2.0 * slower))
+        for way, many in (("lbfgs", most), ("newton", 0.5), ("refused: overload", 90.0))
+    ]
     tables = {"half_cylinder": cylinder, "ball": ball, "large": big, "ranks": plane}
-    tables["tagged"] = tagged
+    tables |= {"tagged": tagged, "bolted_joint": joint}
     for name, rows in tables.items():
         (folder / name).mkdir(exist_ok=True)
         timing.save(folder / name / f"{name}.csv", rows)
@@ -102,7 +108,7 @@ def test_targets(tmp_path: Path) -> None:
     assert {row["met"] for row in targets.table(tmp_path)} == {targets.NOT_MEASURED}
     made_up(tmp_path, 1.0)
     rows = targets.table(tmp_path)
-    expected = [0.9, 0.1, 1.2, 0.1, 1.9, 2.4, 0.16, 0.5, 1.8, 5.0, 5.4, 2, 2, 2]
+    expected = [0.9, 0.1, 1.2, 0.1, 1.9, 2.4, 0.16, 0.5, 1.8, 2.5, 2.0, 5.0, 5.4, 2, 2, 2]
     expected += [10 / 6, 10 / 6]
     assert [row["measured"] for row in rows] == pytest.approx(expected)
     assert {row["met"] for row in rows} == {"yes"}
@@ -209,6 +215,21 @@ def test_short_benchmark(name: str, tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     assert len(rows) > 10
     assert all(float(row["seconds"]) > 0 and row["iterations"] != "none" for row in rows)
+
+
+@pytest.mark.slow
+def test_the_bolted_joint_runs(tmp_path: Path) -> None:
+    """Every increment is solved, the same on two ranks, and what is beyond friction is named."""
+    command = [sys.executable, str(ROOT / "benchmarks" / "bolted_joint.py"), "--short"]
+    command += ["--repeat", "1", "--output", str(tmp_path)]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stdout + done.stderr
+    with open(tmp_path / "bolted_joint.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    one, two = ([row for row in rows if row["ranks"] == ranks] for ranks in "12")
+    assert len(one) == len(two) == 7
+    assert [row["increment"] for row in one] == [row["increment"] for row in two]
+    assert all(row[-1]["way"] == "refused: overload" for row in (one, two))
 
 
 @pytest.mark.slow

@@ -1,0 +1,118 @@
+"""Bolted joint: what each increment costs, and how soon the limit of its friction is told.
+
+Two plates and a bolt that friction alone holds (``scenes/bolted_joint.py``), quadratic tetrahedra,
+three contacts between pairs of bodies: tightened in two increments, pulled to 2000 N in four, then
+by five percent more than friction bears, which has no solution. Times are in units of one linear
+solve of the same bodies, each held (MUMPS' Cholesky factorisation on as many ranks). Meshing is not
+counted, nor are compiled forms. There is no script by hand beside it: DOLFINx finds no pairs.
+
+    OMP_NUM_THREADS=1 python benchmarks/bolted_joint.py            # 55,000 dofs: ten minutes
+    OMP_NUM_THREADS=1 python benchmarks/bolted_joint.py --size 1.1 # 300,000
+    OMP_NUM_THREADS=1 python benchmarks/bolted_joint.py --short
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from pathlib import Path
+
+import numpy as np
+import ufl
+from mpi4py import MPI
+
+import fenics_contact as fc
+from benchmarks import costs, timing
+from scenes import bolted_joint as joint
+from scenes.elasticity import hold, residual
+from scenes.problems import count
+from scenes.processes import answer
+
+COMM = MPI.COMM_WORLD
+TIGHT, PULLED = 1.0, 3.0  # ends of the load parameter
+INCREMENT = 0.5
+BEYOND = 1.05  # of what friction bears
+Row = timing.Row
+
+
+def linear(made: joint.BoltedJoint, repeat: int) -> float:
+    """Median time of one linear solve of the bodies, each held where it is touched (s)."""
+    u = made.u.copy()
+    v = ufl.TestFunction(u.function_space)
+    F = residual(u, v, joint.E, joint.NU) - v[0] * ufl.dx
+    held = (joint.HELD, joint.OVER, joint.RING, joint.NUT_RING)
+    bcs = [hold(u, made.tags, tag, i) for tag in held for i in range(3)]
+    times = []
+    for _ in range(repeat + 1):
+        start = _now()
+        costs.solve_once(u, F, bcs)
+        times.append(_now() - start)
+    return statistics.median(times[1:])  # the first compiles
+
+
+def _now() -> float:
+    COMM.Barrier()
+    return time.perf_counter()
+
+
+def child(size: float, degree: int, repeat: int) -> None:
+    """All increments in these processes; their rows as JSON, the last line of rank 0."""
+    for _ in joint.BoltedJoint(8.0, degree=degree).increments(INCREMENT, steps=1):
+        pass  # forms are compiled
+    made = joint.BoltedJoint(size, degree=degree)
+    unit = linear(made, repeat)
+    common = {"dofs": count(made.u.function_space), "ranks": COMM.size}
+    rows: list[Row] = []
+    start = _now()
+    for step in made.increments(PULLED, steps=round(PULLED / INCREMENT)):
+        seconds = _now() - start
+        tightens = made.pull.value == 0.0
+        what = "tightened" if tightens else f"pulled by {float(made.pull.value):g} N"
+        rows.append({"increment": what, "iterations": step.iterations, "way": step.method})
+        rows[-1] |= {"seconds": seconds, "linear solves": seconds / unit}
+        start = _now()
+    plates, head, _ = (contact.resultants() for contact in made.contacts)
+    borne = joint.FRICTION * (plates.normal_force + head.normal_force)
+    made.load(TIGHT + BEYOND * borne / 1000.0)
+    start = _now()
+    try:
+        step = made.problem.solve()
+        iterations, told = step.iterations, "solved"
+    except fc.NotConverged as error:
+        iterations = error.iterations
+        told = "refused: " + ("overload" if "overload:" in str(error) else "no solution found")
+    seconds = _now() - start
+    what = f"pulled by {float(made.pull.value):.0f} N, beyond friction"
+    rows.append({"increment": what, "iterations": iterations, "way": told})
+    rows[-1] |= {"seconds": seconds, "linear solves": seconds / unit}
+    if COMM.rank == 0:
+        print(json.dumps([common | row for row in rows]), flush=True)
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = timing.parser(__doc__, "bolted_joint")
+    parser.add_argument("--size", type=float, nargs="*", default=[2.1], help="of cells (mm)")
+    parser.add_argument("--degree", type=int, default=2)
+    parser.add_argument("--ranks", type=int, nargs="*", default=[1, 2])
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.child:
+        child(arguments.size[0], arguments.degree, arguments.repeat)
+        return
+    degree = 1 if arguments.short else arguments.degree
+    rows: list[Row] = []
+    for size in [5.0] if arguments.short else arguments.size:
+        for ranks in arguments.ranks:
+            words = ["--child", "--size", size, "--degree", degree, "--repeat", arguments.repeat]
+            rows += answer(ranks, Path(__file__).resolve(), *words)
+            print(f"cells of {size:g} mm, {ranks} ranks: done", flush=True)
+    title = f"Plates under a bolt, tetrahedra of degree {degree}, μ = {joint.FRICTION:g}"
+    timing.write(arguments.output, "bolted_joint", title, rows)
+
+
+if __name__ == "__main__":
+    np.seterr(all="ignore")
+    main()
