@@ -21,7 +21,7 @@ from functools import partial
 import numpy as np
 from mpi4py import MPI
 
-from benchmarks import costs, timing
+from benchmarks import costs
 from scenes import problems
 
 
@@ -41,14 +41,12 @@ def runs(case: costs.Case, friction: float) -> dict[str, Callable[[], costs.Row]
 
 def main() -> None:
     """Run."""
-    parser = timing.parser(__doc__, "ball")
+    parser = costs.parser(__doc__, "ball")
     parser.add_argument(
         "--cells", type=int, nargs="+", default=[7, 11, 16, 23, 32], help="a side; table: the last"
     )
     parser.add_argument("--reference", type=int, default=40, help="cells a side of the finer mesh")
     parser.add_argument("--friction", type=float, default=0.3)
-    parser.add_argument("--stiffness", type=float, default=10.0, help="k_n and k_t h/E")
-    parser.add_argument("--only", default="", help="runs whose name contains this")
     arguments = parser.parse_args()
     if MPI.COMM_WORLD.size > 1:
         parser.error("times here are of one rank; large.py takes several (--ranks)")
@@ -68,14 +66,10 @@ def main() -> None:
     def make(cells: int) -> costs.Case:
         return costs.Case(problems.ball_on_block(cells), 1, arguments.stiffness, errors)
 
-    def choose(case: costs.Case) -> dict[str, Callable[[], costs.Row]]:
-        found = runs(case, arguments.friction)
-        return {n: r for n, r in found.items() if arguments.only in n or n == costs.YARDSTICK}
-
     title = f"Ball on a block, trilinear, μ = {arguments.friction:g}, k h/E = "
     title += f"{arguments.stiffness:g}"
     cases = {f"{n} cells a side": partial(make, n) for n in sizes}
-    costs.study("ball", title, cases, choose, arguments)
+    costs.study("ball", title, cases, partial(runs, friction=arguments.friction), arguments)
 
 
 if __name__ == "__main__":

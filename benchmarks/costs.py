@@ -281,6 +281,14 @@ def runs(
     return found
 
 
+def parser(documentation: str | None, folder: str) -> argparse.ArgumentParser:
+    """The options of every `study`: those of `timing.parser`, ``--stiffness`` and ``--only``."""
+    made = timing.parser(documentation, folder)
+    made.add_argument("--stiffness", type=float, default=10.0, help="k_n and k_t h/E")
+    made.add_argument("--only", default="", help="runs whose name contains this")
+    return made
+
+
 def study(
     name: str,
     title: str,
@@ -295,14 +303,15 @@ def study(
         title: Of the tables.
         cases: Make the scene in its sizes, smallest first; by the name of the size. The table
             is of the last.
-        choose: The runs of a scene.
-        arguments: Those of `timing.parser`.
+        choose: The runs of a scene, from which ``--only`` takes some.
+        arguments: Those of `parser`.
     """
     everything: list[Row] = []
     waits: dict[str, float] = {}  # of the smallest scene, which compiles the forms
     for size, make in cases.items():
         case = make()
-        chosen = choose(case)
+        only = arguments.only
+        chosen = {n: run for n, run in choose(case).items() if only in n or n == YARDSTICK}
         rows = timing.measure(
             chosen, repeat=arguments.repeat, first=None if waits else chosen, once=ONCE
         )

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from benchmarks import costs, timing
+from benchmarks import costs
 from scenes import problems
 from scenes.problems import hertz
 
@@ -56,7 +56,7 @@ def errors(finer: float, friction: float, steps: int, results: costs.Row) -> cos
 
 def main() -> None:
     """Run."""
-    parser = timing.parser(__doc__, "half_cylinder")
+    parser = costs.parser(__doc__, "half_cylinder")
     parser.add_argument(
         "--h",
         type=float,
@@ -67,9 +67,7 @@ def main() -> None:
     parser.add_argument("--degree", type=int, default=2)
     parser.add_argument("--friction", type=float, nargs="*", default=[0.0, 0.2])
     parser.add_argument("--increments", type=int, nargs="*", default=[1, MANY])
-    parser.add_argument("--stiffness", type=float, default=10.0, help="k_n and k_t h/E")
     parser.add_argument("--all", action="store_true", help="histories on all unknowns too")
-    parser.add_argument("--only", default="", help="runs whose name contains this")
     arguments = parser.parse_args()
     if MPI.COMM_WORLD.size > 1:
         parser.error("times here are of one rank; ranks.py compares several")
@@ -84,10 +82,9 @@ def main() -> None:
         return costs.Case(body, arguments.degree, arguments.stiffness, partial(errors, finer))
 
     def choose(case: costs.Case) -> dict[str, Any]:
-        found = costs.runs(
+        return costs.runs(
             case, arguments.friction, arguments.increments, all_unknowns=arguments.all
         )
-        return {n: r for n, r in found.items() if arguments.only in n or n == costs.YARDSTICK}
 
     title = f"Half-cylinder, degree {arguments.degree}, k h/E = {arguments.stiffness:g}"
     cases = {f"h = {h:g}": partial(make, h) for h in sizes}

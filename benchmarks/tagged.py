@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 from mpi4py import MPI
 
-from benchmarks import costs, timing
+from benchmarks import costs
 from scenes import problems
 
 
@@ -37,13 +37,11 @@ def runs(case: costs.Case, friction: float) -> dict[str, Callable[[], costs.Row]
 
 def main() -> None:
     """Run."""
-    parser = timing.parser(__doc__, "tagged")
+    parser = costs.parser(__doc__, "tagged")
     parser.add_argument(
         "--cells", type=int, nargs="+", default=[12, 20, 30], help="a side; table: the last"
     )
     parser.add_argument("--friction", type=float, default=0.3)
-    parser.add_argument("--stiffness", type=float, default=10.0, help="k_n and k_t h/E")
-    parser.add_argument("--only", default="", help="runs whose name contains this")
     arguments = parser.parse_args()
     if MPI.COMM_WORLD.size > 1:
         parser.error("times here are of one rank")
@@ -52,14 +50,10 @@ def main() -> None:
     def make(cells: int) -> costs.Case:
         return costs.Case(problems.ball_on_tagged_block(cells), 1, arguments.stiffness)
 
-    def choose(case: costs.Case) -> dict[str, Callable[[], costs.Row]]:
-        found = runs(case, arguments.friction)
-        return {n: r for n, r in found.items() if arguments.only in n or n == costs.YARDSTICK}
-
     title = f"Ball on a block, all of its top tagged, linear tetrahedra, μ = {arguments.friction:g}"
     title += f", k h/E = {arguments.stiffness:g}"
     cases = {f"{n} cells a side": partial(make, n) for n in sizes}
-    costs.study("tagged", title, cases, choose, arguments)
+    costs.study("tagged", title, cases, partial(runs, friction=arguments.friction), arguments)
 
 
 if __name__ == "__main__":
