@@ -86,7 +86,7 @@ def test_few_changes_are_corrections(size, monkeypatch):
 
 
 def test_the_operator_multiplies():
-    """S x + C x, by numpy."""
+    """S x + C x, and the transposed, by numpy to round-off."""
     rng, fixed, matrix, _, operator = scene(False)
     values = rng.normal(size=3)
     operator.set_parts(fixed, np.array([1, 1, 7]), np.array([2, 1, 0]), values)
@@ -96,6 +96,8 @@ def test_the_operator_multiplies():
     whole = fixed.copy()
     whole[[1, 1, 7], [2, 1, 0]] += values
     assert np.allclose(y.array, whole @ x.array, rtol=0, atol=1e-13)
+    matrix.multTranspose(x, y)
+    assert np.allclose(y.array, whole.T @ x.array, rtol=0, atol=1e-13)
 
 
 def test_a_part_that_cannot_be_eliminated():
