@@ -15,9 +15,10 @@ ROOT = Path(__file__).resolve().parent.parent
 def environment() -> dict[str, str]:
     """What a new process gets: what mpirun left here would make another mpirun join it.
 
-    More ranks than cores, for Open MPI 5 and 4: MPICH does not know the option of its mpirun.
+    More ranks than cores, for Open MPI 6, 5 and 4: MPICH does not know the option of its mpirun.
     """
     kept = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
+    kept.setdefault("PRTE_MCA_mapby", ":oversubscribe")
     kept.setdefault("PRTE_MCA_rmaps_default_mapping_policy", ":oversubscribe")
     kept.setdefault("OMPI_MCA_rmaps_base_oversubscribe", "1")
     paths = [str(ROOT), *filter(None, [kept.get("PYTHONPATH")])]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import ROOT
+from scenes.processes import ROOT, command, environment
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts a process of its own")
 
@@ -53,6 +53,14 @@ def test_a_command_runs_here_where_dolfinx_is(run) -> None:
     """As it is where the tests run: its own output, and no engine is asked for anything."""
     process, asked = run()
     assert (process.returncode, process.stdout, asked) == (0, "here\n", [])
+
+
+def test_more_ranks_than_cores_start_without_a_word() -> None:
+    """Neither refused, nor with a warning of old names: all that is printed is what they print."""
+    ranks = (os.cpu_count() or 1) + 1
+    words = command(ranks, "-c", "print('here')")
+    process = subprocess.run(words, env=environment(), capture_output=True, text=True, timeout=60)
+    assert (process.returncode, process.stdout, process.stderr) == (0, "here\n" * ranks, "")
 
 
 def test_a_suite_has_a_container_and_an_image_of_its_own(run) -> None:
