@@ -20,12 +20,13 @@ RUN = ROOT / "docker" / "run"
 DOCKER = """#!/bin/sh
 echo "$@" >>"${0%/*}/asked"
 [ "$1" != info ] || echo 99
+[ "$1" != image ] || [ -z "$IMAGES_MISSING" ]
 """
 
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Call docker/run in a given environment, with an engine that has every image.
+    """Call docker/run in a given environment, with an engine that has every image, or none.
 
     Gives the process, and what it asked that engine for, line by line.
     """
@@ -75,6 +76,15 @@ def test_a_suite_has_a_container_and_an_image_of_its_own(run) -> None:
         assert "--env=FENICS_CONTACT_SUITE" not in words
         images.add(words[-3])
     assert len(images) == 2
+
+
+def test_the_image_of_a_suite_is_of_what_is_there_when_it_is_built(run) -> None:
+    """The engine must not take what it remembers of an earlier day's packages."""
+    process, asked = run(FENICS_CONTACT_SUITE="unstable", IMAGES_MISSING="all")
+    assert process.returncode == 0, process.stderr
+    build = next(line for line in asked if line.startswith("build ")).split()
+    assert "--no-cache" in build
+    assert "--build-arg=BASE=docker.io/library/debian:unstable-slim" in build
 
 
 @pytest.mark.whole
