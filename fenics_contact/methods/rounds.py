@@ -25,8 +25,10 @@ _MAX_ROUNDS = 80
 # Residual, relative, to which the first round is solved; share of a round's error to which the next
 # is; and the error, in units of the tolerance, from which on the next may be the last one.
 _FIRST_ROUND, INNER, _NEARLY = 1e-4, 1e-2, 10.0
-# Multipliers begin smaller where the load has fallen to less than this share.
-_FELL = 0.2
+# Multipliers begin smaller where the load has fallen to less than this share. To less than the
+# second it is gone: without multipliers a body would be left to touch by round-off, and multipliers
+# that are too large leave it open.
+_FELL, _NOTHING = 0.2, 1e-10
 # Stiffness of contact, by that of the bulk, that a true overload is found at at the latest.
 _STIFF = 1e3
 
@@ -116,7 +118,7 @@ def _shrink(equations: Equations, load_before: Array) -> None:
         if not sizes[1, mine].any():  # bodies between others have no load of their own
             mine[:] = True
         now, before = (float(np.linalg.norm(size[mine])) for size in sizes)
-        if now < _FELL * before:
+        if _NOTHING * before < now < _FELL * before:
             operator.contact.multipliers.shrink(now / before)
             operator.contact.forget()
 
