@@ -60,29 +60,25 @@ class Sum:
 
     def mult(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Multiply; into what is no number if that fails."""
-        self._multiply(self.fixed, *self.added, x, y)
+        self._multiply(x, y, transposed=False)
 
     def multTranspose(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Multiply by the transpose, as SNES of trust regions does; likewise."""
-        rows, columns, values = self.added
-        self._multiply(self.fixed.T, columns, rows, values, x, y)
+        self._multiply(x, y, transposed=True)
 
-    def _multiply(
-        self,
-        fixed: Array,
-        rows: Index,
-        columns: Index,
-        values: Array,
-        x: PETSc.Vec,
-        y: PETSc.Vec,
-    ) -> None:
+    def _multiply(self, x: PETSc.Vec, y: PETSc.Vec, *, transposed: bool) -> None:
         try:
-            state = x.array_r
-            added = np.bincount(rows, values * state[columns], minlength=state.size)
-            y.array[:] = fixed @ state + added
+            y.array[:] = self._product(x.array_r, transposed)
         except BaseException as error:
             self.error = self.error or error
             y.set(np.nan)
+
+    def _product(self, state: Array, transposed: bool) -> Array:
+        fixed, (rows, columns, values) = self.fixed, self.added
+        if transposed:
+            fixed, rows, columns = fixed.T, columns, rows
+        added = np.bincount(rows, values * state[columns], minlength=state.size)
+        return np.asarray(fixed @ state + added)
 
 
 class PartlyFactored:
