@@ -181,7 +181,8 @@ def quicker(n: int, dimension: int, *, slender: float = 1.0, condensed_for: int 
     A factorisation takes n w² operations if w unknowns lie in a cross-section of the mesh, and
     multigrid some n: what w is, n^(2/3) in a cube, decides. Plates under a bolt
     (`scenes/bolted_joint.py`), half tightened, then pulled, by L-BFGS, processor time with MUMPS
-    and with GAMG: 33,000 unknowns 7.9 and 12 s, 8.8 and 15; 55,000 17 and 26 s, 20 and 30.
+    and with GAMG: 33,000 unknowns 7.9 and 12 s, 8.8 and 15; 55,000 17 and 26 s, 20 and 30, which
+    multigrid solves still: fine cells around the bolt make them less slender, 1.6.
 
     Args:
         n: Number of unknowns.
