@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
     ("friction", "share"), [(0.0, 1e-1), (0.0, 1e-6), (0.5, 1e-3), (0.5, 1e-6)]
 )
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
-def test_a_load_that_falls_takes_no_more_than_one_that_rises(cell, friction, share):
+def test_a_load_that_falls_takes_at_most_twice_what_it_took_to_rise(cell, friction, share):
     """One increment, and no more than twice the iterations that the whole load takes from nothing.
 
     With multipliers of the load before it takes up to a hundred times that, or is refused. The
