@@ -35,4 +35,15 @@ def test_tightened_and_pulled_until_it_slips() -> None:
     assert limit > float(made.pull.value) > 0.7 * limit
     made.load(1.0 + 1.02 * limit / 1000.0)
     words = "overload: along the translation along x of body 2"
-    raised_everywhere(made.problem.solve, fc.NotConverged, words)
+    failed: list[fc.NotConverged] = []
+
+    def solve() -> None:
+        try:
+            made.problem.solve()
+        except fc.NotConverged as error:
+            failed.append(error)
+            raise
+
+    raised_everywhere(solve, fc.NotConverged, words)
+    # 56 here; 351 if all that may help is tried under stiff springs before it is told.
+    assert failed[0].iterations < 120

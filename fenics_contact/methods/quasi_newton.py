@@ -17,8 +17,9 @@ __all__ = ["QuasiNewton"]
 # Rounds in a row that do not lower the residual before the increment is given up: the potential may
 # fall for long before the residual does.
 _MAX_STALLS = 10
-# The same where friction seems not to bear the load, which another method can tell.
-_FEW_STALLS = 3
+# The same where friction seems not to bear the load, which another method can tell; and if it is by
+# so much.
+_FEW_STALLS, _CLEARLY = 3, 1.02
 # Contact that bears less than this share of the residual an increment begins with tells nothing of
 # which points will be closed.
 _IDLE = 1e-3
@@ -100,8 +101,10 @@ class QuasiNewton(SnesMethod):
                 return iterations, failure
             if not self._refresh():
                 return iterations, compat.NOT_FINITE
-            if stalls >= _FEW_STALLS and self.gives_up() and equations.friction_needed() > 1.0:
-                return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
+            if stalls and self.gives_up():
+                most = 1.0 if stalls >= _FEW_STALLS else _CLEARLY
+                if equations.friction_needed() > most:
+                    return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
 
     def _start(self) -> None:
         """Begin with H₀ as it is before anything is known of the status. Collective."""

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from fenics_contact.checks.verdict import Attempt
-from fenics_contact.contact.contact import Contact
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.method import OVERLOADED
 from fenics_contact.parallel import global_sum
@@ -29,13 +28,11 @@ _FIRST_ROUND, INNER, _NEARLY = 1e-4, 1e-2, 10.0
 # second it is gone: without multipliers a body would be left to touch by round-off, and multipliers
 # that are too large leave it open.
 _FELL, _NOTHING = 0.2, 1e-10
-# Stiffness of contact, by that of the bulk, that a true overload is found at at the latest.
-_STIFF = 1e3
 
 
 def solve_in_rounds(
     equations: Equations,
-    iterate: Callable[[float, bool], tuple[int, list[Attempt]]],
+    iterate: Callable[[float, bool, bool], tuple[int, list[Attempt]]],
     ahead: float,
     stiffness_changed: bool,
     load_before: Array,
@@ -46,8 +43,9 @@ def solve_in_rounds(
 
     Args:
         equations: What is solved.
-        iterate: A solution, from a start by how much of an increment is ahead, and by whether the
-            bulk's tangent has changed: its reason as SNES has it, and what was tried.
+        iterate: A solution, from a start by how much of an increment is ahead, by whether the
+            bulk's tangent has changed, and by whether friction could not bear the load in the last
+            round: its reason as SNES has it, and what was tried.
         ahead: Size of the increment in units of the last one.
         stiffness_changed: Whether the bulk's tangent is another one than in the last increment.
         load_before: External forces at this rank's unknowns in the committed state (force).
@@ -57,23 +55,18 @@ def solve_in_rounds(
     """
     augmented = [c for c in equations.contacts if c.multipliers is not None]
     if not augmented:
-        return *iterate(ahead, stiffness_changed), 1
+        return *iterate(ahead, stiffness_changed, False), 1
     _shrink(equations, load_before)
     attempts: list[Attempt] = []
-    exact = False
+    exact = overloaded = False
     # The first solutions need not be better than the multipliers they are found with.
     equations.round_rtol = _FIRST_ROUND
     try:
         for number in range(1, _MAX_ROUNDS + 1):
-            start = equations.system.state()
-            reason, tried = iterate(ahead, stiffness_changed)
+            reason, tried = iterate(ahead, stiffness_changed, overloaded)
             _append(attempts, tried)
-            stiff = reason == OVERLOADED and _stiffen(equations, augmented)
-            if stiff:
-                equations.system.set_state(start)
-                reason, tried = iterate(ahead, False)
-                _append(attempts, tried)
-            if reason <= 0:
+            overloaded = reason == OVERLOADED
+            if reason <= 0 and not overloaded:
                 break
             for operator in equations.full.operators:
                 if operator.contact in augmented:
@@ -84,7 +77,9 @@ def solve_in_rounds(
             errors = [c.enforcement_error() for c in augmented]
             worst = max(e / c.tolerance for e, c in zip(errors, augmented, strict=True))
             logger.debug("round %d: errors %s", number, errors)
-            if worst <= 1.0 and exact and not stiff:
+            # Given displacements squeeze a body the less the softer the springs are, and there is
+            # less friction: an overload is none before the multipliers bear what springs cannot.
+            if worst <= 1.0 and (exact or overloaded):
                 break
             ahead, stiffness_changed = 0.0, False
             exact = worst <= _NEARLY
@@ -93,9 +88,7 @@ def solve_in_rounds(
             if number < _MAX_ROUNDS and worst > 1.0:
                 for contact in augmented:
                     contact.augment()
-            _soften(equations, augmented)
     finally:
-        _soften(equations, augmented)
         equations.round_rtol = 0.0
     return reason, attempts, number
 
@@ -121,32 +114,6 @@ def _shrink(equations: Equations, load_before: Array) -> None:
         if _NOTHING * before < now < _FELL * before:
             operator.contact.multipliers.shrink(now / before)
             operator.contact.forget()
-
-
-def _stiffen(equations: Equations, augmented: Sequence[Contact]) -> bool:
-    """Let the springs be stiff for one round, if they are not. Collective.
-
-    Given displacements squeeze a body the less the softer the springs are, and there is less
-    friction: it is the multipliers of later rounds that bear what soft springs cannot.
-
-    Returns:
-        Whether they were soft.
-    """
-    factor = _STIFF / equations.hardness()
-    if factor <= 1.0:
-        return False
-    for contact in augmented:
-        contact.stiffness_factor.value = factor
-    equations.forget_h0()
-    return True
-
-
-def _soften(equations: Equations, augmented: Sequence[Contact]) -> None:
-    """Let the springs be what they were before `_stiffen`."""
-    if any(contact.stiffness_factor.value != 1.0 for contact in augmented):
-        for contact in augmented:
-            contact.stiffness_factor.value = 1.0
-        equations.forget_h0()
 
 
 def _append(attempts: list[Attempt], tried: Sequence[Attempt]) -> None:

@@ -438,15 +438,25 @@ class Solver:
         """
         self.equations.start = np.zeros_like(self.equations.start)
 
-        def iterate(ahead: float, stiffness_changed: bool) -> tuple[int, list[Attempt]]:
-            return self._iterate(ahead, rate, cold, stiffness_changed)
+        def iterate(
+            ahead: float, stiffness_changed: bool, overloaded: bool
+        ) -> tuple[int, list[Attempt]]:
+            return self._iterate(ahead, rate, cold, stiffness_changed, overloaded)
 
         return solve_in_rounds(self.equations, iterate, ahead, stiffness_changed, load_before)
 
     def _iterate(
-        self, ahead: float, rate: Array | None, cold: bool, stiffness_changed: bool
+        self,
+        ahead: float,
+        rate: Array | None,
+        cold: bool,
+        stiffness_changed: bool,
+        overloaded: bool,
     ) -> tuple[int, list[Attempt]]:
         """Iterate from one start after another, then by continuation. Collective.
+
+        Where friction could not bear the load in the round of multipliers before, minimum problems
+        tell soonest whether it can now.
 
         Returns:
             Reason, and what was tried.
@@ -465,7 +475,9 @@ class Solver:
             tries.append((starts[0], _LAST_RESORT))
             if self._hurries:
                 tries = [tries[0], tries[-1], *tries[:-1]]
-        suspected = cold
+        if overloaded:
+            tries.insert(0, (starts[0], "alternating"))
+        suspected = cold or overloaded
         for number, (start, method) in enumerate(tries):
             self.main.enough = _ENOUGH if self._hurries and number == 0 else np.inf
             equations.solution.array[:] = start
