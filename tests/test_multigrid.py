@@ -2,7 +2,6 @@
 
 import logging
 
-import dolfinx
 import numpy as np
 import pytest
 import ufl
@@ -12,8 +11,10 @@ from petsc4py import PETSc
 from scipy.spatial.transform import Rotation
 
 import fenics_contact as fc
+from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.systems import linear
 from scenes.blocks import GRID, LEFT, TOP, block, layers
+from scenes.bodies import boxes
 from scenes.comparing import at_points, close, nodal, raised_everywhere
 from scenes.elasticity import residual
 from scenes.rubbing import PATH, Rub, cushion, walk
@@ -212,25 +213,30 @@ def test_chosen_where_it_is_quicker():
     assert not linear.quicker(100_000, 3, condensed_for=4)
     assert linear.quicker(1_000_000, 3, condensed_for=4)
     assert not linear.quicker(1_000_000, 2)
-    # As many in plates, whose cross-sections have fewer nodes than a cube's.
-    assert not linear.quicker(55_000, 3, slender=3.0)
-    assert linear.quicker(300_000, 3, slender=3.0)
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_a_box_is_as_slender_as_its_sides_say(turned):
-    """a/√(b c), wherever it is and however it is turned.
+def test_bodies_count_as_much_as_they_cost_to_factor(turned):
+    """Boxes a, b, c of n unknowns as cubes of n √(b c)/a, and of several the mean of n^(4/3).
 
-    The nodes of n cells along an edge are spread as (1 + 2/n) says, which is why it is not exact.
+    Wherever they are and however they are turned. The nodes of n cells along an edge are spread as
+    (1 + 2/n) says, which is why it is not exact.
     """
-    sides, cells = np.array([4.0, 2.0, 1.0]), (24, 12, 6)
-    box = dolfinx.mesh.create_box(COMM, [(0, 0, 0), sides], cells)
-    if turned:
-        turn = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
-        box.geometry.x[:] = box.geometry.x @ turn.T + 1e4
-    found = linear.slenderness(fem.functionspace(box, ("Lagrange", 1, (3,))))
-    spread = sides**2 * (1 + 2 / np.array(cells))
-    assert found == pytest.approx(np.sqrt(spread[0] / np.sqrt(spread[1] * spread[2])), rel=1e-9)
+    sides, cells = np.array([4.0, 2.0, 1.0]), np.array([24, 12, 6])
+    lines = [np.linspace(0, side, n + 1) for side, n in zip(sides, cells, strict=True)]
+    coarse = [np.linspace(0, 1, 7) + 10.0 * (axis == 0) for axis in range(3)]
+    spread = sides**2 * (1 + 2 / cells)
+    slender = np.sqrt(spread[0] / np.sqrt(spread[1] * spread[2]))
+    nodes, cubes = np.array([25 * 13 * 7, 7**3]), np.array([25 * 13 * 7 / slender, 7**3])
+    for number, axes in ((1, [lines]), (2, [lines, coarse])):
+        mesh, _ = boxes(axes, {})
+        if turned:
+            turn = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
+            mesh.geometry.x[:] = mesh.geometry.x @ turn.T + 1e4
+        space = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
+        found = linear.cube_size(space, connected_bodies(space)[1])
+        work = nodes[:number] @ cubes[:number] ** (4 / 3) / nodes[:number].sum()
+        assert found == pytest.approx(3 * work ** (3 / 4), rel=1e-9)
 
 
 def test_chosen_by_the_number_of_increments(monkeypatch):

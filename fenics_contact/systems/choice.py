@@ -62,7 +62,7 @@ def obstacle_to_condensation(
         return None
     n_bytes = linear.factor_bytes(n, gdim, symmetric=full.bulk.symmetric)
     obstacle = linear.too_large(n_bytes, unknowns.comm)
-    if not obstacle and linear.quicker(n, gdim, slender=full.slenderness, condensed_for=increments):
+    if not obstacle and linear.quicker(full.size_to_factor, gdim, condensed_for=increments):
         obstacle = f"multigrid is quicker for {n} unknowns"
     return obstacle or None
 
@@ -104,7 +104,7 @@ def linear_kind(
         if not tangent_symmetric:  # L-BFGS keeps the factors of both
             n_bytes += linear.factor_bytes(n, gdim, symmetric=False)
         reason = linear.too_large(n_bytes, full.unknowns.comm) or ""
-        if not reason and linear.quicker(n, gdim, slender=full.slenderness):
+        if not reason and linear.quicker(full.size_to_factor, gdim):
             reason = "it is quicker for as many"
         kind = "multigrid" if reason and not condensed and not named else "direct"
     if kind == "multigrid" and full.unknowns.n_motions:

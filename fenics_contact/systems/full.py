@@ -64,11 +64,14 @@ class FullSystem(System):
         self._moves: Mask = unknowns.joined(moves, np.ones(n_motions)) > 0
         self.stiffness: PETSc.Mat | None = None
         self._near_nullspace: PETSc.NullSpace | None = None
+        self._body = body
 
     @cached_property
-    def slenderness(self) -> float:
-        """`linear.slenderness` of the mesh; 1 in the plane. Collective when first asked for."""
-        return linear.slenderness(self.displacement.u.function_space) if self.gdim == 3 else 1.0
+    def size_to_factor(self) -> float:
+        """`linear.cube_size` of the bodies; in the plane the unknowns. Collective at first."""
+        if self.gdim != 3:
+            return self.unknowns.first_motion
+        return linear.cube_size(self.displacement.u.function_space, self._body)
 
     def update_stiffness(self) -> bool:
         """Assemble the bulk's tangent if it may have changed; True if it did. Collective."""

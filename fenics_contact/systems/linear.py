@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -29,6 +30,7 @@ from fenics_contact.systems.modes import rigid_motions
 
 __all__ = [
     "KINDS",
+    "cube_size",
     "factor_bytes",
     "forget_failure",
     "memory",
@@ -37,7 +39,6 @@ __all__ = [
     "options",
     "quicker",
     "refused_memory",
-    "slenderness",
     "too_large",
     "warn_of_slow_blas",
 ]
@@ -52,8 +53,8 @@ _FACTOR = {2: 75.0, 3: 230.0}
 _LU = 1.8
 # A factor, with all else that is kept, may take this share of the memory.
 _SHARE = 0.5
-# From this many unknowns of a body as long as it is wide and high on multigrid is quicker, in three
-# dimensions. In two MUMPS always is.
+# From this many unknowns of a cube on multigrid is quicker, in three dimensions; in two MUMPS
+# always is.
 _MANY = 30_000
 # One factorisation for a whole load history pays longer: condensed onto Γc, it takes as long as two
 # increments by multigrid at 108,000 unknowns, and as long as four at 200,000.
@@ -175,37 +176,49 @@ def warn_of_slow_blas() -> None:
         )
 
 
-def quicker(n: int, dimension: int, *, slender: float = 1.0, condensed_for: int = 0) -> bool:
+def quicker(n: float, dimension: int, *, condensed_for: int = 0) -> bool:
     """Whether multigrid is quicker than factorisations, by measured cost.
 
-    A factorisation takes n w² operations if w unknowns lie in a cross-section of the mesh, and
-    multigrid some n: what w is, n^(2/3) in a cube, decides. Plates under a bolt
-    (`scenes/bolted_joint.py`), half tightened, then pulled, by L-BFGS, processor time with MUMPS
-    and with GAMG: 33,000 unknowns 7.9 and 12 s, 8.8 and 15; 55,000 17 and 26 s, 20 and 30, which
-    multigrid solves still: fine cells around the bolt make them less slender, 1.6.
+    Plates under a bolt (`scenes/bolted_joint.py`, three bodies, quadratic), one Cholesky
+    factorisation by MUMPS over a solution by conjugate gradients with GAMG: 0.30 at 33,000
+    unknowns, 0.41 at 55,000, 0.60 at 107,000 and 1.02 at 190,000, whose `cube_size` is 29,000.
 
     Args:
-        n: Number of unknowns.
+        n: Number of unknowns in the plane, their `cube_size` in space.
         dimension: Of the mesh.
-        slender: Its `slenderness`.
         condensed_for: The increments that one factorisation serves; 0: it serves none alone.
     """
-    many = max(_MANY, condensed_for * _MANY_PER_INCREMENT)
-    return dimension == 3 and n / slender > many
+    return dimension == 3 and n > max(_MANY, condensed_for * _MANY_PER_INCREMENT)
 
 
-def slenderness(space: fem.FunctionSpace) -> float:
-    """Length over the mean of width and height of a mesh in space, by its nodes. Collective.
+def cube_size(space: fem.FunctionSpace, body: npt.NDArray[np.intp]) -> float:
+    """Unknowns of a cube that takes as many operations for each of them to factor. Collective.
 
-    1 of a cube, a/√(b c) of a box a, b, c with even cells: cross-sections along it have fewer nodes
-    than a cube's of as many, by this to the power 2/3. Turning it changes nothing. At least 1.
+    A factorisation takes n w² operations if w unknowns lie in a cross-section of a body, and
+    multigrid some n. In a cube w is n^(2/3). A body longer than it is wide and high, by s to the
+    mean of both, has as many in its cross-sections as a cube of n / s; and of several bodies, which
+    contact ties together at their sides alone, the mean of w² counts. Turning it changes nothing.
+
+    Args:
+        space: Of the displacement, in space; of its nodes s is told: 1 of a cube, a/√(b c) of a box
+            a, b, c with even cells.
+        body: That of each node, ghosts included.
     """
     comm, dofmap = space.mesh.comm, space.dofmap
-    x = space.tabulate_dof_coordinates()[: dofmap.index_map.size_local]
+    n_owned, n = dofmap.index_map.size_local, dofmap.index_map.size_global
+    x, body = space.tabulate_dof_coordinates()[:n_owned], body[:n_owned]
     # About a place within the mesh, however far that is from the origin.
-    x = x - global_sum(comm, x.sum(axis=0)) / dofmap.index_map.size_global
-    spread = agreed(comm, np.linalg.eigvalsh(global_sum(comm, x.T @ x)))
-    return float(np.sqrt(spread[2] / np.sqrt(spread[0] * spread[1])))
+    x = x - global_sum(comm, x.sum(axis=0)) / n
+    n_bodies = 1 + int(global_max(comm, body.astype(np.float64)))
+    moments = np.zeros((n_bodies, 4, 4))  # of 1 and x, their products summed up
+    np.add.at(moments, body, np.einsum("pi,pj->pij", *[np.insert(x, 0, 1.0, axis=1)] * 2))
+    work = 0.0
+    for moment in agreed(comm, global_sum(comm, moments)):
+        count, first = moment[0, 0], moment[0, 1:]
+        spread = np.linalg.eigvalsh(moment[1:, 1:] - np.outer(first, first) / count)
+        slender = np.sqrt(spread[2] / np.sqrt(spread[0] * spread[1]))
+        work += count * (count / slender) ** (4 / 3)
+    return float(dofmap.bs * (work / n) ** (3 / 4))
 
 
 def near_nullspace(space: fem.FunctionSpace) -> PETSc.NullSpace:
