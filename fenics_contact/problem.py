@@ -500,9 +500,9 @@ class ContactProblem:
             return False
         if any(contact.opposite.pairs_anew for contact in self.contacts):
             return False
-        moved = self._comm.allreduce(int(self._committed.any()))
-        at_rest = self.increment == 0 and not moved
-        return at_rest or self.solver.system.mark in self._then.energy.forces
+        if self.solver.system.mark in self._then.energy.forces:
+            return True
+        return self.increment == 0 and not self._comm.allreduce(int(self._committed.any()))
 
     def _begin_energy_kept(self) -> None:
         """Have the committed forces in the coordinates of the unknowns kept; at rest are none."""

@@ -107,6 +107,7 @@ class RigidMotions:
         self.free: Array = np.zeros((0, len(modes)))
         self.resultant: Array = np.zeros(0)
         self._free_fields: Array = np.zeros((0, unknowns.n_local))
+        self._free_sizes = self._free_fields  # of their entries
         self._balanced: list[Array] = []
         # Masks of points that were found to hold all motions, and of which contacts.
         self._holding: list[Mask] = []
@@ -140,6 +141,7 @@ class RigidMotions:
         self._jumps.clear()
         self.free = _plain(free.T)
         self._free_fields = self.free @ self._modes
+        self._free_sizes = np.abs(self._free_fields)
         self._balanced = []
         self._holding = []
         for vector in (diagonal, work, image):
@@ -285,7 +287,7 @@ class RigidMotions:
 
         But for those by which supports turn: what presses may have no moment.
         """
-        return global_sum(self.comm, self._free_fields[self._straight()] @ forces)
+        return global_sum(self.comm, (self._free_fields @ forces)[self._straight()])
 
     def approach(self, load: Array, operators: Sequence[ContactOperator]) -> Array | None:
         """Rigid motion to first touch, where the load sets free bodies moving. Collective.
@@ -334,10 +336,9 @@ class RigidMotions:
         self.resultant = np.zeros(len(rows))
         if not len(rows):
             return
-        named, free = self.free[rows], self._free_fields[rows]
-        resultant = global_sum(self.comm, free @ load)
+        named, resultant = self.free[rows], self.resultants(load)
         # What the load could do at most, were all of it along the motion: the scale of "zero".
-        size = float(global_sum(self.comm, np.abs(free) @ np.abs(load)).max())
+        size = float(global_sum(self.comm, (self._free_sizes @ np.abs(load))[rows]).max())
         contacts = [operator.contact for operator in operators]
         for operator, contact in zip(operators, contacts, strict=True):
             if not contact.law.has_normal_stiffness:  # a prescribed normal traction is a load

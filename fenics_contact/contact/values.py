@@ -113,7 +113,6 @@ class PointValues:
         normal_stiffness: -∂r_n/∂u_n where closed (stress/length).
         normal_reaction: r_n by the law's own potential, where it has one (stress).
         traction: τ on the body (stress).
-        tangential_stiffness: K_t of a sticking point, (n_points, gdim, gdim) (stress/length).
         grip: Bound of |τ|/p; not zero where motion along Γc is resisted.
         stored: Energy in the springs per area.
         increment: Δu_t since the last commit (length).
@@ -151,7 +150,6 @@ class PointValues:
     normal_stiffness: Array
     normal_reaction: Array
     traction: Array
-    tangential_stiffness: Array
     grip: Array
     stored: Array
     increment: Array
@@ -171,7 +169,7 @@ class PointValues:
 
     @classmethod
     def of(cls, arrays: Mapping[str, Array]) -> PointValues:
-        """Sort arrays by name: "parameter NAME" are parameters, "tangential_stiffness I" rows."""
+        """Sort arrays by name: "parameter NAME" are parameters."""
         n, d = arrays["x"].shape
         parameters = {
             name.removeprefix("parameter "): values
@@ -182,10 +180,6 @@ class PointValues:
         def get(name: str, *shape: int) -> Array:
             return arrays[name] if name in arrays else _everywhere(0.0, (n, *shape))
 
-        stiffness = _everywhere(0.0, (n, d, d))
-        if "tangential_stiffness 0" in arrays:
-            rows = [arrays[f"tangential_stiffness {i}"] for i in range(d)]
-            stiffness = np.stack(rows, axis=1)
         by_penalty = parameters.get("k_n", _everywhere(0.0, (n,)))
         scalars = (
             *("normal_reaction", "grip", "limit", "limit_told", "limit_slope", "dissipated"),
@@ -207,7 +201,6 @@ class PointValues:
             parameters=parameters,
             paired=arrays.get("paired", _everywhere(1.0, (n,))),
             normal_stiffness=arrays.get("normal_stiffness", by_penalty),
-            tangential_stiffness=stiffness,
             slip_increment=get("slip_increment", 0),
             arrays=arrays,
         )
@@ -215,6 +208,15 @@ class PointValues:
     def at(self, points: Mask) -> PointValues:
         """Those of some of the points."""
         return self.of({name: values[points] for name, values in self.arrays.items()})
+
+    @cached_property
+    def tangential_stiffness(self) -> Array:
+        """K_t of a sticking point, (n_points, gdim, gdim) (stress/length)."""
+        n, d = self.x.shape
+        if "tangential_stiffness 0" not in self.arrays:
+            return _everywhere(0.0, (n, d, d))
+        rows = [self.arrays[f"tangential_stiffness {i}"] for i in range(d)]
+        return np.stack(rows, axis=1)
 
     @property
     def gap(self) -> Array:

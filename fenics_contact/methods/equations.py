@@ -219,7 +219,8 @@ class Equations:
         """Evaluate bulk and contacts at ``x``, where the residual was computed last. Collective."""
         residual = self.norms.total
         self.set_state(x)
-        self.full.update_stiffness()
+        if not self._bulk.linear:  # else nothing changes it during a solution
+            self.full.update_stiffness()
         for contact in self.contacts:
             contact.evaluate()
         self.watch.note(residual)

@@ -38,10 +38,11 @@ class Starts:
             before: The state of the full system in which the last increment ended.
         """
         full = self._equations.full
-        change = full.vector()
-        change.array[:] = full.state() - before
-        moved = not full.bulk.linear and change.norm() > 0
-        self._moved = change.array.copy() if moved else None
+        self._moved = None
+        if not full.bulk.linear:
+            change = full.vector()
+            change.array[:] = full.state() - before
+            self._moved = change.array.copy() if change.norm() > 0 else None
 
     def of(self, ahead: float, rate: Array | None, cold: bool) -> list[Array]:
         """Unknowns of the system to start from, nearest to equilibrium first. Collective.

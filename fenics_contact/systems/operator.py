@@ -56,7 +56,8 @@ class ContactOperator:
         self.unknowns = unknowns or Unknowns(displacement.whole.function_space)
         self._gdim = contact.surface.mesh.geometry.dim
         self._first = self.unknowns.first_motion + first_motion
-        self._of_bodies = self.unknowns.widened(displacement.lifted(contact.pairs.jump_map))
+        felt = self.unknowns.widened(displacement.lifted(contact.pairs.jump_map))
+        self._of_bodies = _without_zeros(felt)
         self.within = self._find_within()
         self._motions: PETSc.Mat | None = None
         self._map = self._of_bodies
@@ -172,14 +173,11 @@ class ContactOperator:
         blocks = self.contact.area[:, None, None] * stiffness
         if isinstance(self.unknowns, Selection) and self._turn is None:
             return self._product(blocks)
-        matrix = self._block_diagonal(blocks, self._map)
         if self._turn is None:
-            product = matrix.ptap(self._map)
-        else:
-            present = self._present_map(self._turn)
-            product = matrix.ptap(present)
-            present.destroy()
-        matrix.destroy()
+            return self._sandwiched(blocks, self._map)
+        present = self._present_map(self._turn)
+        product = self._sandwiched(blocks, present)
+        present.destroy()
         return product
 
     def tangent(self, tangent: PointTangent | None = None) -> PETSc.Mat:
@@ -214,10 +212,7 @@ class ContactOperator:
     def _local_tangent(self, by_local: Array, local_map: PETSc.Mat) -> PETSc.Mat:
         """Of pairs that follow the bodies; see `PresentPairs.tangent`. Collective."""
         lifted = self.unknowns.widened(self.contact.displacement.lifted(local_map))
-        blocks = self._block_diagonal(-self.contact.area[:, None, None] * by_local, lifted)
-        product = blocks.ptap(lifted)
-        blocks.destroy()
-        return product
+        return self._sandwiched(-self.contact.area[:, None, None] * by_local, lifted)
 
     # ---- a support that is turned by a moment ----------------------------------------------------
 
@@ -339,6 +334,19 @@ class ContactOperator:
     def _product(self) -> PointProduct:
         return PointProduct(self._map, self._gdim)
 
+    def _sandwiched(self, blocks: Array, felt_map: PETSc.Mat) -> PETSc.Mat:
+        """DᵀBD for one block per point and a map D, a new matrix. Collective.
+
+        By two products, which take half the time of PETSc's own for all three.
+        """
+        inner, across = self._block_diagonal(blocks, felt_map), PETSc.Mat()
+        felt_map.transpose(across)
+        right = inner.matMult(felt_map)
+        product = across.matMult(right)
+        for item in (inner, across, right):
+            item.destroy()
+        return product
+
     def _block_diagonal(self, blocks: Array, over: PETSc.Mat) -> PETSc.Mat:
         """One block per point, (n_points, d, d), over the rows of a matrix."""
         n, d = blocks.shape[:2]
@@ -355,3 +363,15 @@ class ContactOperator:
             ),
             comm=self.contact.surface.mesh.comm,
         )
+
+
+def _without_zeros(matrix: PETSc.Mat) -> PETSc.Mat:
+    """The same matrix without the zeros that are stored in it. Collective.
+
+    Functions of nodes inside of a cell are none on its facets.
+    """
+    pointers, columns, values = matrix.getValuesCSR()
+    there = values != 0.0
+    counts = np.append(0, np.cumsum(there))[pointers].astype(PETSc.IntType)
+    csr = counts, columns[there], values[there]
+    return PETSc.Mat().createAIJ(matrix.getSizes(), csr=csr, comm=matrix.comm)
