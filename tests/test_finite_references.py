@@ -80,7 +80,7 @@ def test_rubber_block_under_a_disc(second_route):
         assert -contact.resultants().force[1] == pytest.approx(expected, rel=1e-7)
         assert bool(step.verdict.routes) == second_route
         iterations += step.iterations
-    assert iterations <= 45  # GetFEM, with its simplest line search: 125
+    assert iterations <= 42  # GetFEM, with its simplest line search: 125
 
 
 def test_rubber_block_pressed_turned_and_dragged():
@@ -117,4 +117,5 @@ def test_rubber_block_pressed_turned_and_dragged():
         found = np.array([x, y, contact.moment(centre)[0] / 4.0])
         wanted = np.array(expected) / (1.0, 1.0, 4.0)
         assert found == pytest.approx(wanted, abs=1e-7 * abs(expected[1]))
-    assert iterations <= 200  # GetFEM: 282
+    # GetFEM: 282; without the tractions of sticking points in the first guesses 170.
+    assert iterations <= 115

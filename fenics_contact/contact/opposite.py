@@ -90,6 +90,7 @@ class Opposite(ABC):
         is_finite: Whether displacements may be of any size.
         is_rigid: Whether it is a rigid support, whose reactions are external to the mesh.
         follows: Whether the pairs follow the bodies wherever they go.
+        carries: Whether it is a support that takes along what sticks to it by any amount.
         pairs_anew: Whether pairs are found anew, on the deformed bodies, at every commit.
         degenerate: Whether Γc has lost its tangent plane somewhere, where pairs follow the bodies.
         local_map: Sparse map from ``u`` to what derivatives at the points are by, where that is
@@ -99,6 +100,7 @@ class Opposite(ABC):
     is_finite = False
     is_rigid = True
     follows = False
+    carries = False
 
     def __init__(
         self,
@@ -281,17 +283,37 @@ class Opposite(ABC):
         Args:
             values: Of the last evaluation.
         """
+        return self._angle(values.arrays)
+
+    def _angle(self, arrays: Mapping[str, Array]) -> float:
+        """`angle`, of arrays at the points. Collective."""
         inputs = self._parts.inputs
         if inputs.free_angle is not None:
             return float(inputs.free_angle.value)
         if inputs.angle is None:
             return 0.0
         # The same at all points.
-        return global_max(self._mesh.comm, values.arrays["angle"])
+        return global_max(self._mesh.comm, arrays["angle"])
 
     def turned_by(self, values: PointValues) -> float:
         """By which the support has turned since the last commit (radians). Collective."""
         return self.angle(values) - self.committed_angle
+
+    def carried(self, values: PointValues, traction: Array) -> tuple[Array, Array]:
+        """What a support that has moved since a state would do to points that stuck. Collective.
+
+        Args:
+            values: Of that state, with ``u`` as it is now.
+            traction: Then, (n_points, gdim) (stress).
+
+        Returns:
+            The way from where they are to where it would have taken them, (n_points, gdim)
+            (length), and the traction, turned with it.
+
+        Raises:
+            ValueError: It does not; see `carries`.
+        """
+        raise ValueError(f"{self._parts.name}: what lies opposite carries nothing")
 
     def turning_rate(self) -> Array:
         """Way by a unit angle of the support's points where those of Γc are now. Collective.

@@ -61,6 +61,7 @@ class MovingOpposite(Opposite):
     """A rigid support that may move and turn by any amount, seen from where Γc is now."""
 
     is_finite = True
+    carries = True
 
     def __init__(self, parts: Parts) -> None:
         """Place it, and see it from moving points. Collective.
@@ -125,6 +126,16 @@ class MovingOpposite(Opposite):
     def turned(self, vectors: Array) -> Array:
         """See `Opposite`: of the frame of the support."""
         return self._view.turned(vectors)
+
+    def carried(self, values: PointValues, traction: Array) -> tuple[Array, Array]:
+        """See `Opposite`."""
+        self.update()
+        way = self.turned(values.jump - self._view.values("relative"))
+        rotation = self._parts.support.rotation
+        if rotation is not None:
+            turn = self._angle(self.data.values) - self.angle(values)
+            traction = rotation.turned(traction, turn)
+        return way, traction
 
     def slope(self, values: PointValues) -> Array:
         """See `Opposite`."""

@@ -504,6 +504,8 @@ class Solver:
         newton = by_newton and not self._quasi_newton
         made = sum(attempt.iterations for attempt in attempts[-1:])
         self.starts.predict = reason > 0 and newton and (factored or made > 0)
+        if self.starts.predict:
+            self.starts.keep()
         return int(reason), attempts
 
     def _is_overloaded(self) -> bool:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from fenics_contact.contact.point_law import PointTangent
+from fenics_contact.contact.values import PointValues
 from fenics_contact.methods.equations import Equations
+from fenics_contact.parallel import global_max
 from fenics_contact.systems import dense, linear
 from fenics_contact.types import Array
 
@@ -16,6 +21,25 @@ _FAR = 100.0
 # By how much a step makes the residual larger where the load has turned round: 4 measured in
 # fretting. Where contact grows it does so too, and the step goes on in the direction of the last.
 _TURNED = 2.0
+
+
+# Γc is where a solution was found if its points are there to this share of the size of the mesh.
+_THERE = 1e-10
+
+
+@dataclass(frozen=True)
+class _Borne:
+    """What a contact bore in a solution.
+
+    Attributes:
+        values: At the points.
+        tangent: Of the tractions there.
+        displacement: Of the points, (n_points, gdim) (length).
+    """
+
+    values: PointValues
+    tangent: PointTangent
+    displacement: Array
 
 
 class Starts:
@@ -30,6 +54,7 @@ class Starts:
         self.predict = False
         self._equations = equations
         self._moved: Array | None = None  # of the values prescribed, since the last increment
+        self._borne: list[_Borne] = []  # by contact, in the solution found last
 
     def moved_from(self, before: Array) -> None:
         """Take note of how far the values prescribed now have moved. Collective.
@@ -44,14 +69,29 @@ class Starts:
             change.array[:] = full.state() - before
             self._moved = change.array.copy() if change.norm() > 0 else None
 
+    def keep(self) -> None:
+        """Take note of what contacts bear in the solution that was just found. Collective.
+
+        Supports that move by the next increment take those points along that stick, and no others.
+        """
+        self._borne = []
+        contacts = self._equations.contacts
+        if self._equations.full.bulk.linear or not any(c.opposite.carries for c in contacts):
+            return
+        for contact in contacts:
+            contact.evaluate()
+            displacement = contact.opposite.present_jump()
+            self._borne.append(_Borne(contact.values, contact.acting.tangent(), displacement))
+
     def of(self, ahead: float, rate: Array | None, cold: bool) -> list[Array]:
         """Unknowns of the system to start from, nearest to equilibrium first. Collective.
 
         The present state; that state moved on by as much as the last increment moved it: in
         proportional loading that is the solution; that state with one step of Newton's method on
-        the tangent of the last solution; with a nonlinear bulk what `_followed` finds; and the
-        state moved, or the present one, with supports that turn freely rolled to where they are
-        now: where all points would slip no tangent tells by how much.
+        the tangent of the last solution; with a nonlinear bulk what `_followed` finds, or
+        `_carried` where no values prescribed have moved; and the state moved, or the present one,
+        with supports that turn freely rolled to where they are now: where all points would slip no
+        tangent tells by how much.
 
         At the present state itself no point has slipped yet, and all closed ones stick: from there
         Newton's method takes ten steps to let them slip again, one after another from the edge of
@@ -89,7 +129,7 @@ class Starts:
         predicts = self.predict and not cold
         self.predict = False
         first = None
-        if predicts:
+        if predicts and (self._moved is not None or equations.full.bulk.linear):
             step = self._predicted if self._moved is None else self._followed
             first = add(step(present))
         last = None
@@ -102,9 +142,9 @@ class Starts:
                 moved = starts[add(self._followed(present, anew=True))]
             else:
                 moved = starts[first]
-        elif not equations.full.bulk.linear:
-            # It does not come back from far off: a support moved into open points.
-            first = None
+        elif predicts and ahead and not equations.full.bulk.linear:
+            carried = self._carried(present)
+            first = None if carried is None else add(carried)
         self._moved = None
         if ahead and any(c.free_angle is not None for c in equations.contacts):
             add(system.rolled(moved))
@@ -166,6 +206,61 @@ class Starts:
         full.set_state(present)
         full.update_stiffness()
         return present + step.array_r if found else present
+
+    def _carried(self, present: Array) -> Array | None:
+        """Where supports that have moved take the body, by one step from before. Collective.
+
+        On the tangent factored last, with the tractions that points would have if those that stuck
+        still did, and all others bore what they bore: in the residual at the present state a
+        support is deep in points that were open, and nothing sticks to it any more.
+
+        Returns:
+            The state; None where no support has moved, or no step is found.
+        """
+        equations = self._equations
+        equations.system.set_state(present)
+        tractions = self._tractions()
+        if tractions is None:
+            return None
+        forces, step = equations.system.vector(), equations.system.vector()
+        forces.array[:] = equations.system.bulk_force()
+        for operator, traction in zip(equations.system.operators, tractions, strict=True):
+            operator.add_force(forces, traction)
+        forces.array[equations.system.constrained] = 0.0
+        forces.scale(-1.0 / equations.full.bulk.scale)
+        ksp = equations.solvers[True]
+        ksp.solve(forces, step)
+        found = ksp.getConvergedReason() > 0
+        linear.forget_failure(ksp.getPC())
+        moved = np.asarray(present + step.array_r) if found else None
+        for vector in (forces, step):
+            vector.destroy()
+        return moved
+
+    def _tractions(self) -> list[Array] | None:
+        """Those of the last solution, as moved supports would change them to first order.
+
+        Collective.
+
+        Returns:
+            (n_points, gdim) (stress) for every contact; None: no support has moved, or Γc is not
+            where they were found.
+        """
+        equations, tractions, moved = self._equations, [], False
+        comm = equations.full.unknowns.comm
+        if not self._borne:
+            return None
+        for contact, borne in zip(equations.contacts, self._borne, strict=True):
+            opposite, traction = contact.opposite, borne.values.total_traction
+            change = np.abs(opposite.present_jump() - borne.displacement)
+            if global_max(comm, change) > _THERE * equations.length:
+                return None
+            if opposite.carries:
+                way, turned = opposite.carried(borne.values, traction)
+                moved = moved or global_max(comm, np.abs(way)) > 0.0
+                traction = turned - np.einsum("qij,qj->qi", borne.tangent.by_jump, way)
+            tractions.append(traction)
+        return tractions if moved else None
 
     def _predicted(self, present: Array) -> Array:
         """One Newton step on the tangent factored last; the residual is there. Collective."""
