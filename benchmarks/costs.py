@@ -178,16 +178,19 @@ def newton(
     bcs: Sequence[fem.DirichletBC],
     size: float,
     kind: str = "direct",
+    *,
+    lift: bool = False,
 ) -> Row:
-    """Newton's method on a form with contact in it, from the present u. Collective.
+    """Newton's method on a form, from the present u. Collective.
 
     Args:
         F: Residual.
         u: Displacement.
-        bcs: Conditions that u meets.
+        bcs: Conditions, which u meets unless the first step is to ``lift`` it to them.
         size: Of the forces; the residual gets `TOLERANCE` of it, as in the package.
         kind: "direct": LU by MUMPS; "multigrid": GMRES with GAMG, told of the rigid motions, to
             PETSc's default of 1e-5 of the residual.
+        lift: See ``bcs``.
     """
     residual = fem.form(F)
     tangent = fem.form(ufl.derivative(F, u, ufl.TrialFunction(u.function_space)))
@@ -199,6 +202,8 @@ def newton(
         with f.localForm() as local:
             local.set(0.0)
         fem.petsc.assemble_vector(f, residual)
+        if lift:
+            fem.petsc.apply_lifting(f, [tangent], [bcs], [x], alpha=-1.0)
         f.ghostUpdate(*_REVERSE)
         fem.petsc.set_bc(f, bcs, x, alpha=-1.0)
 

@@ -80,6 +80,25 @@ def speed_up(run: str, size: int) -> Callable[[Rows], tuple[float, str]]:
     return measure
 
 
+def newton_steps(scene: str, friction: str, beside: str) -> Callable[[Rows], tuple[float, str]]:
+    """Newton steps with contact over those of the bulk alone, of `benchmarks/finite.py`.
+
+    Args:
+        scene: As it is called there.
+        friction: μ.
+        beside: "plain" or "prescribed": by what the bulk alone is solved.
+    """
+
+    def measure(rows: Rows) -> tuple[float, str]:
+        for row in rows:
+            if (row["scene"], float(row["μ"]), row["run"]) == (scene, float(friction), "contact"):
+                note = f"{row['Newton steps']} steps, {row['dofs']} dofs"
+                return float(row[f"steps / {beside}"]), note
+        raise LookupError(scene)
+
+    return measure
+
+
 def worst(ranks: int) -> Callable[[Rows], tuple[float, str]]:
     """Most linear solves of an increment that has a solution, on a number of ranks."""
 
@@ -129,6 +148,13 @@ def _all() -> list[Target]:
         scene = f"plates under a bolt, each increment, {ranks} rank{'s' * (ranks > 1)}"
         joint = "bolted_joint/bolted_joint.csv"
         found.append(Target(scene, "time / linear solve", joint, worst(ranks), 3.0))
+    for what in ("disc", "two bodies"):
+        for friction in ("0", "0.3"):
+            scene = f"rubber at large strains, {what}, μ = {friction}"
+            for beside, name in (("plain", "plain DOLFINx's"), ("prescribed", "the package's")):
+                steps = newton_steps(what, friction, beside)
+                target = f"Newton steps / {name} without contact"
+                found.append(Target(scene, target, "finite/finite.csv", steps, 1.3))
     large, million = "large/large.csv", 1_000_000
     scene = "ball on a block, a million dofs"
     one = ratio("contact", "linear, multigrid", million)

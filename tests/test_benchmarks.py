@@ -94,8 +94,15 @@ def made_up(folder: Path, slower: float) -> None:
         for p, most in ((1, 2.5 * slower), (2, 2.0 * slower))
         for way, many in (("lbfgs", most), ("newton", 0.5), ("refused: overload", 90.0))
     ]
+    ratios = {"steps / plain": 1.1 * slower, "steps / prescribed": 1.2 * slower}
+    rubber = [
+        {"scene": scene, "μ": mu, "dofs": 5_330, "run": run, "Newton steps": 67, **ratios}
+        for scene in ("disc", "two bodies")
+        for mu in (0.0, 0.3)
+        for run in ("contact", "prescribed")
+    ]
     tables = {"half_cylinder": cylinder, "ball": ball, "large": big, "ranks": plane}
-    tables |= {"tagged": tagged, "bolted_joint": joint}
+    tables |= {"tagged": tagged, "bolted_joint": joint, "finite": rubber}
     for name, rows in tables.items():
         (folder / name).mkdir(exist_ok=True)
         timing.save(folder / name / f"{name}.csv", rows)
@@ -108,8 +115,8 @@ def test_targets(tmp_path: Path) -> None:
     assert {row["met"] for row in targets.table(tmp_path)} == {targets.NOT_MEASURED}
     made_up(tmp_path, 1.0)
     rows = targets.table(tmp_path)
-    expected = [0.9, 0.1, 1.2, 0.1, 1.9, 2.4, 0.16, 0.5, 1.8, 2.5, 2.0, 5.0, 5.4, 2, 2, 2]
-    expected += [10 / 6, 10 / 6]
+    expected = [0.9, 0.1, 1.2, 0.1, 1.9, 2.4, 0.16, 0.5, 1.8, 2.5, 2.0]
+    expected += [1.1, 1.2] * 4 + [5.0, 5.4, 2, 2, 2, 10 / 6, 10 / 6]
     assert [row["measured"] for row in rows] == pytest.approx(expected)
     assert {row["met"] for row in rows} == {"yes"}
     assert "error of peak [%] 1" in next(r["with"] for r in rows if r["scene"].startswith("ball"))
@@ -309,19 +316,18 @@ def test_a_history_of_pressing_takes_few_iterations() -> None:
 
 
 def test_contact_at_large_strains_costs_few_newton_steps(tmp_path: Path) -> None:
-    """Steps are counts, the same on every machine: twice those of the bulk alone without friction.
+    """Steps are counts, the same on every machine: over SNES on the bulk alone, a third more.
 
-    With friction three times: while points begin to slip, Newton's method looks for those that do.
+    Measured: 1.07 and 1.19 under a disc, 1.22 and 1.35 between two bodies, without friction and
+    with it; over the package's own on the bulk alone 1.6 to 2.0.
     """
     command = [sys.executable, str(ROOT / "benchmarks" / "finite.py"), "--short"]
     subprocess.run(
         [*command, "--output", str(tmp_path)], check=True, env=environment(), timeout=120
     )
     with open(tmp_path / "finite.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    ratios = {
-        (float(row["μ"]), row["run"]): float(row["steps / prescribed"])
-        for row in rows  # on the coarser mesh: 1.75 and 2.72
-    }
-    assert ratios[0.0, "contact"] < 2 and ratios[0.3, "contact"] < 3
-    assert ratios[0.0, "prescribed"] == ratios[0.3, "prescribed"] == 1
+        rows = [row for row in csv.DictReader(file) if row["run"] == "contact"]
+    ratios = {(row["scene"], float(row["μ"])): float(row["steps / plain"]) for row in rows}
+    assert ratios["disc", 0.0] < 1.2 and ratios["disc", 0.3] < 1.3
+    assert ratios["two bodies", 0.0] < 1.3 and ratios["two bodies", 0.3] < 1.45
+    assert max(float(row["steps / prescribed"]) for row in rows) < 2.2

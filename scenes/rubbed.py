@@ -1,0 +1,119 @@
+"""A small block of rubber with a rounded lower side, pressed on another one and dragged along it.
+
+Plane strain: lower block [0, 6] x [0, 2], its bottom held; upper one [0.6, 2.6] x [2, 3], whose
+lower side is rounded off by 0.3 at both ends, its top led. Γc is the lower side of the upper one,
+whose cells are the finer ones. Both are neo-Hookean, W = G/2 (I₁ - 3 - 2 ln J) + λ/4 (J² - 1 - 2 ln
+J), the upper one twice as stiff. The geometry is simple enough to be given to other programs.
+"""
+
+from __future__ import annotations
+
+import dolfinx
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import CellType
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact import compat
+from fenics_contact.elasticity import NeoHookean
+from fenics_contact.types import Array
+from scenes.meshes import mesh_of
+from scenes.tags import between, near, tagged
+
+BOTTOM, TOP, LOWER, UPPER, SIDE = 1, 2, 3, 4, 5
+# Origin, size, cells along and up, modulus.
+BLOCKS = (((0.0, 0.0), (6.0, 2.0), (24, 8), 1000.0), ((0.6, 2.0), (2.0, 1.0), (12, 6), 2000.0))
+NU, ROUND = 0.3, 0.3
+K_N, K_T = 2e4, 2e4
+PRESSED, DRAGGED = 4, 20  # increments
+DOWN, WAY = 0.2, 1.6
+PATH = (
+    *((0.0, DOWN * i / PRESSED) for i in range(1, PRESSED + 1)),
+    *((WAY * i / DRAGGED, DOWN) for i in range(1, DRAGGED + 1)),
+)
+
+
+def rubbed_mesh(fine: int = 1) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
+    """Both blocks in one mesh, and the tags of their facets. Collective.
+
+    Args:
+        fine: By how much cells are smaller than in `BLOCKS`.
+    """
+    x, cells, offset = [], [], 0
+    for number, (origin, size, n, _) in enumerate(BLOCKS):
+        corners = [np.array(origin), np.array(origin) + size]
+        counts = tuple(fine * k for k in n)
+        block = dolfinx.mesh.create_rectangle(
+            MPI.COMM_SELF, corners, counts, CellType.quadrilateral
+        )
+        places = block.geometry.x[:, :2].copy()
+        if number:
+            middle, high = origin[0] + size[0] / 2, origin[1] + size[1]
+            share = (high - places[:, 1]) / size[1]
+            places[:, 1] += ROUND * share * ((places[:, 0] - middle) / (size[0] / 2)) ** 2
+        x.append(places)
+        cells.append(compat.geometry_dofmap(block) + offset)
+        offset += len(places)
+    mesh = mesh_of("quadrilateral", np.concatenate(x), np.concatenate(cells))
+    low, high = BLOCKS[0][1][1], BLOCKS[0][1][1] + BLOCKS[1][1][1]
+    ends = BLOCKS[1][0][0], BLOCKS[1][0][0] + BLOCKS[1][1][0]
+
+    def rounded(at: Array, cell: Array) -> Array:
+        upright = np.any([np.abs(at[:, 0] - end) < 1e-9 for end in ends], axis=0)
+        return (cell[:, 1] > low) & ~upright & (at[:, 1] < high - 1e-9)
+
+    faces = {
+        BOTTOM: near(1, 0.0),
+        TOP: near(1, high),
+        LOWER: between(1, low, above=False),
+        UPPER: rounded,
+        SIDE: near(0, 0.0),
+    }
+    return mesh, tagged(mesh, faces)
+
+
+class Rubbed:
+    """The blocks, and one contact between them.
+
+    Attributes:
+        u: Displacement, quadratic.
+        residual: Of the bulk.
+        bcs: Conditions at `BOTTOM` and `TOP`.
+        contact: The contact.
+        tags: Of the facets.
+    """
+
+    def __init__(self, friction: float, fine: int = 1) -> None:
+        """Set it up. Collective.
+
+        Args:
+            friction: μ; 0: none.
+            fine: See `rubbed_mesh`.
+        """
+        mesh, self.tags = rubbed_mesh(fine)
+        V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
+        self.u = fem.Function(V)
+        modulus = fem.Function(fem.functionspace(mesh, ("DG", 0)))
+        middles = dolfinx.mesh.compute_midpoints(
+            mesh, 2, np.arange(modulus.x.array.size, dtype=np.int32)
+        )
+        # Of `DG 0` the dofs are the cells.
+        modulus.x.array[:] = np.where(middles[:, 1] < BLOCKS[0][1][1], BLOCKS[0][3], BLOCKS[1][3])
+        body = NeoHookean(self.u, modulus, NU, "plane strain")
+        dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4})
+        self.residual = body.residual(ufl.TestFunction(V), dx)
+        self._top = fem.Constant(mesh, np.zeros(2))
+        self.bcs = [
+            fem.dirichletbc(value, fem.locate_dofs_topological(V, 1, self.tags.find(tag)), V)
+            for tag, value in ((BOTTOM, fem.Constant(mesh, np.zeros(2))), (TOP, self._top))
+        ]
+        law = fc.Coulomb(friction, K_N, K_T) if friction else fc.Frictionless(K_N)
+        surface = fc.ContactSurface(mesh, self.tags, UPPER)
+        opposite = fc.DeformableBody(self.tags, LOWER)
+        self.contact = fc.Contact(self.u, surface, opposite, law, kinematics="finite")
+
+    def lead(self, along: float, down: float) -> None:
+        """Move the top of the upper block."""
+        self._top.value[:] = along, -down
