@@ -1,0 +1,193 @@
+"""A block of rubber dragged over another one, by GetFEM, for `tests/test_finite_references.py`.
+
+    python3 verification/getfem_two_bodies.py                    # by penalty, with μ = 0.3
+    python3 verification/getfem_two_bodies.py --frictionless     # needs GetFEM 5.4, on Debian
+    python3 verification/getfem_two_bodies.py --brick            # python3-getfem
+
+The scene of scenes/rubbed.py, mesh and elements as there: biquadratic cells, three Gauss points
+along each side of them. Points of the upper block find their partners by GetFEM's raytracing.
+
+By penalty: p = k ⟨-g⟩ per undeformed length of the upper block's lower side, g the way to the lower
+block along its present normal n, and friction -q times the slip since the last increment, added to
+what it was, and no more than μ p. Slip is t₀·(u - w + g (n - n₀)), u less w at both ends of the
+ray: w and n₀, t₀ are displacement, normal and tangent of the last increment. All derivatives are
+GetFEM's. With ``--brick`` its own brick for large sliding does all that, with multipliers that are
+linear along the side: an augmented Lagrangian, without penetration where these are tested. Newton's
+method takes full steps; with the line search "simplest" it takes 26 to 38 of them an increment.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import getfem as gf  # no dependency: this script and getfem_disc.py alone need it
+import numpy as np
+
+NU, ROUND, K, KT, MU = 0.3, 0.3, 2e4, 2e4, 0.3
+BLOCKS = (((0.0, 0.0), (6.0, 2.0), (24, 8), 1000.0), ((0.6, 2.0), (2.0, 1.0), (12, 6), 2000.0))
+PRESSED, DRAGGED, DOWN, WAY = 4, 20, 0.2, 1.6
+HELD, CONTACT = 1, 2
+RAY = 0.5  # release distance
+LOWER, UPPER = 0, 1
+
+
+def block(number: int) -> tuple[gf.Mesh, gf.MeshFem, gf.MeshIm]:
+    """One of the blocks: its mesh, displacements and points."""
+    origin, size, n, _ = BLOCKS[number]
+    # Bilinear cells: those of "cartesian" meshes are affine, and stay so when points are moved.
+    shape = f"ORG={list(origin)};SIZES={list(size)};NSUBDIV={list(n)}"
+    mesh = gf.Mesh("import", "structured", f"GT='GT_QK(2,1)';{shape}")
+    at, far = 1e-6, 1e3
+    low, high = origin[1], origin[1] + size[1]
+    ends = [[-far, low - at], [far, low + at]], [[-far, high - at], [far, high + at]]
+    held, contact = ends if number == LOWER else ends[::-1]
+    mesh.set_region(HELD, mesh.outer_faces_in_box(*held))
+    mesh.set_region(CONTACT, mesh.outer_faces_in_box(*contact))
+    if number == UPPER:
+        places = mesh.pts()
+        middle = origin[0] + size[0] / 2
+        share = (high - places[1]) / size[1]
+        places[1] += ROUND * share * ((places[0] - middle) / (size[0] / 2)) ** 2
+        mesh.set_pts(places)
+    space = gf.MeshFem(mesh, 2)
+    space.set_classical_fem(2)
+    return mesh, space, gf.MeshIm(mesh, gf.Integ("IM_GAUSS_PARALLELEPIPED(2,4)"))
+
+
+def bulk(model: gf.Model, rule: gf.MeshIm, name: str, modulus: float) -> None:
+    """The block's energy."""
+    shear, lame = modulus / (2 * (1 + NU)), modulus * NU / ((1 + NU) * (1 - 2 * NU))
+    gradient = f"(Id(2)+Grad_{name})"
+    model.add_nonlinear_term(
+        rule,
+        f"{shear!r}/2*(Norm_sqr{gradient}+1-3-2*log(Det{gradient}))"
+        f"+{lame!r}/4*(sqr(Det{gradient})-1-2*log(Det{gradient}))",
+    )
+
+
+class ByPenalty:
+    """Penalty and friction written by hand on GetFEM's raytracing."""
+
+    def __init__(self, model: gf.Model, blocks: list, mu: float) -> None:
+        """Add them to the model."""
+        (mesh2, space2, _), (mesh1, space1, self.rule) = blocks
+        self.model, self.mu = model, mu
+        model.add_raytracing_transformation("ray", RAY)
+        model.add_master_contact_boundary_to_raytracing_transformation("ray", mesh2, "u2", CONTACT)
+        model.add_slave_contact_boundary_to_raytracing_transformation("ray", mesh1, "u1", CONTACT)
+        for name, value in {"k": K, "q": KT, "mu": mu}.items():
+            model.add_initialized_data(name, [value])
+        model.add_fem_data("w1", space1)
+        model.add_fem_data("w2", space2)
+        self.points = gf.MeshImData(self.rule, CONTACT)
+        model.add_im_data("borne", self.points)
+        n, n0 = (f"Transformed_unit_vector(Grad_{v}1,Normal)" for v in "uw")
+        gap = f"((Interpolate(X,ray)+Interpolate(u2,ray)-X-u1).{n})"
+        pressure = f"(k*neg_part({gap}))"
+        way = f"(u1-w1-Interpolate(u2,ray)+Interpolate(w2,ray)+{gap}*({n}-{n0}))"
+        trial = f"(borne-q*({way}.([0,-1;1,0]*{n0})))"
+        bound = f"(mu*{pressure})"
+        self.friction = f"({trial}-pos_part({trial}-{bound})+neg_part({trial}+{bound}))"
+        self.traction = f"(-{pressure}*{n}+{self.friction}*([0,-1;1,0]*{n}))"
+        if not mu:
+            self.traction = f"(-{pressure}*{n})"
+        term = f"-{self.traction}.(Test_u1-Interpolate(Test_u2,ray))"
+        model.add_nonlinear_term(self.rule, f"Interpolate_filter(ray,{term},1)", CONTACT)
+
+    def force(self) -> np.ndarray:
+        """On the upper block."""
+        return np.array(
+            [
+                gf.asm(
+                    "generic",
+                    self.rule,
+                    0,
+                    f"Interpolate_filter(ray,{self.traction}({i}),1)",
+                    CONTACT,
+                    self.model,
+                )
+                for i in (1, 2)
+            ]
+        )
+
+    def keep(self) -> None:
+        """Let the present state be the committed one."""
+        model = self.model
+        if self.mu:
+            told = f"Interpolate_filter(ray,{self.friction},1)"
+            found = model.interpolation(told, self.points, CONTACT)
+            model.set_variable("borne", found)
+        for i in "12":
+            model.set_variable("w" + i, model.variable("u" + i))
+
+
+class ByBrick:
+    """GetFEM's brick for large sliding, with multipliers on the upper block."""
+
+    def __init__(self, model: gf.Model, blocks: list, mu: float) -> None:
+        """Add it to the model."""
+        (_, space2, rule2), (mesh1, space1, self.rule) = blocks
+        self.model = model
+        linear = gf.MeshFem(mesh1, 2)
+        linear.set_classical_fem(1)
+        model.add_filtered_fem_variable("m", linear, CONTACT)
+        for name, value in {"r": 1e3, "mu": mu, "alpha": 1.0}.items():
+            model.add_initialized_data(name, [value])
+        model.add_fem_data("w1", space1)
+        model.add_fem_data("w2", space2)
+        brick = model.add_integral_large_sliding_contact_brick_raytracing(
+            "r", RAY, "mu", "alpha", 0
+        )
+        model.add_slave_contact_boundary_to_large_sliding_contact_brick(
+            brick, self.rule, CONTACT, "u1", "m", "w1"
+        )
+        model.add_master_contact_boundary_to_large_sliding_contact_brick(
+            brick, rule2, CONTACT, "u2", "w2"
+        )
+
+    def force(self) -> np.ndarray:
+        """On the upper block."""
+        return np.array(
+            [gf.asm("generic", self.rule, 0, f"m({i})", CONTACT, self.model) for i in (1, 2)]
+        )
+
+    def keep(self) -> None:
+        """Let the present state be the committed one."""
+        for i in "12":
+            self.model.set_variable("w" + i, self.model.variable("u" + i))
+
+
+def main() -> None:
+    """Solve and print."""
+    gf.util_trace_level(0)
+    gf.util_warning_level(0)
+    start, clock = time.process_time(), time.perf_counter()
+    mu = 0.0 if "--frictionless" in sys.argv else MU
+    blocks = [block(LOWER), block(UPPER)]
+    model = gf.Model("real")
+    for name, (_, space, rule), (_, _, _, modulus) in zip(
+        ("u2", "u1"), blocks, BLOCKS, strict=True
+    ):
+        model.add_fem_variable(name, space)
+        bulk(model, rule, name, modulus)
+    model.add_initialized_data("led", [0.0, 0.0])
+    model.add_Dirichlet_condition_with_simplification("u2", HELD)
+    model.add_Dirichlet_condition_with_multipliers(blocks[UPPER][2], "u1", 2, HELD, "led")
+    contact = (ByBrick if "--brick" in sys.argv else ByPenalty)(model, blocks, mu)
+    path = [(0.0, DOWN * i / PRESSED) for i in range(1, PRESSED + 1)]
+    path += [(WAY * i / DRAGGED, DOWN) for i in range(1, DRAGGED + 1)]
+    iterations = []
+    for along, down in path:
+        model.set_variable("led", [along, -down])
+        made, _ = model.solve("max_iter", 100, "max_res", 1e-9, "lsearch", "basic")
+        iterations.append(int(made))
+        found = contact.force()
+        contact.keep()
+        print(f"({found[0]:.6f}, {found[1]:.6f}),  # {made}", flush=True)
+    spent, waited = time.process_time() - start, time.perf_counter() - clock
+    print(f"{sum(iterations)} Newton iterations, {spent:.2f} s of the processor, {waited:.2f} s")
+
+
+if __name__ == "__main__":
+    main()
