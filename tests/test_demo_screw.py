@@ -1,0 +1,34 @@
+"""The screw demo, run as its user runs it, against textbooks' torque of a square thread."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from scenes.processes import run_demo, values
+
+pytestmark = [
+    pytest.mark.demo,
+    pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own"),
+]
+
+
+def test_torque_over_axial_force(tmp_path: Path) -> None:
+    """F P without friction, which all points meet by their normals; F R tan(α ± φ) with μ = 0.2.
+
+    To round-off, and to 3e-4 of F R: pressures whose middle is by a hundredth of the width off that
+    of the block change friction's part, μ = 0.2, by a thousandth.
+    """
+    result = run_demo("screw", tmp_path, "--friction", "0.2", "--cells", "3")
+    found = values(result)
+    alpha, phi = np.arctan(0.3), np.arctan(0.2)
+    assert found["no friction: largest of |M / (F P) - 1|"] < 1e-9
+    assert found["raising, M / (F R)"] == pytest.approx(np.tan(alpha + phi), abs=3e-4)
+    assert found["lowering, M / (F R)"] == pytest.approx(np.tan(alpha - phi), abs=3e-4)
+    assert all(row["force"] > 0.5 for row in result["path"][1:])
+    assert [result["path"][i]["stick"] for i in (13, -1)] == [0, 0]
+    for name in ("screw.png", "pressure.png"):
+        assert (tmp_path / name).read_bytes()[:4] == b"\x89PNG"
