@@ -1,6 +1,7 @@
 """What notebooks show: well-formed tables with the object's numbers, and no markup of a name's."""
 
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,7 +48,7 @@ def test_a_step(solved):
     assert [shown[s] for s in ("stick", "slip", "open")] == [
         str(n) for n in (r.stick, r.slip, r.open)
     ]
-    assert f"{step.iterations} iterations" in remark
+    assert remark.startswith(f"{step.method}: ")
     # Friction is against the motion everywhere here, and the ball's flanks press aside.
     text = step.summary()
     assert (
@@ -55,6 +56,21 @@ def test_a_step(solved):
         in text
     )
     assert abs(abs(force[0]) - r.tangential_force) > 1e-3 * r.tangential_force
+
+
+@pytest.mark.parametrize(
+    ("iterations", "told"),
+    [
+        (0, "solved by its first guess"),
+        (1, "1 iteration"),
+        (7, "7 iterations"),
+    ],
+)
+def test_iterations_are_told_in_words(solved, iterations, told):
+    """By the line and by the table alike."""
+    step = replace(solved[1], iterations=iterations, method="newton")
+    for text in (step.summary(), table(step)[2][0]):
+        assert f"newton: {told}; residual" in text
 
 
 def test_a_verdict(solved):

@@ -66,8 +66,7 @@ class Step:
         parts = [f"increment {self.increment}"]
         if self.load is not None:
             parts.append(f"load {self.load:.6g}")
-        made = f"{self.iterations} iterations" if self.iterations else "solved by its first guess"
-        parts.append(f"{self.method}: {made}")
+        parts.append(self._made())
         residual, force = self.verdict.relative_residual, self.verdict.force
         parts.append(f"residual {residual:.1e} of the forces" if force > 0 else "no forces")
         for name, r in self.contacts.items():
@@ -77,6 +76,12 @@ class Step:
                 f"area {r.area:.4g}, {r.stick} stick {r.slip} slip {r.open} open"
             )
         return "; ".join(parts)
+
+    def _made(self) -> str:
+        """By which method, and in how many iterations."""
+        if not self.iterations:
+            return f"{self.method}: solved by its first guess"
+        return f"{self.method}: {self.iterations} iteration{'s' if self.iterations > 1 else ''}"
 
     def _repr_html_(self) -> str:
         """The same as a table, for notebooks."""
@@ -95,10 +100,7 @@ class Step:
             )
             for name, r in self.contacts.items()
         ]
-        remarks = [
-            f"{self.method}: {self.iterations} iterations; residual "
-            f"{self.verdict.relative_residual:.1e} of the forces"
-        ]
+        remarks = [f"{self._made()}; residual {self.verdict.relative_residual:.1e} of the forces"]
         return shown(title, (*header, "stick", "slip", "open"), rows, remarks)
 
 
