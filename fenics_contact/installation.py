@@ -5,6 +5,9 @@ from __future__ import annotations
 import importlib
 import os
 import platform
+import shlex
+import subprocess
+import sysconfig
 from importlib import metadata
 from pathlib import Path
 
@@ -43,12 +46,13 @@ def information(comm: MPI.Comm = MPI.COMM_WORLD) -> dict[str, str]:
     found["indices"] = np.dtype(PETSc.IntType).name
     hosts = len(set(comm.allgather(MPI.Get_processor_name())))
     library = MPI.Get_library_version().splitlines()[0].split(",")[0].rstrip("\0")
-    found["MPI"] = f"{library}; {comm.size} rank(s) on {hosts} machine(s)"
+    found["MPI"] = f"{' '.join(library.split())}; {comm.size} rank(s) on {hosts} machine(s)"
     found["threads"] = "OMP_NUM_THREADS " + os.environ.get("OMP_NUM_THREADS", "is not set")
     found["direct solver"] = _direct_solver()
     found["BLAS"] = _blas()
     for name, cost in _OPTIONAL.items():
         found[name] = _version(name, cost)
+    found["C compiler"] = comm.bcast(_compiler() if comm.rank == 0 else "")
     found["compiled forms"] = _cache(Path(jit.get_options()["cache_dir"]))
     return found
 
@@ -118,6 +122,27 @@ def _blas() -> str:
     slow = any("/blas/libblas.so" in path for path in loaded)
     cost = "; the reference BLAS: factorisations take up to eight times longer than with OpenBLAS"
     return ", ".join(loaded) + (cost if slow else "")
+
+
+def _compiler() -> str:
+    """What forms are compiled by, tried on what they begin with: the header of Python."""
+    command = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc")
+    include = f"-I{sysconfig.get_path('include')}"
+    try:
+        subprocess.run(
+            [*command, include, "-x", "c", "-c", "-", "-o", os.devnull],
+            input="#include <Python.h>\n",
+            text=True,
+            capture_output=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError) as error:
+        told = getattr(error, "stderr", None) or str(error)
+        return (
+            f"missing ({told.strip().splitlines()[0]}): new forms cannot be compiled; it takes a "
+            "C compiler and the headers of C and Python (Debian: gcc libc6-dev python3-dev)"
+        )
+    return shlex.join(command)
 
 
 def _cache(folder: Path) -> str:

@@ -3,7 +3,9 @@
 import importlib
 import itertools
 import logging
+import re
 import sys
+import sysconfig
 from pathlib import Path
 
 import dolfinx
@@ -67,6 +69,18 @@ def test_what_is_missing_and_what_it_costs(monkeypatch):
     monkeypatch.setattr(importlib, "import_module", without)
     found = information()["gmsh"]
     assert found.startswith("missing (libGLU.so.1") and "model_to_mesh" in found
+
+
+def test_the_compiler_is_tried(monkeypatch):
+    """As forms take it: no compiler, or no Python.h, is told, with what to install."""
+    compiling.compile_form(area())  # there is one
+    assert not information()["C compiler"].startswith("missing")
+    monkeypatch.setenv("CC", "no-compiler-of-this-name -O2")
+    assert re.match(r"missing \(.*no-compiler-of-this-name", information()["C compiler"])
+    monkeypatch.delenv("CC")
+    monkeypatch.setattr(sysconfig, "get_path", lambda name: "/nowhere")
+    found = information()["C compiler"]
+    assert found.startswith("missing") and "Python.h" in found and "python3-dev" in found
 
 
 def test_the_program(capsys):
