@@ -56,6 +56,19 @@ def test_a_command_runs_here_where_dolfinx_is(run) -> None:
     assert (process.returncode, process.stdout, asked) == (0, "here\n", [])
 
 
+def test_dolfinx_under_another_name_is_found(run, tmp_path: Path) -> None:
+    """Wheels by others are called otherwise; what counts then is the module itself."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "from importlib import metadata\n"
+        "found = metadata.version\n"
+        "def version(name):\n"
+        "    return found(name + '-of-others' * (name == 'fenics-dolfinx'))\n"
+        "metadata.version = version\n"
+    )
+    process, asked = run(PYTHONPATH=f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    assert (process.returncode, process.stdout, asked) == (0, "here\n", [])
+
+
 def test_more_ranks_than_cores_start_without_a_word() -> None:
     """Neither refused, nor with a warning of old names: all that is printed is what they print."""
     ranks = (os.cpu_count() or 1) + 1
