@@ -182,7 +182,16 @@ def interrupted_at(event: int):
         sys.setprofile(None)
 
 
+@pytest.fixture
+def python_is_interrupted():
+    """By Ctrl-C, as at its start: gmsh has the process ended instead, from its first use on."""
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, handler)
+
+
 @pytest.mark.skipif(COMM.size > 1, reason="a signal to one rank")
+@pytest.mark.usefixtures("python_is_interrupted")
 @pytest.mark.skipif(
     "PYTEST_XDIST_WORKER" in os.environ, reason="the signal may end a worker: run it by itself"
 )
