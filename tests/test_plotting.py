@@ -145,9 +145,9 @@ def shapes(collection):
     """Corners of what is in a collection, as given."""
     if hasattr(collection, "_segments3d"):
         return [np.asarray(ends) for ends in collection._segments3d]
-    if hasattr(collection, "_vec"):  # in space: rows x, y, z, 1 of all corners one after another
-        if hasattr(collection, "_faces"):
-            return [np.asarray(face) for face in collection._faces]
+    if hasattr(collection, "_faces"):  # in space; some releases have both
+        return [np.asarray(face) for face in collection._faces]
+    if hasattr(collection, "_vec"):  # rows x, y, z, 1 of all corners one after another
         return [collection._vec[:3, s].T for s in collection._segslices]
     return [path.vertices for path in collection.get_paths()]
 
