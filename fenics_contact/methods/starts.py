@@ -198,6 +198,12 @@ class Starts:
             equations.assemble(matrix, parts)
         assert full.stiffness is not None
         full.stiffness.mult(change, image)
+        tractions = None if anew else self._tractions()
+        if tractions is not None:  # supports have moved, too
+            for operator, borne, traction in zip(
+                full.operators, self._borne, tractions, strict=True
+            ):
+                operator.add_force(image, traction - borne.values.total_traction)
         image.array[full.constrained] = 0.0
         image.scale(-1.0 / full.bulk.scale)
         ksp.solve(image, step)
