@@ -17,6 +17,7 @@ from fenics_contact.types import Array
 
 __all__ = [
     "agreed",
+    "all_finite",
     "collective_errors",
     "fail_together",
     "gather_rows",
@@ -135,6 +136,11 @@ def global_max(comm: MPI.Comm, values: Array, empty: float = 0.0) -> float:
 def global_min(comm: MPI.Comm, values: Array, empty: float = 0.0) -> float:
     """Smallest entry over the ranks; ``empty`` where no rank has one; NaN wins. Collective."""
     return -global_max(comm, -np.asarray(values), -empty)
+
+
+def all_finite(comm: MPI.Comm, values: Array) -> bool:
+    """Whether all of the ranks' values are numbers, and finite. Collective."""
+    return bool(comm.allreduce(bool(np.isfinite(values).all()), op=MPI.LAND))
 
 
 def gather_rows(comm: MPI.Comm, rows: Array) -> Array:

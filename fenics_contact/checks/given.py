@@ -12,7 +12,7 @@ from dolfinx import fem
 
 from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
-from fenics_contact.parallel import global_max, global_min
+from fenics_contact.parallel import all_finite, global_max, global_min
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_nodes
 from fenics_contact.systems.unknowns import Unknowns
@@ -103,10 +103,10 @@ def check_values(bcs: Sequence[fem.DirichletBC], u: fem.Function) -> None:
     Raises:
         ValueError: On all ranks.
     """
+    comm, values = u.function_space.mesh.comm, np.zeros_like(u.x.array)
     for number, bc in enumerate(bcs):
-        values = np.zeros_like(u.x.array)
         bc.set(values)
-        if not np.isfinite(global_max(u.function_space.mesh.comm, np.abs(values))):
+        if not all_finite(comm, values[bc.dof_indices()[0]]):
             raise ValueError(f"Dirichlet condition number {number} has values that are not finite")
 
 

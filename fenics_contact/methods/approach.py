@@ -41,14 +41,17 @@ class Approach:
         if not len(motions.free):
             return first
         cold = first
+        for contact in full.contacts:
+            contact.evaluate()
         # Of contact not the resultants: those of a body that friction has locked are zero.
-        borne = float(global_sum(full.unknowns.comm, np.abs(full.contact_force()).sum()))
+        forces = [c.measure @ np.abs(c.values.total_traction).sum(axis=1) for c in full.contacts]
+        borne = float(global_sum(full.unknowns.comm, sum(forces, 0.0)))
         outside = np.abs(motions.resultants(load)).max(initial=0.0)
         if borne < _IDLE * outside:
             cold = True
             full.set_state(np.where(full.constrained, full.state(), self._rest))
-        for contact in full.contacts:
-            contact.evaluate()
+            for contact in full.contacts:
+                contact.evaluate()
         touching = [bool(np.any(c.status != Status.OPEN)) for c in full.contacts]
         if not full.unknowns.comm.allreduce(any(touching)):
             way = motions.approach(load, full.operators)

@@ -20,7 +20,7 @@ from ufl.algorithms import extract_coefficients
 from ufl.corealg.traversal import unique_pre_traversal
 
 from fenics_contact.compiling import compile_form
-from fenics_contact.parallel import collective_errors, global_max, global_min
+from fenics_contact.parallel import all_finite, collective_errors, global_max, global_min
 from fenics_contact.surface.dependence import Dependence
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.mass import assembled
@@ -131,7 +131,7 @@ class Bulk:
         ):
             for position, item in enumerate(items):
                 array = item.x.array if kind == "function" else np.ravel(item.value)
-                if not np.isfinite(global_max(comm, np.abs(array))):
+                if not all_finite(comm, array):
                     name = "u" if item is self._u else getattr(item, "name", f"number {position}")
                     raise ValueError(
                         f"the {kind} {name!r} in F has values that are not finite (NaN or inf); "

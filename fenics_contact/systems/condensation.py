@@ -134,7 +134,7 @@ class Condensation:
                 self.directions.append((scaled, responses[-1]))
                 del self.directions[:-_DIRECTIONS]
         nothing = Response.none(force.size, self._unknowns.n_local)
-        self.response = nothing.plus(shares, responses)
+        self.response = Response.combined(shares, responses) if responses else nothing
 
     def _norm(self, values: Array) -> float:
         """Over all ranks, without overflow. Collective."""
@@ -404,9 +404,19 @@ class Response:
         """To nothing."""
         return cls(np.zeros(n), np.zeros(n), np.zeros(n_kept), np.zeros(n_kept))
 
-    def plus(self, shares: Sequence[float], others: Sequence[Response]) -> Response:
-        """This and shares of others added, in place."""
-        for share, other in zip(shares, others, strict=True):
-            for name in ("field", "forces", "load", "by_values"):
-                getattr(self, name)[:] += share * getattr(other, name)
-        return self
+    @classmethod
+    def combined(cls, shares: Sequence[float], responses: Sequence[Response]) -> Response:
+        """The sum of shares of some, at least one."""
+
+        def total(parts: Sequence[Array]) -> Array:
+            found = shares[0] * parts[0]
+            for share, part in zip(shares[1:], parts[1:], strict=True):
+                found += share * part
+            return found
+
+        return cls(
+            total([r.field for r in responses]),
+            total([r.forces for r in responses]),
+            total([r.load for r in responses]),
+            total([r.by_values for r in responses]),
+        )
