@@ -63,6 +63,7 @@ def solve_in_rounds(
     equations.round_rtol = _FIRST_ROUND
     try:
         for number in range(1, _MAX_ROUNDS + 1):
+            start = equations.system.state()
             reason, tried = iterate(ahead, stiffness_changed, overloaded)
             _append(attempts, tried)
             overloaded = reason == OVERLOADED
@@ -88,6 +89,8 @@ def solve_in_rounds(
             if number < _MAX_ROUNDS and worst > 1.0:
                 for contact in augmented:
                     contact.augment()
+                if overloaded:  # what the load moved may be too far away to come back
+                    equations.system.set_state(start)
     finally:
         equations.round_rtol = 0.0
     return reason, attempts, number
