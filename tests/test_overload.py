@@ -155,6 +155,33 @@ def test_a_tight_fit_held_by_soft_multipliers_is_none(by, share, stiffness, meth
     assert found.normal_force == pytest.approx(force, rel=(1 + modulus / stiffness) * tolerance)
 
 
+@pytest.mark.whole
+@pytest.mark.parametrize("method", [None, "lbfgs", "newton", "alternating", "continuation"])
+def test_soft_multipliers_that_hardly_grow_are_not_at_their_end(method):
+    """A hundredth as stiff as the column, they take over 1 % of what they miss in a round.
+
+    That is less than their tolerance of 4 % long before they bear the push. Friction bears all of
+    it in the end, to the residual.
+    """
+    modulus, stiffness = 1000.0, 10.0
+    scene = block("quadrilateral", E=modulus, nu=0.0, n=2)
+    depth = fem.Constant(scene.mesh, 0.0)
+    problem, contact = scene.problem(
+        fc.Coulomb(MU, k_n=stiffness, k_t=stiffness),
+        [scene.hold(TOP, 1, depth)],
+        contact={"enforcement": "augmented", "tolerance": 0.04},
+        kinematics=np.inf,
+        method=method,
+    )
+    for force, share in ((1000.0, 0.5), (100.0, -0.25), (100.0, 0.625)):
+        depth.value = -force / modulus
+        scene.load(side=share * MU * force)
+        problem.solve()
+        problem.commit()
+        found = contact.resultants().force[0]
+        assert found == pytest.approx(-share * MU * force, rel=1e-6)
+
+
 def test_the_larger_friction_of_two():
     """An ellipse bears across its direction what the limit along it would not."""
     scene = block("hexahedron", n=3, size=(1.0, 1.0, 0.25), up=-10.0)

@@ -80,13 +80,15 @@ def solve_in_rounds(
             logger.debug("round %d: errors %s", number, errors)
             # Given displacements squeeze a body the less the softer the springs are, and there is
             # less friction: an overload is none before the multipliers bear what springs cannot.
-            if worst <= 1.0 and (exact or overloaded):
+            # Soft ones take over no more in a round than their stiffness by the bulk's of the rest.
+            enough = min(1.0, equations.hardness()) if overloaded else 1.0
+            if worst <= enough and (exact or overloaded):
                 break
             ahead, stiffness_changed = 0.0, False
             exact = worst <= _NEARLY
             left = min((e for e in errors if e > 0), default=0.0)
             equations.round_rtol = 0.0 if exact else min(_FIRST_ROUND, INNER * left)
-            if number < _MAX_ROUNDS and worst > 1.0:
+            if number < _MAX_ROUNDS and worst > enough:
                 for contact in augmented:
                     contact.augment()
                 if overloaded:  # what the load moved may be too far away to come back
