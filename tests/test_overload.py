@@ -1,14 +1,18 @@
 """Loads that friction cannot bear: found by limit analysis, said in words, and nothing else is."""
 
+import dolfinx
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.checks.overload import find_overload
 from scenes.blocks import TOP, block
 from scenes.comparing import raised_everywhere
+from scenes.elasticity import hold
+from scenes.tags import sides
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
 
@@ -180,6 +184,50 @@ def test_soft_multipliers_that_hardly_grow_are_not_at_their_end(method):
         problem.commit()
         found = contact.resultants().force[0]
         assert found == pytest.approx(-share * MU * force, rel=1e-6)
+
+
+def test_blocks_on_both_sides_do_not_hide_an_overload():
+    """A block squeezed by two others, with nothing else to hold it, is pushed by 2 % too much.
+
+    Under a tenth of what squeezed it before, its multipliers fluctuate by more than their tolerance
+    while it runs away, and by less than friction lacks. 1265 iterations here; 2495 if all rounds go
+    on to the tolerance.
+    """
+    modulus, height = 1000.0, 0.5
+
+    def made(low, n):
+        corners = [(0.0, low), (1.0, low + height)]
+        mesh = dolfinx.mesh.create_rectangle(MPI.COMM_WORLD, corners, (n, n))
+        ends = {1: lambda x: np.isclose(x[1], low), 2: lambda x: np.isclose(x[1], low + height)}
+        return mesh, None, sides(mesh, ends)
+
+    joined = fc.join_meshes({"a": made(0.0, 2), "b": made(height, 1), "c": made(2 * height, 3)})
+    space = fem.functionspace(joined.mesh, ("Lagrange", 1, (2,)))
+    u, v = fem.Function(space), ufl.TestFunction(space)
+    depth, push = fem.Constant(joined.mesh, 0.0), fem.Constant(joined.mesh, 0.0)
+    y = ufl.SpatialCoordinate(joined.mesh)[1]
+    pushed = ufl.conditional(abs(y - 1.5 * height) < height / 2, push / height, 0.0)
+    F = fc.elasticity.LinearElastic(u, modulus, nu=0.0, kind="plane strain").residual(v)
+    F -= pushed * v[0] * ufl.dx
+    floor, roof = joined.facet("a", 1), joined.facet("c", 2)
+    bcs = [hold(u, joined.facets, tag, 0) for tag in (floor, roof)]
+    bcs += [hold(u, joined.facets, floor, 1), hold(u, joined.facets, roof, 1, depth)]
+    law = fc.Coulomb(MU, 100 * modulus, 100 * modulus)
+    contacts = fc.contact_pairs(
+        u, law, distance=0.05, bodies=joined, enforcement="augmented", tolerance=1e-4
+    )
+    problem = fc.ContactProblem(
+        F, u, bcs=bcs, contacts=contacts, kinematics=np.inf, method="newton"
+    )
+    for force, share in ((10.0, 0.13), (1.0, 1.02)):
+        depth.value, push.value = -force * 3 * height / modulus, 2 * share * MU * force
+        if share < 1.0:
+            problem.solve()
+            problem.commit()
+            continue
+        with pytest.raises(fc.NotConverged, match=r"of body 2, .* the load is") as failed:
+            problem.solve()
+        assert failed.value.iterations < 1800
 
 
 def test_the_larger_friction_of_two():

@@ -24,6 +24,8 @@ _MAX_ROUNDS = 80
 # Residual, relative, to which the first round is solved; share of a round's error to which the next
 # is; and the error, in units of the tolerance, from which on the next may be the last one.
 _FIRST_ROUND, INNER, _NEARLY = 1e-4, 1e-2, 10.0
+# An overload is sure if tractions may still grow by less than this share of what friction lacks.
+_SURELY = 0.1
 # Multipliers begin smaller where the load has fallen to less than this share. To less than the
 # second it is gone: without multipliers a body would be left to touch by round-off, and multipliers
 # that are too large leave it open.
@@ -81,14 +83,18 @@ def solve_in_rounds(
             # Given displacements squeeze a body the less the softer the springs are, and there is
             # less friction: an overload is none before the multipliers bear what springs cannot.
             # Soft ones take over no more in a round than their stiffness by the bulk's of the rest.
-            enough = min(1.0, equations.hardness()) if overloaded else 1.0
-            if worst <= enough and (exact or overloaded):
+            share = min(1.0, equations.hardness()) if overloaded else 1.0
+            if overloaded and equations.overload is not None:
+                grows = max(errors) / share
+                if grows < _SURELY * (equations.overload.factor - 1.0) < np.inf:
+                    break
+            if worst <= share and (exact or overloaded):
                 break
             ahead, stiffness_changed = 0.0, False
             exact = worst <= _NEARLY
             left = min((e for e in errors if e > 0), default=0.0)
             equations.round_rtol = 0.0 if exact else min(_FIRST_ROUND, INNER * left)
-            if number < _MAX_ROUNDS and worst > enough:
+            if number < _MAX_ROUNDS and worst > share:
                 for contact in augmented:
                     contact.augment()
                 if overloaded:  # what the load moved may be too far away to come back
