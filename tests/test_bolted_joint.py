@@ -45,5 +45,5 @@ def test_tightened_and_pulled_until_it_slips() -> None:
             raise
 
     raised_everywhere(solve, fc.NotConverged, words)
-    # 56 here; 351 if all that may help is tried under stiff springs before it is told.
+    # 62 here; 351 if all that may help is tried under stiff springs before it is told.
     assert failed[0].iterations < 120

@@ -368,7 +368,7 @@ class RigidMotions:
             rest *= agreed(self.comm, unbalanced(rays.T, -resultant / rest))
         if rest > _BALANCED * max(size, np.abs(resultant).max()):
             scale = np.abs(resultant).max()
-            limits = scale * agreed(self.comm, _borne(rays.T, -resultant / scale))
+            limits = scale * agreed(self.comm, _borne(rays.T, -resultant / scale)) + 0.0  # no -0
             size = max(size, scale)
             beyond = [i for i, r in enumerate(resultant) if abs(r) > limits[i] + _BALANCED * size]
             said = [
