@@ -89,7 +89,7 @@ class FullSystem(System):
     def state(self) -> Array:
         """The present unknowns of this rank; a copy."""
         values = self.bulk.in_units(self.u.x.array[: self.unknowns.n_dofs])
-        return self.unknowns.joined(values, self.motions())
+        return self.unknowns.joined(values, self.motions()) if self.unknowns.n_motions else values
 
     def set_state(self, state: Array) -> None:
         """Make a state the present one. Collective."""

@@ -51,8 +51,8 @@ class Unknowns:
         return PETSc.Vec().createMPI((self.n_local, None), comm=self.comm)
 
     def joined(self, dofs: Array, motions: Array) -> Array:
-        """This rank's unknowns, of its dofs, themselves where it has no others, and all motions."""
-        return np.concatenate([dofs, motions]) if self.has_motions_here else dofs
+        """This rank's unknowns, of its dofs and all motions."""
+        return np.concatenate([dofs, motions]) if self.has_motions_here else dofs.copy()
 
     def motions(self, values: Array) -> Array:
         """The motions out of the ranks' unknowns, on every rank. Collective."""
