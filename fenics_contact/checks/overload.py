@@ -22,8 +22,10 @@ from fenics_contact.parallel import agreed, global_max, global_sum
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.types import Array
 
-__all__ = ["Overload", "find_overload"]
+__all__ = ["CLEARLY", "Overload", "find_overload"]
 
+# From this factor of an `Overload` on friction is too little even by pressures that are not exact.
+CLEARLY = 1.02
 # Steps of the search, and how close to the worst motion it ends.
 _STEPS, _NEAR = 200, 1e-3
 # Motions are of order one; where friction takes nothing of one, the search is kept within this.

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
+from fenics_contact.checks.overload import CLEARLY
 from fenics_contact.contact.contact import Contact
 from fenics_contact.methods.method import OVERLOADED, InnerSnes, OwnMethod, Tools
 from fenics_contact.types import Array
@@ -54,9 +55,8 @@ _PATIENCE = 2
 _LEAST = 1 / 8
 # Where the load needs more friction than there is, the problem with the limit given has no solution
 # but with this much more than it needs. It is believed after so many cycles in a row that find so;
-# if more than so many times the friction is needed, after the second, whose pressures are those of
-# an equilibrium.
-_MORE, _OVERLOADS, _CLEARLY = 1.01, 3, 1.02
+# if that is clear, after the second, whose pressures are those of an equilibrium.
+_MORE, _OVERLOADS = 1.01, 3
 # Share of the whole law's residual to which a subproblem is solved: more would be lost again.
 _INNER = 1e-2
 # Share of k_t that keeps a slipping body in place in the matrix (not in the equations).
@@ -117,7 +117,7 @@ class Alternation(OwnMethod):
                 needed = equations.friction_needed()
                 overloads = overloads + 1 if 1.0 < needed < np.inf else 0
                 # Limits that the pressure does not set are what they are.
-                enough = 1 if equations.has_potential else 2 if needed > _CLEARLY else _OVERLOADS
+                enough = 1 if equations.has_potential else 2 if needed > CLEARLY else _OVERLOADS
                 if overloads >= enough:
                     logger.debug("%d cycles, %d Newton iterations: overload", cycle, iterations)
                     return iterations, OVERLOADED

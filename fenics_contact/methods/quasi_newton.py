@@ -9,6 +9,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact import compat
+from fenics_contact.checks.overload import CLEARLY
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.method import SnesMethod
 
@@ -17,9 +18,9 @@ __all__ = ["QuasiNewton"]
 # Rounds in a row that do not lower the residual before the increment is given up: the potential may
 # fall for long before the residual does.
 _MAX_STALLS = 10
-# The same where friction seems not to bear the load, which another method can tell; and if it is by
-# so much.
-_FEW_STALLS, _CLEARLY = 3, 1.02
+# The same where friction seems not to bear the load, which another method can tell; if that is
+# clear, one is enough.
+_FEW_STALLS = 3
 # Contact that bears less than this share of the residual an increment begins with tells nothing of
 # which points will be closed.
 _IDLE = 1e-3
@@ -102,7 +103,7 @@ class QuasiNewton(SnesMethod):
             if not self._refresh():
                 return iterations, compat.NOT_FINITE
             if stalls and self.gives_up():
-                most = 1.0 if stalls >= _FEW_STALLS else _CLEARLY
+                most = 1.0 if stalls >= _FEW_STALLS else CLEARLY
                 if equations.friction_needed() > most:
                     return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
 

@@ -133,8 +133,10 @@ class Condensation:
             if known:
                 self.directions.append((scaled, responses[-1]))
                 del self.directions[:-_DIRECTIONS]
-        nothing = Response.none(force.size, self._unknowns.n_local)
-        self.response = Response.combined(shares, responses) if responses else nothing
+        if responses:
+            self.response = Response.combined(shares, responses)
+        else:
+            self.response = Response.none(force.size, self._unknowns.n_local)
 
     def _norm(self, values: Array) -> float:
         """Over all ranks, without overflow. Collective."""
