@@ -6,7 +6,7 @@ by five percent more than friction bears, which has no solution. Times are in un
 solve of the same bodies, each held (MUMPS' Cholesky factorisation on as many ranks). Meshing is not
 counted, nor are compiled forms. There is no script by hand beside it: DOLFINx finds no pairs.
 
-    OMP_NUM_THREADS=1 python benchmarks/bolted_joint.py            # 55,000: over ten minutes
+    OMP_NUM_THREADS=1 python benchmarks/bolted_joint.py            # 55,000: 4 min on one rank
     OMP_NUM_THREADS=1 python benchmarks/bolted_joint.py --size 1.1 # 300,000
     OMP_NUM_THREADS=1 python benchmarks/bolted_joint.py --short
 """

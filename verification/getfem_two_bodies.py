@@ -13,7 +13,7 @@ what it was, and no more than μ p. Slip is t₀·(u - w + g (n - n₀)), u less
 ray: w and n₀, t₀ are displacement, normal and tangent of the last increment. All derivatives are
 GetFEM's. With ``--brick`` its own brick for large sliding does all that, with multipliers that are
 linear along the side: an augmented Lagrangian, without penetration where these are tested. Newton's
-method takes full steps; with the line search "simplest" it takes 26 to 38 of them an increment.
+method takes full steps; with the line search "simplest" it takes 18 to 38 of them an increment.
 """
 
 from __future__ import annotations
