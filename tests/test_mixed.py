@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from petsc4py import PETSc
 
 import fenics_contact as fc
 from fenics_contact import compat
 from fenics_contact.compiling import compile_form
+from fenics_contact.elasticity import NeoHookean
 from fenics_contact.parallel import global_max
-from scenes.blocks import TOP, wave
+from scenes.blocks import BOTTOM, TOP, wave
 from scenes.comparing import (
     assemble_matrix,
     assemble_owned,
@@ -19,6 +21,7 @@ from scenes.comparing import (
     close,
     compiled,
     owned,
+    set_owned,
     shared_folder,
 )
 from scenes.histories import goes_on
@@ -122,6 +125,65 @@ def test_first_touch_in_increments_that_are_cut():
         ends.append(made.tractions())
     assert np.abs(ends[1]).max() > 100.0
     assert close(ends[0], ends[1], 1e-7)
+
+
+def test_the_form_in_blocks_of_ones_own():
+    """Displacement and pressure as two functions, in blocks of DOLFINx: the mixed one's tractions.
+
+    A disc presses a block with ν = 1/2 and drags it, in two increments; to 1e-9. What is solved by
+    Newton's method is F + contact.form(v), by functions of two spaces.
+    """
+    one = tool("isochoric", law=fc.Coulomb(0.3, 1e3, 1e3))
+    mesh, tags, d = one.scene.mesh, one.scene.tags, one.scene.dim
+    V = fem.functionspace(mesh, ("Lagrange", 2, (d,)))
+    Q = fem.functionspace(mesh, ("Lagrange", 1))
+    u, p, both = fem.Function(V), fem.Function(Q), ufl.MixedFunctionSpace(V, Q)
+    (v, q), (du, dp) = ufl.TestFunctions(both), ufl.TrialFunctions(both)
+    shift, angle = fem.Constant(mesh, np.zeros(d)), fem.Constant(mesh, 0.0)
+    contact = fc.Contact(
+        u,
+        fc.ContactSurface(mesh, tags, TOP),
+        disc(one.scene, 0.8, displacement=shift, angle=angle),
+        one.contact.law,
+        kinematics="finite",
+    )
+    body = NeoHookean(u, 1000.0, 0.5, "plane strain", isochoric=True, pressure=p)
+    bulk = body.residual(v, q=q)
+    residual = bulk + contact.form(v)
+    tangent = ufl.derivative(bulk, u, du) + ufl.derivative(bulk, p, dp) + contact.tangent(v, du)
+    forms = [compiled(part, contact) for part in ufl.extract_blocks(residual)]
+    blocks = [[compiled(b, contact) for b in row] for row in ufl.extract_blocks(tangent)]
+    dofs = fem.locate_dofs_topological(V, tags.dim, tags.find(BOTTOM))
+    held, n_held = fem.dirichletbc(np.zeros(d), dofs, V).dof_indices()
+    held = held[:n_held]
+    solver = PETSc.KSP().create(mesh.comm)
+    solver.setType("preonly")
+    solver.getPC().setType("lu")
+    solver.getPC().setFactorSolverType("mumps")
+    for side, up in ((0.0, -0.03), (0.005, -0.035)):
+        shift.value[:] = side, up
+        size = 0.0
+        for _ in range(30):
+            A = PETSc.Mat().createNest([[assemble_matrix(b) for b in row] for row in blocks])
+            A.convert("aij")
+            A.zeroRows((A.getOwnershipRange()[0] + held).astype(PETSc.IntType), 1.0)
+            b, step = A.createVecLeft(), A.createVecRight()
+            forces, excess = assemble_owned(forms[0], V), assemble_owned(forms[1], Q)
+            forces[held] = 0.0
+            b.array[:] = np.concatenate([forces, excess])
+            solver.setOperators(A)
+            solver.solve(b, step)
+            set_owned(u, owned(u) - step.array_r[: forces.size])
+            set_owned(p, owned(p) - step.array_r[forces.size :])
+            size = max(size, step.norm())
+            if step.norm() < 1e-11 * size:
+                break
+        else:
+            pytest.fail("Newton's method written here has not converged")
+        contact.commit()
+        one.go(side, up)
+    assert np.abs(one.tractions()).max() > 10.0
+    assert close(at_points(contact, contact.traction), one.tractions(), 1e-9)
 
 
 # ---- single states -------------------------------------------------------------------------------
