@@ -51,6 +51,10 @@ autoapi_member_order = "bysource"
 autoapi_python_class_content = "both"
 add_module_names = False
 
+# `-b linkcheck` asks all addresses; a host that is busy once is not gone.
+linkcheck_retries = 3
+linkcheck_timeout = 30
+
 html_theme = "pydata_sphinx_theme"
 html_title = "fenics_contact"
 html_show_sourcelink = False
