@@ -32,10 +32,10 @@ def rubbed(cell):
 
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
 def test_a_frame_is_a_state(cell, tmp_path, monkeypatch):
-    """Every body once, where it was then; one scale of colours and one of axes for all."""
+    """Every body once, where it was then; one scale of colours, one of axes, a legend."""
     folder = shared_folder(tmp_path)
     made, sigma = rubbed(cell)
-    bodies, colours, axes = [], [], []
+    bodies, colours, axes, figures = [], [], [], []
     polygons, made_axes, scale_of = drawing.polygons, drawing.made_axes, drawing.scale_of
 
     def drawn(corners, faces, *rest):
@@ -45,7 +45,9 @@ def test_a_frame_is_a_state(cell, tmp_path, monkeypatch):
 
     def framed(places, *rest):
         axes.append(places.reshape(-1, places.shape[-1]))
-        return made_axes(places, *rest)
+        made = made_axes(places, *rest)
+        figures.append(made[0])
+        return made
 
     monkeypatch.setattr(drawing, "polygons", drawn)
     monkeypatch.setattr(drawing, "made_axes", framed)
@@ -72,6 +74,10 @@ def test_a_frame_is_a_state(cell, tmp_path, monkeypatch):
         everything = np.concatenate([body.reshape(-1, body.shape[2]) for body in bodies])
         assert np.array_equal(places.min(axis=0), everything.min(axis=0))
         assert np.array_equal(places.max(axis=0), everything.max(axis=0))
+        (legend,) = figures[0].legends
+        told = ["displacement × 2"]
+        told += ["open", "sticking", "slipping"] if dimension(cell) == 2 else []
+        assert [text.get_text() for text in legend.get_texts()] == told
 
     on_first(check)
     del film

@@ -14,7 +14,6 @@ import numpy as np
 
 from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.checks.step import Step
-from fenics_contact.contact.values import Status
 from fenics_contact.parallel import collective_errors
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import drawing, files
@@ -23,17 +22,16 @@ from fenics_contact.types import Array
 
 __all__ = ["Animation"]
 
-_STATUS = {Status.OPEN: "open", Status.STICK: "pressure", Status.SLIP: "tangential"}
-
 
 class Animation:
     """A film of a problem's states, one frame a call of `add`, written by `save`.
 
     The body is drawn as it is deformed, coloured by its von Mises stress where one is given; in the
-    plane Γc, too: grey where it is open, blue where it sticks, red where it slips. All frames have
-    the same axes and the same colours, those of all states together. So they are drawn at the end;
-    until then what is to be drawn is in temporary files beside the film, and in memory nothing of
-    it. While they are drawn a frame takes one byte for each of its pixels.
+    plane Γc, too: grey where it is open, blue where it sticks, red where it slips. A legend says
+    so, and how many times the displacement is drawn. All frames have the same axes and the same
+    colours, those of all states together. So they are drawn at the end; until then what is to be
+    drawn is in temporary files beside the film, and in memory nothing of it. While they are drawn a
+    frame takes one byte for each of its pixels.
     """
 
     def __init__(
@@ -162,18 +160,23 @@ class Animation:
 
     def _drawn(self) -> Iterator[Any]:
         """The frames as images of Pillow, one at a time."""
+        from matplotlib.patches import Patch
         from PIL import Image
 
         # Axes and colours of all of them.
-        corners, largest = [], 0.0
+        corners, largest, surfaces = [], 0.0, False
         for frame in self._frames():
+            surfaces |= "ends" in frame
             flat = frame["body"].reshape(-1, frame["body"].shape[2])
             corners.append(np.array([flat.min(axis=0), flat.max(axis=0)]))
             largest = max(largest, frame.get("stress", np.zeros(0)).max(initial=0.0))
         unit, stress_unit, title = self._words
         figure, axes = drawing.made_axes(np.array(corners), unit, title, self._view)
         colours = drawing.scale_of(0.0, largest)
-        plane = axes.name != "3d"
+        body_of = drawing.magnified(self._magnification)
+        handles = [Patch(fc="#e3ebf5", ec="#11111180", label=body_of)]
+        handles += drawing.status_patches() if surfaces else []
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
         try:
             for number, frame in enumerate(self._frames()):
                 faces: Any = "#e3ebf5"
@@ -184,9 +187,9 @@ class Animation:
                         figure.colorbar(colours, ax=axes, **bar)
                 body = drawing.polygons(frame["body"], faces, "#11111180", 0.2)
                 drawn = [axes.add_collection(body)]
-                if plane and "ends" in frame:
-                    names = [_STATUS[Status(state)] for state in frame["status"]]
-                    line = drawing.on_surface(frame["ends"], [drawing.COLOURS[n] for n in names])
+                if "ends" in frame:
+                    colour = drawing.status_colours(frame["status"])
+                    line = drawing.on_surface(frame["ends"], colour)
                     line.set_linewidth(3.0)
                     drawn.append(axes.add_collection(line))
                 axes.set_title(f"{title}: {frame['words']}" if title else str(frame["words"]))

@@ -32,11 +32,14 @@ __all__ = [
     "deformed",
     "facets_of",
     "made_axes",
+    "magnified",
     "on_surface",
     "polygons",
     "pyplot",
     "save",
     "scale_of",
+    "status_colours",
+    "status_patches",
     "surface_of",
     "von_mises",
 ]
@@ -47,6 +50,12 @@ COLOURS = {
     "tangential": "#c8502a",
     "mesh": "#9a9a9a",
     "open": "#d8d8d8",
+}
+# What legends call them, and their colours.
+_STATUS = {
+    Status.OPEN: ("open", COLOURS["open"]),
+    Status.STICK: ("sticking", COLOURS["pressure"]),
+    Status.SLIP: ("slipping", COLOURS["tangential"]),
 }
 
 
@@ -273,8 +282,6 @@ def deformed(
 ) -> Any:
     """The figure of `plotting.plot_deformation`; units are those of length and stress."""
     original, moved = shape.original, shape.deformed(magnification)
-    true = magnification == 1.0
-    label = "deformed (true scale)" if true else f"displacement × {magnification:g}"
     places = np.concatenate([original, moved])
     figure, axes = made_axes(places, units[0], title, view)
     plane = original.shape[2] == 2  # in space what is behind is hidden
@@ -296,7 +303,7 @@ def deformed(
 
     handles = [
         Line2D([], [], color=COLOURS["mesh"], label="original"),
-        Line2D([], [], color=edges[:7], label=label),
+        Line2D([], [], color=edges[:7], label=magnified(magnification)),
     ]
     if support is not None:
         ends = np.asarray(support)
@@ -307,6 +314,12 @@ def deformed(
         axes.margins(0.03)
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
+
+
+def magnified(magnification: float) -> str:
+    """What a legend calls the deformed body."""
+    true = magnification == 1.0
+    return "deformed (true scale)" if true else f"displacement × {magnification:g}"
 
 
 def _ridges(facets: Array) -> Array:
@@ -378,6 +391,18 @@ def on_surface(facets: Array, colours: Any) -> Any:
     if facets.shape[2] == 3:
         return polygons(facets, colours, "#555555", 0.3)
     return LineCollection(list(facets), colors=colours, linewidths=5.0)
+
+
+def status_colours(status: npt.NDArray[Any]) -> list[str]:
+    """Of facets that are open, stick or slip."""
+    return [_STATUS[Status(each)][1] for each in status]
+
+
+def status_patches() -> list[Any]:
+    """Entries of a legend for them."""
+    from matplotlib.patches import Patch
+
+    return [Patch(fc=colour, ec="#555555", label=name) for name, colour in _STATUS.values()]
 
 
 def scale_of(low: float, high: float) -> Any:

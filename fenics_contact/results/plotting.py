@@ -197,13 +197,9 @@ def plot_status(
             return
         drawn = drawn.around(near)
         figure, axes = drawn.axes(length, title, view)
-        from matplotlib.patches import Patch
-
-        colours = np.array([drawing.COLOURS[name] for name in ("open", "pressure", "tangential")])
-        axes.add_collection(drawing.on_surface(drawn.facets, list(colours[drawn.values])))
-        names = {Status.OPEN: "open", Status.STICK: "sticking", Status.SLIP: "slipping"}
-        patches = [Patch(fc=colours[s], ec="#555555", label=name) for s, name in names.items()]
-        figure.legend(handles=patches, loc="outside lower center", ncols=3)
+        colours = drawing.status_colours(drawn.values)
+        axes.add_collection(drawing.on_surface(drawn.facets, colours))
+        figure.legend(handles=drawing.status_patches(), loc="outside lower center", ncols=3)
         drawing.save(figure, path)
 
 
