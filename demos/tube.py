@@ -1,0 +1,285 @@
+"""Tube: pinched by two round bars until its inside closes, and touches itself.
+
+Plane strain, neo-Hookean rubber (E = 3, ν = 0.45); lengths in mm, stresses in MPa, forces per mm of
+the tube. A tube of mean radius R = 10 and thickness t = 2 is pinched, as in a valve, by two rigid
+bars of radius 4, one from above and one from below, without friction. It becomes an eight, and its
+inside closes in the middle; from then on the bars press wall on wall. All of the inside is Γc and
+opposite at once: each point looks along its present normal for what of the same wall it may meet.
+
+    python demos/tube.py
+    python demos/tube.py --cells 6
+    mpirun -n 2 python demos/tube.py
+
+References. A second route: a quarter of the tube, whose inside is pressed on the plane of symmetry
+as on a rigid half-space. In the whole tube both walls have points and springs, and each spring is
+as long as both go in each other: a quarter of the stiffness gives the same pressure. Forces of the
+bars and of wall on wall are those of the quarter (1e-3: normals of walls that are not flat do not
+end at mirror images), and the quarter's those in cells of half the size (1 %). At the first
+pinch there is Winkler's curved beam under two opposite forces (S. Timoshenko, Strength of
+Materials; Roark's table of rings), whose middle line becomes lower and wider by
+
+    F R²/(E' t e) (π k₁/4 - 2 k₂²/π)    and    F R²/(E' t e) (k₁/2 - k₂ + 2 k₂²/π),
+
+k₂ = 1 - e/R, k₁ = k₂ + 6/5 E'/G e/R, e = R - t/ln(outer/inner), E' = E/(1 - ν²) (1.5 %: half of
+(t/R)², as sections do not stay plane, and what 1 % of the radius changes). The exit code is 1 if
+one of them is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import dolfinx
+import gmsh
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from tqdm import tqdm
+
+import fenics_contact as fc
+from fenics_contact import output, plotting
+from fenics_contact.elasticity import NeoHookean
+
+E, NU, R, T, BAR = 3.0, 0.45, 10.0, 2.0, 4.0
+INNER, OUTER = R - T / 2, R + T / 2
+AROUND = 6  # cells around a quarter, by those through the wall
+K = 20.0  # of the springs to the bars, and of the quarter to the plane [N/mm³]
+# By both bars together, at the ends of increments; those that are compared.
+CLOSING = (0.1, *(float(c) for c in range(2, 18, 2)), 17.0, 17.5, 18.0, 18.5, 19.0)
+SHOWN = (10.0, 18.5, 19.0)
+ROUTES, CELLS, BEAM = 1e-3, 0.01, 0.015
+WALL, RIM, LEVEL, UPRIGHT = 1, 2, 3, 4
+
+
+def slopes() -> tuple[float, float]:
+    """How much the middle line becomes lower and wider, by the force (length²/force)."""
+    modulus, shear = E / (1 - NU**2), E / (2 * (1 + NU))
+    e = R - T / np.log(OUTER / INNER)
+    k2 = 1 - e / R
+    k1 = k2 + 1.2 * modulus / shear * e / R
+    soft = R**2 / (modulus * T * e)
+    lower = soft * (np.pi * k1 / 4 - 2 * k2**2 / np.pi)
+    return float(lower), float(soft * (k1 / 2 - k2 + 2 * k2**2 / np.pi))
+
+
+@dataclass
+class Run:
+    """A tube, or a quarter of it.
+
+    Attributes:
+        name: In words.
+        share: Of what each bar meets that is there: 1, or 1/2.
+        closing: Of the bars after every increment (length).
+        force: Of each bar on all of the tube (force/length).
+        inside: What wall and wall bear of it (force/length).
+        lower, wider: By how much its middle line is (length).
+        place, pressure: Of the wall at the end: x, and pressure there per undeformed area.
+    """
+
+    name: str
+    share: float
+    problem: fc.ContactProblem
+    rubber: NeoHookean
+    dofs: int
+    closing: list[float] = field(default_factory=list)
+    force: list[float] = field(default_factory=list)
+    inside: list[float] = field(default_factory=list)
+    lower: list[float] = field(default_factory=list)
+    wider: list[float] = field(default_factory=list)
+    iterations: list[int] = field(default_factory=list)
+    place: np.ndarray = field(default_factory=lambda: np.empty(0))
+    pressure: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+
+def make_mesh(cells: int, quarters: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
+    """The section, ``cells`` through its wall, curved; one quarter or all four. Collective."""
+    gmsh.initialize()
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.model.add("section")
+        if MPI.COMM_WORLD.rank == 0:
+            geo = gmsh.model.geo
+            centre = geo.addPoint(0, 0, 0)
+            ends = []
+            for angle in np.arange(quarters + 1 if quarters < 4 else 4) * np.pi / 2:
+                x, y = np.cos(angle), np.sin(angle)
+                ends.append([geo.addPoint(r * x, r * y, 0) for r in (INNER, OUTER)])
+            rays = [geo.addLine(*pair) for pair in ends]
+            walls, rims, sections = [], [], []
+            for i in range(quarters):
+                j = (i + 1) % len(ends)
+                wall, rim = (geo.addCircleArc(ends[i][k], centre, ends[j][k]) for k in (0, 1))
+                loop = geo.addCurveLoop([rays[i], rim, -rays[j], -wall])
+                section = geo.addPlaneSurface([loop])
+                for arc in (wall, rim):
+                    geo.mesh.setTransfiniteCurve(arc, AROUND * cells + 1)
+                geo.mesh.setTransfiniteSurface(section)
+                geo.mesh.setRecombine(2, section)
+                walls.append(wall)
+                rims.append(rim)
+                sections.append(section)
+            for ray in rays:
+                geo.mesh.setTransfiniteCurve(ray, cells + 1)
+            geo.synchronize()
+            gmsh.model.addPhysicalGroup(2, sections, 1)
+            groups = {WALL: walls, RIM: rims, LEVEL: rays[::2], UPRIGHT: rays[1::2]}
+            for tag, lines in groups.items():
+                gmsh.model.addPhysicalGroup(1, lines, tag)
+            gmsh.model.mesh.generate(2)
+            gmsh.model.mesh.setOrder(2)
+        mesh, _, tags = fc.model_to_mesh(gmsh.model, MPI.COMM_WORLD, gdim=2)
+        return mesh, tags
+    finally:
+        gmsh.finalize()
+
+
+def solve(name: str, cells: int, quarters: int) -> Run:
+    """Pinch a tube, or a quarter of it. Collective."""
+    mesh, tags = make_mesh(cells, quarters)
+    V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
+    u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
+    rubber = NeoHookean(u, E, NU, "plane strain")
+    dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4})
+
+    def held(tag: int, i: int) -> fem.DirichletBC:
+        facets = tags.find(tag)
+        return fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 1, facets), V.sub(i))
+
+    closing = fem.Constant(mesh, 0.0)
+    wall, rim = (fc.ContactSurface(mesh, tags, tag) for tag in (WALL, RIM))
+    bars = {"upper": 1.0} if quarters == 1 else {"upper": 1.0, "lower": -1.0}
+    supports: dict[str, Any] = {
+        called: fc.Cylinder(
+            (0, up * (OUTER + BAR)), BAR, displacement=ufl.as_vector([0, -up * closing / 2])
+        )
+        for called, up in bars.items()
+    }
+    contacts = [
+        fc.Contact(u, rim, support, fc.Frictionless(K), kinematics="finite", name=called)
+        for called, support in supports.items()
+    ]
+    # Nothing moves aside where x = 0: of the whole tube that is what holds it.
+    bcs = [held(UPRIGHT, 0)]
+    if quarters == 1:
+        bcs.append(held(LEVEL, 1))
+        opposite: Any = fc.HalfSpace((0, 0), (0, 1))
+        law = fc.Frictionless(K)
+    else:
+        opposite, law = fc.DeformableBody(tags, WALL), fc.Frictionless(K / 4)
+    inside = fc.Contact(u, wall, opposite, law, kinematics="finite", name="inside")
+    problem = fc.ContactProblem(rubber.residual(v, dx), u, bcs=bcs, contacts=[*contacts, inside])
+    places = [fem.locate_dofs_geometrical(V, near) for near in (at(0.0, R), at(R, 0.0))]
+
+    share = 0.5 if quarters == 1 else 1.0
+    run = Run(name, share, problem, rubber, V.dofmap.index_map.size_global * 2)
+    history = fc.increments(problem, closing, 0.0, CLOSING[-1], steps=CLOSING)
+    quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
+    for step in tqdm(history, name, len(CLOSING), disable=quiet, unit="increment"):
+        run.closing.append(step.load)
+        run.iterations.append(step.iterations)
+        run.force.append(-float(contacts[0].resultants().force[1]) / share)
+        # Both walls of the whole tube have half of the pressure.
+        run.inside.append(inside.resultants().normal_force / share)
+        moved = [moved_by(u, dofs) for dofs in places]
+        run.lower.append(-2 * moved[0][1])
+        run.wider.append(2 * moved[1][0])
+    x = inside.points[:, 0] + inside.own_displacement()[:, 0]
+    rows = MPI.COMM_WORLD.allgather(np.stack([x, inside.pressure * 2 * share]))
+    run.place, run.pressure = np.concatenate(rows, axis=1)
+    return run
+
+
+def at(x: float, y: float) -> Any:
+    """Whether a node is there."""
+    return lambda nodes: np.isclose(nodes[0], x, atol=1e-6) & np.isclose(nodes[1], y, atol=1e-6)
+
+
+def moved_by(u: fem.Function, dofs: np.ndarray) -> np.ndarray:
+    """Displacement of a node, on all ranks. Collective."""
+    mine = dofs[dofs < u.function_space.dofmap.index_map.size_local]
+    values = u.x.array.reshape(-1, 2)[mine].sum(axis=0)
+    return np.asarray(MPI.COMM_WORLD.allreduce(values))
+
+
+def compare(whole: Run, quarter: Run, fine: Run) -> dict[str, Any]:
+    """The whole tube beside its quarter, and that beside itself in finer cells and Winkler."""
+    values, references = {}, {}
+    for c in SHOWN:
+        i = CLOSING.index(c)
+        values[f"force, closed by {c:g} [N/mm]"] = whole.force[i]
+        references[f"force, closed by {c:g} [N/mm]"] = (quarter.force[i], ROUTES)
+        values[f"force, quarter, by {c:g} [N/mm]"] = quarter.force[i]
+        references[f"force, quarter, by {c:g} [N/mm]"] = (fine.force[i], CELLS)
+    values["wall on wall at the end [N/mm]"] = whole.inside[-1]
+    references["wall on wall at the end [N/mm]"] = (quarter.inside[-1], ROUTES)
+    found = whole.lower[0] / whole.force[0], whole.wider[0] / whole.force[0]
+    for name, value, known in zip(("lower", "wider"), found, slopes(), strict=True):
+        values[f"{name} by the force [mm²/N]"] = value
+        references[f"{name} by the force [mm²/N]"] = (known, BEAM)
+    return output.compare(values, references)
+
+
+def draw(path: Path, whole: Run, quarter: Run) -> None:
+    """Force over closing, and pressure of wall on wall at the end. On this rank."""
+    with plotting.figure(path, 2) as (left, right):
+        left.plot(whole.closing, whole.force, ".-", label="bars")
+        left.plot(whole.closing, whole.inside, ".-", label="wall on wall")
+        left.plot(quarter.closing, quarter.force, "kx", label="quarter on a rigid plane")
+        left.plot(quarter.closing, quarter.inside, "kx")
+        stiff = 1 / slopes()[0]
+        left.plot([0, 4], [0, 4 * stiff], "k--", lw=1, label="Winkler's beam")
+        left.set(xlabel="closing of the bars [mm]", ylabel="force [N per mm of tube]")
+        left.set(title=f"Tube, R = {R:g}, t = {T:g} mm, E = {E:g} MPa, ν = {NU:g}")
+        for run, style in ((whole, "."), (quarter, "kx")):
+            closed = (run.pressure > 0) & (run.place > -1e-9)
+            right.plot(run.place[closed], run.pressure[closed], style, label=run.name)
+        right.set(xlabel="x [mm]", ylabel="pressure inside, nominal [MPa]", ylim=(0, None))
+        right.set(title=f"Wall on wall, closed by {CLOSING[-1]:g} mm")
+        for ax in (left, right):
+            ax.grid(alpha=0.25)
+            ax.legend()
+
+
+def main() -> int:
+    """Pinch tube and quarters, and write all results; 0 if every reference is met."""
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.add_argument("--cells", type=int, default=4, help="through the wall")
+    parser.add_argument("--output", type=Path, default=Path("output/tube"), help="folder")
+    arguments, _ = parser.parse_known_args()
+    start, cells, comm = time.perf_counter(), arguments.cells, MPI.COMM_WORLD
+    if cells < 2 or cells % 2:
+        parser.error("there is to be a node in the middle of the wall: give an even number")
+    whole = solve("tube", cells, 4)
+    quarter, fine = solve("quarter", cells, 1), solve("quarter, fine", 2 * cells, 1)
+    result: dict[str, Any] = {
+        "references": compare(whole, quarter, fine),
+        "dofs": whole.dofs,
+        "iterations": [run.iterations for run in (whole, quarter, fine)],
+        "closing": whole.closing,
+        "forces": {run.name: run.force for run in (whole, quarter, fine)},
+        "inside": {run.name: run.inside for run in (whole, quarter, fine)},
+        "wall_seconds": time.perf_counter() - start,
+    }
+    fc.Writer(arguments.output, whole.problem, stress=whole.rubber.stress).write(CLOSING[-1])
+    plotting.plot_pressure(
+        arguments.output / "section.png",
+        whole.problem.contacts[-1],
+        title=f"Closed by {CLOSING[-1]:g} mm; springs of each wall bear half",
+    )
+    if comm.rank == 0:
+        print(output.table(result["references"]))
+        draw(arguments.output / "tube.png", whole, quarter)
+    output.write_json(arguments.output / "result.json", result, comm)
+    return 0 if all(entry["passed"] for entry in result["references"].values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,47 @@
+"""The tube demo, run as its user runs it, against a quarter on a rigid plane and Winkler's beam."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mpi4py import MPI
+
+from scenes.processes import run_demo, values
+
+pytestmark = [
+    pytest.mark.demo,
+    pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own"),
+]
+
+
+def test_forces_before_and_after_it_closes(tmp_path: Path) -> None:
+    """Winkler's beam at the first pinch; a quarter on a rigid plane once the walls bear.
+
+    1.5 %: half of (t/R)², as sections do not stay plane; 1e-3 between the routes: normals of walls
+    that are not flat do not end at mirror images. Without contact the walls would pass through each
+    other under the force of before, a twelfth of the last.
+    """
+    result = run_demo("tube", tmp_path)
+    found = values(result)
+    assert found["lower by the force [mm²/N]"] == pytest.approx(64.368, rel=0.015)
+    assert found["wider by the force [mm²/N]"] == pytest.approx(56.207, rel=0.015)
+    whole, quarter = (result["forces"][name] for name in ("tube", "quarter"))
+    assert whole == pytest.approx(quarter, rel=1e-3)
+    closing, inside = result["closing"], result["inside"]["tube"]
+    assert [f > 0 for f in inside] == [c > 18 for c in closing]
+    assert whole[-1] > 10 * whole[closing.index(18)]
+    # What is left is borne by the bent loops, a little more than when it closed.
+    loops = whole[-1] - inside[-1]
+    assert whole[closing.index(18)] < loops < 1.2 * whole[closing.index(18)]
+    for name in ("tube.png", "section.png"):
+        assert (tmp_path / name).read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.slow
+def test_two_ranks_agree(tmp_path: Path) -> None:
+    """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
+    serial = run_demo("tube", tmp_path / "1")
+    parallel = run_demo("tube", tmp_path / "2", ranks=2)
+    for name, value in values(serial).items():
+        assert values(parallel)[name] == pytest.approx(value, rel=1e-6)
