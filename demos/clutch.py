@@ -47,7 +47,10 @@ BOTTOM, TOP = 1, 2
 ANGLES = (*np.arange(0.25, 1.6, 0.25), 2.5, *np.arange(5.0, 91.0, 5.0))
 STEADY = 25.0  # [°] of the turn, from which on slip goes round
 WHOLE, UNTIL = 1.2, 25.0  # [rad] turn of all of the scene, while the ring turns by so much [°]
-OBLIQUE = np.array([1.0, 2.0, 2.0]) / 3
+SHAFT = np.array([0.0, 0.0, 1.0])
+TURN, TURN_OF_ALL = (fc.Rotation(0.0, (0, 0, 0), axis) for axis in (SHAFT, (1, 2, 2)))
+# Of an even pressure: by it friction that slips all over has its torque.
+ARM = 2 / 3 * (RING[1] ** 3 - RING[0] ** 3) / (RING[1] ** 2 - RING[0] ** 2)
 
 
 def annulus(radii: tuple[float, float], low: float, cells: tuple[int, int, int]) -> tuple:
@@ -88,14 +91,8 @@ def annulus(radii: tuple[float, float], low: float, cells: tuple[int, int, int])
         gmsh.finalize()
 
 
-def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Matrix of a turn about an axis through the origin."""
-    cross = np.cross(np.eye(3), axis)
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-
-
 def solve(
-    cells: int, until: float = 90.0, whole: float = 0.0
+    cells: int, until: float = ANGLES[-1], whole: float = 0.0
 ) -> tuple[list[dict[str, float]], fc.ContactProblem, NeoHookean]:
     """Press and turn; force and torque after each increment. Collective.
 
@@ -133,20 +130,22 @@ def solve(
     held = held[held < V.dofmap.index_map.size_local]
     x = V.tabulate_dof_coordinates()
 
+    def with_all(vectors: np.ndarray, t: float) -> np.ndarray:
+        """Turned as all of the scene is."""
+        return TURN_OF_ALL.turned(vectors, whole * (t + 1) / (until + 1))
+
     def load(t: float) -> None:
         """Pressed until 0, then turned by so many degrees."""
-        share, shaft = (t + 1) / (until + 1), np.array([0.0, 0.0, 1.0])
-        scene, down = rotation(OBLIQUE, whole * share), DEPTH * min(t + 1, 1) * shaft
-        turn = rotation(shaft, np.radians(max(t, 0)))
-        for body, place in (("disc", x), ("ring", x @ turn.T - down)):
-            plates[body][0].x.array[:] = (place @ scene.T - x).ravel()
+        lowered = TURN.turned(x, np.radians(max(t, 0))) - DEPTH * min(t + 1, 1) * SHAFT
+        for body, place in (("disc", x), ("ring", lowered)):
+            plates[body][0].x.array[:] = (with_all(place, t) - x).ravel()
 
     path, ends, before = [], [-0.5, 0.0, *(a for a in ANGLES if a <= until)], 0.0
     name = "scene turned" if whole else "scene at rest"
     quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
     history = fc.increments(problem, load, -1.0, until, steps=ends)
     for step in tqdm(history, name, len(ends), disable=quiet, unit="increment"):
-        shaft = rotation(OBLIQUE, whole * (step.load + 1) / (until + 1))[:, 2]
+        shaft = with_all(SHAFT[None], step.load)[0]
         found = contact.resultants()
         radius = np.linalg.norm(np.cross(contact.places(), shaft), axis=1)
         slipping = float(contact.measure @ (MU * contact.pressure * radius))
@@ -175,42 +174,33 @@ def solve(
 def compare(path: list[dict[str, float]], turned: list[dict[str, float]]) -> dict[str, Any]:
     """Torques of full slip, and the scene at rest beside the one that is turned."""
     ratios = [r["torque"] / r["of all slipping"] for r in path if r["angle"] >= STEADY]
-    last, (inner, outer) = path[-1], RING
-    arm = 2 / 3 * (outer**3 - inner**3) / (outer**2 - inner**2)
-    entries = {
-        "torque over μ F arm, even pressure": (
-            last["torque"] / (MU * last["force"] * arm),
-            1,
-            0.02,
-        ),
-        "torque over ∫ μ p r, farthest": (max(ratios, key=lambda q: abs(q - 1)), 1, 1e-6),
-        "torque over that of the disc's plate": (last["torque"] / last["held"], 1, 1e-6),
+    last = path[-1]
+    values = {
+        "torque over μ F arm, even pressure": last["torque"] / (MU * last["force"] * ARM),
+        "torque over ∫ μ p r, farthest": max(ratios, key=lambda q: abs(q - 1)),
+        "torque over that of the disc's plate": last["torque"] / last["held"],
     }
+    references = dict(zip(values, ((1.0, 0.02), (1.0, 1e-6), (1.0, 1e-6)), strict=True))
     for name in ("force", "torque"):
         pairs = zip(path[: len(turned)], turned, strict=True)
-        apart = max(abs(a[name] - b[name]) for a, b in pairs) / last[name]
-        entries[f"{name}, scene turned, from at rest"] = (apart, 0, 1e-7)
-    return output.compare(
-        {name: value for name, (value, _, _) in entries.items()},
-        {name: (float(known), within) for name, (_, known, within) in entries.items()},
-    )
+        apart = f"{name}, scene turned, from at rest"
+        values[apart] = max(abs(a[name] - b[name]) for a, b in pairs) / last[name]
+        references[apart] = (0.0, 1e-7)
+    return output.compare(values, references)
 
 
 def draw(file: Path, path: list[dict[str, float]]) -> None:
-    """Torque over the angle, and how many points stick. On this rank."""
+    """Torque over the angle, while slip begins and all the way. On this rank."""
     rows = path[1:]
-    arm = 2 / 3 * (RING[1] ** 3 - RING[0] ** 3) / (RING[1] ** 2 - RING[0] ** 2)
     with plotting.figure(file, 2) as (left, right):
-        for ax, until in ((left, 2.0), (right, 90.0)):
+        for ax, until in ((left, 2.0), (right, ANGLES[-1])):
             some = [row for row in rows if row["angle"] <= until + 1e-9]
             angle = [row["angle"] for row in some]
             ax.plot(angle, [row["torque"] / 1e3 for row in some], ".-", label="torque")
-            for name, style, factor in (
-                ("of all slipping", "k:", 1.0),
-                ("force", "k--", MU * arm),
-            ):
-                label = "μ ∫p r" if factor == 1 else "μ F arm"
-                ax.plot(angle, [row[name] * factor / 1e3 for row in some], style, label=label)
+            slipping = [row["of all slipping"] / 1e3 for row in some]
+            ax.plot(angle, slipping, "k:", label="μ ∫p r")
+            even = [MU * row["force"] * ARM / 1e3 for row in some]
+            ax.plot(angle, even, "k--", label="μ F arm")
             ax.set(xlabel="turn of the ring [°]", ylabel="torque [N m]", ylim=(0, None))
             ax.grid(alpha=0.25)
             ax.legend(loc="lower right")
@@ -236,7 +226,7 @@ def main() -> int:
         "scene turned": turned,
         "wall_seconds": time.perf_counter() - start,
     }
-    fc.Writer(arguments.output, problem, stress=rubber.stress).write(2.0)
+    fc.Writer(arguments.output, problem, stress=rubber.stress).write(ANGLES[-1])
     plotting.plot_pressure(arguments.output / "pressure.png", problem.contacts[0])
     if comm.rank == 0:
         print(output.table(result["references"]))

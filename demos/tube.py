@@ -174,7 +174,6 @@ def solve(name: str, cells: int, quarters: int) -> Run:
         opposite, law = fc.DeformableBody(tags, WALL), fc.Frictionless(K / 4)
     inside = fc.Contact(u, wall, opposite, law, kinematics="finite", name="inside")
     problem = fc.ContactProblem(rubber.residual(v, dx), u, bcs=bcs, contacts=[*contacts, inside])
-    places = [fem.locate_dofs_geometrical(V, near) for near in (at(0.0, R), at(R, 0.0))]
 
     share = 0.5 if quarters == 1 else 1.0
     run = Run(name, share, problem, rubber, V.dofmap.index_map.size_global * 2)
@@ -186,25 +185,12 @@ def solve(name: str, cells: int, quarters: int) -> Run:
         run.force.append(-float(contacts[0].resultants().force[1]) / share)
         # Both walls of the whole tube have half of the pressure.
         run.inside.append(inside.resultants().normal_force / share)
-        moved = [moved_by(u, dofs) for dofs in places]
-        run.lower.append(-2 * moved[0][1])
-        run.wider.append(2 * moved[1][0])
+        run.lower.append(-2 * float(output.at_node(u, (0.0, R))[1]))
+        run.wider.append(2 * float(output.at_node(u, (R, 0.0))[0]))
     x = inside.points[:, 0] + inside.own_displacement()[:, 0]
     rows = MPI.COMM_WORLD.allgather(np.stack([x, inside.pressure * 2 * share]))
     run.place, run.pressure = np.concatenate(rows, axis=1)
     return run
-
-
-def at(x: float, y: float) -> Any:
-    """Whether a node is there."""
-    return lambda nodes: np.isclose(nodes[0], x, atol=1e-6) & np.isclose(nodes[1], y, atol=1e-6)
-
-
-def moved_by(u: fem.Function, dofs: np.ndarray) -> np.ndarray:
-    """Displacement of a node, on all ranks. Collective."""
-    mine = dofs[dofs < u.function_space.dofmap.index_map.size_local]
-    values = u.x.array.reshape(-1, 2)[mine].sum(axis=0)
-    return np.asarray(MPI.COMM_WORLD.allreduce(values))
 
 
 def compare(whole: Run, quarter: Run, fine: Run) -> dict[str, Any]:
