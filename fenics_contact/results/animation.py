@@ -22,6 +22,9 @@ from fenics_contact.types import Array
 
 __all__ = ["Animation"]
 
+# The body where no stress is drawn, and the edges of its cells.
+_BODY, _EDGES = "#e3ebf5", "#11111180"
+
 
 class Animation:
     """A film of a problem's states, one frame a call of `add`, written by `save`.
@@ -174,22 +177,22 @@ class Animation:
         figure, axes = drawing.made_axes(np.array(corners), unit, title, self._view)
         colours = drawing.scale_of(0.0, largest)
         body_of = drawing.magnified(self._magnification)
-        handles = [Patch(fc="#e3ebf5", ec="#11111180", label=body_of)]
+        handles = [Patch(fc=_BODY, ec=_EDGES, label=body_of)]
         handles += drawing.status_patches() if surfaces else []
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
         try:
             for number, frame in enumerate(self._frames()):
-                faces: Any = "#e3ebf5"
+                faces: Any = _BODY
                 if "stress" in frame:
                     faces = colours.to_rgba(frame["stress"])
                     if number == 0:
                         bar = {"label": f"von Mises stress [{stress_unit}]", "shrink": 0.8}
                         figure.colorbar(colours, ax=axes, **bar)
-                body = drawing.polygons(frame["body"], faces, "#11111180", 0.2)
+                body = drawing.polygons(frame["body"], faces, _EDGES, 0.2)
                 drawn = [axes.add_collection(body)]
                 if "ends" in frame:
-                    colour = drawing.status_colours(frame["status"])
-                    line = drawing.on_surface(frame["ends"], colour)
+                    of_status = drawing.status_colours(frame["status"])
+                    line = drawing.on_surface(frame["ends"], of_status)
                     line.set_linewidth(3.0)
                     drawn.append(axes.add_collection(line))
                 axes.set_title(f"{title}: {frame['words']}" if title else str(frame["words"]))
