@@ -277,6 +277,40 @@ DEMOS = [
         budget="ends that are not covered and axial displacements weigh more than the error",
     ),
     demo(
+        "Screw turned under a nut of rubber, finite",
+        "1e-9 without friction: the work of torque and force, to the solver's tolerance; with it "
+        "3e-4 of F R: the middle of the pressure, and the square of the width over R",
+        "screw",
+        source={"no friction": "work: M = F P", "": "square thread: tan(α ± φ)"},
+        budget="torque over force follows from statics",
+    ),
+    demo(
+        "Ring of rubber turned on a disc, finite",
+        "2 %: the pressure is not even, the ring has 32 sides; 1e-6: slip along the radius that is "
+        "left; 1e-7: the solver's tolerance",
+        "clutch",
+        source={
+            "even pressure": "textbooks: μ F 2/3 (b³ - a³)/(b² - a²)",
+            "plate": "equilibrium",
+            "turned": "frame indifference",
+            "": "Coulomb",
+        },
+        budget="torque over force follows from statics, the rest from equilibrium",
+    ),
+    demo(
+        "Tube of rubber pinched until it touches itself, finite",
+        "1e-3: normals of curved walls do not end at mirror images; 1 %: between meshes; 1.5 %: "
+        "(t/R)²/2, as sections do not stay plane",
+        "tube",
+        source={
+            "quarter": "half the cells",
+            "by the force": "Winkler's curved beam, Timoshenko",
+            "": "a quarter on a rigid plane",
+        },
+        budget="forces here are compared between routes with the same errors, slopes with a beam, "
+        "known to less than the error",
+    ),
+    demo(
         "Disc pressed into rubber, turned and dragged, finite",
         "1e-7 of the force that presses, the digits that are written down; 1e-10 between two "
         "routes of one program; 2 % for what penetration takes off the radius",
