@@ -12,7 +12,8 @@ it: the jump, the angle, the pairs.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -131,6 +132,7 @@ class Opposite(ABC):
         self.at_points: AnyKinematics = small
         self.committed_jump: Array = np.zeros((parts.quadrature.n_points, self._gdim))
         self.committed_angle = 0.0
+        self._displaced: Array | None = None
 
     # ---- construction ----------------------------------------------------------------------------
 
@@ -223,7 +225,22 @@ class Opposite(ABC):
         displacement = self._parts.displacement
         displacement.follow()
         self.pairs.jump_map.mult(displacement.u.x.petsc_vec, self.jump.x.petsc_vec)
+        if self._displaced is not None:
+            self.jump.x.array[: self._displaced.size] += self._displaced.ravel()
         self.jump.x.scatter_forward()
+
+    @contextmanager
+    def displaced(self, by: Array) -> Iterator[None]:
+        """Let points be somewhat beside where ``u`` has them, inside of the block.
+
+        Args:
+            by: (n_points, gdim) (length).
+        """
+        self._displaced = by
+        try:
+            yield
+        finally:
+            self._displaced = None
 
     def present_jump(self) -> Array:
         """Displacement relative to what lies opposite, or of the body alone. Collective."""

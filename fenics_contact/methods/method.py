@@ -77,6 +77,11 @@ class OwnMethod(Method):
     def __init__(self, tools: Tools) -> None:
         """Set up what solves. Collective."""
 
+    @property
+    def suits(self) -> bool:
+        """Whether there is what it solves, which others are to be tried before."""
+        return True
+
     def check(self) -> None:
         """Look whether there is what it solves, where it was asked for.
 
@@ -125,6 +130,7 @@ class InnerSnes:
         assemble: Callable[[PETSc.Vec, PETSc.Mat], None],
         converged: Callable[[], int],
         energy: Callable[[PETSc.Vec], float] | None = None,
+        residual: Callable[[PETSc.Vec, PETSc.Vec], None] | None = None,
     ) -> None:
         """Take vectors, matrix and solver of the present system. Collective.
 
@@ -132,6 +138,7 @@ class InnerSnes:
             assemble: Fills the matrix at x. It must not keep this object, which keeps it.
             converged: Whether to end, and why; likewise.
             energy: What the line search is to lower; none: it looks at the residual.
+            residual: What steps are to take away, likewise; none: that of the equations.
         """
         equations = self._equations
         if self._function is not equations.function:
@@ -142,7 +149,7 @@ class InnerSnes:
         this: InnerSnes = weakref.proxy(self)
         self._callbacks.attach(
             self.snes,
-            lambda x, f: this._compute_residual(x, f),
+            residual or (lambda x, f: this._compute_residual(x, f)),
             self._function,
             assemble,
             equations.matrix(self._consistent),

@@ -24,6 +24,7 @@ from fenics_contact.methods.kept import Kept
 from fenics_contact.methods.method import OVERLOADED, Method, Newton, OwnMethod, SnesMethod, Tools
 from fenics_contact.methods.neighbourhood import linearised, respond
 from fenics_contact.methods.options import Defaults, take_command_line
+from fenics_contact.methods.primal_dual import PrimalDual
 from fenics_contact.methods.quasi_newton import QuasiNewton
 from fenics_contact.methods.rounds import INNER, solve_in_rounds
 from fenics_contact.methods.starts import Starts
@@ -81,9 +82,13 @@ METHODS: dict[str, type[Method]] = {
     "newton": Newton,
     "alternating": Alternation,
     "continuation": Continuation,
+    "primal_dual": PrimalDual,
 }
 # What takes over where a method fails.
 _LAST_RESORT = "continuation"
+# By how many times contact is stiffer than the bulk where a step of Newton's method on
+# displacements alone goes wrong, and where points on a facet are too many for what it can do.
+_STIFF, _TOO_STIFF = 50.0, 1e5
 
 
 @dataclass(frozen=True)
@@ -475,6 +480,8 @@ class Solver:
             tries.append((starts[0], _LAST_RESORT))
             if self._hurries:
                 tries = [tries[0], tries[-1], *tries[:-1]]
+        if goes_on and self._is_stiff():
+            tries.insert(0 if self._automatic else len(tries) - 1, (starts[0], "primal_dual"))
         if overloaded:
             tries.insert(0, (starts[0], "alternating"))
         suspected = cold or overloaded
@@ -507,6 +514,11 @@ class Solver:
         if self.starts.predict:
             self.starts.keep()
         return int(reason), attempts
+
+    def _is_stiff(self) -> bool:
+        """Whether tractions are to be unknowns beside displacements. Collective."""
+        suits = self.methods["primal_dual"].suits and self.method != "primal_dual"
+        return suits and _STIFF < self.equations.hardness() < _TOO_STIFF
 
     def _is_overloaded(self) -> bool:
         """Whether friction cannot bear the load by the pressures at ``solution``. Collective."""

@@ -229,6 +229,10 @@ class CondensedSystem(System):
         ksp.pc.setType("python")
         ksp.pc.setPythonContext(PartlyFactored(self._places))
 
+    def bulk_diagonal(self) -> Array:
+        """See `System.bulk_diagonal`: that of S."""
+        return np.asarray(np.diag(self.condensation.schur), dtype=np.float64)
+
     def fill(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
         """S plus contact, conditions applied, dimensionless; no sparse factorisation."""
         scale = self.bulk.scale

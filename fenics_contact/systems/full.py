@@ -213,6 +213,14 @@ class FullSystem(System):
         matrix.scale(1.0 / scale)
         return int(self.linear_kind == "direct")
 
+    def bulk_diagonal(self) -> Array:
+        """See `System.bulk_diagonal`."""
+        assert self.stiffness is not None
+        diagonal = self.stiffness.getDiagonal()
+        values: Array = diagonal.array.copy()
+        diagonal.destroy()
+        return values
+
     def take_diagonal(self, matrix: PETSc.Mat) -> None:
         """Let the diagonal be that of a matrix on all unknowns. Collective."""
         diagonal = matrix.getDiagonal()

@@ -334,6 +334,10 @@ class System(ABC):
         """
 
     @abstractmethod
+    def bulk_diagonal(self) -> Array:
+        """Diagonal of the bulk's tangent at this rank's unknowns, (n_local,) (force/length)."""
+
+    @abstractmethod
     def linear_solver(self, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
         """Options of the solver for `matrix`; see `linear.options`."""
 

@@ -1,0 +1,272 @@
+"""Newton's method on displacements and tractions of the points at once, however stiff contact is.
+
+A stiff law answers a step of Newton's method that is a little too long by tractions that are much
+too large, and a line search takes the step back. Here tractions s at the points are unknowns beside
+the displacements g there, and the law is asked about both, in terms of a moderate stiffness c:
+
+    s = R(s + c (g - C s)),    C = K⁻¹,
+
+in which R is its return map, of a trial traction, and K its stiffness, k_n and k_t. Solutions are
+those of s = R(K g), whatever c is. With c = K this is Newton's method as usual; for K → ∞ it is the
+primal-dual active set method (P. Alart and A. Curnier, Comput. Methods Appl. Mech. Engrg. 92, 1991;
+S. Hüeber, G. Stadler and B. Wohlmuth, SIAM J. Sci. Comput. 30, 2008), whose c is at choice. With c
+as stiff as the bulk, points change their status by what body and tractions say of one another. R is
+had from the law as it is, at the displacement C (s + c (g - C s)) = g - (1 - c C) e, where e = g -
+C s tells by how much s and g do not fit. Tractions are eliminated point by point, so that systems
+to be solved have the unknowns that they always have.
+
+Without friction Newton's method with its line search is as quick, and does not go round in cycles.
+"""
+
+from __future__ import annotations
+
+import weakref
+
+import numpy as np
+from petsc4py import PETSc
+
+from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.point_law import PointTangent
+from fenics_contact.contact.values import PointValues
+from fenics_contact.methods.method import InnerSnes, OwnMethod, Tools
+from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.types import Array
+
+__all__ = ["PrimalDual"]
+
+_OPTIONS = {
+    "snes_type": "newtonls",
+    "snes_rtol": 0.0,
+    "snes_stol": 0.0,
+    "snes_atol": 0.0,
+    "snes_max_it": 75,
+    "snes_linesearch_type": "basic",
+}
+# c by the stiffness of the bulk, one after another, and iterations with each: what makes one of
+# them go round in a cycle does not with the next.
+_MODERATE, _PATIENCE = (1.0, 0.3, 3.0, 0.1, 10.0), 15
+
+
+class PrimalDual(OwnMethod):
+    """The method.
+
+    Attributes:
+        snes: Newton's method, prefix "primal_dual_" behind the problem's.
+    """
+
+    by_newton = True
+
+    def __init__(self, tools: Tools) -> None:
+        """Set up SNES; the matrix is that of the consistent tangent. Collective."""
+        equations = self._equations = tools.equations
+        solver = tools.linear_solver(equations.symmetric(True))
+        both = tools.prefix, "primal_dual_"
+        self._newton = InnerSnes(equations, tools.defaults, both, _OPTIONS, solver, consistent=True)
+        self.snes = self._newton.snes
+        self._points: list[_Points] = []
+        self._hardness, self._evaluations = 1.0, 0
+
+    def check(self) -> None:
+        """See `OwnMethod.check`: friction by springs, of a linear bulk."""
+        if not self.suits:
+            raise ValueError(
+                "method is 'primal_dual', which is for friction by the springs k_n and k_t in "
+                "small displacements, for a bulk that is linear, and supports that do not move "
+                "freely; use another method"
+            )
+
+    @property
+    def suits(self) -> bool:
+        """See `OwnMethod.suits`."""
+        full = self._equations.full
+        rubs = any(contact.law.has_friction for contact in full.contacts)
+        return rubs and full.bulk.linear and all(_suits(c) for c in full.contacts)
+
+    def solve(self) -> tuple[int, int]:
+        """See `Method.solve`."""
+        this: PrimalDual = weakref.proxy(self)
+        self._points = []
+        self._newton.attach(
+            lambda x, J: this._assemble(J),
+            lambda: this._test(),
+            residual=lambda x, f: this._compute_residual(x, f),
+        )
+        try:
+            return self._newton.solve()
+        finally:
+            self._points = []
+            for contact in self._equations.contacts:
+                contact.forget()  # it was evaluated elsewhere
+
+    def _test(self) -> int:
+        reasons = PETSc.SNES.ConvergedReason
+        solved = self._equations.solved()
+        return int(reasons.CONVERGED_FNORM_RELATIVE if solved else reasons.ITERATING)
+
+    def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        """What the next step takes away, into ``f``. Collective."""
+        equations, system = self._equations, self._equations.system
+        if not self._points:
+            self._hardness, self._evaluations = equations.hardness(), 0
+            equations.set_state(x)
+            self._points = [_Points(operator) for operator in system.operators]
+        moderate = _MODERATE[self._evaluations // _PATIENCE % len(_MODERATE)]
+        self._evaluations += 1
+        equations.residual(x, f)  # of the law as it is: that it vanishes ends the iteration
+        for points in self._points:
+            points.follow(moderate / max(self._hardness, moderate))
+        everywhere = not equations.held()
+        for points in self._points:
+            points.linearise(everywhere=everywhere)
+        total = f.duplicate()
+        total.array[:] = system.bulk_force()
+        for points in self._points:
+            points.operator.add_force(total, points.traction)
+        total.array[system.constrained] = 0.0
+        f.array[:] = total.array_r / (equations.full.bulk.scale * equations.length)
+        total.destroy()
+
+    def _assemble(self, matrix: PETSc.Mat) -> None:
+        tangents = (p.operator.tangent(PointTangent(p.tangent)) for p in self._points)
+        self._equations.assemble(matrix, tangents)
+
+
+def _suits(contact: Contact) -> bool:
+    law = contact.law
+    springs = law.has_normal_stiffness and not (law.has_own_normal or law.has_tension)
+    rubs = law.has_friction or not law.has_tangential
+    return springs and rubs and not (contact.finite or contact.motions)
+
+
+class _Points:
+    """The points of a contact, and the tractions there.
+
+    Attributes:
+        operator: What their displacements and forces are by.
+        traction: On the body at the end of the next step if the points stay where they are,
+            (n_points, gdim) (stress).
+        tangent: By how much it changes as they move, (n_points, gdim, gdim) (stress/length).
+    """
+
+    def __init__(self, operator: ContactOperator) -> None:
+        """Begin at the present state with what was borne at the last commit. Collective."""
+        self.operator, self._share = operator, 1.0
+        contact = self._contact = operator.contact
+        contact.evaluate()
+        values = self._values = contact.values
+        self._jump = contact.opposite.present_jump()
+        self._springs = _Springs(values, friction=contact.law.has_friction)
+        before: Array = np.zeros(len(self._jump))
+        if contact.multipliers is None:
+            before = contact.history.values("normal_traction") / values.normal_stiffness
+        self._misfit = (before - values.gap)[:, None] * values.normal + values.increment
+        self.traction = self._correction = np.zeros_like(self._jump)
+        self.tangent: Array = np.zeros((*self._jump.shape, self._jump.shape[1]))
+
+    def follow(self, share: float) -> None:
+        """Let the tractions make the step that the displacement has made. Collective.
+
+        Then the law is evaluated at the displacement that both of them tell.
+
+        Args:
+            share: c from now on, by the stiffness of the law.
+        """
+        self._share = share
+        contact, springs = self._contact, self._springs
+        jump = contact.opposite.present_jump()
+        moved = springs.felt(jump - self._jump)
+        answer = _times(self.tangent, moved) - self._correction
+        self._misfit = self._misfit + moved - _times(springs.compliance, answer)
+        self._jump = jump
+        with contact.opposite.displaced((self._share - 1.0) * self._misfit):
+            contact.evaluate()
+            tangent = contact.acting.tangent().by_jump
+        self._values = contact.values
+        self.tangent = springs.exact(tangent, self._values)
+
+    def linearise(self, *, everywhere: bool) -> None:
+        """Set `traction` and `tangent` by what the law said.
+
+        Args:
+            everywhere: Take all points for closed and sticking: too few of them are to hold the
+                body.
+        """
+        springs, values, share = self._springs, self._values, self._share
+        beyond = springs.beyond(values)
+        if everywhere:
+            paired = values.paired > 0
+            beyond[paired] = 0.0
+            self.tangent = np.where(paired[:, None, None], springs.stiffness, self.tangent)
+        stretched = share * _times(springs.stiffness, self._misfit)
+        matrix = np.eye(self.tangent.shape[1])
+        matrix = matrix + (share - 1.0) * self.tangent @ springs.compliance
+        correction = np.linalg.solve(matrix, (beyond - stretched)[:, :, None])[:, :, 0]
+        self._correction = np.asarray(correction, dtype=np.float64)
+        self.tangent = np.asarray(share * np.linalg.solve(matrix, self.tangent), dtype=np.float64)
+        self.traction = springs.trial(values) - stretched - self._correction
+
+
+class _Springs:
+    """The springs of a law, which its points are closed and stick by.
+
+    Attributes:
+        stiffness: Derivative of the traction by the displacement, (n_points, gdim, gdim)
+            (stress/length); negative.
+        compliance: Its inverse, across the normal none without friction (length/stress).
+    """
+
+    def __init__(self, values: PointValues, *, friction: bool) -> None:
+        """Take them from values at the points; they do not change with the state."""
+        self._friction = friction
+        self._normal = values.normal
+        normal = np.einsum("qi,qj->qij", values.normal, values.normal)
+        along = values.normal_stiffness[:, None, None] * normal
+        if friction:
+            self.stiffness = -(along + values.tangential_stiffness)
+            self.compliance: Array = np.asarray(np.linalg.inv(self.stiffness), dtype=np.float64)
+        else:
+            self.stiffness = -along
+            self.compliance = np.asarray(-normal / values.normal_stiffness[:, None, None])
+
+    def felt(self, vectors: Array) -> Array:
+        """What of displacements they answer."""
+        if self._friction:
+            return vectors
+        return np.sum(vectors * self._normal, axis=1)[:, None] * self._normal
+
+    def _trial(self, values: PointValues) -> tuple[Array, Array]:
+        """Normal and tangential traction if all points were closed and stuck."""
+        pressure = values.multiplier - values.normal_stiffness * values.gap
+        stuck = values.old_traction - _times(values.tangential_stiffness, values.increment)
+        return -pressure, stuck
+
+    def trial(self, values: PointValues) -> Array:
+        """The traction if all points were closed and stuck, (n_points, gdim) (stress)."""
+        normal, tangential = self._trial(values)
+        return normal[:, None] * values.normal + tangential
+
+    def exact(self, tangent: Array, values: PointValues) -> Array:
+        """The tangent of the law without the round-off in its normal rows.
+
+        The iteration divides by c/K. Friction has a normal part by as much as displacements are
+        larger than those of the springs.
+        """
+        normal = values.normal
+        closed = np.where(values.normal_traction < 0, values.normal_stiffness, 0.0)
+        row = -closed[:, None] * normal - np.einsum("qi,qij->qj", normal, tangent)
+        return tangent + normal[:, :, None] * row[:, None, :]
+
+    def beyond(self, values: PointValues) -> Array:
+        """By how much that is beyond what the law bears, zero where it is not (stress).
+
+        Not a difference of both there, for the reason that `exact` is for.
+        """
+        normal, tangential = self._trial(values)
+        lifted = np.where(values.normal_traction < 0, 0.0, normal)
+        sticks = (values.limit > 0) & np.all(values.slip_increment == 0, axis=1)
+        slid = values.tangential(tangential - values.traction)
+        return lifted[:, None] * values.normal + np.where(sticks[:, None], 0.0, slid)
+
+
+def _times(blocks: Array, vectors: Array) -> Array:
+    return np.asarray(np.einsum("qij,qj->qi", blocks, vectors))

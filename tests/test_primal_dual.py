@@ -1,0 +1,178 @@
+"""Newton's method on displacements and tractions at once: stiff contact with friction.
+
+What it finds is compared with solutions by minimum problems (the alternation), whose matrices, line
+search and limits of friction are others, and with continuation. All satisfy the law to 1e-9 of the
+forces, and at 1e4 E/h displacements of Γc are known to some hundred times that: states agree to
+1e-6.
+"""
+
+import dataclasses
+
+import pytest
+from mpi4py import MPI
+
+import fenics_contact as fc
+from scenes import problems, two_blocks
+from scenes.blocks import TOP, block, kirchhoff
+from scenes.comparing import close, nodal
+from scenes.rubbing import Rub, cushion, pressed
+
+pytestmark = pytest.mark.mpi
+
+SERIAL = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="the same on several ranks")
+
+
+def coulomb(k, friction=0.3, **others):
+    return fc.Coulomb(friction, fc.Scaled(k), fc.Scaled(k), **others)
+
+
+@pytest.mark.parametrize("k", [1.0, 100.0, 1e4])
+@pytest.mark.parametrize(
+    ("cell", "degree"), [("triangle", 1), ("quadrilateral", 2), ("tetrahedron", 1)]
+)
+def test_the_same_solution(cell, degree, k):
+    """However stiff."""
+    states = []
+    for method in ("primal_dual", "alternating"):
+        scene, problem, _ = pressed(
+            cell, coulomb(k), method, degree=degree, n=3, side=0.06, fallback=False
+        )
+        step = problem.solve()
+        assert [attempt.method for attempt in step.attempts] == [method]
+        states.append(nodal(scene.u))
+    assert close(*states, 1e-6)
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        coulomb(300.0, modes=6),
+        coulomb(300.0, transverse_friction=0.1, direction=(1.0, 1.0, 0.0)),
+        fc.Tresca(0.3, 30.0, fc.Scaled(300.0), fc.Scaled(300.0)),
+        fc.Coulomb(0.3, fc.Scaled(1000.0), fc.Scaled(30.0)),
+    ],
+    ids=["polygon", "ellipse", "Tresca", "soft along Γc"],
+)
+def test_other_laws(law):
+    """Return maps of other yield surfaces, and springs that are not alike."""
+    states = []
+    for method in ("primal_dual", "alternating"):
+        scene, problem, _ = pressed("hexahedron", law, method, n=3, side=0.06, fallback=False)
+        problem.solve()
+        states.append(nodal(scene.u))
+    assert close(*states, 1e-6)
+
+
+@pytest.mark.parametrize("condensation", [True, False])
+def test_to_and_fro(condensation):
+    """A history with reversals, each increment from the last: as by continuation.
+
+    At 1000 E/h Newton's method on displacements needs two to ten times the iterations.
+    """
+    ends, made = [], []
+    for method in ("primal_dual", "continuation"):
+        rub = Rub(coulomb(1e3), mesh={"n": 8}, reach=0.05, method=method, condensation=condensation)
+        steps = list(fc.increments(rub.problem, rub.load, 0.0, 4.0, steps=8, max_cuts=0))
+        assert all(step.energy.dissipation >= 0 for step in steps)
+        ends.append(nodal(rub.scene.u))
+        made.append(sum(step.iterations for step in steps))
+    assert close(*ends, 1e-6)
+    assert made[0] < made[1]
+
+
+@SERIAL
+def test_iterations_hardly_grow_with_the_stiffness():
+    """The half-cylinder pressed by a force in one increment: from nothing at most twenty.
+
+    At 100 E/h these take 17. Continuation takes 37 to 41 there, and Newton's method and L-BFGS fail
+    at 1000 E/h.
+    """
+    found = []
+    for k in (1e2, 1e3, 1e4):
+        problem, _, _, load = problems.problem(problems.half_cylinder(0.2, 0.2), 1, k)
+        load.value = problems.half_cylinder(0.2, 0.2).end
+        step = problem.solve()
+        assert step.method == "primal_dual" and len(step.attempts) == 1
+        found.append(step.iterations)
+    assert max(found) <= 20
+
+
+@SERIAL
+def test_in_space_by_multigrid():
+    """The ball on a block, where nothing is factored: by default at high stiffness alone."""
+    ends = []
+    for options in ({}, {"method": "continuation"}):
+        body = dataclasses.replace(problems.ball_on_block(8), friction=0.3)
+        problem, contact, _, load = problems.problem(
+            body, 1, 1e3, condensation=False, linear_solver="multigrid", **options
+        )
+        load.value = body.end
+        step = problem.solve()
+        ends.append((step.method, contact.resultants().normal_force))
+    assert [method for method, _ in ends] == ["primal_dual", "continuation"]
+    assert close(ends[0][1], ends[1][1], 1e-8)
+
+
+def test_between_two_bodies():
+    """Pairs found anew as one block slides on another: pressed, and dragged until all of it slips.
+
+    Forces as by minimum problems, to 1e-7: both residuals are below 1e-9 of them.
+    """
+    forces = []
+    for method in ("primal_dual", "alternating"):
+        slider = two_blocks.Slider("triangle", coulomb(300.0), start=1.0, method=method)
+        steps = [slider.step(0.01, along) for along in (0.0, 0.002, 0.1)]
+        assert all(step.method == method for step in steps)
+        found = [step.contacts["contact"] for step in steps]
+        forces.append([value for r in found for value in (r.normal_force, r.tangential_force)])
+        assert found[-1].stick == 0
+    assert close(*forces, 1e-7)
+
+
+def test_under_multipliers():
+    """Rounds that begin where the last one ended: forces are those with springs of 10 E/h.
+
+    Multipliers leave 1e-7 of the tractions to springs, whatever these are; friction that points
+    have spent on their way there differs by as much as they moved: 1e-4.
+    """
+    found = []
+    for k in (10.0, 300.0):
+        augmented = {"enforcement": "augmented", "tolerance": 1e-7}
+        rub = Rub(coulomb(k), contact=augmented)
+        rub.move(0.06, 0.03)
+        step = rub.problem.solve()
+        found.append(step.contacts["contact"])
+    assert step.attempts[0].method == "primal_dual"
+    assert close(found[0].normal_force, found[1].normal_force, 1e-4)
+    assert close(found[0].tangential_force, found[1].tangential_force, 1e-4)
+
+
+def test_in_other_units():
+    """The same iterations: c is told by the stiffness of the bulk."""
+    made = []
+    for length, pressure in ((1.0, 1.0), (1e-3, 1e6)):
+        rub = Rub(
+            coulomb(1e3), mesh={"n": 8}, length=length, pressure=pressure, method="primal_dual"
+        )
+        rub.move(0.01 * length, 0.03 * length)
+        made.append(rub.problem.solve().attempts)
+    assert [a.iterations for a in made[0]] == [a.iterations for a in made[1]]
+
+
+@pytest.mark.parametrize(
+    "case", ["no friction", "a support that is moved by a force", "a nonlinear bulk"]
+)
+def test_what_it_is_not_for_is_refused(case):
+    """By the method's name, before any work."""
+    scene = block("triangle", n=2)
+    law, support, form = coulomb(10.0), cushion(2), scene.F
+    if case == "no friction":
+        law = fc.Frictionless()
+    elif case == "a nonlinear bulk":
+        form = kirchhoff(scene)
+    else:
+        support = fc.HalfSpace((0, 0), (0, 1), displacement=fc.Motion(force=(None, 1.0)))
+    contact = scene.contact(law, support=support)
+    bcs = [scene.hold(TOP, i) for i in range(2)]
+    with pytest.raises(ValueError, match="method is 'primal_dual', which is for friction by"):
+        fc.ContactProblem(form, scene.u, bcs=bcs, contacts=[contact], method="primal_dual")
