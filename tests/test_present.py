@@ -381,6 +381,22 @@ def test_no_body_is_pressed_through_the_other():
     np.testing.assert_allclose(forces[0], forces[1], atol=1e-8 * forces[1][1])
 
 
+def test_bodies_that_have_come_apart_are_in_balance_to_round_off():
+    """Dragged off the end, and on: nothing acts, and I + ∇u of the body at rest has round-off.
+
+    Its residual, 1e-15, is no share of any force; increments in which all was open were refused.
+    """
+    blocks = Blocks("quadrilateral", fc.Coulomb(0.3), (12, 6))
+
+    def load(t: float) -> None:
+        blocks.top[1].value, blocks.top[0].value = -0.05 * min(t, 1.0), 2.0 * max(t - 1.0, 0.0)
+
+    steps = list(fc.increments(blocks.problem, load, 0.0, 2.0, steps=[1.0, 1.4, 1.95, 1.98, 2.0]))
+    forces = np.array([step.contacts["contact"].force for step in steps])
+    assert forces[0, 1] > 1.0
+    assert not forces[-3:].any()
+
+
 def slotted() -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
     """A plate with a slot from its right side; tags of the slot's lips, of bottom and top end."""
     whole = dolfinx.mesh.create_rectangle(

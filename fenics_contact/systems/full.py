@@ -99,9 +99,21 @@ class FullSystem(System):
         self.displacement.follow()
         self.set_motions(state)
 
+    @cached_property
+    def _cell_size(self) -> float:
+        """Of the largest cell (length). Collective at first."""
+        mesh = self.u.function_space.mesh
+        cells = np.arange(mesh.topology.index_map(mesh.topology.dim).size_local, dtype=np.int32)
+        return global_max(mesh.comm, mesh.h(mesh.topology.dim, cells))
+
     def terms(self, state: Array) -> Array:
-        """See `System.terms`; a constraint on displacements sums up these. Collective."""
+        """See `System.terms`; a constraint on displacements sums up these. Collective.
+
+        A bulk that is not linear sums up I + ∇u, with the round-off of 1 in a body at rest, too.
+        """
         terms = super().terms(state)
+        if not self.bulk.linear:
+            terms = terms + self.diagonal * self._cell_size
         if not self.displacement.mixed:
             return terms
         moved = min(global_max(self.unknowns.comm, np.abs(state[self._moves])), self.farthest)
