@@ -26,7 +26,8 @@ E, NU = 1000.0, 0.3
 RADIUS, DEPTH = 0.8, 0.1
 
 
-def _relative(found: Any, wanted: Any) -> float:
+def relative(found: Any, wanted: Any) -> float:
+    """Largest difference, by the largest number wanted."""
     found, wanted = np.asarray(found), np.asarray(wanted)
     return float(np.abs(found - wanted).max() / np.abs(wanted).max())
 
@@ -65,7 +66,7 @@ def drum(angle: float, steps: int, mu: float = 0.3, **options: Any) -> Solve:
         contact, centre = tool.contact, np.array([0.0, tool.scene.height + RADIUS - DEPTH])
         arm = np.linalg.norm(contact.points + contact.own_displacement() - centre, axis=1)
         wanted = np.sign(angle) * mu * (contact.measure * arm) @ contact.pressure
-        return made, _relative(contact.moment(centre), wanted)
+        return made, relative(contact.moment(centre), wanted)
 
     return solve
 
@@ -90,7 +91,7 @@ def turned_with_all(steps: int, angle: float = 2 * np.pi) -> Solve:
             tool.angle.value = t * angle
 
         made += list(fc.increments(tool.problem, load, steps=steps))
-        return made, _relative(tool.tractions(), before)
+        return made, relative(tool.tractions(), before)
 
     return solve
 
@@ -125,7 +126,7 @@ def over_facets(n: int, steps: int, way: float) -> Solve:
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         made, found = force(method, facets)
-        return made, _relative(found, force(method, plane)[1])
+        return made, relative(found, force(method, plane)[1])
 
     return solve
 
@@ -156,7 +157,7 @@ def over_drum(n: int, steps: int, angle: float) -> Solve:
         made, found = force(
             method, lambda c, move: fc.RigidSurface(circle(n, RADIUS, c), ring(n), **move)
         )
-        return made, _relative(found, force(method, lambda c, m: fc.Ball(c, RADIUS, **m))[1])
+        return made, relative(found, force(method, lambda c, m: fc.Ball(c, RADIUS, **m))[1])
 
     return solve
 
@@ -188,7 +189,7 @@ def off_the_edge(mu: float, steps: int, linear: bool = True) -> Solve:
             return made, float(np.abs(off).max() / np.abs(first).max())
         made += lead((3.0, -0.05), (0.0, -0.05), steps)
         back = contact.resultants().force
-        return made, max(_relative(back, first), float(np.abs(off).max()))
+        return made, max(relative(back, first), float(np.abs(off).max()))
 
     return solve
 
@@ -227,7 +228,7 @@ def column(
             shift.value[1] = -down * t
 
         made = list(fc.increments(problem, load, steps=steps))
-        wanted = _bisect(lambda s: _stress(s) + k_n * (s - share), share * 0.5, 1.0)
+        wanted = bisect(lambda s: stress(s) + k_n * (s - share), share * 0.5, 1.0)
         found = 1.0 + u.x.array.reshape(-1, 2)[:, 1].min()
         return made, abs(found - wanted) / (1.0 - wanted)
 
@@ -240,19 +241,21 @@ def _test(u: fem.Function) -> Any:
     return ufl.TestFunction(u.function_space)
 
 
-def _nominal(along: float, across: float) -> tuple[float, float]:
+def nominal(along: float, across: float) -> tuple[float, float]:
     """Nominal stress along and across a column in plane strain."""
     shear, lame = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
     volume = 0.5 * lame * ((along * across) ** 2 - 1)
     return tuple(shear * (s - 1 / s) + volume / s for s in (along, across))
 
 
-def _stress(along: float) -> float:
-    across = _bisect(lambda s: _nominal(along, s)[1], 0.5, 5.0)
-    return _nominal(along, across)[0]
+def stress(along: float) -> float:
+    """Nominal stress along a column whose sides are free."""
+    across = bisect(lambda s: nominal(along, s)[1], 0.5, 5.0)
+    return nominal(along, across)[0]
 
 
-def _bisect(rises: Any, low: float, high: float) -> float:
+def bisect(rises: Any, low: float, high: float) -> float:
+    """Where a function that rises is zero."""
     for _ in range(100):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if rises(middle) < 0 else (low, middle)
@@ -280,16 +283,28 @@ def rubbed(kappa: float, mu: float, bulk: str = "rubber", steps: int = 2, **chan
     scene |= {"holds": [[0, "top", [0, 1], "still"]], "strain": 0.1, "share": 1.0}
     scene |= {"stages": stages} | change
 
+    return solved_twice(scene, finite_scenes.FiniteMade, finite_reference.model)
+
+
+def solved_twice(scene: dict[str, Any], make: Any, model: Any) -> Solve:
+    """A random scene's history: largest difference from the forces that the second solution finds.
+
+    Args:
+        scene: The scene, without a method.
+        make: Its class of `finite_scenes` or `present_scenes`.
+        model: The second solution's function of that name.
+    """
+
     def solve(method: str) -> tuple[list[fc.Step], float | None]:
-        made = finite_scenes.FiniteMade(scene | {"method": method}, MPI.COMM_WORLD)
+        made = make(scene | {"method": method}, MPI.COMM_WORLD)
         problem = made.problem()
-        other, _, loads = finite_reference.model(scene)
+        other, _, loads = model(scene)
         old = [c.start() for c in other.contacts]
         u, motion = np.zeros(other.body.places.size), np.zeros(0)
         known, steps, worst = True, [], 0.0
-        for stage in range(len(scene["stages"])):
+        for stage, given in enumerate(scene["stages"]):
             for step in fc.increments(
-                problem, lambda t, s=stage: made.apply(s, t), steps=scene["stages"][stage]["steps"]
+                problem, lambda t, s=stage: made.apply(s, t), steps=given["steps"]
             ):
                 steps.append(step)
                 if not known:
@@ -304,7 +319,7 @@ def rubbed(kappa: float, mu: float, bulk: str = "rubber", steps: int = 2, **chan
                 pairs = zip(other.contacts, found, old, strict=True)
                 old = [c.next_state(f, o) for c, f, o in pairs]
                 force = other.contacts[0].weights @ found[0]["traction"]
-                worst = max(worst, _relative(step.contacts["contact 0"].force, force))
+                worst = max(worst, relative(step.contacts["contact 0"].force, force))
         return steps, worst if known else None
 
     return solve
@@ -335,7 +350,7 @@ def from_afar(gap: float, by_force: bool = False) -> Solve:
     def solve(method: str) -> tuple[list[fc.Step], float]:
         made, found = force(method, gap)
         # The mesh is not symmetric, and a disc led by a prescribed way is held aside.
-        return made, _relative(found[1], -60.0 if by_force else force(method, 0.0)[1][1])
+        return made, relative(found[1], -60.0 if by_force else force(method, 0.0)[1][1])
 
     return solve
 
@@ -350,6 +365,6 @@ def pressed_in(steps: int, down: float = 0.3, **options: Any) -> Solve:
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         made, found = force(method, steps)
-        return made, _relative(found, force(method, 16)[1])
+        return made, relative(found, force(method, 16)[1])
 
     return solve

@@ -458,12 +458,15 @@ class FiniteProblem(reference.Problem):
         rest, size, floor, whole = evaluate(u, motion)
         if not whole:
             raise Failed("cells are turned inside out")
-        best = (np.inf, u, motion, size, floor)
+        best, idle = (np.inf, u, motion, size, floor), 0
         for iteration in range(80):
             norm = float(np.linalg.norm(rest))
+            idle = 0 if norm < 0.9 * best[0] else idle + 1
             if norm < best[0]:
                 best = (norm, u.copy(), motion.copy(), size, floor)
             if norm <= rtol * size or norm <= 1e-15 * floor:
+                break
+            if idle > 4 and best[0] <= 1e-13 * floor:  # round-off, which falls no further
                 break
             matrix = tangent(u, motion, closed=False)
             scale = np.sqrt(np.abs(np.diag(tangent(u, motion, closed=True))))

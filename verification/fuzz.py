@@ -6,6 +6,7 @@
     docker/run python verification/fuzz.py --scenes 9000 --alike 12 --resume more.csv  # faster
     docker/run python verification/fuzz.py --finite --scenes 300 --alike 12 --resume finite.csv
     docker/run python verification/fuzz.py --bodies --scenes 300 --alike 24 --resume bodies.csv
+    docker/run python verification/fuzz.py --bodies --extreme --scenes 300 --resume extreme.csv
     docker/run python verification/fuzz.py --replay scene.json --minimise
     docker/run python verification/fuzz.py --table results.csv        # Markdown
 
@@ -264,8 +265,21 @@ def features(scene: Scene) -> list[str]:
     found += ["two scales"] if scene["share"] != 1.0 else []
     sizes = [s["normal"] for s in scene["stages"] if s["normal"] > 0]
     found += ["levels"] if sizes and max(sizes) > 50 * min(sizes) else []
+    found += _unlikeness(scene) if scene.get("kinematics") == "present" else []
     found += ["off"] if any(s["normal"] <= 0 for s in scene["stages"]) else []
     return sorted(set(found))
+
+
+def _unlikeness(scene: Scene) -> list[str]:
+    """Of two bodies: which has facets at least four times as wide, or is 1000 times as stiff."""
+    own, other = (
+        scene["bodies"][side["body"]]
+        for side in (scene["contacts"][0], scene["contacts"][0]["support"])
+    )
+    wide, stiff = (own["size"][0] / own["n"][0]) / (other["size"][0] / other["n"][0]), own["E"]
+    found = [f"Γc {'coarse' if wide > 1 else 'fine'}"] * (not 0.25 < wide < 4)
+    stiff /= other["E"]
+    return found + [f"Γc {'stiff' if stiff > 1 else 'soft'}"] * (not 1e-3 < stiff < 1e3)
 
 
 # ---- many scenes ---------------------------------------------------------------------------------
@@ -276,10 +290,10 @@ def _drawn(seed: int, arguments: argparse.Namespace, ranks: int) -> Scene:
     from verification import finite_scenes, fuzz_scenes, present_scenes
 
     family = seed // arguments.alike if arguments.alike > 1 else None
-    draw = finite_scenes.draw if arguments.finite else fuzz_scenes.draw
+    options = {"without": tuple(arguments.without), "ranks": ranks, "family": family}
     if arguments.bodies:
-        draw = present_scenes.draw
-    return draw(seed, without=tuple(arguments.without), ranks=ranks, family=family)
+        return present_scenes.draw(seed, **options, extreme=arguments.extreme)
+    return (finite_scenes if arguments.finite else fuzz_scenes).draw(seed, **options)
 
 
 def _keep_forms() -> None:
@@ -328,7 +342,7 @@ def _batch(seeds: list[int], arguments: argparse.Namespace) -> Iterator[dict[str
     """Results of scenes solved in one process; ends early where it hangs or dies."""
     words = ["--work", ",".join(map(str, seeds)), "--limit", arguments.limit]
     words += ["--alike", arguments.alike] + ["--finite"] * arguments.finite
-    words += ["--bodies"] * arguments.bodies
+    words += ["--bodies"] * arguments.bodies + ["--extreme"] * arguments.extreme
     words += [v for name in arguments.without for v in ("--without", name)]
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
@@ -604,6 +618,9 @@ def main() -> int:
     )
     parser.add_argument(
         "--bodies", action="store_true", help="of two bodies with finite kinematics; likewise"
+    )
+    parser.add_argument(
+        "--extreme", action="store_true", help="bodies as unlike as can be; with --bodies"
     )
     parser.add_argument("--table", nargs="+", help="print the table of files of results")
     parser.add_argument("--verbose", action="store_true", help="a line for every scene")

@@ -18,13 +18,18 @@ from verification.finite_scenes import FiniteMade
 from verification.fuzz_made import Made
 from verification.fuzz_scenes import Scene, dice, element
 
-__all__ = ["PresentMade", "draw"]
+__all__ = ["PresentMade", "draw", "turn"]
 
 Array = np.ndarray
 
 
 def draw(
-    seed: int, *, without: tuple[str, ...] = (), ranks: int = 1, family: int | None = None
+    seed: int,
+    *,
+    without: tuple[str, ...] = (),
+    ranks: int = 1,
+    family: int | None = None,
+    extreme: bool = False,
 ) -> Scene:
     """A random scene.
 
@@ -34,6 +39,7 @@ def draw(
             "units", "restart", "method", "ration", "edge", "stiff", "fine".
         ranks: Kept in the scene.
         family: See `fuzz_scenes.draw`.
+        extreme: The same scene, its bodies as unlike as `_unlike` makes them.
     """
     rng = np.random.default_rng([seed, 40])
     built = rng if family is None else np.random.default_rng([family, 41])
@@ -162,11 +168,32 @@ def draw(
         scene["thickness"] = log(-2, 2)
     if chance(0.05, "ration", of=rng):
         scene["ration"] = int(rng.integers(4, 12))
+    if extreme:
+        _unlike(scene, np.random.default_rng([seed, 42]))
     return scene
 
 
-def _turn(d: int, angle: float) -> Array:
-    """About the axis out of the plane of x and the height."""
+def _unlike(scene: Scene, rng: np.random.Generator) -> None:
+    """Facets of one body up to twenty times as wide as the other's, a modulus up to 1e6 times.
+
+    Which is which is left to chance. The block is nearly as wide as the slab, so that twenty times
+    as fine is no more cells than the second solution bears; of degree 2 ten, and in space four.
+    """
+    slab, block = scene["bodies"]
+    wide, room = block["size"], slab["size"][0]
+    wide[0] = float(f"{rng.uniform(0.6, 0.9) * room:.3g}")
+    block["origin"][0] = float(f"{rng.uniform(0.0, 1.0) * (room - wide[0]):.3g}")
+    fine, coarse = (slab, block) if rng.random() < 0.5 else (block, slab)
+    most = 4 if len(wide) == 3 else 20 / scene["degree"]
+    ratio = most ** rng.uniform(0.5, 1.0)
+    for body, n in ((coarse, 1), (fine, round(ratio * fine["size"][0] / coarse["size"][0]))):
+        body["n"][:-1] = [max(n, 1)] * (len(wide) - 1)
+    soft, stiff = (slab, block) if rng.random() < 0.5 else (block, slab)
+    soft["E"], stiff["E"] = 100.0, float(f"{100 * 10 ** rng.uniform(3.0, 6.0):.3g}")
+
+
+def turn(d: int, angle: float) -> Array:
+    """Matrix of a turn about the axis out of the plane of x and the height."""
     c, s = np.cos(angle), np.sin(angle)
     found = np.eye(d)
     found[0, 0], found[0, -1], found[-1, 0], found[-1, -1] = c, -s, s, c
@@ -214,7 +241,7 @@ class PresentMade(FiniteMade):
         way[-1] = -down * block["size"][-1]
         middle = 0.5 * np.array(slab["size"]) * self.length
         pivot = (np.array(block["origin"]) + 0.5 * np.array(block["size"])) * self.length
-        whole, own = _turn(d, now["spin"]), _turn(d, now["turn"])
+        whole, own = turn(d, now["spin"]), turn(d, now["turn"])
         x = self.V.tabulate_dof_coordinates()[:, :d]
         for body, value in self._held:
             place = x

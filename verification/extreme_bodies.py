@@ -1,0 +1,358 @@
+"""The extremes of two bodies that deform and slide far.
+
+As in `extreme_scenes` a scene is a function of the method that returns the steps made and the error
+against its reference, relative. One block of rubber is on another one; the lower one's bottom is
+held and the upper one's top led where nothing else is said.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import dolfinx
+import numpy as np
+import ufl
+from dolfinx import fem
+
+import fenics_contact as fc
+from fenics_contact import compat
+from fenics_contact.elasticity import NeoHookean
+from scenes.bodies import boxes
+from scenes.comparing import at_points
+from scenes.elasticity import displacement_space, hold
+from scenes.rubber import TIGHT, rubber
+from scenes.tags import between, either, near
+from verification import present_reference, present_scenes
+from verification.extreme_finite import NU, E, bisect, nominal, relative, solved_twice, stress
+from verification.extreme_scenes import Array, Solve, friction_law
+from verification.present_scenes import turn
+
+BOTTOM, TOP, LOWER, UPPER, LEFT, RIGHT = 1, 2, 3, 4, 5, 6
+DOWN = 0.1  # how far blocks are pressed together
+
+
+class Two:
+    """Two blocks of rubber in plane strain, each 1 high.
+
+    Attributes:
+        u, contact, problem: As made.
+        at: Where the top has been led, aside and down, and the angle of both ends (radians).
+        push: Pressure on the top.
+    """
+
+    def __init__(
+        self,
+        method: str,
+        *,
+        kappa: float = 10.0,
+        mu: float = 0.0,
+        widths: tuple[float, float] = (2.0, 1.0),
+        start: float = 0.5,
+        n: tuple[int, int] = (8, 6),
+        rows: int = 4,
+        moduli: tuple[float, float] = (E, E),
+        own: int = UPPER,
+        rounded: float = 0.0,
+        gap: float = 0.0,
+        ends: str = "led",
+        points: int | None = None,
+    ) -> None:
+        """Make them, unloaded. Collective.
+
+        Args:
+            method: Of the problem.
+            kappa: Stiffness of the springs, by the smaller modulus over the height of a cell.
+            mu: Friction.
+            widths: Of the lower and of the upper block.
+            start: Where the upper one begins.
+            n: Cells along each.
+            rows: Cells over the height of each.
+            moduli: Of each.
+            own: Γc, `LOWER` or `UPPER`.
+            rounded: How much higher the upper one's lower side is at its ends.
+            gap: Between both.
+            ends: "led": bottom and top; "smooth": they are moved up and down alone, and the left
+                sides stay along; "confined": so do the right sides; "pushed": the bottom is held,
+                and the top along alone.
+            points: Of a facet of Γc.
+        """
+        lefts = (0.0, start)
+        lines = [
+            [np.linspace(left, left + width, m + 1), np.linspace(low, low + 1.0, rows + 1)]
+            for left, width, m, low in zip(lefts, widths, n, (0.0, 1.0), strict=True)
+        ]
+        sides = {LEFT: either(*(near(0, left) for left in lefts))}
+        sides[RIGHT] = either(*(near(0, a + b) for a, b in zip(lefts, widths, strict=True)))
+        sides |= {BOTTOM: near(1, 0.0), TOP: near(1, 2.0)}
+        sides |= {LOWER: between(1, 1.0, above=False), UPPER: between(1, 1.0, above=True)}
+        mesh, tags = boxes(lines, sides)
+        cells = np.arange(mesh.topology.index_map(2).size_local, dtype=np.int32)
+        upper = dolfinx.mesh.compute_midpoints(mesh, 2, cells)[:, 1] > 1.0
+        x, lifted = mesh.geometry.x, np.unique(compat.geometry_dofmap(mesh)[upper])
+        away = 2 * (x[lifted, 0] - start) / widths[1] - 1
+        x[lifted, 1] += gap + rounded * away**2 * (2.0 - x[lifted, 1])
+        modulus = fem.Function(fem.functionspace(mesh, ("DG", 0)))
+        modulus.x.array[:] = np.where(upper, moduli[1], moduli[0])
+        self.u = u = fem.Function(displacement_space(mesh, 1))
+        V, v = u.function_space, ufl.TestFunction(u.function_space)
+        self.at, self.push = np.zeros(3), fem.Constant(mesh, 0.0)
+        self._top, self._led = [fem.Constant(mesh, 0.0) for _ in range(2)], []
+        if ends == "led":
+            for tag in (BOTTOM, TOP):
+                dofs = fem.locate_dofs_topological(V, 1, tags.find(tag))
+                self._led.append(fem.dirichletbc(fem.Function(V), dofs))
+        bcs = list(self._led)
+        if ends == "pushed":
+            bcs = [hold(u, tags, BOTTOM, i) for i in range(2)] + [hold(u, tags, TOP, 0)]
+        elif ends != "led":
+            bcs = [hold(u, tags, BOTTOM, 1), hold(u, tags, TOP, 1, self._top[1])]
+            bcs += [hold(u, tags, side, 0) for side in (LEFT, RIGHT)[: 1 + (ends == "confined")]]
+        body = NeoHookean(u, modulus, NU, "plane strain")
+        ds = ufl.ds(mesh, subdomain_data=tags)
+        F = body.residual(v) + self.push * v[1] * ds(TOP)
+        degree = None if points is None else 2 * points - 1
+        self.contact = fc.Contact(
+            u,
+            fc.ContactSurface(mesh, tags, own, quadrature_degree=degree),
+            fc.DeformableBody(tags, LOWER if own == UPPER else UPPER),
+            friction_law(mu, kappa * min(moduli) * rows),
+            kinematics="finite",
+        )
+        self.problem = fc.ContactProblem(
+            F, u, bcs=bcs, contacts=[self.contact], method=method, petsc_options=TIGHT
+        )
+
+    @property
+    def force(self) -> Array:
+        """On the body with Γc, (2,)."""
+        return self.contact.resultants().force
+
+    def place(self, aside: float, down: float, angle: float) -> None:
+        """Let bottom and top be there: the top moved, then both turned about the origin."""
+        self._top[1].value = -down
+        for bc, way in zip(self._led, ((0.0, 0.0), (aside, -down)), strict=False):
+            x = self.u.function_space.tabulate_dof_coordinates()[:, :2]
+            bc.g.x.array[:] = ((x + way) @ turn(2, angle).T - x).ravel()
+
+    def lead(
+        self, aside: float, down: float, steps: int, angle: float = 0.0, **options: Any
+    ) -> list[fc.Step]:
+        """In equal increments to a place and an angle. Collective."""
+        start, end = self.at, np.array([aside, down, angle])
+
+        def load(t: float) -> None:
+            self.place(*(start + t * (end - start)))
+
+        made = list(fc.increments(self.problem, load, steps=steps, **options))
+        self.at = end
+        return made
+
+
+# ---- turns and ways ------------------------------------------------------------------------------
+
+
+def turned_with_all(steps: int, mu: float = 0.3, angle: float = 2 * np.pi, **two: Any) -> Solve:
+    """Pressed and dragged, then both turned: the first tractions again."""
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        both = Two(method, mu=mu, rounded=0.1, **two)
+        made = both.lead(0.0, DOWN, 2) + both.lead(0.05, DOWN, 2)
+        before = at_points(both.contact, both.contact.traction)
+        made += both.lead(0.05, DOWN, steps, angle)
+        now = at_points(both.contact, both.contact.traction)
+        return made, relative(now, before @ turn(2, angle).T)
+
+    return solve
+
+
+def over_facets(n: int, steps: int, mu: float, wide: int = 50) -> Solve:
+    """Dragged along a block of n facets and 20 heights, over more than half of them.
+
+    The force is that after a tenth of the way, whole facets before. The ends of the long block are
+    more than 4 of its heights away, which are felt by less than 1e-4.
+
+    Args:
+        n: Facets of the lower block, 20 long; those of the upper one are ``wide``, 1 long.
+        steps: Increments.
+        mu: Friction.
+        wide: See ``n``.
+    """
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        both = Two(method, mu=mu, widths=(20.0, 1.0), start=4.0, n=(n, wide), rows=2)
+        made = both.lead(0.0, DOWN, 2)
+        made += both.lead(1.1, DOWN, max(1, steps // 10))
+        first = both.force
+        made += both.lead(11.0, DOWN, steps)
+        return made, relative(both.force, first)
+
+    return solve
+
+
+def off_the_edge(mu: float, steps: int, **two: Any) -> Solve:
+    """Dragged off the end: no force; without friction all of it again, back where it was."""
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        both = Two(method, mu=mu, **two)
+        made = both.lead(0.0, 0.5 * DOWN, 1)
+        first = both.force
+        made += both.lead(2.0, 0.5 * DOWN, steps, max_cuts=6)
+        off = float(np.abs(both.force).max() / np.abs(first).max())
+        if mu:
+            return made, off
+        made += both.lead(0.0, 0.5 * DOWN, steps, max_cuts=6)
+        return made, max(relative(both.force, first), off)
+
+    return solve
+
+
+def lifted(mu: float, **two: Any) -> Solve:
+    """Pressed, dragged and taken off: no force, and no strain (by displacements)."""
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        both = Two(method, mu=mu, rounded=0.1, gap=1e-3, **two)
+        made = both.lead(0.0, DOWN, 2) + both.lead(0.2, DOWN, 4)
+        first = np.abs(both.force).max()
+        made += both.lead(0.3, -0.2, 4)
+        upper = both.u.function_space.tabulate_dof_coordinates()[:, 1] > 1.0 + 1e-4
+        rigid = np.where(upper[:, None], (0.3, 0.2), (0.0, 0.0))
+        bent = np.abs(both.u.x.array.reshape(-1, 2) - rigid).max()
+        return made, max(float(np.abs(both.force).max() / first), float(bent))
+
+    return solve
+
+
+# ---- strain, stiffness, first touch --------------------------------------------------------------
+
+
+def column(
+    kappa: float,
+    share: float = 0.6,
+    steps: int = 1,
+    *,
+    gap: float = 0.0,
+    mu: float = 0.0,
+    cuts: int = 6,
+    **two: Any,
+) -> Solve:
+    """Two blocks of a width pressed until both are as high as a share of their heights.
+
+    All stretches are uniform: the pressure is found by bisection, and that at every point of Γc
+    compared. Blocks of one modulus are free aside; of others their sides are held.
+    """
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        moduli = two.get("moduli", (E, E))
+        ends = "smooth" if moduli[0] == moduli[1] else "confined"
+        options = {"n": (4, 4)} | two
+        both = Two(
+            method, kappa=kappa, mu=mu, widths=(1.0, 1.0), start=0.0, gap=gap, ends=ends, **options
+        )
+        down = gap + 2.0 * (1.0 - share)
+        made = both.lead(0.0, down, steps, max_cuts=cuts)
+        k_n = kappa * min(moduli) * options.get("rows", 4)
+
+        def borne(along: float) -> float:
+            return stress(along) if ends == "smooth" else nominal(along, 1.0)[0]
+
+        def height(p: float, modulus: float) -> float:
+            return bisect(lambda s: modulus / E * borne(s) + p, 1e-3, 1.0)
+
+        def lacking(p: float) -> float:
+            return p / k_n - sum(height(p, modulus) for modulus in moduli) + 2.0 * share
+
+        wanted = bisect(lacking, 0.0, 1e3 * min(moduli))
+        return made, relative(both.contact.pressure, wanted)
+
+    return solve
+
+
+def rubbed(
+    kappa: float,
+    mu: float,
+    bulk: str = "rubber",
+    *,
+    n: tuple[int, int] = (4, 3),
+    moduli: tuple[float, float] = (E, E),
+    own: int = UPPER,
+    steps: int = 2,
+) -> Solve:
+    """A block pressed on another one, dragged and rocked: forces of the second solution."""
+    soft = min(moduli) / moduli[0 if own == LOWER else 1]
+    law: dict[str, Any] = {"kind": "coulomb" if mu else "frictionless"}
+    law |= {"k_n": ["number", 4 * kappa * soft]}
+    law |= {"k_t": ["number", 4 * kappa * soft], "friction": mu} if mu else {}
+    upper, lower = {"body": 1, "side": "bottom"}, {"body": 0, "side": "top"}
+    here, there = (upper, lower) if own == UPPER else (lower, upper)
+    support = {"kind": "body", "update": "never"} | there
+    slab = {"origin": [0.0, 0.0], "size": [2.0, 1.0], "n": [n[0], 2], "E": moduli[0], "jitter": 0}
+    block = {"origin": [0.6, 1.0], "size": [0.8, 0.5], "n": [n[1], 2], "E": moduli[1], "jitter": 0}
+    still = {"normal": 1.0, "across": 0.0, "spin": 0.0, "steps": steps}
+    scene = {"kinematics": "present", "bulk": bulk, "layout": "two", "cell": "quadrilateral"}
+    scene |= {"degree": 1, "nu": NU, "bodies": [slab, block], "units": [1.0, 1.0]}
+    scene |= {"drive": "prescribed", "contacts": [here | {"support": support, "law": law}]}
+    scene |= {"holds": [[0, "bottom", [0, 1], "still"], [1, "top", [0, 1], "moved"]]}
+    scene |= {"strain": 0.1, "share": 1.0, "bend": [0.0, 0.1]}
+    scene |= {"stages": [still | {"side": 0.0, "turn": 0.0}, still | {"side": 0.1, "turn": 0.05}]}
+    return solved_twice(scene, present_scenes.PresentMade, present_reference.model)
+
+
+def like_rigid(ratio: float, mu: float, n: tuple[int, int] = (8, 4), kappa: float = 10.0) -> Solve:
+    """A block under a plate ratio times as stiff, pressed and dragged: forces of a rigid plate."""
+
+    def rigid(method: str) -> Array:
+        block = rubber("quadrilateral", 1, n=(n[0], 4), size=(1.0, 1.0), E=E, nu=NU)
+        shift = fem.Constant(block.mesh, np.zeros(2))
+        plate = fc.HalfSpace((0.0, 1.0), (0.0, -1.0), displacement=shift)
+        law = friction_law(mu, kappa * E * 4)
+        problem, contact = block.problem(plate, law, method=method, petsc_options=TIGHT)
+        found = []
+        for t in range(1, 5):
+            shift.value[:] = 0.05 * max(t - 2, 0), -0.5 * DOWN * min(t, 2)
+            problem.solve()
+            problem.commit()
+            found.append(contact.resultants().force)
+        return np.array(found)
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        two = {"widths": (1.0, 2.0), "start": -0.5, "n": n, "moduli": (E, ratio * E)}
+        both = Two(method, kappa=kappa, mu=mu, own=LOWER, **two)
+        made, found = [], []
+        for t in range(1, 5):
+            made += both.lead(0.05 * max(t - 2, 0), 0.5 * DOWN * min(t, 2), 1)
+            found.append(both.force)
+        return made, relative(found, rigid(method))
+
+    return solve
+
+
+def from_afar(gap: float, by_force: bool = False, **two: Any) -> Solve:
+    """The upper block comes from a gap away in one increment: its force from near, or its load."""
+
+    def force(method: str, gap: float) -> tuple[list[fc.Step], float]:
+        options = {"ends": "pushed"} if by_force else {"rounded": 0.1}
+        both = Two(method, gap=gap, **options, **two)
+        if not by_force:
+            return both.lead(0.0, gap + DOWN, 1, max_cuts=10), both.force[1]
+        made = list(fc.increments(both.problem, both.push, 0.0, 60.0, steps=1, max_cuts=10))
+        return made, both.force[1]
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        made, found = force(method, gap)
+        return made, relative(found, 60.0 if by_force else force(method, 0.0)[1])
+
+    return solve
+
+
+def pressed_in(steps: int, **two: Any) -> Solve:
+    """Pressed in without friction, in any number of increments: the force of 16."""
+
+    def force(method: str, steps: int) -> tuple[list[fc.Step], Array]:
+        both = Two(method, rounded=0.1, **two)
+        return both.lead(0.0, 0.3, steps), both.force
+
+    def solve(method: str) -> tuple[list[fc.Step], float]:
+        made, found = force(method, steps)
+        return made, relative(found, force(method, 16)[1])
+
+    return solve
