@@ -21,6 +21,7 @@ from scenes.elasticity import displacement_space, hold, residual
 from scenes.meshes import mesh_of
 from scenes.tags import near, tagged
 from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, two_blocks
+from verification.extreme_bodies import Two
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 LAWS = {
@@ -395,6 +396,17 @@ def test_bodies_that_have_come_apart_are_in_balance_to_round_off():
     forces = np.array([step.contacts["contact"].force for step in steps])
     assert forces[0, 1] > 1.0
     assert not forces[-3:].any()
+
+
+def test_bodies_that_just_touch_may_be_turned():
+    """By a full turn: what round-off lets them into each other between points is no penetration.
+
+    Γc has two points, under which 20 facets of the other body are; 1e-14 deep it was refused.
+    """
+    both = Two("newton", mu=0.3, n=(40, 1), rounded=0.1)
+    steps = both.lead(0.0, 0.1, 2) + both.lead(0.05, 0.1, 2) + both.lead(0.05, 0.1, 36, 2 * np.pi)
+    assert len(steps) == 40
+    assert np.abs(both.force).max() < 1e-8
 
 
 def slotted() -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:

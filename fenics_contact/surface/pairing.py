@@ -42,6 +42,8 @@ __all__ = ["LookBack", "Pairing"]
 
 # Of a distance, by the size of the coordinates that it is the difference of.
 _ROUND_OFF = 16 * np.finfo(float).eps
+# What equations solved to round-off leave of displacements, by their size.
+_SOLVED = 10 * _ROUND_OFF
 # Angle between the normals of a facet and of the surface at its corner (radian), up to which the
 # facets stand for a smooth surface.
 _SMOOTH = 0.5
@@ -167,12 +169,15 @@ class Pairing:
         kept = np.flatnonzero(found.facet >= 0)
         distance = found.distance if present else np.einsum("qd,qd->q", found.place - x, ray)
         hit = found.facet[kept]
+        slack = self._slack(here)[hit] + self._slack(there)[there.first + facet[kept]]
+        if present and u is not None:
+            slack += _SOLVED * global_max(self._comm, np.abs(u.x.array))
         return LookBack(
             x[kept],
             self.facets[facet[kept]],
             hit,
             distance[kept],
-            self._slack(here)[hit] + self._slack(there)[there.first + facet[kept]],
+            slack,
             None if present else self._approach(facet, place, ray, kept, found),
         )
 
