@@ -383,6 +383,22 @@ def test_seeds_reproduce_and_features_can_be_left_out():
 
 
 @serial
+def test_unlike_bodies_change_nothing_else_of_a_scene():
+    """Facets up to 20 times as wide either way, by rounding 24, and moduli 1e3 to 1e6 times."""
+    ratios = []
+    for seed in range(60):
+        plain, unlike = (present_scenes.draw(seed, extreme=e) for e in (False, True))
+        assert {name for name in plain if plain[name] != unlike[name]} == {"bodies"}
+        slab, block = unlike["bodies"]
+        wide = [body["size"][0] / body["n"][0] for body in (slab, block)]
+        ratios.append([wide[0] / wide[1], slab["E"] / block["E"]])
+    log = np.log10(ratios)
+    assert np.abs(log[:, 0]).max() < np.log10(24) and np.ptp(log[:, 0]) > 2
+    assert 3 <= np.abs(log[:, 1]).min() and np.abs(log[:, 1]).max() <= 6.01
+    assert np.ptp(log[:, 1]) > 9
+
+
+@serial
 def test_minimise_keeps_what_fails_and_nothing_else():
     scene = copy.deepcopy(ONE) | {"method": "newton", "units": [1e3, 1e-3], "weight": 0.1}
     scene["contacts"][0]["gap"] = -0.001

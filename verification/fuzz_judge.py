@@ -345,7 +345,10 @@ class Judge:
             deep = np.where(found["r_n"] < 0, contact.project @ found["closing"], 0.0).max()
             # Γc may be one point.
             size = np.ptp(contact.x, axis=0).max() or np.ptp(self.problem.body.places, axis=0).max()
-            self._check(name, "inside", deep, _INSIDE * size)
+            # Multipliers are linear over a facet; of a coarse one what it bulges stays inside.
+            given = self.scene["contacts"][self.problem.contacts.index(contact)]
+            bulges = self._bulge / self.scene["bodies"][given["body"]]["n"][0] ** 2
+            self._check(name, "inside", deep, _INSIDE * size + bulges)
 
     def _check_through(self, name: str, u: Array, found: list[dict], now: dict[str, Any]) -> None:
         """Whether the other body sees far more contact than Γc does: it has passed through."""
