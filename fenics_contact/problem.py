@@ -188,7 +188,8 @@ class ContactProblem:
             prefix=prefix,
             accuracy=self.accuracy,
         )
-        linear.warn_of_slow_blas()
+        if u.function_space.mesh.comm.rank == 0:
+            linear.warn_of_slow_blas()
         self.displacement = find_displacement(u, self.contacts)
         self.u = u
         self.bulk = Bulk(F, self.displacement)
