@@ -287,22 +287,23 @@ def _words(line: str) -> str:
 @pytest.mark.parametrize("path", SCRIPTS, ids=[path.stem for path in SCRIPTS])
 def test_scripts_run(path: Path, tmp_path: Path) -> None:
     """They end with 0, having asserted a number or written what the page says."""
-    done = subprocess.run(
-        [sys.executable, str(path)],
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    for _ in range(2 if path.stem in ("log", "results") else 1):  # what is there is not in the way
+        done = subprocess.run(
+            [sys.executable, str(path)],
+            cwd=tmp_path,
+            env=environment(),
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
     said = {_words(line) for line in done.stdout.splitlines()}
     assert [line for line in _quoted(path) if _words(line) not in said] == []
     if path.stem != "results":
         assert "assert " in path.read_text()
         return
     written = {each.name for each in (tmp_path / "output").iterdir()}
-    assert written >= {"body.pvd", "contact.pvd", "contact_points.pvd", "state.npz", "history.csv"}
+    assert written >= {"body.pvd", "contact.pvd", "contact_points.pvd", "history.csv"}
     assert written >= {"pressure.png", "status.png", "deformation.png", "film.gif", "report.html"}
     assert len((tmp_path / "output" / "history.csv").read_text().splitlines()) >= 1 + 5
     assert "INFO:fenics_contact:condensed onto" in done.stderr

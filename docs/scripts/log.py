@@ -41,7 +41,7 @@ bcs = [fem.dirichletbc(push, top, V.sub(0))]
 floor, law = fc.HalfSpace((0, 0), (0, 1)), fc.Coulomb(0.3, k_n=fc.Scaled(1e4))  # too stiff
 contact = fc.Contact(u, fc.ContactSurface(msh, tags, 1), floor, law)
 problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method="lbfgs")
-for step in fc.increments(problem, push, 0, 1e-4, steps=2, checkpoint="state.npz"):
+for step in fc.increments(problem, push, 0, 1e-4, steps=2):
     if msh.comm.rank == 0:
         print(step.summary())
 written = "" if msh.comm.rank else open("run.log", encoding="utf-8").read()

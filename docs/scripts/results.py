@@ -33,8 +33,7 @@ problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
 # begin results
 writer = fc.Writer("output", problem, stress=steel.stress)
 film = fc.Animation("output/film.gif", problem, stress=steel.stress, magnification=1000)
-kept = {"checkpoint": "output/state.npz", "history": "output/history.csv"}
-for step in fc.increments(problem, push, 0, 1e-4, steps=5, **kept):
+for step in fc.increments(problem, push, 0, 1e-4, steps=5, history="output/history.csv"):
     print(step.summary())
     writer.write(step)
     film.add(step)
