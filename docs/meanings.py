@@ -147,6 +147,7 @@ GROUPS: list[tuple[str, list[str], str]] = [
             "results.drawing",
             "results.plotting",
             "results.animation",
+            "histories.progress",
             "histories.report",
         ],
         "Files of another program are never overwritten.",
@@ -284,6 +285,23 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "with changed data": (
             'A checkpoint is gone on with by other data, as `changed="continue"` allows.',
             "Nothing, if the list is what you changed.",
+        ),
+        "and nothing on the mesh has this tag": (
+            "A load, or another integral of F, is over a tag that no facet or cell has.",
+            "The number of the tag; the tags that the measure was made with.",
+        ),
+        "holds nothing": (
+            "A Dirichlet condition was made of an empty list of degrees of freedom.",
+            "The tag, or the function that locates; `np.isclose` instead of `==`.",
+        ),
+        "nothing will change with it": (
+            "The load that `increments` leads stands nowhere in the problem.",
+            "Put the constant itself into the form, the condition or the support, not a number "
+            "made of it.",
+        ),
+        "will not be solved for": (
+            "A history starts at another load than the last one has ended at.",
+            "`increments(problem, load, start, ...)` with the load that was reached.",
         ),
         "nothing was solved": (
             "`increments` returns what is to be iterated over.",

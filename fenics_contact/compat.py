@@ -23,6 +23,7 @@ __all__ = [
     "collapsed",
     "contains",
     "create_facet_submesh",
+    "entities_of",
     "geometry_dofmap",
     "geometry_element",
     "gmsh_data",
@@ -76,6 +77,13 @@ def create_facet_submesh(
         return submesh, {submesh: parent_to_sub}, parents
     local = np.arange(n_cells, dtype=np.int32)
     return submesh, [facet_map], facet_map.sub_topology_to_topology(local, False)
+
+
+def entities_of(tags: dolfinx.mesh.MeshTags, mesh: dolfinx.mesh.Mesh) -> bool:
+    """Whether tags are of the entities of this mesh: numbers of another one mean others here."""
+    # Some releases wrap what is compared, and make the wrapper anew each time.
+    mine, theirs = tags.topology, mesh.topology
+    return getattr(mine, "_cpp_object", mine) is getattr(theirs, "_cpp_object", theirs)
 
 
 def option_was_read(name: str) -> bool:

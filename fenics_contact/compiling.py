@@ -52,7 +52,7 @@ class Waiting:
         if logger.isEnabledFor(logging.INFO):
             logger.info(text)
         elif sys.stderr.isatty():
-            print(text, file=sys.stderr)
+            print(f"\r\x1b[K{text}", file=sys.stderr)  # in place of a bar's line
 
 
 waiting = Waiting()

@@ -25,7 +25,7 @@ __all__ = ["information"]
 _OPTIONAL = {
     "gmsh": "fc.model_to_mesh and the demos on meshes of gmsh do not run",
     "matplotlib": "no pictures: fc.plotting and the demos do not run",
-    "tqdm": "the demos do not run (progress bars)",
+    "tqdm": "the demos do not run, nor increments(progress=True)",
 }
 # MUMPS' names of orderings, by its option ICNTL(7).
 _ORDERINGS = {0: "AMD", 2: "AMF", 3: "SCOTCH", 4: "PORD", 5: "METIS", 6: "QAMD"}

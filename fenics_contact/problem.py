@@ -18,6 +18,7 @@ from fenics_contact.arguments import is_number, listed
 from fenics_contact.checks.energy import EnergyState
 from fenics_contact.checks.given import (
     check_contacts,
+    check_measures,
     check_start,
     check_values,
     constrained_unknowns,
@@ -188,14 +189,15 @@ class ContactProblem:
             prefix=prefix,
             accuracy=self.accuracy,
         )
+        self.displacement = find_displacement(u, self.contacts)
         if u.function_space.mesh.comm.rank == 0:
             linear.warn_of_slow_blas()
-        self.displacement = find_displacement(u, self.contacts)
         self.u = u
         self.bulk = Bulk(F, self.displacement)
         self.increment = 0
         self.prefix = prefix
         self._comm = u.function_space.mesh.comm
+        check_measures(F, self._comm)
         n_motions = sum(len(contact.motions) for contact in self.contacts)
         self.unknowns = Unknowns(u.function_space, n_motions)
         self._n_owned = self.unknowns.n_dofs
@@ -717,6 +719,19 @@ class ContactProblem:
         finally:
             self.full.set_state(before)
             self._modulus.put_back(modulus)
+
+    def reads(self, constant: fem.Constant) -> bool:
+        """Whether F, a Dirichlet condition or a contact was given with it. Collective."""
+        if constant in self.bulk.form.constants() or any(c.reads(constant) for c in self.contacts):
+            return True
+        value, prescribed = constant.value.copy(), list[Array]()
+        try:
+            for other in (value, value + 1.0):
+                constant.value = other
+                prescribed.append(self.prescribed_values())
+        finally:
+            constant.value = value
+        return bool(self._comm.allreduce(int(not np.array_equal(prescribed[0], prescribed[1]))))
 
     def present_load(self) -> Array:
         """External forces as they are now at this rank's unknowns (force). Collective."""

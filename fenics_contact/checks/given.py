@@ -5,14 +5,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
 
 from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
-from fenics_contact.parallel import all_finite, global_max, global_min
+from fenics_contact.parallel import all_finite, global_max, global_min, warn
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_nodes
 from fenics_contact.systems.unknowns import Unknowns
@@ -20,6 +22,7 @@ from fenics_contact.types import Array, Mask
 
 __all__ = [
     "check_contacts",
+    "check_measures",
     "check_start",
     "check_values",
     "constrained_unknowns",
@@ -29,6 +32,7 @@ __all__ = [
 
 logger = logging.getLogger("fenics_contact")
 
+_MEASURES = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
 # Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
 _TOUCHING = 1e-12
 # Round-off of coordinates that leaves too little of what is next to them, relative to the mesh.
@@ -49,6 +53,8 @@ def find_displacement(u: fem.Function, contacts: Sequence[Contact]) -> Displacem
     Raises:
         ValueError: It is not.
     """
+    if isinstance(u, ufl.Form):
+        raise ValueError("u is a Form; the order is ContactProblem(F, u): residual, function")
     if isinstance(u, ufl.core.expr.Expr) and not isinstance(u, fem.Function):
         raise ValueError(
             "problem: u is a part of a function, or another expression; give the function that "
@@ -70,6 +76,41 @@ def find_displacement(u: fem.Function, contacts: Sequence[Contact]) -> Displacem
     return Displacement.only(u, "problem")
 
 
+def check_measures(form: ufl.Form, comm: MPI.Comm) -> None:
+    """Refuse integrals over tags that their measure does not know; warn of tags of nothing.
+
+    Either is zero without a word from DOLFINx: a load that is not there. Collective.
+
+    Raises:
+        ValueError: A measure has no tags. On all ranks.
+    """
+    for integral in form.integrals():
+        ids, data = integral.subdomain_id(), integral.subdomain_data()
+        measure = _MEASURES.get(integral.integral_type(), integral.integral_type())
+        for tag in ids if isinstance(ids, tuple) else (ids,):
+            if isinstance(tag, str):  # everywhere
+                continue
+            if data is None:
+                raise ValueError(
+                    f"F has an integral over {measure}({tag}) whose measure has no tags, so that "
+                    f'it is zero; make it by {measure} = ufl.Measure("{measure}", domain=mesh, '
+                    "subdomain_data=tags)"
+                )
+            if not comm.allreduce(_n_tagged(data, int(tag))):
+                warn(
+                    comm,
+                    f"F has an integral over {measure}({tag}), and nothing on the mesh has this "
+                    "tag: it is zero",
+                )
+
+
+def _n_tagged(data: Any, tag: int) -> int:
+    """How many of this rank's entities have a tag: of MeshTags, or of (tag, entities) pairs."""
+    if hasattr(data, "find"):
+        return len(data.find(tag))
+    return sum(len(entities) for number, entities in data if number == tag)
+
+
 def constrained_unknowns(
     bcs: Sequence[fem.DirichletBC], u: fem.Function, unknowns: Unknowns, *, mixed: bool
 ) -> Mask:
@@ -85,7 +126,7 @@ def constrained_unknowns(
         ValueError: A condition is of another function.
     """
     mask = np.zeros(unknowns.n_local, dtype=np.bool_)
-    for bc in bcs:
+    for number, bc in enumerate(bcs):
         dofs, _ = bc.dof_indices()
         # A scalar space, or a collapsed part, may have as many nodes and other numbers of dofs.
         other = not compat.contains(u.function_space, bc.function_space)
@@ -94,6 +135,12 @@ def constrained_unknowns(
             raise ValueError(f"a Dirichlet condition is on another function space than u{advice}")
         # Their number of owned dofs, which comes with them, is wrong for blocked conditions.
         mask[dofs[dofs < unknowns.n_dofs]] = True
+        if not unknowns.comm.allreduce(dofs.size):
+            warn(
+                unknowns.comm,
+                f"bcs[{number}] holds nothing: it has no degree of freedom on any rank; check the "
+                "tag or the place by which they were located",
+            )
     return mask
 
 

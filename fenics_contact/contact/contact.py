@@ -28,7 +28,7 @@ from fenics_contact.contact.pairs import Pairs
 from fenics_contact.contact.results import PointResults
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law
-from fenics_contact.supports.base import Support
+from fenics_contact.supports.base import SampledSupport, Support
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.displacement import Displacement, check_kind
 from fenics_contact.surface.fields import PointFields
@@ -421,6 +421,16 @@ class Contact(PointResults):
         if self.gap_prescribed or not self.opposite.may_pair_anew:
             names.append("initial_gap")
         return {n: v for n, v in data.items() if n in names or n.startswith("parameter ")}
+
+    def reads(self, constant: fem.Constant) -> bool:
+        """Whether law, support, gap or weight were given with it.
+
+        True where that cannot be seen: shapes in numbers, and laws from elsewhere, may hold it.
+        """
+        own = type(self.law).__module__.split(".")[0] == __name__.split(".")[0]
+        seen = own and not isinstance(self.support, SampledSupport)
+        loads = [motion.load() for motion in self.motions]
+        return not seen or self.opposite.data.reads(constant) or any(f is constant for f in loads)
 
     # ---- pairs -----------------------------------------------------------------------------------
 

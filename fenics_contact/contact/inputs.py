@@ -181,7 +181,7 @@ class Inputs:
         if array.dtype.kind not in "iuf":
             raise TypeError(
                 f"{self._name}: {name} is {value!r}; give numbers, a fem.Constant, a fem.Function "
-                "or a UFL expression"
+                "or a UFL expression, of components such as ufl.as_vector([way, 0.0])"
             )
         constant = fem.Constant(self._surface.mesh, array.astype(np.float64))
         if name != "support":

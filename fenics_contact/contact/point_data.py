@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import ufl
+from dolfinx import fem
 
 from fenics_contact.parallel import fail_together
 from fenics_contact.surface.dependence import Dependence
@@ -64,6 +65,10 @@ class PointData:
     def ufl(self, name: str) -> ufl.core.expr.Expr:
         """One of those that laws see, as a function at the points (UFL)."""
         return self._fields.ufl(name)
+
+    def reads(self, constant: fem.Constant) -> bool:
+        """Whether a constant is in any of the expressions."""
+        return self._dependence.has(constant)
 
     def update(self) -> None:
         """Sample again if a constant or a function has changed. Collective."""

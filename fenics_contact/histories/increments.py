@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import tempfile
 import weakref
 from collections.abc import Callable, Generator, Iterator, Sequence
 from numbers import Real
@@ -17,6 +18,7 @@ from fenics_contact.checks.step import Step
 from fenics_contact.checks.verdict import Attempt, NotConverged
 from fenics_contact.estimates.errors import quantities
 from fenics_contact.histories import checkpoint as states
+from fenics_contact.histories.progress import Bar
 from fenics_contact.histories.table import Table
 from fenics_contact.parallel import collective_errors, warn
 from fenics_contact.problem import ContactProblem
@@ -47,6 +49,7 @@ def increments(
     fields: Sequence[fem.Function] = (),
     changed: str = "refuse",
     history: str | Path | None = None,
+    progress: bool | str = False,
 ) -> Iterator[Step]:
     """Lead the load parameter from ``start`` to ``end``; solve and commit increments. Collective.
 
@@ -97,6 +100,8 @@ def increments(
             one (all, where a history starts; those behind the checkpoint, where it goes on) are
             replaced, those before it stay, so that several calls may share a file, which is not
             that of the checkpoint.
+        progress: Whether to show, in a terminal or a notebook, how much of the way is done and the
+            time left; words for the head of the bar. It takes tqdm. Nothing is shown elsewhere.
 
     Yields:
         The step, after its commit; ``load`` is its load parameter, and ``attempts`` has what was
@@ -133,16 +138,27 @@ def increments(
     if not isinstance(checkpoint, str | Path | None):
         raise ValueError(f"checkpoint is {checkpoint!r}; it must be the name of a file")
     comm, set_load = problem.u.function_space.mesh.comm, _setter(load)
+    if isinstance(load, fem.Constant):
+        _check_constant(problem, load, start, end)
     file = None if checkpoint is None else Path(checkpoint)
     if file is not None:
         states.check_places(problem)
     with collective_errors(comm):
-        if file is not None and comm.rank == 0 and not file.parent.is_dir():
-            raise ValueError(f"checkpoint is {file}, and there is no folder {file.parent}; make it")
+        if file is not None and comm.rank == 0:
+            _check_folder(file)
+
+    if not isinstance(progress, bool | str):
+        raise ValueError(f"progress is {progress!r}; it must be True, False, or words for the bar")
+    bar = None
+    with collective_errors(comm):
+        if progress and comm.rank == 0:
+            bar = Bar(progress if isinstance(progress, str) else "", start, end)
 
     def apply(value: float) -> None:
         with collective_errors(comm):
             set_load(value)
+        if bar is not None:
+            bar.lead(value)
 
     if not isinstance(history, str | Path | None):
         raise ValueError(f"history is {history!r}; it must be the name of a file")
@@ -157,25 +173,65 @@ def increments(
     leg = _Leg(float(start), ends, float(start), estimate)
     every = max_cuts, checkpoint_every, field
     made = _history(problem, apply, leg, file, every, list(fields), changed, table)
-    return _Started(made, comm)
+    return _Started(made, comm, bar)
+
+
+def _check_folder(checkpoint: Path) -> None:
+    """Refuse a folder that is not there, or where nothing can be written. On the calling rank."""
+    folder = checkpoint.parent
+    if not folder.is_dir():
+        raise ValueError(f"checkpoint is {checkpoint}, and there is no folder {folder}; make it")
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        words = f"checkpoint is {checkpoint}, and nothing can be written in {folder}"
+        raise OSError(f"{words}: {error.strerror}") from error
+
+
+def _check_constant(problem: ContactProblem, load: fem.Constant, start: float, end: float) -> None:
+    """Warn of a load that nothing depends on, and of one that would jump. Collective."""
+    comm, now = problem.u.function_space.mesh.comm, float(load.value)
+    if not problem.reads(load):
+        warn(
+            comm,
+            "load is a constant that neither F, nor a Dirichlet condition, nor a contact was given "
+            "with: nothing will change with it; put the fem.Constant itself there, not its value",
+        )
+    if problem.increment and abs(now - start) > _SAME * max(abs(now), abs(end - start)):
+        warn(
+            comm,
+            f"start is {start:g}, and the load is {now:g} after {problem.increment} increments: "
+            f"the way from there to {start:g} will not be solved for; go on from where it is, "
+            f"increments(problem, load, {now:g}, ...)",
+        )
 
 
 class _Started(Iterator[Step]):
     """Increments that are solved as they are asked for; warns if none ever is."""
 
-    def __init__(self, steps: Generator[Step, None, None], comm: MPI.Comm) -> None:
-        self._steps, self._comm, self._asked = steps, comm, False
+    def __init__(self, steps: Generator[Step, None, None], comm: MPI.Comm, bar: Bar | None) -> None:
+        self._steps, self._comm, self._asked, self._bar = steps, comm, False, bar
 
     def __next__(self) -> Step:
         self._asked = True
-        return next(self._steps)
+        if self._bar is None:
+            return next(self._steps)
+        with self._bar.shown():
+            step = next(self._steps)
+        assert step.load is not None
+        self._bar.reach(step.load)
+        return step
 
     def close(self) -> None:
         """End the history here, as for a generator: the last committed increment was the last."""
         self._asked = True
         self._steps.close()
+        if self._bar is not None:
+            self._bar.wipe()
 
     def __del__(self) -> None:
+        if self._bar is not None:
+            self._bar.wipe()
         if not self._asked:
             warn(
                 self._comm,

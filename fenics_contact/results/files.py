@@ -33,10 +33,13 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     Else ``path`` is as before. On the calling rank only.
 
     Raises:
+        FileNotFoundError: Its folder is not there.
         ValueError: ``path`` is a device, a pipe or a socket.
     """
     path = Path(path)
     check_file(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path} is to be written, and there is no folder {path.parent}")
     # The ending stays: it may tell the format.
     temporary = path.with_name(f".{os.getpid()}.part.{path.name}")
     try:

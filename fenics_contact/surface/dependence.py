@@ -34,6 +34,10 @@ class Dependence:
         """Whether a number is another one than noted, on this rank; True if none was noted."""
         return self._noted is None or not np.array_equal(self._numbers(), self._noted)
 
+    def has(self, constant: fem.Constant) -> bool:
+        """Whether a constant is among them."""
+        return any(constant is mine for mine in self._owners[0])
+
     def note(self) -> None:
         """Note the numbers as they are now."""
         self._noted = self._numbers()

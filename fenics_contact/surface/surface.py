@@ -148,7 +148,8 @@ def tagged_facets(
     """Owned exterior facets with the tags, ascending. Collective.
 
     Raises:
-        ValueError: Wrong dimension, a tag that no facet has, an interior facet with the tag.
+        ValueError: Wrong dimension, tags of another mesh, a tag that no facet has, an interior
+            facet with the tag.
     """
     check_instance("mesh", mesh, dolfinx.mesh.Mesh)
     check_instance("facet_tags", facet_tags, dolfinx.mesh.MeshTags)
@@ -168,6 +169,11 @@ def tagged_facets(
             f"{tdim} has facets of dimension {tdim - 1}: pass its facet tags, not its cell tags"
         )
 
+    if not compat.entities_of(facet_tags, mesh):
+        raise ValueError(
+            "facet_tags are of another mesh, whose facets have other numbers: take the tags that "
+            "were made on, or read with, the mesh of u"
+        )
     mesh.topology.create_connectivity(tdim - 1, tdim)
     exterior = dolfinx.mesh.exterior_facet_indices(mesh.topology)
     n_owned = mesh.topology.index_map(tdim - 1).size_local

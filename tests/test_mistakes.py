@@ -1,0 +1,183 @@
+"""Mistakes of a first script: each is refused or warned of on all ranks, and nothing is silent."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.checks.given import check_measures
+from scenes.blocks import BOTTOM, TOP, block_mesh
+from scenes.comparing import raised_everywhere
+from scenes.sound import MESH, coulomb, pressed
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+COMM = MPI.COMM_WORLD
+NOWHERE = 77
+
+
+def bulk(scene, ds, tag):
+    """The scene's stiffness, and a pressure of one on a tag of the measure."""
+    v = ufl.TestFunction(scene.u.function_space)
+    eps = ufl.sym(ufl.grad(scene.u))
+    return ufl.inner(1000 * eps, ufl.grad(v)) * ufl.dx + v[1] * ds(tag)
+
+
+def problem_of(scene, F=None, bcs=None):
+    """On the bottom, by any form."""
+    bcs = scene.rollers() if bcs is None else bcs
+    if F is None:
+        return scene.problem(coulomb(), bcs)[0]
+    return fc.ContactProblem(F, scene.u, bcs=bcs, contacts=[scene.contact(coulomb())])
+
+
+def test_the_order_of_a_problem():
+    """Function and form swapped."""
+    scene = pressed()
+    F = bulk(scene, ufl.ds(scene.mesh, subdomain_data=scene.tags), TOP)
+    raised_everywhere(lambda: fc.ContactProblem(scene.u, F), ValueError, "ContactProblem(F, u)")
+
+
+def test_a_measure_without_tags():
+    """``ufl.ds(2)`` of no tags is zero for DOLFINx, and so would be the load."""
+    scene = pressed()
+    F = bulk(scene, ufl.ds(scene.mesh), TOP)
+    raised_everywhere(lambda: problem_of(scene, F), ValueError, f"ds({TOP})", "subdomain_data=tags")
+
+
+@pytest.mark.parametrize("pairs", [False, True])
+def test_a_tag_of_nothing(pairs):
+    """In the bulk form; tags as they are, and as pairs of a number and entities."""
+    scene = pressed()
+    data = scene.tags
+    if pairs:  # what stands there does not matter here, nothing is compiled
+        data = [(TOP, np.zeros(2 * len(scene.tags.find(TOP)), dtype=np.int32))]
+    ds = ufl.Measure("ds", scene.mesh, subdomain_data=data)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_measures(bulk(scene, ds, TOP), COMM)
+    with pytest.warns(UserWarning, match=rf"over ds\({NOWHERE}\), and nothing"):
+        check_measures(bulk(scene, ds, NOWHERE), COMM)
+
+
+def test_a_problem_with_a_tag_of_nothing():
+    """It is told when the problem is made."""
+    scene = pressed()
+    ds = ufl.Measure("ds", scene.mesh, subdomain_data=scene.tags)
+    with pytest.warns(UserWarning, match=rf"over ds\({NOWHERE}\), and nothing"):
+        problem_of(scene, bulk(scene, ds, NOWHERE))
+
+
+def test_a_condition_on_nothing():
+    """A tag that no facet has, with those that hold: it is told which."""
+    scene = pressed()
+    V = scene.u.function_space
+    dofs = fem.locate_dofs_topological(V, 1, scene.tags.find(NOWHERE))
+    empty = fem.dirichletbc(fem.Function(V), dofs)
+    bcs = [*scene.rollers(), empty]
+    with pytest.warns(UserWarning, match=rf"bcs\[{len(bcs) - 1}\] holds nothing"):
+        problem_of(scene, bcs=bcs)
+
+
+def test_tags_of_another_mesh():
+    """Numbers of facets mean others there, even if the meshes are made alike."""
+    scene = pressed()
+    mesh, other = block_mesh("quadrilateral", **MESH)
+    fc.ContactSurface(mesh, other, BOTTOM)
+    raised_everywhere(
+        lambda: fc.ContactSurface(scene.mesh, other, BOTTOM), ValueError, "of another mesh"
+    )
+    raised_everywhere(
+        lambda: scene.contact(coulomb(), support=fc.DeformableBody(other, TOP)),
+        ValueError,
+        "of another mesh",
+    )
+
+
+def test_a_load_that_nothing_reads():
+    """A constant whose value, not itself, stands in the form."""
+    scene = pressed()
+    problem = problem_of(scene)
+    with pytest.warns(UserWarning, match="neither F, nor a Dirichlet condition, nor a contact"):
+        list(fc.increments(problem, fem.Constant(scene.mesh, 0.0), 0, 1))
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("where", ["form", "condition", "support", "force", "friction", "gap"])
+def test_a_load_that_something_reads(where):
+    """No warning, wherever it stands, and its value is as before."""
+    scene = pressed()
+    load = fem.Constant(scene.mesh, 0.25)
+    bcs, F, law, options = scene.rollers(), scene.F, coulomb(), {}
+    if where == "form":
+        F = F + load * ufl.TestFunction(scene.u.function_space)[0] * ufl.dx
+    elif where == "condition":
+        V = scene.u.function_space
+        dofs = fem.locate_dofs_topological(V.sub(1), 1, scene.tags.find(TOP))
+        bcs = [*bcs, fem.dirichletbc(load, dofs, V.sub(1))]
+    elif where == "support":
+        options["support"] = fc.HalfSpace((0, 0), (0, 1), displacement=ufl.as_vector([load, 0.0]))
+    elif where == "force":
+        motion = fc.Motion(force=(None, load), displacement=(0.0, None))
+        options["support"] = fc.HalfSpace((0, 0), (0, 1), displacement=motion)
+        bcs = [*bcs, scene.hold(TOP, 1)]
+    elif where == "friction":
+        law = coulomb(load)
+    else:
+        options["gap"] = load
+    contact = scene.contact(law, **options)
+    problem = fc.ContactProblem(F, scene.u, bcs=bcs, contacts=[contact])
+    assert problem.reads(load)
+    assert not problem.reads(fem.Constant(scene.mesh, 0.25))
+    assert load.value == 0.25
+
+
+def test_components_in_a_tuple():
+    """A constant among numbers: it is said how to write it."""
+    scene = pressed()
+    way = fem.Constant(scene.mesh, 0.0)
+    support = fc.HalfSpace((0, 0), (0, 1), displacement=(way, 0.0))
+    raised_everywhere(
+        lambda: scene.contact(coulomb(), support=support), TypeError, "ufl.as_vector([way, 0.0])"
+    )
+
+
+def test_a_history_that_jumps():
+    """Led to 1, and then from 0 anew: the way back is not solved for. From where it is: silent."""
+    scene = pressed()
+    problem = problem_of(scene)
+    pull = scene.E  # any constant of the form
+    value = float(pull.value)
+    list(fc.increments(problem, pull, value, 2 * value))
+    with pytest.warns(UserWarning, match="will not be solved for"):
+        list(fc.increments(problem, pull, value, 1.5 * value))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        list(fc.increments(problem, pull, 1.5 * value, value))
+
+
+def test_folders_that_are_not_there(tmp_path: Path):
+    """Of a picture: the folder is named, not a temporary file in it."""
+    scene = pressed()
+    contact = scene.contact(coulomb())
+    path = Path(COMM.bcast(str(tmp_path))) / "nowhere" / "pressure.png"
+    raised_everywhere(
+        lambda: fc.plotting.plot_pressure(path, contact), OSError, f"no folder {path.parent}"
+    )
+
+
+def test_a_checkpoint_where_nothing_can_be_written():
+    """Before any work; /proc is such a folder, for root, too."""
+    scene = pressed()
+    problem = problem_of(scene)
+    raised_everywhere(
+        lambda: fc.increments(problem, scene.E, 1, 2, checkpoint="/proc/state.npz"),
+        OSError,
+        "nothing can be written in /proc",
+    )
