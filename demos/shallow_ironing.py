@@ -26,6 +26,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,6 @@ SLAB, DIE = 1, 2
 BOTTOM, SURFACE, TOP, SIDE = 1, 2, 3, 4
 # Of the die's cells by those of the slab.
 FINER = 0.4
-PRESSING = 20  # increments
 # Least and largest of the programs named above: t, name, [N/mm].
 PUBLISHED = {
     (1.0, "V"): (268.0, 332.0),
@@ -58,13 +58,50 @@ PUBLISHED = {
 }
 
 
+@dataclass(frozen=True)
+class Setting:
+    """What `verification/shallow_ironing.py` varies; the demo itself takes the first three.
+
+    Attributes:
+        size: Of the slab's cells down to 0.5 below its surface, growing from there on [mm].
+        increments: While the die is dragged until t = 2.
+        until: t at which to end.
+        pressing: Increments while the die is pressed.
+        stiffness: Multiple of E/h of the die, of which k_n and k_t are. Its E is 10 times that of
+            the slab, its h 0.4 times: 1 of it is 25 E/h of the slab, where 10 is usual.
+        enforcement: "penalty" or "augmented".
+        degree: Of the displacement.
+        quadrature: Degree of the rule on Γc; by default the package's.
+        side: Which body carries Γc, "die" or "slab".
+        isochoric: Take the energy G/2 (J^(-2/3) I1 - 3) + K/4 (J² - 1 - 2 ln J).
+        height: Of the slab below its surface [mm].
+        die: Young's modulus of the die [MPa].
+        friction: μ.
+    """
+
+    size: float = 0.2
+    increments: int = 250
+    until: float = 2.0
+    pressing: int = 20
+    stiffness: float = 1.0
+    enforcement: str = "penalty"
+    degree: int = 2
+    quadrature: int | None = None
+    side: str = "die"
+    isochoric: bool = False
+    height: float = HEIGHT
+    die: float = DIE_E
+    friction: float = MU
+
+
 def make_mesh(
-    size: float,
+    size: float, height: float = HEIGHT
 ) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags, dolfinx.mesh.MeshTags]:
     """Both bodies in one mesh, and the tags of its cells and facets. Collective.
 
     Args:
         size: Of the slab's cells down to 0.5 below its surface, growing from there on.
+        height: Of the slab, whose surface stays where it is.
     """
     gmsh.initialize()
     try:
@@ -74,7 +111,8 @@ def make_mesh(
         if MPI.COMM_WORLD.rank == 0:
             occ, middle_x = gmsh.model.occ, (LEFT + RIGHT) / 2
             lowest = HEIGHT + GAP
-            corners = ((0, 0), (LENGTH, 0), (LENGTH, HEIGHT), (0, HEIGHT))
+            bottom = HEIGHT - height
+            corners = ((0, bottom), (LENGTH, bottom), (LENGTH, HEIGHT), (0, HEIGHT))
             slab = [occ.addPoint(x, y, 0) for x, y in corners]
             corners = (
                 (LEFT, SHOULDER),
@@ -114,56 +152,63 @@ def make_mesh(
         gmsh.finalize()
 
 
-def ends(increments: int, until: float) -> list[float]:
+def ends(setting: Setting) -> list[float]:
     """Of the increments: while it is pressed, and while it is dragged."""
-    pressed = np.linspace(0.0, 1.0, PRESSING + 1)[1:]
-    dragged = np.linspace(1.0, 2.0, increments + 1)[1:]
-    return [float(t) for t in (*pressed, *dragged) if t <= until + 1e-9]
+    pressed = np.linspace(0.0, 1.0, setting.pressing + 1)[1:]
+    dragged = np.linspace(1.0, 2.0, setting.increments + 1)[1:]
+    return [float(t) for t in (*pressed, *dragged) if t <= setting.until + 1e-9]
 
 
 def solve(
-    size: float, increments: int, until: float
+    setting: Setting,
 ) -> tuple[list[dict[str, float]], fc.ContactProblem, NeoHookean, int]:
     """Press and drag; forces after each increment. Collective."""
-    mesh, cells, facets = make_mesh(size)
-    V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
+    mesh, cells, facets = make_mesh(setting.size, setting.height)
+    V = fem.functionspace(mesh, ("Lagrange", setting.degree, (2,)))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
     modulus = fem.Function(fem.functionspace(mesh, ("DG", 0)))
     modulus.x.array[:] = SLAB_E
-    modulus.x.array[cells.find(DIE)] = DIE_E
+    modulus.x.array[cells.find(DIE)] = setting.die
     modulus.x.scatter_forward()
-    body = NeoHookean(u, modulus, NU, "plane strain")
+    body = NeoHookean(u, modulus, NU, "plane strain", isochoric=setting.isochoric)
 
     top, bottom = fem.Constant(mesh, np.zeros(2)), fem.Constant(mesh, np.zeros(2))
     bcs = [
         fem.dirichletbc(value, fem.locate_dofs_topological(V, 1, facets.find(tag)), V)
         for tag, value in ((BOTTOM, bottom), (TOP, top))
     ]
+    # E/h of the stiff die, which is 25 times that of the slab, in units of its own body's.
+    own, other, unit = SIDE, SURFACE, DIE_E / setting.die
+    if setting.side == "slab":
+        own, other, unit = SURFACE, SIDE, DIE_E / SLAB_E / FINER
+    k = fc.Scaled(setting.stiffness * unit)
     contact = fc.Contact(
         u,
-        fc.ContactSurface(mesh, facets, SIDE),
-        fc.DeformableBody(facets, SURFACE),
-        # E/h of the stiff die, which is 25 times that of the slab: the usual is 10.
-        fc.Coulomb(MU, fc.Scaled(1.0), fc.Scaled(1.0)),
+        fc.ContactSurface(mesh, facets, own, quadrature_degree=setting.quadrature),
+        fc.DeformableBody(facets, other),
+        fc.Coulomb(setting.friction, k, k),
+        enforcement=setting.enforcement,
         kinematics="finite",
     )
-    dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4})
+    dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 2 * setting.degree})
     problem = fc.ContactProblem(body.residual(v, dx), u, bcs=bcs, contacts=[contact])
 
     def load(t: float) -> None:
         """Down until 1, along until 2."""
         top.value[:] = ALONG * max(t - 1.0, 0.0), -DOWN * min(t, 1.0)
 
-    path, times = [], ends(increments, until)
+    path, times = [], ends(setting)
+    on_slab = np.array([-1, 1]) if own == SIDE else np.array([1, -1])
     history = fc.increments(problem, load, 0.0, times[-1], steps=times)
     quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
     for step in tqdm(history, "shallow ironing", len(times), disable=quiet, unit="increment"):
         r = step.contacts["contact"]
+        along, down = on_slab * r.force
         path.append(
             {
                 "time": step.load,
-                "H": -float(r.force[0]),
-                "V": float(r.force[1]),
+                "H": float(along),
+                "V": float(down),
                 "stick": r.stick,
                 "slip": r.slip,
                 "penetration": r.max_penetration,
@@ -219,7 +264,8 @@ def main() -> int:
     )
     arguments, _ = parser.parse_known_args()
     start = time.perf_counter()
-    path, problem, body, dofs = solve(arguments.size, arguments.increments, arguments.until)
+    setting = Setting(arguments.size, arguments.increments, arguments.until)
+    path, problem, body, dofs = solve(setting)
     comm = MPI.COMM_WORLD
     result: dict[str, Any] = {
         "references": compare(path),
