@@ -1,0 +1,215 @@
+"""Shallow ironing, converged: `demos/shallow_ironing.py` with one thing varied at a time.
+
+python verification/shallow_ironing.py            # runs what is missing, then draws
+python verification/shallow_ironing.py --jobs 2
+python verification/shallow_ironing.py --draw     # evaluates what is there
+
+Each run is a process of its own, whose row and curve are kept as it ends in
+``verification/shallow_ironing.csv`` and ``shallow_ironing_curves.csv``: a study that was ended goes
+on with what is missing. Prints the tables of docs/finite.md and draws docs/shallow-ironing.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+from demos.shallow_ironing import Setting, solve
+from scenes.processes import ROOT, command, environment
+from verification import shallow_ironing_page as page
+
+STUDY = ROOT / "verification" / "shallow_ironing.csv"
+CURVES = STUDY.with_name("shallow_ironing_curves.csv")
+PICTURE = ROOT / "docs" / "shallow-ironing.png"
+TIMEOUT = 3600.0  # s, of one run
+# Facets pass under the die: V and H are fitted by a parabola over this time, and ripple about it.
+WINDOW = (1.4, 1.6)
+QUANTITIES = ("V(1)", "V(1.5)", "H(1.5)")
+RESULTS = (
+    *QUANTITIES,
+    *("fitted V(1.5)", "fitted H(1.5)", "ripple of V", "ripple of H"),
+    *("dofs", "increments done", "iterations", "most iterations", "processor seconds", "failure"),
+)
+COLUMNS = ("name", *(field.name for field in fields(Setting)), *RESULTS)
+BASE = Setting(until=2.0)
+
+
+def sized(size: float, increments: int, until: float = 1.6) -> Setting:
+    """The base on another mesh: springs of the same stiffness, a fifth of a facet an increment."""
+    stiffness = BASE.stiffness * size / BASE.size
+    return replace(BASE, size=size, increments=increments, until=until, stiffness=stiffness)
+
+
+def settings() -> dict[str, Setting]:
+    """All runs by name, in the order in which they are made.
+
+    Variants differ from the base, all else from a mesh that is coarser by half an octave.
+    """
+    short, coarse = replace(BASE, until=1.6), sized(0.283, 180)
+    runs = {
+        "base": BASE,
+        "isochoric": replace(short, isochoric=True),
+        "height 3": replace(short, height=3.0),
+        "isochoric, height 3": replace(short, isochoric=True, height=3.0),
+        "size 0.4": sized(0.4, 126),
+        "size 0.283": coarse,
+    }
+    varied = {
+        "augmented": replace(coarse, enforcement="augmented"),
+        "10 times the stiffness": replace(coarse, stiffness=10 * coarse.stiffness),
+        "80 increments of pressing": replace(coarse, pressing=80, until=1.0),
+        "quadrature of degree 16": replace(coarse, quadrature=16),
+        "360 increments of sliding": replace(coarse, increments=360),
+        "Γc of slab": replace(coarse, side="slab"),
+        "friction 0.4": replace(coarse, friction=0.4),
+        "die 100 times stiffer": replace(coarse, die=100 * BASE.die),
+        "quadrature of degree 2": replace(coarse, quadrature=2),
+        "10 increments of pressing": replace(coarse, pressing=10),
+        "degree 3": replace(coarse, degree=3),
+        "degree 1": replace(coarse, degree=1),
+    }
+    runs |= {f"{name}, size 0.283": setting for name, setting in varied.items()}
+    return runs | {"size 0.1": sized(0.1, 500, 2.0)}
+
+
+# ---- one run -------------------------------------------------------------------------------------
+
+
+def evaluate(path: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """V and H at 1 and 1.5, fitted about 1.5, and how far they ripple about the fit."""
+    t = np.array([row["time"] for row in path])
+    found = {}
+    inside = (t > WINDOW[0] - 1e-9) & (t < WINDOW[1] + 1e-9)
+    for name in "VH":
+        values = np.array([row[name] for row in path])
+        for at in (1.0, 1.5):
+            here = np.abs(t - at) < 1e-9
+            if here.any() and f"{name}({at:g})" in QUANTITIES:
+                found[f"{name}({at:g})"] = float(values[here][0])
+        if t[-1] > WINDOW[1] - 0.01:
+            fit = np.polynomial.Polynomial.fit(t[inside], values[inside], 2)
+            found[f"fitted {name}(1.5)"] = float(fit(1.5))
+            found[f"ripple of {name}"] = float(np.abs(values[inside] - fit(t[inside])).max())
+    return found
+
+
+def run(setting: Setting) -> tuple[dict[str, Any], list[tuple[float, float, float]]]:
+    """Solve: what its row has beside the setting, and t, V, H of all increments."""
+    start = time.process_time()
+    path, _, _, dofs = solve(setting)
+    iterations = [int(row["iterations"]) for row in path]
+    row = evaluate(path) | {
+        "dofs": dofs,
+        "increments done": len(path),
+        "iterations": sum(iterations),
+        "most iterations": max(iterations),
+        "processor seconds": round(time.process_time() - start, 1),
+    }
+    return row, [(row["time"], row["V"], row["H"]) for row in path]
+
+
+def started(name: str) -> tuple[dict[str, Any], list[tuple[float, float, float]]]:
+    """`run` in a process of its own; a row with a failure where it ends otherwise."""
+    words = command(1, Path(__file__), "--one", name)
+    try:
+        done = subprocess.run(
+            words, env=environment(), capture_output=True, text=True, timeout=TIMEOUT
+        )
+        if done.returncode == 0:
+            row, curve = json.loads(done.stdout.strip().splitlines()[-1])
+            return row, curve
+        failure = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+    except subprocess.TimeoutExpired:
+        failure = f"given up after {TIMEOUT:g} s"
+    return {"failure": failure[:200]}, []
+
+
+# ---- rows that are kept --------------------------------------------------------------------------
+
+
+def append(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Rows at the end of a file, to the disk, below a header where it is new."""
+    new = not path.exists()
+    with open(path, "a", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerows([columns, *rows] if new else rows)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """The rows of a file; none where there is none."""
+    if not path.exists():
+        return []
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def results() -> dict[str, dict[str, float]]:
+    """What was found, by name of the run and of the quantity; failed runs are left out."""
+    return {
+        row["name"]: {name: float(row[name]) for name in RESULTS[:-1] if row[name]}
+        for row in read(STUDY)
+        if not row["failure"]
+    }
+
+
+def curves() -> dict[str, np.ndarray]:
+    """t, V and H of all increments, shape (n, 3), by name of the run."""
+    found: dict[str, list[list[float]]] = {}
+    for row in read(CURVES):
+        found.setdefault(row["name"], []).append([float(row[name]) for name in ("t", "V", "H")])
+    return {name: np.array(points) for name, points in found.items()}
+
+
+def study(jobs: int) -> None:
+    """Make the runs that are not there yet."""
+    there = {row["name"] for row in read(STUDY)}
+    lock = Lock()
+
+    def make(name: str) -> None:
+        row, curve = started(name)
+        full = {"name": name} | asdict(settings()[name]) | row
+        with lock:
+            if curve:
+                rows = [(name, *(f"{value:.7g}" for value in point)) for point in curve]
+                append(CURVES, ("name", "t", "V", "H"), rows)
+            append(STUDY, COLUMNS, [[full.get(column, "") for column in COLUMNS]])
+        print(name, row, flush=True)
+
+    with ThreadPoolExecutor(jobs) as pool:
+        list(pool.map(make, [name for name in settings() if name not in there]))
+
+
+def main() -> None:
+    """Run what is missing, and draw."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--jobs", type=int, default=1, help="processes at a time")
+    parser.add_argument("--one", metavar="NAME", help="make this run and print it as JSON")
+    parser.add_argument("--draw", action="store_true", help="make no runs")
+    arguments = parser.parse_args()
+    if arguments.one:
+        print(json.dumps(run(settings()[arguments.one])))
+        return
+    if not arguments.draw:
+        study(arguments.jobs)
+    rows = results()
+    print("\n\n".join(made(rows) for made in (page.answers, page.budget, page.factors)))
+    page.draw(PICTURE, rows, curves())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,204 @@
+"""What the runs of `verification/shallow_ironing.py` add up to: values, errors, tables, a picture.
+
+A mesh's error is Richardson's: of three sizes h, h/2, h/4 the order and the limit. All else is a
+difference of two runs on one mesh. Bars are the sum of all that is left, each taken as if it went
+the same way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fenics_contact import plotting
+
+Rows = Mapping[str, Mapping[str, float]]  # results by name of the run and of the quantity
+
+# As they are called in tables, and in the rows: at 1.5 without the ripple.
+QUANTITIES = {"V(1)": "V(1)", "V(1.5)": "fitted V(1.5)", "H(1.5)": "fitted H(1.5)"}
+# V(1), V(1.5), H(1.5) [N/mm], read off curves.
+PUBLISHED = {
+    "Poulios and Renard": (268.0, 337.0, 102.0),
+    "Hartmann et al.": (320.0, 408.0, 160.0),
+    "Fischer and Wriggers": (298.0, 365.0, 189.0),
+    "Yastrebov": (290.0, 360.0, 171.0),
+    "Code_Aster": (332.0, 421.0, 143.0),
+}
+MESHES = ("size 0.4", "base", "size 0.1")
+# Where one thing alone is varied but for the variants of the problem.
+COARSE = ", size 0.283"
+VARIANTS = (
+    "isochoric",
+    "height 3",
+    "isochoric, height 3",
+    f"friction 0.4{COARSE}",
+    f"die 100 times stiffer{COARSE}",
+)
+# Roache's factor of safety for an order that three meshes show, and for one that they do not.
+SAFE, UNSAFE = 1.25, 3.0
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Of a mesh sequence.
+
+    Attributes:
+        value: The limit; the finest mesh's where no order is seen.
+        order: The order, NaN where none is seen.
+        error: Bar of the value, of its unit.
+    """
+
+    value: float
+    order: float
+    error: float
+
+
+def richardson(values: Sequence[float], ratio: float = 2.0) -> Limit:
+    """The limit of values on three meshes, each `ratio` times finer than the one before.
+
+    Roache, J. Fluids Eng. 116, 1994: an error of 1.25 times the distance from the finest mesh's
+    value; where differences do not fall by an order between 1/2 and 4, 3 times the larger of them.
+    """
+    first, last = np.diff(values)
+    if first * last > 0 and ratio**0.5 <= first / last <= ratio**4:
+        order = float(np.log(first / last) / np.log(ratio))
+        rest = last / (ratio**order - 1)
+        return Limit(float(values[-1] + rest), order, float(SAFE * abs(rest)))
+    return Limit(float(values[-1]), np.nan, float(UNSAFE * max(abs(first), abs(last))))
+
+
+def differences(rows: Rows, quantity: str) -> dict[str, float]:
+    """Of a quantity, by run: how far it is from the run that differs in one thing alone."""
+    key = QUANTITIES[quantity]
+    found = {}
+    for name, row in rows.items():
+        _, on_another, size = name.partition(", size ")
+        other = f"size {size}" if on_another else "base"
+        if key in row and name != other:
+            found[name] = row[key] - rows[other][key]
+    return found
+
+
+def contributions(rows: Rows, quantity: str) -> dict[str, float]:
+    """To the bar of a quantity, by what they come from [N/mm]."""
+    moved = differences(rows, quantity)
+    mesh = richardson([rows[name][QUANTITIES[quantity]] for name in MESHES])
+    pressing = quantity == "V(1)"
+    steps = "80 increments of pressing" if pressing else "360 increments of sliding"
+    augmented, springs = moved[f"augmented{COARSE}"], moved[f"10 times the stiffness{COARSE}"]
+    return {
+        "mesh": mesh.error,
+        "enforcement": abs(augmented - springs),
+        "increments": abs(moved[steps + COARSE]),
+        "quadrature of Γc": abs(moved[f"quadrature of degree 16{COARSE}"]),
+        "side with Γc": abs(moved[f"Γc of slab{COARSE}"]),
+        "ripple": 0.0 if pressing else rows["size 0.1"][f"ripple of {quantity[0]}"],
+    }
+
+
+def converged(rows: Rows, quantity: str) -> tuple[float, float]:
+    """A quantity and its bar [N/mm]: the limit of the meshes, without what the springs give way."""
+    mesh = richardson([rows[name][QUANTITIES[quantity]] for name in MESHES])
+    value = mesh.value + differences(rows, quantity)[f"augmented{COARSE}"]
+    return value, sum(contributions(rows, quantity).values())
+
+
+# ---- tables --------------------------------------------------------------------------------------
+
+
+def table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """In Markdown."""
+    lines = ["| " + " | ".join(row) + " |" for row in (head, *body)]
+    return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
+
+
+def bare(name: str) -> str:
+    """Of a run, without its mesh."""
+    return name.removesuffix(COARSE)
+
+
+def answers(rows: Rows) -> str:
+    """Converged values, variants and what is published."""
+    found = [converged(rows, quantity) for quantity in QUANTITIES]
+    values = [value for value, _ in found]
+    bars = [f"**{value:.1f} ± {error:.1f}**" for value, error in found]
+    body = [["converged", *bars, f"**{values[2] / values[1]:.3f}**"]]
+    for name in VARIANTS:
+        moved = [
+            value + differences(rows, q)[name] for q, value in zip(QUANTITIES, values, strict=True)
+        ]
+        body.append(
+            [bare(name), *(f"{value:.1f}" for value in moved), f"{moved[2] / moved[1]:.3f}"]
+        )
+    for name, points in PUBLISHED.items():
+        body.append([name, *(f"{value:.0f}" for value in points), f"{points[2] / points[1]:.2f}"])
+    return table(("N/mm", *QUANTITIES, "H/V at 1.5"), body)
+
+
+def factors(rows: Rows) -> str:
+    """What each run changes, but for variants."""
+    body = [["base", *(f"{rows['base'][key]:.2f}" for key in QUANTITIES.values())]]
+    moved = [differences(rows, quantity) for quantity in QUANTITIES]
+    for name in rows:
+        if name not in ("base", *VARIANTS):
+            body.append([name, *(f"{one[name]:+.2f}" if name in one else "" for one in moved)])
+    return table(("N/mm", *QUANTITIES), body)
+
+
+def budget(rows: Rows) -> str:
+    """The bars, piece by piece."""
+    parts = [contributions(rows, quantity) for quantity in QUANTITIES]
+    body = [[name, *(f"{one[name]:.2f}" for one in parts)] for name in parts[0]]
+    body.append(["**sum**", *(f"**{sum(one.values()):.2f}**" for one in parts)])
+    return table(("error [N/mm] from", *QUANTITIES), body)
+
+
+# ---- the picture ---------------------------------------------------------------------------------
+
+
+def corrected(
+    rows: Rows, name: str, t: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A curve of size 0.1, V or H, led to the limit, and its bar.
+
+    Both in proportion: as found at t = 1 before (of V, for H as well), as at 1.5 after, and
+    linearly between them.
+    """
+    scales, bars = [], []
+    for quantity in ("V(1)", f"{name}(1.5)"):
+        value, error = converged(rows, quantity)
+        scales.append(value / rows["size 0.1"][QUANTITIES[quantity]])
+        bars.append(error / value)
+    limit = values * np.interp(t, (1.0, 1.5), scales)
+    return limit, np.abs(limit) * np.interp(t, (1.0, 1.5), bars)
+
+
+def draw(file: Path, rows: Rows, curves: Mapping[str, np.ndarray]) -> None:
+    """V and H over t: the converged curve, variants, and what is published.
+
+    Args:
+        file: PNG to write.
+        rows: Of the study.
+        curves: By run: t, V and H, shape (n, 3).
+    """
+    with plotting.figure(file, 2, (6.8, 5.2)) as axes:
+        for ax, name, column in zip(axes, "VH", (1, 2), strict=True):
+            t = curves["size 0.1"][:, 0]
+            limit, bar = corrected(rows, name, t, curves["size 0.1"][:, column])
+            ax.fill_between(t, limit - bar, limit + bar, color="k", alpha=0.25, lw=0)
+            ax.plot(t, limit, "k", lw=1.5, label="converged, and its error")
+            for i, each in enumerate(VARIANTS):
+                points = curves[each]
+                ax.plot(points[:, 0], points[:, column], f"C{i}", lw=1, label=bare(each))
+            for marker, (program, values) in zip("osD^v", PUBLISHED.items(), strict=True):
+                at, shown = ((1.0, 1.5), values[:2]) if name == "V" else ((1.5,), values[2:])
+                style = {"ms": 8, "mec": "k", "mfc": "w", "ls": "", "zorder": 5}
+                ax.plot(at, shown, marker, label=program, **style)
+            words = {"V": "vertical force V", "H": "horizontal force H"}[name]
+            ax.set(xlabel="time: pressed to 1, dragged to 2 [–]", xlim=(0, 2))
+            ax.set(ylabel=f"{words} on the slab [N/mm]", ylim=(0, None))
+            ax.grid(alpha=0.25)
+        axes[1].legend(loc="upper left", fontsize="small")
