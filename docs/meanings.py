@@ -88,6 +88,7 @@ GROUPS: list[tuple[str, list[str], str]] = [
             "methods.solver",
             "methods.options",
             "methods.alternating",
+            "methods.primal_dual",
             "systems.choice",
         ],
         "[](choose.md) says which method and linear solver are for what.",

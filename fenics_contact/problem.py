@@ -132,18 +132,18 @@ class ContactProblem:
             method: "lbfgs" (quasi-Newton, H₀ = (K + αK_n + φK_t)⁻¹), "newton" (consistent
                 tangent), "continuation" (the same, from soft contact to stiff; alternating where
                 it is stuck), "primal_dual" (tractions of the points are unknowns beside
-                displacements: friction on stiff contact of a linear bulk), or "alternating" (minimum problems in turn, each by Newton's method
-                with a line search on the energy). By default "lbfgs" on all unknowns, where a
+                displacements: friction on stiff contact of a linear bulk), or "alternating"
+                (minimum problems in turn, each by Newton's method with a line search on the
+                energy). By default "lbfgs" on all unknowns, where a
                 factorisation costs as much as dozens of iterations, and condensed, where it costs
                 as much as ten, "newton", with "continuation" for the first increment, and again
                 "newton" where that is stuck; "newton" for a nonlinear bulk, too, whose tangent
-                changes. With a mixed function the equations
-                are those of a saddle point: "alternating" is refused there.
+                changes. Where friction meets contact 50 to 1e5 times as stiff as the bulk
+                "primal_dual" comes before them, if it can be had. With a mixed function the
+                equations are those of a saddle point: "alternating" is refused there.
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
                 paper has 0; 1 needs a third of the iterations once a point sticks.
-                Where friction meets contact 50 to 1e5 times as stiff as the bulk "primal_dual"
-                comes first, if it can be had.
             fallback: Whether to go on by other methods where the method fails with no less than its
                 usual limit on iterations.
             condensation: Whether to iterate on the unknowns that contact touches alone, all others
