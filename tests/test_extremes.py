@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from scenes.comparing import close
 from verification.extreme_scenes import pressed, ranked
-from verification.extremes import METHODS, Row, Trial, trials
+from verification.extremes import METHODS, PAGE, Row, Trial, known, page, trials
 
 COMM = MPI.COMM_WORLD
 # Some of every group, and what is cheap; all of it takes minutes.
@@ -59,13 +59,38 @@ FINITE = {
     "first touch from afar, in body heights": ("1000", "1000, by force"),
     "increments": ("pressed in without friction in 1", "a disc turned by 90° in 1"),
 }
+# Of two bodies with finite kinematics.
+BODIES = {
+    "both turned by 360°, in increments": ("36, μ = 1, Γc 20 times as fine",),
+    "facets slid over": ("110 in 10, 1.2 of Γc on each, μ = 0",),
+    "dragged off the end, in increments": ("10, μ = 0.3",),
+    "lifted off after a drag, μ": ("0.3, upper 1e6 times as stiff",),
+    "columns of rubber, to 60 % of their height": (
+        "k_n h/E = 1e-03",
+        "k_n h/E = 1e+06, Γc 20 times as fine",
+        "k_n h/E = 1e+01, Γc 20 times as coarse, 40 points a facet",
+        "k_n h/E = 1e+01, sides held, upper 1e+06 times as stiff",
+    ),
+    "a block pressed, dragged and rocked, k_n h/E, μ = 1": (
+        "1e+00, rubber",
+        "1e+01, rubber, Γc 20 times as fine",
+        "1e+01, rubber, lower 1e3 times as stiff",
+    ),
+    "under a plate, so many times as stiff, against a rigid one": (
+        "1e+06, μ = 0, k_n h/E = 1e+03, 8 facets under 4",
+        "1e+06, μ = 0.3, k_n h/E = 1e+01, 20 facets under 2",
+    ),
+    "first touch from afar, in body heights": ("1000", "1000, by force"),
+    "increments": ("pressed in without friction in 1",),
+}
 REFUSED = ("pushed beyond friction", "no friction", "-1 times")
 FAST = [t for t in trials() if t.case in CHOSEN.get(t.group, ())]
 LARGE = [
     dataclasses.replace(t, methods=(method,))
     for t in trials()
+    for start, chosen in (("finite", FINITE), ("two bodies, finite", BODIES))
     for method in t.methods
-    if t.case in FINITE.get(t.group.removeprefix("finite kinematics, "), ()) and not t.slow
+    if t.case in chosen.get(t.group.removeprefix(f"{start} kinematics, "), ()) and not t.slow
 ]
 MORE = [Trial("loads", f"{load:g} times", pressed(10, load=load), "patch") for load in (1e3, -1.0)]
 
@@ -93,7 +118,8 @@ def test_extreme_of_finite_kinematics(trial):
 def test_nothing_of_the_list_is_missing():
     """Every name above is that of a trial."""
     assert len(FAST) == sum(len(cases) for cases in CHOSEN.values())
-    assert len({(t.group, t.case) for t in LARGE}) == sum(map(len, FINITE.values()))
+    wanted = [cases for chosen in (FINITE, BODIES) for cases in chosen.values()]
+    assert len({(t.group, t.case) for t in LARGE}) == sum(map(len, wanted))
 
 
 @pytest.mark.mpi
@@ -106,6 +132,13 @@ def test_contact_on_one_rank_only(kind, method):
     assert np.count_nonzero(facets) == 1
     _, spread, _ = ranked(kind, 10.0, 0.3, method, apart=False)
     assert close(rows, spread, 1e-8, scale=np.abs(rows[:, 2:]).max())
+
+
+def test_rows_of_some_groups_take_the_place_of_those_before():
+    """What is read back of the table is what it was made of, to the digit."""
+    rows = known(PAGE.with_suffix(".csv"))
+    text = PAGE.read_text(encoding="utf-8")
+    assert page(list(rows.values())) == text
 
 
 @pytest.mark.parametrize("error", [float("nan"), float("inf"), 1e-5])
