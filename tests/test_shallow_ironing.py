@@ -1,12 +1,15 @@
-"""The study of shallow ironing: its limits and bars, and runs that are kept."""
+"""The study of shallow ironing: its limits and bars, what it stores, and what the page says."""
 
 from __future__ import annotations
+
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 from mpi4py import MPI
 
 from demos import shallow_ironing as demo
+from scenes.processes import ROOT
 from verification import shallow_ironing as study
 from verification import shallow_ironing_page as page
 
@@ -80,6 +83,38 @@ def test_the_bars_cover_the_truth() -> None:
     for name, exact in EXACT.items():
         value, error = page.converged(rows, name)
         assert abs(value - exact) <= error < 4.0
+
+
+# ---- what is stored ------------------------------------------------------------------------------
+
+
+def test_every_run_is_there() -> None:
+    """As it is asked for, once, and none failed."""
+    rows = study.read(study.STUDY)
+    assert {row["name"] for row in rows} == set(study.settings()) and not any(
+        row["failure"] for row in rows
+    )
+    assert len(rows) == len(study.settings())
+    for row in rows:
+        for name, value in asdict(study.settings()[row["name"]]).items():
+            assert row[name] == ("" if value is None else str(value)), (row["name"], name)
+
+
+def test_rows_are_those_of_their_curves() -> None:
+    """What is evaluated anew is in the rows: 1e-4 N/mm, curves have seven digits."""
+    curves = study.curves()
+    for row in study.read(study.STUDY):
+        path = [dict(zip(("time", "V", "H"), point, strict=True)) for point in curves[row["name"]]]
+        assert len(path) == int(row["increments done"])
+        for name, value in study.evaluate(path).items():
+            assert value == pytest.approx(float(row[name]), abs=1e-4)
+
+
+def test_the_page_says_what_was_found() -> None:
+    """All its tables are those of the rows."""
+    text = (ROOT / "docs" / "finite.md").read_text()
+    for made in (page.answers, page.budget, page.factors):
+        assert made(study.results()) in text, made.__name__
 
 
 def test_the_demo_has_the_spread_that_is_published() -> None:

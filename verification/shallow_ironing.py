@@ -76,6 +76,7 @@ def settings() -> dict[str, Setting]:
         "80 increments of pressing": replace(coarse, pressing=80, until=1.0),
         "quadrature of degree 16": replace(coarse, quadrature=16),
         "360 increments of sliding": replace(coarse, increments=360),
+        "height 5": replace(coarse, height=5.0),
         "friction 0.4": replace(coarse, friction=0.4),
         "die 100 times stiffer": replace(coarse, die=100 * BASE.die),
     }

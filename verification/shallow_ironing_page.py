@@ -35,6 +35,7 @@ VARIANTS = (
     "isochoric",
     "height 3",
     "isochoric, height 3",
+    f"height 5{COARSE}",
     f"friction 0.4{COARSE}",
     f"die 100 times stiffer{COARSE}",
 )
