@@ -35,7 +35,6 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from tqdm import tqdm
 
 import fenics_contact as fc
 from fenics_contact import output, plotting
@@ -162,12 +161,13 @@ def solve(thickness: float, cells: int) -> Run:
 
     tension = STRAIN * E * thickness
     run = Run(thickness, tension, problem, rubber, V.dofmap.index_map.size_global * 2)
-    quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
     for step in fc.increments(problem, weight, 0.0, tension):
         run.iterations.append(step.iterations)
     friction.value = MU
-    turning = fc.increments(problem, angle, 0.0, TURN[-1], steps=TURN)
-    for step in tqdm(turning, f"t = {thickness:g}", len(TURN), disable=quiet, unit="increment"):
+    turning = fc.increments(
+        problem, angle, 0.0, TURN[-1], steps=TURN, progress=f"t = {thickness:g}"
+    )
+    for step in turning:
         run.iterations.append(step.iterations)
         drawn = -mesh.comm.allreduce(fem.assemble_scalar(reaction))
         run.path.append((step.load, drawn / tension))

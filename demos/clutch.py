@@ -32,7 +32,6 @@ import numpy as np
 import ufl
 from dolfinx import fem, la
 from mpi4py import MPI
-from tqdm import tqdm
 
 import fenics_contact as fc
 from fenics_contact import output, plotting
@@ -142,9 +141,8 @@ def solve(
 
     path, ends, before = [], [-0.5, 0.0, *(a for a in ANGLES if a <= until)], 0.0
     name = "scene turned" if whole else "scene at rest"
-    quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
-    history = fc.increments(problem, load, -1.0, until, steps=ends)
-    for step in tqdm(history, name, len(ends), disable=quiet, unit="increment"):
+    history = fc.increments(problem, load, -1.0, until, steps=ends, progress=name)
+    for step in history:
         shaft = with_all(SHAFT[None], step.load)[0]
         found = contact.resultants()
         radius = np.linalg.norm(np.cross(contact.places(), shaft), axis=1)

@@ -26,7 +26,6 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from tqdm import tqdm
 
 import fenics_contact as fc
 from fenics_contact import output, plotting
@@ -82,11 +81,8 @@ def solve(arguments: argparse.Namespace) -> tuple[fc.ContactProblem, dict[str, A
     law = fc.Coulomb(FRICTION, k_n=fc.Scaled(30), k_t=fc.Scaled(10))
     contact = fc.Contact(u, surface, fc.HalfSpace(point=(0, 0), normal=(0, 1)), law)
     problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method="newton")
-    quiet = None if mesh.comm.rank == 0 else True
-    options = {"steps": increments, "estimate": arguments.errors}
-    history = fc.increments(problem, load, 0.0, 1.0, **options)
-    expected = 2 * increments if arguments.errors else increments
-    made = list(tqdm(history, "GRECO block", expected, disable=quiet, unit="increment"))
+    options = {"steps": increments, "estimate": arguments.errors, "progress": "GRECO block"}
+    made = list(fc.increments(problem, load, 0.0, 1.0, **options))
 
     resultants = contact.resultants()
     moved = 1e3 * along_bottom(u)

@@ -28,7 +28,6 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,7 +39,6 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from tqdm import tqdm
 
 import fenics_contact as fc
 from fenics_contact import output, plotting
@@ -185,12 +183,16 @@ def solve(arguments: argparse.Namespace, friction: float) -> tuple[Scene, dict[s
     steps = arguments.increments or (80 if friction > 0 else 1)
     if arguments.accuracy is not None and not arguments.increments:
         steps = scene.problem.increments_wanted
-    history: Iterable[fc.Step] = fc.increments(
-        scene.problem, scene.pressure, 0.0, load, steps=steps, estimate=arguments.errors
+    words = f"μ = {friction:g}"
+    history = fc.increments(
+        scene.problem,
+        scene.pressure,
+        0.0,
+        load,
+        steps=steps,
+        estimate=arguments.errors,
+        progress=words,
     )
-    quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
-    expected = 2 * steps if arguments.errors else steps
-    history = tqdm(history, f"μ = {friction:g}", expected, disable=quiet, unit="increment")
     begin = time.perf_counter()
     made = list(history)
     solved = time.perf_counter() - begin

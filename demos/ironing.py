@@ -35,7 +35,6 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from tqdm import tqdm
 
 import fenics_contact as fc
 from fenics_contact import output, plotting
@@ -125,10 +124,9 @@ def solve(
         along.value = WAY * max(t - 1.0, 0.0)
 
     ends = [0.5, 1.0, *(1 + np.arange(1, arguments.increments + 1) / arguments.increments)]
-    history: Any = fc.increments(problem, load, 0.0, 2.0, steps=ends)
-    quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
+    history: Any = fc.increments(problem, load, 0.0, 2.0, steps=ends, progress="ironing")
     path, iterations, last = [], [], 0.0
-    for step in tqdm(history, "ironing", len(ends), disable=quiet, unit="increment"):
+    for step in history:
         iterations.append(step.iterations)
         if step.load <= 1.0:
             continue

@@ -29,7 +29,6 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from tqdm import tqdm
 
 import fenics_contact as fc
 from fenics_contact import output, plotting
@@ -97,9 +96,9 @@ def solve(moved: str) -> tuple[list[dict[str, float]], fc.ContactProblem, NeoHoo
             lambda x: np.stack([0 * x[0] - (along if moved == "block" else 0), 0 * x[0]])
         )
 
-    path, history = [], fc.increments(problem, load, 0.0, 3.0, steps=TIMES)
-    quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
-    for step in tqdm(history, f"{moved} moved", len(TIMES), disable=quiet, unit="increment"):
+    path, words = [], f"{moved} moved"
+    history = fc.increments(problem, load, 0.0, 3.0, steps=TIMES, progress=words)
+    for step in history:
         r = step.contacts["contact"]
         path.append(
             {

@@ -38,7 +38,6 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from tqdm import tqdm
 
 import fenics_contact as fc
 from fenics_contact import output, plotting
@@ -160,9 +159,8 @@ def solve(name: str, cells: int) -> Run:
     length = 2 * np.pi * RING
     run = Run(name, cells, problem, rubber, W.dofmap.index_map.size_global)
     ends = D * np.array(CLOSING)
-    history: Any = fc.increments(problem, closing, 0.0, ends[-1], steps=ends)
-    quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
-    for step in tqdm(history, name, len(ends), disable=quiet, unit="increment"):
+    history: Any = fc.increments(problem, closing, 0.0, ends[-1], steps=ends, progress=name)
+    for step in history:
         run.iterations.append(step.iterations)
         run.squeeze.append(step.load / D)
         run.lid.append(-float(contacts[0].resultants().force[1]) / length)

@@ -36,7 +36,6 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from tqdm import tqdm
 
 import fenics_contact as fc
 from fenics_contact import output, plotting
@@ -199,9 +198,8 @@ def solve(
 
     path, times = [], ends(setting)
     on_slab = np.array([-1, 1]) if own == SIDE else np.array([1, -1])
-    history = fc.increments(problem, load, 0.0, times[-1], steps=times)
-    quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
-    for step in tqdm(history, "shallow ironing", len(times), disable=quiet, unit="increment"):
+    history = fc.increments(problem, load, 0.0, times[-1], steps=times, progress="shallow ironing")
+    for step in history:
         r = step.contacts["contact"]
         along, down = on_slab * r.force
         path.append(

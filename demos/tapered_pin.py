@@ -46,7 +46,6 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from tqdm import tqdm
 
 import fenics_contact as fc
 from fenics_contact import output, plotting
@@ -148,10 +147,9 @@ class Scene:
                 self.way.value = -value
 
         start = self.path[-1][0] if self.path else 0.0
-        history: Any = fc.increments(self.problem, load, start, steps[-1], steps=steps)
         words = f"μ = {joint.friction:g}, {'force' if joint.free_ends else 'way'}"
-        quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
-        for step in tqdm(history, words, len(steps), disable=quiet, unit="increment"):
+        history = fc.increments(self.problem, load, start, steps[-1], steps=steps, progress=words)
+        for step in history:
             # Friction strains both halves of the pin, one as much as the other.
             ends = [
                 output.at_node(self.problem.u, (0.0, z))[1] for z in (joint.way, joint.way + LENGTH)

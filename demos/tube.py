@@ -40,7 +40,6 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from tqdm import tqdm
 
 import fenics_contact as fc
 from fenics_contact import output, plotting
@@ -177,9 +176,8 @@ def solve(name: str, cells: int, quarters: int) -> Run:
 
     share = 0.5 if quarters == 1 else 1.0
     run = Run(name, share, problem, rubber, V.dofmap.index_map.size_global * 2)
-    history = fc.increments(problem, closing, 0.0, CLOSING[-1], steps=CLOSING)
-    quiet = None if MPI.COMM_WORLD.rank == 0 else True  # None: silent when not a terminal
-    for step in tqdm(history, name, len(CLOSING), disable=quiet, unit="increment"):
+    history = fc.increments(problem, closing, 0.0, CLOSING[-1], steps=CLOSING, progress=name)
+    for step in history:
         run.closing.append(step.load)
         run.iterations.append(step.iterations)
         run.force.append(-float(contacts[0].resultants().force[1]) / share)

@@ -39,7 +39,6 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from tqdm import tqdm
 
 import fenics_contact as fc
 from fenics_contact import output, plotting
@@ -161,10 +160,10 @@ def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
     start = time.perf_counter()
     scene = press(arguments.cells, arguments.degree, arguments.stiffness)
     contact = scene.contact
-    history = fc.increments(scene.problem, scene.shear, 0.0, SHEAR, steps=arguments.increments)
-    quiet = None if MPI.COMM_WORLD.rank == 0 else True
-    bar = tqdm(history, "shear", arguments.increments, disable=quiet, unit="increment")
-    made = [scene.step, *bar]
+    history = fc.increments(
+        scene.problem, scene.shear, 0.0, SHEAR, steps=arguments.increments, progress="shear"
+    )
+    made = [scene.step, *history]
 
     points, resultants = contact.gather(), contact.resultants()
     extents = resultants.extents
