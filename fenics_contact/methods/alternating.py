@@ -104,7 +104,7 @@ class Alternation(OwnMethod):
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`. Iterations are Newton's, in all."""
         equations, reasons = self._equations, PETSc.SNES.ConvergedReason
-        if not self._possible():
+        if not self.suits:
             return 0, int(reasons.DIVERGED_LINE_SEARCH)
         self._attach()
         iterations = stalls = overloads = 0
@@ -166,8 +166,9 @@ class Alternation(OwnMethod):
                 "minimise; use another method"
             )
 
-    def _possible(self) -> bool:
-        """Whether `check` would pass, and there are contacts."""
+    @property
+    def suits(self) -> bool:
+        """See `OwnMethod.suits`."""
         mixed = self._equations.full.displacement.mixed
         return bool(self._equations.contacts) and not mixed and not self._without_potential()
 

@@ -79,7 +79,7 @@ class OwnMethod(Method):
 
     @property
     def suits(self) -> bool:
-        """Whether there is what it solves, which others are to be tried before."""
+        """Whether `check` would pass, and there are contacts that it is for."""
         return True
 
     def check(self) -> None:

@@ -192,7 +192,7 @@ class _Points:
                 body.
         """
         springs, values, share = self._springs, self._values, self._share
-        beyond = springs.beyond(values)
+        trial, beyond = springs.trial(values)
         if everywhere:
             paired = values.paired > 0
             beyond[paired] = 0.0
@@ -203,7 +203,7 @@ class _Points:
         correction = np.linalg.solve(matrix, (beyond - stretched)[:, :, None])[:, :, 0]
         self._correction = np.asarray(correction, dtype=np.float64)
         self.tangent = np.asarray(share * np.linalg.solve(matrix, self.tangent), dtype=np.float64)
-        self.traction = springs.trial(values) - stretched - self._correction
+        self.traction = trial - stretched - self._correction
 
 
 class _Springs:
@@ -234,17 +234,6 @@ class _Springs:
             return vectors
         return np.sum(vectors * self._normal, axis=1)[:, None] * self._normal
 
-    def _trial(self, values: PointValues) -> tuple[Array, Array]:
-        """Normal and tangential traction if all points were closed and stuck."""
-        pressure = values.multiplier - values.normal_stiffness * values.gap
-        stuck = values.old_traction - _times(values.tangential_stiffness, values.increment)
-        return -pressure, stuck
-
-    def trial(self, values: PointValues) -> Array:
-        """The traction if all points were closed and stuck, (n_points, gdim) (stress)."""
-        normal, tangential = self._trial(values)
-        return normal[:, None] * values.normal + tangential
-
     def exact(self, tangent: Array, values: PointValues) -> Array:
         """The tangent of the law without the round-off in its normal rows.
 
@@ -256,16 +245,22 @@ class _Springs:
         row = -closed[:, None] * normal - np.einsum("qi,qij->qj", normal, tangent)
         return tangent + normal[:, :, None] * row[:, None, :]
 
-    def beyond(self, values: PointValues) -> Array:
-        """By how much that is beyond what the law bears, zero where it is not (stress).
+    def trial(self, values: PointValues) -> tuple[Array, Array]:
+        """The traction if all points were closed and stuck, and what the law does not bear of it.
 
-        Not a difference of both there, for the reason that `exact` is for.
+        The latter is zero where they are, and no difference there, for the reason that `exact` is
+        for.
+
+        Returns:
+            Both (n_points, gdim) (stress).
         """
-        normal, tangential = self._trial(values)
+        normal = values.normal_stiffness * values.gap - values.multiplier
+        stuck = values.old_traction - _times(values.tangential_stiffness, values.increment)
         lifted = np.where(values.normal_traction < 0, 0.0, normal)
         sticks = (values.limit > 0) & np.all(values.slip_increment == 0, axis=1)
-        slid = values.tangential(tangential - values.traction)
-        return lifted[:, None] * values.normal + np.where(sticks[:, None], 0.0, slid)
+        slid = np.where(sticks[:, None], 0.0, values.tangential(stuck - values.traction))
+        n = values.normal
+        return normal[:, None] * n + stuck, lifted[:, None] * n + slid
 
 
 def _times(blocks: Array, vectors: Array) -> Array:

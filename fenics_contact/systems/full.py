@@ -228,17 +228,20 @@ class FullSystem(System):
     def bulk_diagonal(self) -> Array:
         """See `System.bulk_diagonal`."""
         assert self.stiffness is not None
-        diagonal = self.stiffness.getDiagonal()
-        values: Array = diagonal.array.copy()
-        diagonal.destroy()
-        return values
+        return _diagonal(self.stiffness)
 
     def take_diagonal(self, matrix: PETSc.Mat) -> None:
         """Let the diagonal be that of a matrix on all unknowns. Collective."""
-        diagonal = matrix.getDiagonal()
-        self.diagonal = diagonal.array.copy()
-        diagonal.destroy()
+        self.diagonal = _diagonal(matrix)
 
     def change_diagonal(self, dofs: Indices, values: Array) -> None:
         """Let a part of the diagonal be another."""
         self.diagonal[dofs] = values
+
+
+def _diagonal(matrix: PETSc.Mat) -> Array:
+    """Of this rank's rows; a copy. Collective."""
+    diagonal = matrix.getDiagonal()
+    values: Array = diagonal.array.copy()
+    diagonal.destroy()
+    return values
