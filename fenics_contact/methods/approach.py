@@ -56,5 +56,5 @@ class Approach:
         if not full.unknowns.comm.allreduce(any(touching)):
             way = motions.approach(load, full.operators)
             if way is not None:
-                full.set_state(full.state() + way)
+                full.set_state(full.state() + np.where(full.constrained, 0.0, way))
         return cold
