@@ -300,6 +300,10 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "Put the constant itself into the form, the condition or the support, not a number "
             "made of it.",
         ),
+        "was solved and not committed": (
+            "Friction remembers what is committed alone; a loop of one's own has left it out.",
+            "`problem.commit()` after `problem.solve()`, or take `increments`.",
+        ),
         "will not be solved for": (
             "A history starts at another load than the last one has ended at.",
             "`increments(problem, load, start, ...)` with the load that was reached.",

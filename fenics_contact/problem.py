@@ -32,7 +32,7 @@ from fenics_contact.contact.contact import Contact, Found
 from fenics_contact.methods.approach import Approach
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
 from fenics_contact.methods.solver import Settings, Solver
-from fenics_contact.parallel import fail_together, global_max
+from fenics_contact.parallel import fail_together, global_max, warn
 from fenics_contact.systems import linear
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.committed import CommittedState
@@ -241,6 +241,7 @@ class ContactProblem:
         self._rate: Array | None = None
         self._solved: _Solved | None = None
         self._fresh = True  # nothing was solved yet
+        self._told = False  # of an increment that was not committed
 
     def _unloaded(self) -> _Balance:
         """That of a body at rest."""
@@ -367,6 +368,7 @@ class ContactProblem:
                 can balance.
         """
         start = time.perf_counter()
+        self._check_committed()
         first, self._fresh = self._fresh, False
         if first:
             for contact in self.contacts:
@@ -403,6 +405,18 @@ class ContactProblem:
             if self._comm.rank == 0:
                 self.solver.options.warn_of_unread(self.prefix)
         return step
+
+    def _check_committed(self) -> None:
+        """Warn, once, where an increment with friction is solved and the last is no history."""
+        friction = any(contact.law.has_friction for contact in self.contacts)
+        if self._solved is None or self._told or not friction:
+            return
+        self._told = True
+        warn(
+            self._comm,
+            f"increment {self.increment + 1} was solved and not committed, and is solved again "
+            "from the same start: call commit() after each that is to be history, or restore()",
+        )
 
     def _go_back(self, state: Array, balance: _Balance) -> None:
         """To where the increment starts: committed, or solved and not committed. Collective."""

@@ -44,6 +44,22 @@ def test_the_order_of_a_problem():
     raised_everywhere(lambda: fc.ContactProblem(scene.u, F), ValueError, "ContactProblem(F, u)")
 
 
+def test_an_energy_for_a_residual():
+    """It is said how to make one of it."""
+    scene = pressed()
+    energy = ufl.inner(ufl.grad(scene.u), ufl.grad(scene.u)) * ufl.dx
+    raised_everywhere(lambda: problem_of(scene, energy), ValueError, "ufl.derivative(energy, u, v)")
+
+
+def test_increments_of_what():
+    """Of a contact; of a number, which is not taken for the start."""
+    scene = pressed()
+    contact = scene.contact(coulomb())
+    raised_everywhere(lambda: fc.increments(contact, scene.E), ValueError, "problem is a Contact")
+    problem = problem_of(scene)
+    raised_everywhere(lambda: fc.increments(problem, 0, 1), ValueError, "load is a int")
+
+
 def test_a_measure_without_tags():
     """``ufl.ds(2)`` of no tags is zero for DOLFINx, and so would be the load."""
     scene = pressed()
@@ -146,6 +162,28 @@ def test_components_in_a_tuple():
     raised_everywhere(
         lambda: scene.contact(coulomb(), support=support), TypeError, "ufl.as_vector([way, 0.0])"
     )
+
+
+def test_a_solution_that_is_not_committed():
+    """A loop without ``commit``: told once; not after ``restore``, and not where nothing rubs."""
+    scene = pressed()
+    problem = problem_of(scene)
+    problem.solve()
+    with pytest.warns(UserWarning, match="increment 1 was solved and not committed"):
+        problem.solve()
+    scene = pressed()
+    smooth, _ = scene.problem(fc.Frictionless(k_n=1e4), scene.rollers())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        problem.solve()
+        smooth.solve()
+        smooth.solve()
+        other = problem_of(pressed())
+        other.solve()
+        other.restore()
+        other.solve()
+        other.commit()
+        other.solve()
 
 
 def test_a_history_that_jumps():

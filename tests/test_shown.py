@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import fenics_contact as fc
+from fenics_contact.checks.verdict import Attempt
 from scenes.elasticity import stress
 from scenes.rubbing import Rub
 
@@ -110,3 +111,9 @@ def test_an_error_budget(solved):
         [100 * t for t in budget.total.values()], rel=0.06
     )
     assert remarks == lines[len(rows) :]
+
+
+@pytest.mark.parametrize(("number", "words"), [(0, "0 iterations"), (1, "1 iteration")])
+def test_attempts_are_told_in_words(number, words):
+    """One iteration is one, in messages, logs and reports."""
+    assert str(Attempt("newton", number, "converged")) == f"newton: converged ({words})"

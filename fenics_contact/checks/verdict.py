@@ -351,7 +351,8 @@ class Attempt:
 
     def __str__(self) -> str:
         """For logs and messages."""
-        return f"{self.method}: {self.outcome} ({self.iterations} iterations)"
+        iterations = f"{self.iterations} iteration{'s' if self.iterations != 1 else ''}"
+        return f"{self.method}: {self.outcome} ({iterations})"
 
 
 class NotConverged(RuntimeError):

@@ -179,9 +179,11 @@ class Inputs:
         except (ValueError, OverflowError):  # a ragged list, a number beyond all
             array = np.asarray(None)
         if array.dtype.kind not in "iuf":
+            rows = isinstance(value, list | tuple)
+            of_components = ", such as ufl.as_vector([way, 0.0])" if rows else ""
             raise TypeError(
                 f"{self._name}: {name} is {value!r}; give numbers, a fem.Constant, a fem.Function "
-                "or a UFL expression, of components such as ufl.as_vector([way, 0.0])"
+                f"or a UFL expression{of_components}"
             )
         constant = fem.Constant(self._surface.mesh, array.astype(np.float64))
         if name != "support":

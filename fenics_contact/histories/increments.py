@@ -14,6 +14,7 @@ import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
+from fenics_contact.arguments import check_instance
 from fenics_contact.checks.step import Step
 from fenics_contact.checks.verdict import Attempt, NotConverged
 from fenics_contact.estimates.errors import quantities
@@ -115,6 +116,8 @@ def increments(
         NotConverged: An increment failed even when cut; u, history and load are those of the last
             committed one.
     """
+    check_instance("problem", problem, ContactProblem)
+    comm, set_load = problem.u.function_space.mesh.comm, _setter(load)
     for name, place in (("start", start), ("end", end)):
         if not (isinstance(place, Real) and np.isfinite(place)):
             raise ValueError(f"{name} is {place!r}; it must be a finite number")
@@ -137,7 +140,6 @@ def increments(
         raise ValueError("fields are kept in a checkpoint, and there is none; give checkpoint=")
     if not isinstance(checkpoint, str | Path | None):
         raise ValueError(f"checkpoint is {checkpoint!r}; it must be the name of a file")
-    comm, set_load = problem.u.function_space.mesh.comm, _setter(load)
     if isinstance(load, fem.Constant):
         _check_constant(problem, load, start, end)
     file = None if checkpoint is None else Path(checkpoint)

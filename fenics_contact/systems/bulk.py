@@ -74,6 +74,11 @@ class Bulk:
         arguments = form.arguments()
         if any(argument.part() is not None for argument in arguments):
             raise ValueError(f"F is in parts, by the test functions of several spaces{_OF_ONE}")
+        if not arguments:
+            raise ValueError(
+                "F has no TestFunction; it must be a residual: of an energy take "
+                "ufl.derivative(energy, u, v)"
+            )
         if len(arguments) != 1:
             raise ValueError(
                 f"F has {len(arguments)} arguments; it must be a residual in one TestFunction and "
