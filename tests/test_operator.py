@@ -9,6 +9,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import fenics_contact as fc
 from fenics_contact.systems.operator import ContactOperator
@@ -101,3 +102,33 @@ def test_pairs_found_anew_take_another_operator_for_their_contact_alone():
     assert after[0] is not before[0] and after[1] is before[1]
     assert [operator.contact for operator in after] == [pair, floor]
     assert not same(old, read(after[0])) and same(old, read(before[0]))
+
+
+def test_a_matrix_in_space_has_no_entries_for_points_that_are_open():
+    """A factorisation has no more to do than what is closed now; the numbers are the same.
+
+    The matrix is the sum of the bulk's and contact's, whose round-off is some 1e-16 of it, and in a
+    pattern that holds both, and no other entry, whatever was in there before.
+    """
+    slider = Slider("tetrahedron", LAW, start=1.0, n=(6, 2), condensation=False)
+    slider.step(0.002, 0.0)
+    system, contact = slider.problem.full, slider.contact
+    operator, springs = system.operators[0], contact.springs(1.0, 1.0)
+    some = contact.places()[:, 0] < 1.5
+    matrix = system.matrix(symmetric=True)
+    entries = []
+    for closed in (np.zeros_like(some), some, np.ones_like(some), some):
+        blocks = np.where(closed[:, None, None], springs, 0.0)
+        alone = system.stiffness.copy()
+        part = operator.springs(blocks)
+        alone.axpy(1.0, part, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        rows = np.flatnonzero(system.constrained) + alone.getOwnershipRange()[0]
+        alone.zeroRowsColumns(rows.astype(PETSc.IntType), diag=system.bulk.scale)
+        alone.scale(1.0 / system.bulk.scale)
+        system.fill(matrix, [part])
+        entries.append(matrix.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"])
+        alone.axpy(-1.0, matrix, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        assert alone.norm(PETSc.NormType.FROBENIUS) < 1e-14 * matrix.norm()
+        alone.destroy()
+    assert entries[0] < entries[1] < entries[2] and entries[3] == entries[1]
+    matrix.destroy()

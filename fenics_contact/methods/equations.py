@@ -199,7 +199,7 @@ class Equations:
             contacts: Contact's part, used up.
         """
         self.factorisations += self.system.fill(matrix, contacts)
-        if any(contact.opposite.follows for contact in self.contacts):
+        if self.system.pattern_changes:
             # A factorisation of another pattern is no start, whatever the matrix says.
             for consistent, mine in self._matrices.items():
                 if mine.handle == matrix.handle:

@@ -173,6 +173,19 @@ class FullSystem(System):
         forces = [motion.force for c in self.contacts for motion in c.motions]
         return self.unknowns.joined(residual, -np.array(forces))
 
+    @property
+    def pattern_changes(self) -> bool:
+        """Whether what `fill` makes has another pattern each time.
+
+        So it has where pairs follow the bodies, and where a factorisation is to have no more to do
+        than what contact couples now. In space open points that count as coupled cost up to half of
+        it, a new pattern a tenth; in the plane that is the larger part.
+        """
+        couples = self.gdim == 3 and any(c.couples for c in self.contacts)
+        return any(c.opposite.follows for c in self.contacts) or (
+            couples and self.linear_kind == "direct"
+        )
+
     def matrix(self, *, symmetric: bool) -> PETSc.Mat:
         """A new matrix for `fill`. Collective.
 
@@ -182,7 +195,7 @@ class FullSystem(System):
         different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
         matrix = self.stiffness.copy()
         for operator in self.operators:
-            if operator.contact.couples:
+            if operator.contact.couples and not self.pattern_changes:
                 part = operator.springs(operator.contact.springs(1.0, 1.0))
                 matrix.axpy(1.0, part, different)
                 part.destroy()
@@ -206,17 +219,24 @@ class FullSystem(System):
     def fill(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
         """Bulk tangent plus contact, conditions applied, dimensionless; see `System.fill`."""
         assert self.stiffness is not None
-        subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
-        if any(c.opposite.follows for c in self.contacts):  # and so does the pattern
-            subset = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
-        if not any(c.couples for c in self.contacts):
-            self.stiffness.copy(matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        if self.pattern_changes:
+            different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
+            total = self.stiffness.copy()
+            for part in contacts:
+                total.axpy(1.0, part, different)
+                part.destroy()
+            matrix.setPreallocationCSR(total.getValuesCSR())
+            total.destroy()
         else:
-            matrix.zeroEntries()
-            matrix.axpy(1.0, self.stiffness, subset)
-        for part in contacts:
-            matrix.axpy(1.0, part, subset)
-            part.destroy()
+            subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
+            if any(c.couples for c in self.contacts):
+                matrix.zeroEntries()
+                matrix.axpy(1.0, self.stiffness, subset)
+            else:
+                self.stiffness.copy(matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+            for part in contacts:
+                matrix.axpy(1.0, part, subset)
+                part.destroy()
         start, _ = matrix.getOwnershipRange()
         rows = (start + np.flatnonzero(self.constrained)).astype(PETSc.IntType)
         scale = self.bulk.scale

@@ -348,18 +348,20 @@ class ContactOperator:
         return product
 
     def _block_diagonal(self, blocks: Array, over: PETSc.Mat) -> PETSc.Mat:
-        """One block per point, (n_points, d, d), over the rows of a matrix."""
-        n, d = blocks.shape[:2]
+        """One block per point, (n_points, d, d), over a matrix's rows; none where it is zero."""
+        d = blocks.shape[1]
         first, _ = over.getOwnershipRange()
-        columns = first + d * np.arange(n)[:, None, None] + np.arange(d)[None, None, :]
-        columns = np.broadcast_to(columns, (n, d, d))
+        there = np.any(blocks != 0.0, axis=(1, 2))
+        columns = first + d * np.flatnonzero(there)[:, None, None] + np.arange(d)[None, None, :]
+        columns = np.broadcast_to(columns, (len(columns), d, d))
         size = over.getSizes()[0]
+        pointers = np.insert(np.cumsum(np.repeat(d * there, d)), 0, 0)
         return PETSc.Mat().createAIJ(
             (size, size),
             csr=(
-                np.arange(0, n * d * d + 1, d, dtype=PETSc.IntType),
+                pointers.astype(PETSc.IntType),
                 columns.ravel().astype(PETSc.IntType),
-                blocks.ravel(),
+                blocks[there].ravel(),
             ),
             comm=self.contact.surface.mesh.comm,
         )

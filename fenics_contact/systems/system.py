@@ -345,6 +345,11 @@ class System(ABC):
     def prepare(self, ksp: PETSc.KSP, matrix: PETSc.Mat) -> None:
         """Give a solver a matrix of `matrix`. Collective."""
 
+    @property
+    def pattern_changes(self) -> bool:
+        """Whether what `fill` makes has another pattern each time."""
+        return False
+
     @abstractmethod
     def fill(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
         """Bulk tangent plus contact, conditions applied, dimensionless. Collective.
