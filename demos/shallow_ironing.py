@@ -176,10 +176,10 @@ def solve(
         fem.dirichletbc(value, fem.locate_dofs_topological(V, 1, facets.find(tag)), V)
         for tag, value in ((BOTTOM, bottom), (TOP, top))
     ]
-    # E/h of the stiff die, which is 25 times that of the slab, in units of its own body's.
-    own, other, unit = SIDE, SURFACE, DIE_E / setting.die
+    # E/h of the stiff die, which is 25 times that of the slab, by E of the softer body and h of Γc.
+    own, other, unit = SIDE, SURFACE, DIE_E / min(setting.die, SLAB_E)
     if setting.side == "slab":
-        own, other, unit = SURFACE, SIDE, DIE_E / SLAB_E / FINER
+        own, other, unit = SURFACE, SIDE, unit / FINER
     k = fc.Scaled(setting.stiffness * unit)
     contact = fc.Contact(
         u,

@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.blocks import CELLS
-from scenes.elasticity import residual
+from scenes.elasticity import hold, residual
 from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, E, pressed, two_blocks
 
 COMM = MPI.COMM_WORLD
@@ -215,6 +215,31 @@ def test_shrink_fit() -> None:
     # Quadratic cells of a tenth of the radius: the pressure is uniform to 1 %.
     assert points["pressure"] == pytest.approx(np.full(len(points["x"]), mean), rel=0.01)
     assert contact.n_unpaired == 0
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+@pytest.mark.parametrize("contrast", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("swap", [False, True])
+def test_scaled_stiffness_is_by_the_softer_body(cell, contrast, swap) -> None:
+    """k_n = factor E/h with the smaller E, whichever body has Γc, and h of Γc: here 1/3 and 1/4.
+
+    Tolerance 1e-6: E is measured in the bulk form, and smoothed by an iterative solve.
+    """
+    mesh, tags = two_blocks(cell, (3, 4))
+    d = mesh.geometry.dim
+    u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (d,))))
+    modulus = fem.Function(fem.functionspace(mesh, ("DG", 0)))
+    modulus.interpolate(lambda x: np.where(x[d - 1] > 0.5, E, contrast * E))
+    v = ufl.TestFunction(u.function_space)
+    own, other = (LOWER, UPPER) if swap else (UPPER, LOWER)
+    law = fc.Frictionless(k_n=fc.Scaled(3.0))
+    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, own), fc.DeformableBody(tags, other), law)
+    bcs = [hold(u, tags, tag, i) for tag in (BOTTOM, TOP) for i in range(d)]
+    fc.ContactProblem(residual(u, v, modulus, 0.3), u, bcs=bcs, contacts=[contact])
+    contact.evaluate()
+    stiffness = contact.values.normal_stiffness
+    wanted = 3.0 * min(contrast, 1.0) * E / (0.5 if swap else 0.25)
+    assert stiffness == pytest.approx(np.full(len(stiffness), wanted), rel=1e-6)
 
 
 def test_bodies_are_told_apart() -> None:

@@ -114,6 +114,7 @@ def contact_of(
     contact: Scene,
     here: Surface,
     kind_of: Any = reference.ContactModel,
+    there: Surface | None = None,
 ) -> tuple[Any, tuple[Array, Array]]:
     """Points, stiffness and law of a contact without its support; facet and place of points."""
     scene, law = made.scene, contact["law"]
@@ -133,14 +134,16 @@ def contact_of(
     weights = weights * scene.get("thickness", 1.0)
     x, _ = here.place(facet, xi)
     owner = made.box[here.cells]
-    stress = made.moduli[owner[0]]
+    stress, modulus = made.moduli[owner[0]], made.moduli[owner]
+    if there is not None:  # between two bodies the softer one says what is stiff
+        modulus = np.minimum(modulus, made.moduli[made.box[there.cells]].max())
 
     def stiffness(given: Any) -> Array:
         if not given:
             return np.zeros(len(x))
         kind, value = given
         if kind == "scaled":
-            smooth = reference_geometry.smooth_modulus(here, made.moduli[owner], facet, xi)
+            smooth = reference_geometry.smooth_modulus(here, modulus, facet, xi)
             return _scaled(value, contact) * smooth
         if kind == "number":
             return np.full(len(x), value * stress / made.length)
@@ -186,9 +189,10 @@ def contact_of(
 
 def _contact(made: Made, contact: Scene, here: Surface, opposite: Any) -> Any:
     """A contact as the reference has it."""
-    made_model, (facet, xi) = contact_of(made, contact, here)
+    there = opposite() if contact["support"]["kind"] == "body" else None
+    made_model, (facet, xi) = contact_of(made, contact, here, there=there)
     scene, given, x = made.scene, contact.get("gap"), made_model.x
-    if contact["support"]["kind"] != "body":
+    if there is None:
         place = _placement(contact["support"]["kind"], geometry(scene, contact), x)
         if given is not None:
             bare = place
@@ -199,7 +203,7 @@ def _contact(made: Made, contact: Scene, here: Surface, opposite: Any) -> Any:
 
         made_model.place = place
         return made_model
-    there, normal = opposite(), here.normal(facet, xi)
+    normal = here.normal(facet, xi)
     interpolation = made_model.interpolation
 
     def repair(u: Array | None) -> None:

@@ -242,7 +242,7 @@ def model(scene: dict[str, Any]) -> tuple[PresentProblem, Any, Callable[[int, fl
     contacts = []
     for i, contact in enumerate(scene["contacts"]):
         here, there = surface(11 + i), surface(21 + i)
-        found, (facet, xi) = fuzz_models.contact_of(made, contact, here, PresentContact)
+        found, (facet, xi) = fuzz_models.contact_of(made, contact, here, PresentContact, there)
         found.here, found.there, found.facet, found.xi = here, there, facet, xi
         found.reach = np.maximum.outer(here.heights()[0], there.heights()[0])
         contacts.append(found)

@@ -230,7 +230,7 @@ def smooth_modulus(surface: Surface, modulus: Array, facet: Array, xi: Array) ->
 
     Args:
         surface: Γc.
-        modulus: Young's modulus of the cell behind every facet (stress).
+        modulus: Young's modulus by every facet (stress).
         facet: Facet of every point.
         xi: Reference coordinates of every point.
 

@@ -13,7 +13,8 @@ class Scaled:
     """A stiffness per area as a multiple of E/h, Young's modulus over the height of the cell there.
 
     E comes from the bulk form itself, h is the cell's height over its facet on Γc, so that the
-    penetration is about 1/factor of the elastic displacement over the first layer of cells.
+    penetration is about 1/factor of the elastic displacement over the first layer of cells. Between
+    two bodies E is that of the softer one, whichever has Γc.
 
     Args to the constructor:
         factor: The multiple; by default that of the contact's ``accuracy``, or 10.

@@ -13,12 +13,12 @@ from dolfinx import fem
 
 from fenics_contact import compat
 from fenics_contact.compiling import compile_form
-from fenics_contact.parallel import global_min
+from fenics_contact.parallel import global_max, global_min
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_cells
 from fenics_contact.surface.mass import assembled, mass_solver
 from fenics_contact.surface.surface import ContactSurface
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Indices
 
 __all__ = ["cell_modulus", "modulus_over_height"]
 
@@ -74,8 +74,13 @@ def cell_modulus(
     return modulus
 
 
-def modulus_over_height(surface: ContactSurface, modulus: fem.Function) -> fem.Function:
+def modulus_over_height(
+    surface: ContactSurface, modulus: fem.Function, opposite: Indices | None = None
+) -> fem.Function:
     """E/h over Γc, h the height of the cell over the facet, smoothed over a few facets. Collective.
+
+    Between two bodies E is that of the softer one, which contact is to be stiff for; by the other's
+    it may be as stiff as 1e6 E/h of this one.
 
     The smoothing matters: where a penalty jumps from facet to facet, so does the penetration, and
     the body answers with pressure oscillations (10 % on an unstructured mesh of the half-cylinder,
@@ -85,6 +90,8 @@ def modulus_over_height(surface: ContactSurface, modulus: fem.Function) -> fem.F
     Args:
         surface: Γc.
         modulus: Young's modulus, one value per cell of the mesh (stress).
+        opposite: This rank's facets of the opposite surface, whose largest modulus bounds E; none:
+            the support is rigid.
 
     Returns:
         A continuous function of degree 1 on the submesh of Γc (stress/length).
@@ -101,7 +108,12 @@ def modulus_over_height(surface: ContactSurface, modulus: fem.Function) -> fem.F
         dolfinx.mesh.CellType.tetrahedron,
     )
     height = (mesh.topology.dim if simplex else 1) * _sizes(mesh, behind) / area
-    ratio = modulus.x.array[modulus.function_space.dofmap.list[behind, 0]] / height
+    values, cells = modulus.x.array, modulus.function_space.dofmap.list[:, 0]
+    present = values[cells[behind]]
+    if opposite is not None:
+        stiffest = global_max(mesh.comm, values[cells[facet_cells(mesh, opposite)]], empty=np.inf)
+        present = np.minimum(present, stiffest)
+    ratio = present / height
     smallest = global_min(mesh.comm, ratio, empty=1.0)
     if not smallest > 0.0:
         raise ValueError(
