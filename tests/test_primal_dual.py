@@ -77,6 +77,26 @@ def test_to_and_fro(condensation):
     assert made[0] < made[1]
 
 
+@pytest.mark.parametrize(
+    ("cell", "degree", "n", "k", "friction"),
+    [("quadrilateral", 1, 8, 2e4, 5.0), ("triangle", 2, 6, 1e3, 0.3)],
+)
+def test_out_of_a_cycle(cell, degree, n, k, friction):
+    """Whole steps go round among two sets of closed points, or four of sticking ones, with any c.
+
+    By itself, without another method, and no slower than by continuation.
+    """
+    ends, made = [], []
+    for method in ("primal_dual", "continuation"):
+        law = coulomb(k, friction)
+        rub = Rub(law, cell=cell, degree=degree, mesh={"n": n}, method=method, fallback=False)
+        steps = list(fc.increments(rub.problem, rub.load, 0.0, 1.0, steps=2, max_cuts=0))
+        ends.append(nodal(rub.scene.u))
+        made.append(sum(step.iterations for step in steps))
+    assert close(*ends, 1e-6)
+    assert made[0] < made[1]
+
+
 @SERIAL
 def test_iterations_hardly_grow_with_the_stiffness():
     """The half-cylinder pressed by a force in one increment: from nothing at most twenty.

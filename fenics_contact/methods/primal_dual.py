@@ -15,11 +15,16 @@ had from the law as it is, at the displacement C (s + c (g - C s)) = g - (1 - c 
 C s tells by how much s and g do not fit. Tractions are eliminated point by point, so that systems
 to be solved have the unknowns that they always have.
 
+Where points are linear in their status a whole step goes where that status says, wherever it came
+from: one that is found again leads to the same ones again, with any c, since s and g fit but for
+points that are open or slip. Half a step, of both, leads out of such a cycle.
+
 Without friction Newton's method with its line search is as quick, and does not go round in cycles.
 """
 
 from __future__ import annotations
 
+import logging
 import weakref
 
 import numpy as np
@@ -34,6 +39,8 @@ from fenics_contact.types import Array
 
 __all__ = ["PrimalDual"]
 
+logger = logging.getLogger("fenics_contact")
+
 _OPTIONS = {
     "snes_type": "newtonls",
     "snes_rtol": 0.0,
@@ -43,8 +50,11 @@ _OPTIONS = {
     "snes_linesearch_type": "basic",
 }
 # c by the stiffness of the bulk, one after another, and iterations with each: what makes one of
-# them go round in a cycle does not with the next.
+# them go round in a cycle may not with the next.
 _MODERATE, _PATIENCE = (1.0, 0.3, 3.0, 0.1, 10.0), 15
+# A step to be made that is as large as an earlier one to within this share is that one again, and
+# this much of it is made.
+_AGAIN, _DAMPED = 1e-6, 0.5
 
 
 class PrimalDual(OwnMethod):
@@ -64,7 +74,9 @@ class PrimalDual(OwnMethod):
         self._newton = InnerSnes(equations, tools.defaults, both, _OPTIONS, solver, consistent=True)
         self.snes = self._newton.snes
         self._points: list[_Points] = []
-        self._hardness, self._evaluations = 1.0, 0
+        self._hardness = 1.0
+        self._sizes: list[float] = []  # of the residual, of all iterations
+        self._damping = 1.0  # share of the step that is being made
 
     def check(self) -> None:
         """See `OwnMethod.check`: friction by springs, of a linear bulk."""
@@ -107,14 +119,13 @@ class PrimalDual(OwnMethod):
         """What the next step takes away, into ``f``. Collective."""
         equations, system = self._equations, self._equations.system
         if not self._points:
-            self._hardness, self._evaluations = equations.hardness(), 0
+            self._hardness, self._sizes, self._damping = equations.hardness(), [], 1.0
             equations.set_state(x)
             self._points = [_Points(operator) for operator in system.operators]
-        moderate = _MODERATE[self._evaluations // _PATIENCE % len(_MODERATE)]
-        self._evaluations += 1
+        moderate = _MODERATE[len(self._sizes) // _PATIENCE % len(_MODERATE)]
         equations.residual(x, f)  # of the law as it is: that it vanishes ends the iteration
         for points in self._points:
-            points.follow(moderate / max(self._hardness, moderate))
+            points.follow(moderate / max(self._hardness, moderate), self._damping)
         everywhere = not equations.held()
         for points in self._points:
             points.linearise(everywhere=everywhere)
@@ -125,6 +136,13 @@ class PrimalDual(OwnMethod):
         total.array[system.constrained] = 0.0
         f.array[:] = total.array_r / (equations.full.bulk.scale * equations.length)
         total.destroy()
+        size = f.norm()
+        again = any(abs(size - before) <= _AGAIN * before for before in self._sizes)
+        self._damping = _DAMPED if again else 1.0
+        if again:
+            logger.debug("step %d of primal_dual was made before, half of it", len(self._sizes))
+        self._sizes.append(size)
+        f.scale(self._damping)
 
     def _assemble(self, matrix: PETSc.Mat) -> None:
         tangents = (p.operator.tangent(PointTangent(p.tangent)) for p in self._points)
@@ -163,19 +181,20 @@ class _Points:
         self.traction = self._correction = np.zeros_like(self._jump)
         self.tangent: Array = np.zeros((*self._jump.shape, self._jump.shape[1]))
 
-    def follow(self, share: float) -> None:
+    def follow(self, share: float, damping: float) -> None:
         """Let the tractions make the step that the displacement has made. Collective.
 
         Then the law is evaluated at the displacement that both of them tell.
 
         Args:
             share: c from now on, by the stiffness of the law.
+            damping: Share of the step that was made.
         """
         self._share = share
         contact, springs = self._contact, self._springs
         jump = contact.opposite.present_jump()
         moved = springs.felt(jump - self._jump)
-        answer = _times(self.tangent, moved) - self._correction
+        answer = _times(self.tangent, moved) - damping * self._correction
         self._misfit = self._misfit + moved - _times(springs.compliance, answer)
         self._jump = jump
         with contact.opposite.displaced((self._share - 1.0) * self._misfit):
