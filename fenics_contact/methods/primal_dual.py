@@ -49,6 +49,14 @@ _OPTIONS = {
     "snes_max_it": 75,
     "snes_linesearch_type": "basic",
 }
+# Where linear systems are solved by iteration: by how much the residual falls from step to step
+# does not tell how well they need be, since an error of the displacement is one of the traction by
+# K. One that takes long is far from where the iteration ends.
+_ITERATED = {
+    "snes_ksp_ew_rtol0": 1e-4,
+    "snes_ksp_ew_rtolmax": 1e-4,
+    "snes_max_linear_solve_fail": _OPTIONS["snes_max_it"],
+}
 # c by the stiffness of the bulk, one after another, and iterations with each: what makes one of
 # them go round in a cycle may not with the next.
 _MODERATE, _PATIENCE = (1.0, 0.3, 3.0, 0.1, 10.0), 15
@@ -70,6 +78,8 @@ class PrimalDual(OwnMethod):
         """Set up SNES; the matrix is that of the consistent tangent. Collective."""
         equations = self._equations = tools.equations
         solver = tools.linear_solver(equations.symmetric(True))
+        if solver:
+            solver |= _ITERATED
         both = tools.prefix, "primal_dual_"
         self._newton = InnerSnes(equations, tools.defaults, both, _OPTIONS, solver, consistent=True)
         self.snes = self._newton.snes
