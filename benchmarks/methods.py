@@ -1,4 +1,4 @@
-"""The four methods on three scenes with friction: iterations, factorisations and time.
+"""The five methods on three scenes with friction: iterations, factorisations and time.
 
     python benchmarks/methods.py
 
@@ -29,7 +29,7 @@ from scenes import problems
 from scenes.elasticity import displacement_space, hold
 from scenes.tags import plane, sides
 
-METHODS = ("lbfgs", "newton", "continuation", "alternating")
+METHODS = ("lbfgs", "newton", "continuation", "alternating", "primal_dual")
 STIFFNESSES = (10.0, 1000.0)
 # Runs that take longer are not repeated (s).
 ONCE = 5.0
@@ -145,7 +145,7 @@ def main() -> None:
     for row in measure(1 if arguments.short else arguments.repeat):
         rows.append(row)
         print(*row.values(), sep="  ", flush=True)
-    title = "Four methods on three scenes with friction"
+    title = "Five methods on three scenes with friction"
     timing.write(arguments.output, "methods", title, rows)
 
 
