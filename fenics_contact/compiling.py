@@ -1,18 +1,21 @@
-"""Compiled forms, and a word to who waits for them."""
+"""Compiled forms and expressions, and a word to who waits for them."""
 
 from __future__ import annotations
 
 import logging
 import sys
 import time
+from contextlib import AbstractContextManager
 from typing import Any
 
 import dolfinx
+import numpy as np
+import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
-__all__ = ["Waiting", "compile_form", "waiting"]
+__all__ = ["Waiting", "compile_expression", "compile_form", "printed_as_ever", "waiting"]
 
 logger = logging.getLogger("fenics_contact")
 # Seconds: what takes less was in the cache; when a user wonders.
@@ -29,6 +32,35 @@ def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:
     compiled = fem.form(form, entity_maps=entity_maps or None)
     waiting.add(time.perf_counter() - start)
     return compiled
+
+
+def compile_expression(expression: Any, points: npt.NDArray[np.float64]) -> fem.Expression:
+    """Compile a UFL expression at points of the reference cell, shape (n_points, tdim). Collective.
+
+    FFCx names it by its points as they are printed: with few digits another one's name.
+    """
+    with printed_as_ever():
+        return fem.Expression(expression, points)
+
+
+def printed_as_ever() -> AbstractContextManager[Any]:
+    """NumPy's own way of printing, in which Basix names quadrature elements, and FFCx expressions.
+
+    To a name given under other ``np.set_printoptions`` the same element is another one.
+    """
+    return np.printoptions(
+        precision=8,
+        threshold=1000,
+        edgeitems=3,
+        linewidth=75,
+        suppress=False,
+        nanstr="nan",
+        infstr="inf",
+        formatter=None,
+        sign="-",
+        floatmode="maxprec",
+        legacy=False,
+    )
 
 
 class Waiting:

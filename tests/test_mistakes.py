@@ -5,6 +5,8 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 
+import basix
+import dolfinx
 import numpy as np
 import pytest
 import ufl
@@ -12,6 +14,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from fenics_contact import output
 from fenics_contact.checks.given import check_measures
 from scenes.blocks import BOTTOM, TOP, block_mesh
 from scenes.comparing import raised_everywhere
@@ -27,6 +30,34 @@ def bulk(scene, ds, tag):
     v = ufl.TestFunction(scene.u.function_space)
     eps = ufl.sym(ufl.grad(scene.u))
     return ufl.inner(1000 * eps, ufl.grad(v)) * ufl.dx + v[1] * ds(tag)
+
+
+@pytest.mark.parametrize("scheme", ["default", "vertex"])
+def test_numbers_printed_otherwise(scheme):
+    """Quadrature elements have printed numbers in their names: no others after set_printoptions.
+
+    Equal ones of two names in a form end, by chance, in a KeyError of FFCx: names are compared.
+    """
+    scene = pressed(surface={"quadrature_scheme": scheme})
+    quadrature = scene.contact(coulomb()).quadrature
+    for size in (None, 2):
+        before = quadrature.space(size).ufl_element()
+        with np.printoptions(precision=3, suppress=True, linewidth=20, floatmode="fixed"):
+            after = quadrature.space(size).ufl_element()
+        assert after == before and repr(after) == repr(before)
+
+
+def test_points_that_are_printed_alike():
+    """Those of degree 3 and 4, six a triangle: at each the values are those of its own places."""
+    mesh = dolfinx.mesh.create_unit_square(COMM, 1, 1)
+    x = ufl.SpatialCoordinate(mesh)
+    with np.printoptions(formatter={"float": lambda _: "."}):
+        for degree in (3, 4):
+            places, values = output.sample(x[0] ** 5, mesh, degree)
+            # The same expression in NumPy, to its round-off.
+            assert values == pytest.approx(places[:, 0] ** 5, abs=1e-14)
+            rule, _ = basix.make_quadrature(basix.CellType.triangle, degree)
+            assert places[:, 0].min() == pytest.approx(rule.min(), abs=1e-14)
 
 
 def problem_of(scene, F=None, bcs=None):

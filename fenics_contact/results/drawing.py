@@ -15,6 +15,7 @@ from dolfinx import fem
 from dolfinx.mesh import CellType, exterior_facet_indices
 
 from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.compiling import compile_expression
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_sum
@@ -138,7 +139,7 @@ class ShapeOf:
                     "which takes a tensor (3, 3), such as that of elasticity.LinearElastic"
                 )
             middle = basix.geometry(basix.CellType[mesh.topology.cell_name()]).mean(axis=0)
-            self._stress = fem.Expression(tensor, middle[None])
+            self._stress = compile_expression(tensor, middle[None])
         if self._dim == 3:
             mesh.topology.create_connectivity(2, 3)
             self._facets = FacetSet(u.function_space, exterior_facet_indices(mesh.topology))

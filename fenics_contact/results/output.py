@@ -14,6 +14,7 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
+from fenics_contact.compiling import compile_expression
 from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_min
 from fenics_contact.results import files
 from fenics_contact.types import Array
@@ -64,7 +65,7 @@ def sample(expression: Any, mesh: dolfinx.mesh.Mesh, degree: int = 1) -> tuple[A
     cells = np.arange(mesh.topology.index_map(mesh.topology.dim).size_local, dtype=np.int32)
     gdim, shape = mesh.geometry.dim, expression.ufl_shape
     columns = [
-        np.asarray(fem.Expression(e, points).eval(mesh, cells)).reshape(
+        np.asarray(compile_expression(e, points).eval(mesh, cells)).reshape(
             len(cells) * len(points), -1
         )
         for e in (ufl.SpatialCoordinate(mesh), expression)

@@ -19,6 +19,7 @@ from mpi4py import MPI
 
 from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.checks.step import Step
+from fenics_contact.compiling import compile_expression
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import collective_errors
@@ -178,7 +179,7 @@ class _Body:
         nodes = vtu.CELLS[name].nodes(basix.geometry(kind), order)
         places = ufl.SpatialCoordinate(mesh), problem.displacement.expression
         parts = [e[i] for e in places for i in range(d)]
-        self._n_nodes, self._places = len(nodes), fem.Expression(ufl.as_vector(parts), nodes)
+        self._n_nodes, self._places = len(nodes), compile_expression(ufl.as_vector(parts), nodes)
         self._stress: fem.Expression | None = None
         if stress is None:
             return
@@ -197,7 +198,7 @@ class _Body:
         )
         self._shape = stress.ufl_shape
         self._basis = inside.tabulate(0, nodes)[0, :, :, 0]
-        self._stress = fem.Expression(stress, inside.points)
+        self._stress = compile_expression(stress, inside.points)
 
     def grid(self) -> vtu.Grid:
         """The cells of this rank as they are now."""

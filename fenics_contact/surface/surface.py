@@ -16,7 +16,7 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.arguments import check_instance, is_number
-from fenics_contact.compiling import compile_form
+from fenics_contact.compiling import compile_form, printed_as_ever
 from fenics_contact.parallel import gather_rows, global_max, global_min
 from fenics_contact.surface.mass import assembled
 from fenics_contact.types import Array
@@ -246,12 +246,8 @@ class SurfaceQuadrature:
     def space(self, size: int | None = None) -> fem.FunctionSpace:
         """Space of functions at the quadrature points, scalar or with ``size`` components."""
         shape = () if size is None else (size,)
-        if self._points_and_weights is None:
-            element = basix.ufl.quadrature_element(
-                self._cell, value_shape=shape, degree=self.degree
-            )
-        else:
-            points, weights = self._points_and_weights
+        points, weights = self._points_and_weights or (None, None)
+        with printed_as_ever():
             element = basix.ufl.quadrature_element(
                 self._cell, value_shape=shape, points=points, weights=weights, degree=self.degree
             )
