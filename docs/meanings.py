@@ -279,6 +279,12 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "The support's normal is the wrong way round at every point of Γc.",
             "Turn it round. Where the body is deep inside, it is an error.",
         ),
+        "press on one and the same support": (
+            "Two contacts have facets in common, and what they press on is at one place and moves "
+            "as one. Stiffnesses add up, and each has a part of the force, the pressure and the "
+            "friction.",
+            "Tags that overlap; a contact that was made twice. Two laws side by side may be meant.",
+        ),
         "have no opposite": (
             "More than half of Γc looks past the other body.",
             "Tags of Γc and of the opposite, `search_distance`, `release`.",

@@ -48,7 +48,10 @@ def test_numbers_printed_otherwise(scheme):
 
 
 def test_points_that_are_printed_alike():
-    """Those of degree 3 and 4, six a triangle: at each the values are those of its own places."""
+    """Those of degree 3 and 4, six a triangle: at each the values are those of its own places.
+
+    Of three ranks one has no cells.
+    """
     mesh = dolfinx.mesh.create_unit_square(COMM, 1, 1)
     x = ufl.SpatialCoordinate(mesh)
     with np.printoptions(formatter={"float": lambda _: "."}):
@@ -145,6 +148,38 @@ def test_tags_of_another_mesh():
         ValueError,
         "of another mesh",
     )
+
+
+def doubled(scene, support, **options):
+    """A contact of the bottom beside that with the floor, and what is warned of."""
+    contacts = [
+        scene.contact(coulomb(), name="floor"),
+        scene.contact(coulomb(), name="other", support=support, **options),
+    ]
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=contacts)
+    return [str(one.message) for one in told if "same support" in str(one.message)]
+
+
+def test_one_support_twice():
+    """Each would bear half of the force: warned of once, with names and facets, two of them."""
+    scene = pressed()
+    plane = fc.HalfSpace(point=(0.3, 0.0), normal=(0.0, 2.0))
+    for support in (scene.floor(), plane):
+        (told,) = doubled(scene, support)
+        assert told.startswith("floor and other press on one and the same support at 2 facets")
+
+
+def test_two_supports_of_one_surface():
+    """Another place, another way to move, a gap of its own: none of them is the floor."""
+    scene = pressed()
+    moved = fem.Constant(scene.mesh, np.zeros(2))
+    assert not doubled(scene, fc.HalfSpace(point=(0.0, -0.1), normal=(0.0, 1.0)))
+    assert not doubled(scene, fc.HalfSpace(point=(0.0, 0.0), normal=(-0.1, 1.0)))
+    assert not doubled(scene, scene.floor(displacement=moved))
+    assert not doubled(scene, scene.floor(), gap=0.1)
+    assert doubled(scene, scene.floor(), gap=0.0)
 
 
 def test_a_load_that_nothing_reads():

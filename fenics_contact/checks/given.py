@@ -215,7 +215,9 @@ def _facets_held(contact: Contact, constrained: Array) -> int:
 
 
 def check_start(contacts: Sequence[Contact], size: float) -> float:
-    """Refuse input out of range, and warn of bodies that are in their supports. Collective.
+    """Refuse input out of range; warn of bodies in their supports, and of one support twice.
+
+    Collective.
 
     Args:
         contacts: Of a problem.
@@ -249,4 +251,40 @@ def check_start(contacts: Sequence[Contact], size: float) -> float:
                     contact.name,
                     -gap,
                 )
+    _warn_of_doubles(contacts, size)
     return worst
+
+
+def _warn_of_doubles(contacts: Sequence[Contact], size: float) -> None:
+    """Say which two contacts share the force of what is one support. Collective."""
+    if len(contacts) < 2:
+        return
+    comm, pairs = contacts[0].surface.mesh.comm, list(combinations(contacts, 2))
+    shared = comm.allreduce(np.array([_n_doubled(*pair, size) for pair in pairs]))
+    for (one, other), n_facets in zip(pairs, shared, strict=True):
+        if n_facets:
+            warn(
+                comm,
+                f"{one.name} and {other.name} press on one and the same support at {n_facets} "
+                "facets of Γc: each bears its share of the force there, as springs side by side "
+                "do; make one Contact of them, or take these facets out of one, unless two laws "
+                "are meant to act together",
+            )
+
+
+def _n_doubled(one: Contact, other: Contact, size: float) -> int:
+    """Facets of this rank where two supports of one kind that move as one are at one place."""
+    mine, theirs = one.support, other.support
+    moved = mine.displacement is theirs.displacement or mine.displacement == theirs.displacement
+    if type(mine) is not type(theirs) or mine.rotation is not theirs.rotation or not np.all(moved):
+        return 0
+    _, *shared = np.intersect1d(one.surface.facets, other.surface.facets, return_indices=True)
+    places, facing = [], np.ones(len(shared[0]), dtype=np.bool_)
+    for contact, rows in zip((one, other), shared, strict=True):
+        points, values = contact.quadrature.point_rows()[rows], contact.values
+        # Means, as rules may differ, and the order of points on a facet does.
+        places.append([a[points].mean(axis=1) for a in (values.initial_gap / size, values.normal)])
+        facing &= np.all(values.paired[points], axis=1)
+    gaps, normals = (np.abs(a - b) for a, b in zip(*places, strict=True))
+    same = (gaps <= _TOUCHING) & np.all(normals <= _TOUCHING, axis=1)
+    return int(np.count_nonzero(same & facing))

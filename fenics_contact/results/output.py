@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -64,10 +65,9 @@ def sample(expression: Any, mesh: dolfinx.mesh.Mesh, degree: int = 1) -> tuple[A
     points, _ = basix.make_quadrature(mesh.basix_cell(), degree)
     cells = np.arange(mesh.topology.index_map(mesh.topology.dim).size_local, dtype=np.int32)
     gdim, shape = mesh.geometry.dim, expression.ufl_shape
+    n = len(cells) * len(points)  # none on a rank without cells
     columns = [
-        np.asarray(compile_expression(e, points).eval(mesh, cells)).reshape(
-            len(cells) * len(points), -1
-        )
+        np.reshape(compile_expression(e, points).eval(mesh, cells), (n, math.prod(e.ufl_shape)))
         for e in (ufl.SpatialCoordinate(mesh), expression)
     ]
     rows = gather_rows(mesh.comm, np.column_stack(columns))
