@@ -267,8 +267,11 @@ def test_wrong_input(tmp_path):
     made = Rub()
     (folder / "file").touch()
     COMM.barrier()
-    error = (OSError, NotADirectoryError)
-    raised_everywhere(lambda: fc.Writer(folder / "file" / "in", made.problem), error, "file")
+    named = f"and {folder / 'file'} is a file; give another name"
+    for taken in (folder / "file", folder / "file" / "in"):
+        raised_everywhere(
+            lambda taken=taken: fc.Writer(taken, made.problem), (OSError, NotADirectoryError), named
+        )
     raised_everywhere(lambda: fc.Writer(folder, made.contact), ValueError, "ContactProblem")
     vector = made.scene.u
     raised_everywhere(

@@ -115,7 +115,7 @@ def report(
         with collective_errors(comm):
             if comm.rank == 0:
                 drawing.pyplot()  # whether it is there
-                path.parent.mkdir(parents=True, exist_ok=True)
+                files.make_folder(path.parent)
                 tempfile.TemporaryFile(dir=path.parent).close()  # whether it can be written to
                 scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
                 rows = _rows(problem, steps, history)

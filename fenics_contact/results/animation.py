@@ -85,7 +85,7 @@ class Animation:
         with collective_errors(self._comm):
             if self._comm.rank == 0:
                 drawing.pyplot()  # whether it is there
-                self.path.parent.mkdir(parents=True, exist_ok=True)
+                files.make_folder(self.path.parent)
                 # Where there is room for the film; /tmp may be memory.
                 folder, prefix = self.path.parent, f".{self.path.stem}."
                 self._folder = Path(tempfile.mkdtemp(dir=folder, prefix=prefix))

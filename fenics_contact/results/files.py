@@ -1,4 +1,4 @@
-"""Files that are complete or not there, whenever and however writing them ends."""
+"""Files that are complete or not there, whenever and however writing them ends; folders."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["check_file", "replacing"]
+__all__ = ["check_file", "make_folder", "replacing"]
 
 
 def check_file(path: Path) -> None:
@@ -24,6 +24,21 @@ def check_file(path: Path) -> None:
             f"{path} is a device, a pipe or a socket, and a file would take its place; give the "
             "name of a file"
         )
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder, and those above it, where they are not there. On the calling rank only.
+
+    Raises:
+        NotADirectoryError: Something else has its name, or that of one above it.
+        OSError: It cannot be made.
+    """
+    there = next((p for p in (path, *path.parents) if p.exists()), None)
+    if there is not None and not there.is_dir():
+        raise NotADirectoryError(
+            f"{path} is to be a folder, and {there} is a file; give another name, or remove it"
+        )
+    path.mkdir(parents=True, exist_ok=True)
 
 
 @contextmanager

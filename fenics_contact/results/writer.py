@@ -88,7 +88,7 @@ class Writer:
         self._series: dict[str, list[tuple[float, str]]] = {}
         with collective_errors(self._comm):
             if self._comm.rank == 0:
-                self.folder.mkdir(parents=True, exist_ok=True)
+                files.make_folder(self.folder)
                 for name in ("body", *names):
                     self._series[name] = vtu.read_series(self._path(name))
                 tempfile.TemporaryFile(dir=self.folder).close()  # whether it can be written to
