@@ -123,6 +123,8 @@ def test_fields_and_stress(cell, tmp_path, drawn):
             means = per_facet(points | {"pressure": points[field]}, cell)
             ends = [min(0.0, means.min()), max(0.0, means.max())]
             assert close(figure.axes[1].get_ylim(), ends, 1e-12), field
+            grey = field != "gap" and bool(np.any(means == 0.0))
+            assert entries(figure) == ([f"no {field}"] if grey else [])
         if d == 2:
             upper, lower = drawn[4].axes
             curves = {line.get_label(): line.get_data() for line in (*upper.lines, *lower.lines)}
@@ -139,6 +141,11 @@ def test_fields_and_stress(cell, tmp_path, drawn):
         assert len(np.unique(np.asarray(body.get_facecolor()), axis=0)) >= 4
 
     on_first(check)
+
+
+def entries(figure):
+    """What the legends of a figure say."""
+    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
 
 
 def shapes(collection):
@@ -208,6 +215,7 @@ def test_only_what_is_near_the_contact(cell, tmp_path, drawn):
         close_up, _, whole, _ = drawn
         (some, every) = (shapes(figure.axes[0].collections[-1]) for figure in (close_up, whole))
         assert count <= len(some) < len(every)
+        assert entries(whole) == ["no pressure"]
         for figure in drawn[:2]:
             body, surface = figure.axes[0].collections
             bearing = np.concatenate(shapes(surface))

@@ -129,18 +129,23 @@ def plot_field(
         drawn = drawn.around(near)
         figure, axes = drawn.axes(length, title, view)
         from matplotlib.colors import to_rgba
+        from matplotlib.patches import Patch
 
         means = drawn.values
         low, high = (end(means, initial=0.0) for end in (np.nanmin, np.nanmax))
         colours = drawing.scale_of(low, high)
         faces = colours.to_rgba(means)
-        faces[np.isnan(means) | ((means == 0.0) & (field != "gap"))] = to_rgba(
-            drawing.COLOURS["open"]
-        )
+        grey, none = to_rgba(drawing.COLOURS["open"]), np.isnan(means)
+        none |= (means == 0.0) & (field != "gap")
+        faces[none] = grey
         axes.add_collection(drawing.on_surface(drawn.facets, faces))
         name, kind = _FIELDS[field]
         unit = {"stress": stress, "length": length}[kind]
         figure.colorbar(colours, ax=axes, label=f"{name} [{unit}]", shrink=0.8)
+        if none.any():
+            label = "gap not known" if field == "gap" else f"no {field}"
+            entry = Patch(fc=grey, ec="#555555", label=label)
+            figure.legend(handles=[entry], loc="outside lower center")
         drawing.save(figure, path)
 
 
