@@ -299,17 +299,18 @@ def report(result: dict[str, Any]) -> None:
     """Print the results with their references beside them."""
     a, p0 = hertz(result["load"])
     its = result["iterations"]
+    increments = f"{len(its)} increment{'s' * (len(its) > 1)}"
     print(
         f"\nμ = {result['friction']:g}: {result['cells']} cells, {result['dofs']} dofs, "
-        f"{result['increments']} increments, {sum(its)} iterations (at most {max(its)} in one), "
-        f"SNES reasons {sorted(set(result['converged_reasons']))}, {result['wall_seconds']:.2f} s"
+        f"{increments}, {sum(its)} iterations (at most {max(its)} in one), "
+        f"{result['wall_seconds']:.2f} s"
     )
     print(
         f"  Solver {result['solver']}: by {' and '.join(result['methods'])}, "
         f"{result['solve_seconds']:.2f} s for the increments alone"
     )
     print(f"  Hertz (half-plane): a = {a:.4f}, p0 = {p0:.2f}; here a/R = {a / R:.3f}")
-    print(f"  {'':26}{'result':>20}{'reference':>20}{'difference':>12}{'allowed':>10}")
+    print(f"  {'in N, mm, MPa':26}{'result':>20}{'reference':>20}{'difference':>12}{'allowed':>10}")
     names = (
         "peak_pressure half_width tangential_resultant stick_half_width "
         "max_tangential_traction top_centre_displacement top_corner_displacement"

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from scenes.blocks import GRID, TOP, block, layers
+from scenes.blocks import BOTTOM, GRID, LEFT, TOP, block, layers
 from scenes.comparing import (
     at_points,
     close,
@@ -66,6 +66,52 @@ def test_patch(cell, degree):
     assert resultants.area == pytest.approx(1.0, rel=1e-12)
     assert resultants.open == resultants.stick == 0
     assert not step.verdict.failures
+
+
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
+@pytest.mark.parametrize("condensation", [None, False])
+def test_a_block_far_above_its_floor(cell, condensation):
+    """Pressed and pulled with nothing to hold it, it is set down and solved as one that touches.
+
+    Friction counts its way along the floor from where it was: no way by which it came may be in
+    the start, nor a tilt. Reference: the same without a gap, by the friction summed up, to 1e-6:
+    residuals are some 1e-9 of the forces and more, by the round-off of the way. They took 21
+    iterations at most; where the load led the way up to 293, or found nothing.
+    """
+    found = []
+    for gap in (0.0, 0.05, 0.5):
+        scene = block(cell, 1, side=0.05, up=-1.0, n=4 if cell == "triangle" else 2)
+        support = fc.HalfSpace(scene.vector(up=-gap), scene.vector(up=1.0))
+        contact = scene.contact(fc.Coulomb(friction=0.3), support=support)
+        problem = fc.ContactProblem(scene.F, scene.u, contacts=[contact], condensation=condensation)
+        step = problem.solve()
+        assert step.iterations <= 25
+        found.append(contact.resultants().tangential_force)
+    assert close(found[1], found[0], 1e-6) and close(found[2], found[0], 1e-6)
+
+
+def test_a_block_that_is_led_into_a_corner():
+    """Floor and wall grip, and nothing but a turn about the corner goes along neither: no way.
+
+    By its load it is next to both: 12 iterations, by other releases 27; turned it took 157.
+    Reference: the forces of both, which carry the load (-0.6, -1), to the solver's 1e-9.
+    """
+    scene = block("triangle", 1, side=-0.6, up=-1.0, n=4)
+    law, gap = fc.Coulomb(friction=0.2), 0.01
+    contacts = [
+        fc.Contact(
+            scene.u,
+            fc.ContactSurface(scene.mesh, scene.tags, tag),
+            fc.HalfSpace(-gap * np.array(normal), normal),
+            law,
+            name=name,
+        )
+        for name, tag, normal in (("floor", BOTTOM, (0.0, 1.0)), ("wall", LEFT, (1.0, 0.0)))
+    ]
+    step = fc.ContactProblem(scene.F, scene.u, contacts=contacts).solve()
+    assert step.iterations <= 60
+    forces = [contact.resultants().force for contact in contacts]
+    assert close(sum(forces), [0.6, 1.0], 1e-8)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])

@@ -33,6 +33,8 @@ __all__ = ["RigidMotions", "unbalanced"]
 _FREE = 1e-12
 _FELT = 1e-10
 _BALANCED = 1e-8
+# The share of what a load drives that counts as most of it.
+_MOST = 0.5
 # Directions by which the friction cone is enclosed in space: a polygon around the circle, so that a
 # balance that exists is never denied.
 _CONE_SIDES = 64
@@ -265,13 +267,19 @@ class RigidMotions:
             area += contact.quadrature.weights.sum()
             if contact.law.has_normal_stiffness:
                 gram += (along * weights) @ along.T
-            if contact.law.has_tangential:
-                grip = weights * (values.grip > 0)
-                across = modes - along[:, :, None] * values.normal[None]
-                gram += np.einsum("mqd,q,nqd->mn", across, grip, across)
+            gram += self._rubbing(operator, weights)
         mean = global_sum(self.comm, gram) / max(float(global_sum(self.comm, area)), 1e-300)
         sizes, vectors = np.linalg.eigh(mean)
         return agreed(self.comm, vectors[:, sizes < _FELT].T @ self.free)
+
+    def _rubbing(self, operator: ContactOperator, weights: Array) -> Array:
+        """Products of the free motions along Γc where it grips, (n_free, n_free). Collective."""
+        values, modes = operator.contact.values, self.at_points(operator)
+        if not operator.contact.law.has_tangential:
+            return np.zeros((len(modes), len(modes)))
+        across = modes - np.einsum("mqd,qd->mq", modes, values.normal)[:, :, None] * values.normal
+        grip = weights * (values.grip > 0)
+        return np.asarray(np.einsum("mqd,q,nqd->mn", across, grip, across), dtype=np.float64)
 
     def _straight(self) -> Index:
         """Numbers of the free motions but for those by which supports turn."""
@@ -290,7 +298,10 @@ class RigidMotions:
         return global_sum(self.comm, (self._free_fields @ forces)[self._straight()])
 
     def approach(self, load: Array, operators: Sequence[ContactOperator]) -> Array | None:
-        """Rigid motion to first touch, where the load sets free bodies moving. Collective.
+        """Rigid motion to where the load sets free bodies down, or to first touch. Collective.
+
+        A friction that counts slip from where nothing touched yet draws a body back by all that it
+        went along Γc, and one set down on an edge has to be turned: the load does not lead there.
 
         Args:
             load: External forces at this rank's unknowns (force).
@@ -306,6 +317,9 @@ class RigidMotions:
         mass = global_sum(self.comm, free @ free.T)
         if not np.abs(drive).max() > 0:
             return None
+        landed = self._landed(drive / np.abs(drive).max(), mass, operators)
+        if landed is not None:
+            return landed @ free
         coefficients = agreed(self.comm, np.linalg.solve(mass, drive))
         coefficients /= np.abs(coefficients).max()
         way = np.inf
@@ -317,6 +331,51 @@ class RigidMotions:
             ways = values.opening[nearing] / closing[nearing]
             way = min(way, global_min(self.comm, ways, empty=np.inf))
         return None if way == np.inf else way * coefficients @ free
+
+    def _landed(
+        self, drive: Array, mass: Array, operators: Sequence[ContactOperator]
+    ) -> Array | None:
+        """Where rigid bodies come to rest, without a way along a Γc that grips. Collective.
+
+        The load does there all the work that gaps allow, with small rotations: a linear programme.
+
+        Args:
+            drive: Work of the load on the free motions, relative, (n_free,).
+            mass: Products of these, (n_free, n_free).
+            operators: Of evaluated contacts.
+
+        Returns:
+            Coefficients of the free motions; None: such motions are none, are little of what the
+            load drives, as those in a corner are, or do not end.
+        """
+        rubbing: Array = np.zeros((len(drive), len(drive)))
+        area, rows = 0.0, []
+        for operator in operators:
+            contact, values = operator.contact, operator.contact.values
+            weights = contact.quadrature.weights
+            rubbing, area = rubbing + self._rubbing(operator, weights), area + weights.sum()
+            closing = np.einsum("mqd,qd->qm", self.at_points(operator), values.normal)
+            rows.append(np.column_stack([closing, values.opening])[contact.paired])
+        mean = global_sum(self.comm, rubbing) / max(float(global_sum(self.comm, area)), 1e-300)
+        sizes, vectors = np.linalg.eigh(mean)
+        ways = agreed(self.comm, vectors[:, sizes < _FELT])
+        limits = gather_rows(self.comm, np.concatenate(rows))
+        far = np.abs(limits[:, -1]).max(initial=0.0)
+        work = drive @ ways
+        finite = any(operator.contact.finite for operator in operators)
+        if finite or not far > 0 or not len(work):
+            return None
+        led = work @ np.linalg.solve(ways.T @ mass @ ways, work)
+        if not led > _MOST * (drive @ np.linalg.solve(mass, drive)):
+            return None
+        found = scipy.optimize.linprog(
+            -work,
+            A_ub=limits[:, :-1] @ ways,
+            b_ub=limits[:, -1] / far,
+            bounds=(None, None),
+            options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+        )
+        return far * (ways @ agreed(self.comm, found.x)) if found.status == 0 else None
 
     def check_balance(self, load: Array, operators: Sequence[ContactOperator]) -> None:
         """Refuse a load whose resultant no admissible contact forces can balance. Collective.
