@@ -217,6 +217,49 @@ def test_shrink_fit() -> None:
     assert contact.n_unpaired == 0
 
 
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+@pytest.mark.parametrize("fine", [10, 40])
+def test_a_coarse_surface_presses_on_all_of_a_fine_one(kinematics, fine) -> None:
+    """Facets 10 and 40 times as long as the opposite ones have points for each of these.
+
+    Reference: the force with Γc on the fine block, another discretisation of the same scene, to
+    12 %, what four coarse cells leave between the two; by two points a facet, which pierce the fine
+    block, it is 40 to 50 % less.
+    """
+    forces = []
+    for own, other in ((LOWER, UPPER), (UPPER, LOWER)):
+        mesh, tags = two_blocks("quadrilateral", (4, fine), (4.0, 1.0), 1.5)
+        u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (2,))))
+        down, side = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
+        bcs = [hold(u, tags, BOTTOM, i) for i in range(2)]
+        bcs += [hold(u, tags, TOP, i, value) for i, value in enumerate((side, down))]
+        law = fc.Coulomb(0.3, k_n=10 * E, k_t=10 * E)
+        surface, support = fc.ContactSurface(mesh, tags, own), fc.DeformableBody(tags, other)
+        contact = fc.Contact(u, surface, support, law, kinematics=kinematics)
+        F = residual(u, ufl.TestFunction(u.function_space), E, 0.3)
+        problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
+        for depth in (0.05, 0.1):
+            down.value = -depth
+            problem.solve()
+            problem.commit()
+        forces.append(contact.resultants().normal_force)
+    assert forces[0] == pytest.approx(forces[1], rel=0.12)
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_points_are_as_many_as_the_opposite_facets_take(cell) -> None:
+    """P + 1 on each side for every opposite facet, 10 here; a degree that is given is kept."""
+    mesh, tags = two_blocks(cell, (1, 10))
+    d, law = mesh.geometry.dim, fc.Frictionless(k_n=E)
+    u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (d,))))
+    degrees = []
+    for own, other, given in ((LOWER, UPPER, None), (UPPER, LOWER, None), (LOWER, UPPER, 3)):
+        surface = fc.ContactSurface(mesh, tags, own, quadrature_degree=given)
+        contact = fc.Contact(u, surface, fc.DeformableBody(tags, other), law)
+        degrees.append(contact.quadrature.degree)
+    assert degrees == [{2: 38, 3: 6}[d], 2, 3]  # 2n - 2 has n points a side; 6 is the limit
+
+
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 @pytest.mark.parametrize("contrast", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("swap", [False, True])

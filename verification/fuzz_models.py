@@ -130,7 +130,12 @@ def contact_of(
     scheme, rule = contact.get("scheme"), contact.get("quadrature")
     if scheme is None and rule is None and augmented and rigid and degree == 1:
         scheme = "vertex" if scene["cell"] != "hexahedron" else None
-    facet, xi, weights = here.rule(rule or 2 * degree, scheme or "default")
+    if rule is None:
+        rule = 2 * degree
+        if there is not None:  # p + 1 points for every facet that is opposite, but for many
+            times = round(float(np.median(here.lengths()) / np.median(there.lengths())))
+            rule = max(rule, min(2 * ((degree + 1) * times - 1), {2: 78, 3: 6}[d]))
+    facet, xi, weights = here.rule(rule, scheme or "default")
     weights = weights * scene.get("thickness", 1.0)
     x, _ = here.place(facet, xi)
     owner = made.box[here.cells]

@@ -141,6 +141,12 @@ class Surface:
         places = [self.place(every, np.tile(p, (len(every), 1)), u)[0] for p in at]
         return np.stack(places, axis=1)
 
+    def lengths(self) -> Array:
+        """The longest way between two corners of every facet (length)."""
+        corners = self.corners()
+        apart = corners[:, :, None] - corners[:, None, :]
+        return np.linalg.norm(apart, axis=3).max(axis=(1, 2), initial=0.0)
+
     def rule(self, degree: int, scheme: str) -> tuple[Array, Array, Array]:
         """Facet, reference coordinates and weight (length^(d-1)) of every point of Γc."""
         kind = {2: "interval", 3: "triangle" if self.simplex else "quadrilateral"}[self.d]

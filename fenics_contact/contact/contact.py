@@ -32,7 +32,7 @@ from fenics_contact.supports.base import SampledSupport, Support
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.displacement import Displacement, check_kind
 from fenics_contact.surface.fields import PointFields
-from fenics_contact.surface.surface import ContactSurface
+from fenics_contact.surface.surface import ContactSurface, tagged_facets
 from fenics_contact.types import Array, Mask
 
 __all__ = ["Committed", "Contact", "Found"]
@@ -186,7 +186,10 @@ class Contact(PointResults):
         nodal = nodal and surface.submesh.topology.cell_name() != "quadrilateral"
         # Nor where the area of a vertex is not that of its share of a uniform pressure.
         nodal = nodal and not varies(weight)
-        self.quadrature = surface.quadrature(degree, nodal=nodal)
+        opposite = None
+        if isinstance(support, DeformableBody):
+            opposite = tagged_facets(surface.mesh, support.facet_tags, support.tags)
+        self.quadrature = surface.quadrature(degree, nodal=nodal, opposite=opposite)
         moving = self.finite and not isinstance(support, DeformableBody)
         self.multipliers: Multipliers | None = None
         if augments:
