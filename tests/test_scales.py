@@ -8,6 +8,7 @@ a step that changes nothing it is far less.
 
 import numpy as np
 import pytest
+import ufl
 from mpi4py import MPI
 
 import fenics_contact as fc
@@ -161,6 +162,34 @@ def test_a_body_out_of_balance_is_named():
     equations = verdict.equations | {"body 2": broken}
     failures = fc.Verdict(equations, verdict.sums, verdict.laws).failures
     assert len(failures) == 1 and "body 2" in failures[0]
+
+
+@pytest.mark.parametrize("condensation", [None, False])
+def test_a_soft_body_beside_a_stiff_one(condensation):
+    """What passes on a body is a share of its own forces, whatever is as stiff as 1e8 times it.
+
+    Both are held at their tops and pressed on a floor by 1e-3 of their height. The solver is asked
+    for 1e-9 of the forces; the round-off of the stiff body is more than that of the soft one's.
+    """
+    lines = np.linspace(0, 1, 4)
+    sides = {
+        FLOOR: lambda x, c: (np.abs(x[:, 1]) < 1e-9) & (c[:, 0] < 1.5),
+        FLOOR_2: lambda x, c: (np.abs(x[:, 1]) < 1e-9) & (c[:, 0] > 1.5),
+        ROOF: lambda x, c: np.abs(x[:, 1] - 1) < 1e-9,
+    }
+    made = boxes([[lines, lines], [lines + 2, lines]], sides)
+    E = ufl.conditional(ufl.lt(ufl.SpatialCoordinate(made[0])[0], 1.5), 1e8, 1.0)
+    body = Bodies(made, E, 0.3)
+    body.hold(ROOF, 0)
+    body.hold(ROOF, 1, value=-1e-3)
+    floor = fc.HalfSpace((0, 0), (0, 1))
+    contacts = [
+        body.contact(tag, floor, fc.Coulomb(0.3), name=f"floor {tag}") for tag in (FLOOR, FLOOR_2)
+    ]
+    step = body.problem(*contacts, condensation=condensation).solve()
+    soft = step.verdict.equations["body 2"]  # they are numbered along x
+    assert 1e-4 < soft.force < 1e-2
+    assert soft.tolerance == pytest.approx(1e-9 * soft.force, rel=1e-6)
 
 
 # ---- numbers that are none -----------------------------------------------------------------------

@@ -249,7 +249,7 @@ class CondensedSystem(System):
         matrix.assemble()  # says that it changed
         on = rows == columns
         added = np.bincount(rows[on], values[on], minlength=len(fixed))
-        self.diagonal = scale * (np.diag(fixed) + added)
+        self.diagonal = self.bulk_diagonal() + scale * added
         # For the round-off of contact.
         self._full.change_diagonal(self.unknowns.kept, self.unknowns.scattered(self.diagonal))
         return 0

@@ -240,8 +240,9 @@ class FullSystem(System):
         start, _ = matrix.getOwnershipRange()
         rows = (start + np.flatnonzero(self.constrained)).astype(PETSc.IntType)
         scale = self.bulk.scale
-        matrix.zeroRowsColumns(rows, diag=scale)
+        # Before the conditions, whose rows are as large as the stiffest body's.
         self.take_diagonal(matrix)
+        matrix.zeroRowsColumns(rows, diag=scale)
         matrix.scale(1.0 / scale)
         return int(self.linear_kind == "direct")
 
