@@ -136,11 +136,13 @@ class Bodies:
             value = self.constant(value)
         self.bcs += [hold(self.u, self.tags, tag, i, value) for i in components]
 
-    def contact(self, tag: Any, support: Any, law: Any, **options: Any) -> fc.Contact:
+    def contact(
+        self, tag: Any, support: Any, law: Any, *, quadrature: int | None = None, **options: Any
+    ) -> fc.Contact:
         """Contact of a side with a support, or with the sides of a tag or tags. Collective."""
         if not isinstance(support, fc.Support):
             support = fc.DeformableBody(self.tags, support)
-        surface = fc.ContactSurface(self.mesh, self.tags, tag)
+        surface = fc.ContactSurface(self.mesh, self.tags, tag, quadrature_degree=quadrature)
         return fc.Contact(self.u, surface, support, law, **options)
 
     def problem(self, *contacts: fc.Contact, **options: Any) -> fc.ContactProblem:

@@ -360,7 +360,10 @@ def test_the_warning_says_how_many_and_why():
 
 
 def indented(cell, width, depth, *, coarse=2, swap=False, both=False, raised=0.0, fine=2):
-    """A block of ``coarse`` cells on its top, and over its middle a narrow one, moved down."""
+    """A block of ``coarse`` cells on its top, and over its middle a narrow one, moved down.
+
+    Γc has two points along a side of a facet, however small those opposite are.
+    """
     d = 3 if cell in ("hexahedron", "tetrahedron") else 2
     wide = np.linspace(0, 1, coarse + 1)
     where = 0.5 / coarse
@@ -384,7 +387,7 @@ def indented(cell, width, depth, *, coarse=2, swap=False, both=False, raised=0.0
     faces = [(UPPER, LOWER)] if swap else [(LOWER, UPPER)]
     faces += [(UPPER, LOWER)] if both else []
     contacts = [
-        body.contact(here, there, fc.Frictionless(), name=f"side {i}")
+        body.contact(here, there, fc.Frictionless(), name=f"side {i}", quadrature=2)
         for i, (here, there) in enumerate(faces)
     ]
     return body, contacts, body.problem(*contacts)
