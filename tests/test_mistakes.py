@@ -182,6 +182,20 @@ def test_two_supports_of_one_surface():
     assert doubled(scene, scene.floor(), gap=0.0)
 
 
+@pytest.mark.parametrize("force", [(None, 1.0), np.array([None, 1.0])])
+def test_two_supports_each_pressed_by_a_force(force):
+    """Each moves by its own force and bears all of that: not one support, however it is given."""
+    scene = pressed()
+    contacts = [
+        scene.contact(coulomb(), name=name, displacement=fc.Motion(force=force))
+        for name in ("floor", "other")
+    ]
+    bcs = [*scene.rollers(), scene.hold(TOP, 1)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fc.ContactProblem(scene.F, scene.u, bcs=bcs, contacts=contacts)
+
+
 def test_a_load_that_nothing_reads():
     """A constant whose value, not itself, stands in the form."""
     scene = pressed()

@@ -275,6 +275,8 @@ def _warn_of_doubles(contacts: Sequence[Contact], size: float) -> None:
 def _n_doubled(one: Contact, other: Contact, size: float) -> int:
     """Facets of this rank where two supports of one kind that move as one are at one place."""
     mine, theirs = one.support, other.support
+    if one.free_motion or other.free_motion:  # each moves by its own force
+        return 0
     moved = mine.displacement is theirs.displacement or mine.displacement == theirs.displacement
     if type(mine) is not type(theirs) or mine.rotation is not theirs.rotation or not np.all(moved):
         return 0
