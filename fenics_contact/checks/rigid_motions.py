@@ -10,6 +10,7 @@ import weakref
 from collections.abc import Sequence
 
 import numpy as np
+import scipy.linalg
 import scipy.optimize
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -35,6 +36,11 @@ _FELT = 1e-10
 _BALANCED = 1e-8
 # The share of what a load drives that counts as most of it.
 _MOST = 0.5
+# The share of a motion at Γc that may go along a Γc that grips: of a body tilted by up to 0.2.
+_ALONG = 0.05
+# How far bodies are set down into their supports, by the largest gap: round-off is to leave none of
+# the points that bear open, ten times the tolerance of the linear programme.
+_INTO = 1e-9
 # Directions by which the friction cone is enclosed in space: a polygon around the circle, so that a
 # balance that exists is never denied.
 _CONE_SIDES = 64
@@ -335,7 +341,7 @@ class RigidMotions:
     def _landed(
         self, drive: Array, mass: Array, operators: Sequence[ContactOperator]
     ) -> Array | None:
-        """Where rigid bodies come to rest, without a way along a Γc that grips. Collective.
+        """Where rigid bodies come to rest, with little way along a Γc that grips. Collective.
 
         The load does there all the work that gaps allow, with small rotations: a linear programme.
 
@@ -348,17 +354,19 @@ class RigidMotions:
             Coefficients of the free motions; None: such motions are none, are little of what the
             load drives, as those in a corner are, or do not end.
         """
-        rubbing: Array = np.zeros((len(drive), len(drive)))
-        area, rows = 0.0, []
+        grams: Array = np.zeros((2, len(drive), len(drive)))
+        rows = []
         for operator in operators:
             contact, values = operator.contact, operator.contact.values
             weights = contact.quadrature.weights
-            rubbing, area = rubbing + self._rubbing(operator, weights), area + weights.sum()
             closing = np.einsum("mqd,qd->qm", self.at_points(operator), values.normal)
+            grams += [self._rubbing(operator, weights), (closing.T * weights) @ closing]
             rows.append(np.column_stack([closing, values.opening])[contact.paired])
-        mean = global_sum(self.comm, rubbing) / max(float(global_sum(self.comm, area)), 1e-300)
-        sizes, vectors = np.linalg.eigh(mean)
-        ways = agreed(self.comm, vectors[:, sizes < _FELT])
+        rubbing, pressing = global_sum(self.comm, grams)
+        felt = rubbing + pressing
+        felt += _FELT * np.trace(felt) * np.eye(len(felt))  # there are motions that nothing feels
+        shares, vectors = scipy.linalg.eigh(rubbing, felt)
+        ways = agreed(self.comm, vectors[:, shares < _ALONG])
         limits = gather_rows(self.comm, np.concatenate(rows))
         far = np.abs(limits[:, -1]).max(initial=0.0)
         work = drive @ ways
@@ -371,7 +379,7 @@ class RigidMotions:
         found = scipy.optimize.linprog(
             -work,
             A_ub=limits[:, :-1] @ ways,
-            b_ub=limits[:, -1] / far,
+            b_ub=limits[:, -1] / far + _INTO,
             bounds=(None, None),
             options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
         )
