@@ -364,6 +364,8 @@ class RigidMotions:
             rows.append(np.column_stack([closing, values.opening])[contact.paired])
         rubbing, pressing = global_sum(self.comm, grams)
         felt = rubbing + pressing
+        if not np.trace(felt) > 0:
+            return None
         felt += _FELT * np.trace(felt) * np.eye(len(felt))  # there are motions that nothing feels
         shares, vectors = scipy.linalg.eigh(rubbing, felt)
         ways = agreed(self.comm, vectors[:, shares < _ALONG])
