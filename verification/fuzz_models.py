@@ -134,6 +134,7 @@ def contact_of(
         rule = 2 * degree
         if there is not None:  # p + 1 points for every facet that is opposite, but for many
             times = round(float(np.median(here.lengths()) / np.median(there.lengths())))
+            times = 1 if kind_of is reference.ContactModel and times < 6 else times
             rule = max(rule, min(2 * ((degree + 1) * times - 1), {2: 78, 3: 6}[d]))
     facet, xi, weights = here.rule(rule, scheme or "default")
     weights = weights * scene.get("thickness", 1.0)

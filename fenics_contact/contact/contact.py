@@ -189,7 +189,9 @@ class Contact(PointResults):
         opposite = None
         if isinstance(support, DeformableBody):
             opposite = tagged_facets(surface.mesh, support.facet_tags, support.tags)
-        self.quadrature = surface.quadrature(degree, nodal=nodal, opposite=opposite)
+        self.quadrature = surface.quadrature(
+            degree, nodal=nodal, opposite=opposite, pieces=not self.finite
+        )
         moving = self.finite and not isinstance(support, DeformableBody)
         self.multipliers: Multipliers | None = None
         if augments:
