@@ -16,6 +16,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact import compat
+from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import agreed, gather_rows, global_min, global_sum
 from fenics_contact.surface.bodies import connected_bodies
@@ -273,19 +274,10 @@ class RigidMotions:
             area += contact.quadrature.weights.sum()
             if contact.law.has_normal_stiffness:
                 gram += (along * weights) @ along.T
-            gram += self._rubbing(operator, weights)
+            gram += _rubbing(contact, modes, weights)
         mean = global_sum(self.comm, gram) / max(float(global_sum(self.comm, area)), 1e-300)
         sizes, vectors = np.linalg.eigh(mean)
         return agreed(self.comm, vectors[:, sizes < _FELT].T @ self.free)
-
-    def _rubbing(self, operator: ContactOperator, weights: Array) -> Array:
-        """Products of the free motions along Γc where it grips, (n_free, n_free). Collective."""
-        values, modes = operator.contact.values, self.at_points(operator)
-        if not operator.contact.law.has_tangential:
-            return np.zeros((len(modes), len(modes)))
-        across = modes - np.einsum("mqd,qd->mq", modes, values.normal)[:, :, None] * values.normal
-        grip = weights * (values.grip > 0)
-        return np.asarray(np.einsum("mqd,q,nqd->mn", across, grip, across), dtype=np.float64)
 
     def _straight(self) -> Index:
         """Numbers of the free motions but for those by which supports turn."""
@@ -354,13 +346,15 @@ class RigidMotions:
             Coefficients of the free motions; None: such motions are none, are little of what the
             load drives, as those in a corner are, or do not end.
         """
+        if any(operator.contact.finite for operator in operators):
+            return None
         grams: Array = np.zeros((2, len(drive), len(drive)))
         rows = []
         for operator in operators:
             contact, values = operator.contact, operator.contact.values
-            weights = contact.quadrature.weights
-            closing = np.einsum("mqd,qd->qm", self.at_points(operator), values.normal)
-            grams += [self._rubbing(operator, weights), (closing.T * weights) @ closing]
+            weights, modes = contact.quadrature.weights, self.at_points(operator)
+            closing = np.einsum("mqd,qd->qm", modes, values.normal)
+            grams += [_rubbing(contact, modes, weights), (closing.T * weights) @ closing]
             rows.append(np.column_stack([closing, values.opening])[contact.paired])
         rubbing, pressing = global_sum(self.comm, grams)
         felt = rubbing + pressing
@@ -372,8 +366,7 @@ class RigidMotions:
         limits = gather_rows(self.comm, np.concatenate(rows))
         far = np.abs(limits[:, -1]).max(initial=0.0)
         work = drive @ ways
-        finite = any(operator.contact.finite for operator in operators)
-        if finite or not far > 0 or not len(work):
+        if not far > 0 or not len(work):
             return None
         led = work @ np.linalg.solve(ways.T @ mass @ ways, work)
         if not led > _MOST * (drive @ np.linalg.solve(mass, drive)):
@@ -565,3 +558,12 @@ def _around(normal: Array) -> list[Array]:
     second = np.cross(normal, first)
     angles = 2 * np.pi * np.arange(_CONE_SIDES) / _CONE_SIDES
     return [np.cos(a) * first + np.sin(a) * second for a in angles]
+
+
+def _rubbing(contact: Contact, modes: Array, weights: Array) -> Array:
+    """Products along Γc, where it grips, of n motions by their jumps there, (n, n_points, gdim)."""
+    if not contact.law.has_tangential:
+        return np.zeros((len(modes), len(modes)))
+    normal, grip = contact.values.normal, weights * (contact.values.grip > 0)
+    across = modes - np.einsum("mqd,qd->mq", modes, normal)[:, :, None] * normal
+    return np.asarray(np.einsum("mqd,q,nqd->mn", across, grip, across), dtype=np.float64)

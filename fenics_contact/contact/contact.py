@@ -197,7 +197,13 @@ class Contact(PointResults):
         if augments:
             self.multipliers = Multipliers(self.quadrature, degree, law, turning=moving)
         self.inputs = Inputs(
-            name, self.quadrature, law, support, weight=weight, accuracy=self.accuracy
+            name,
+            self.quadrature,
+            law,
+            support,
+            weight=weight,
+            accuracy=self.accuracy,
+            opposite=opposite,
         )
         if modulus is not None:
             self.set_modulus(modulus)

@@ -21,10 +21,9 @@ from fenics_contact.laws.base import Law
 from fenics_contact.laws.stiffness import Scaled, Springs
 from fenics_contact.parallel import global_max, global_min
 from fenics_contact.supports.base import Motion, Rotation, Support, as_vector, nonzero_vector
-from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.modulus import modulus_over_height
-from fenics_contact.surface.surface import SurfaceQuadrature, VertexAreas, tagged_facets
+from fenics_contact.surface.surface import SurfaceQuadrature, VertexAreas
 from fenics_contact.types import Array, Indices
 
 __all__ = ["FreeMotion", "Inputs", "check_given", "varies"]
@@ -113,6 +112,7 @@ class Inputs:
         *,
         weight: Any,
         accuracy: Accuracy | None,
+        opposite: Indices | None,
     ) -> None:
         """Take them over. Collective.
 
@@ -123,6 +123,7 @@ class Inputs:
             support: Whose displacement is.
             weight: Factor of the surface measure; None: 1.
             accuracy: Says the stiffness where the user does not.
+            opposite: This rank's facets of the other body; None: the support is rigid.
 
         Raises:
             ValueError: A number is out of range, or a shape is wrong.
@@ -133,9 +134,7 @@ class Inputs:
         self._gdim = self._surface.mesh.geometry.dim
         self._scale: fem.Function | None = None  # E/h, if a stiffness is Scaled
         self._scale_known = False
-        self._opposite: Indices | None = None  # facets of the other body, if it is one that deforms
-        if isinstance(support, DeformableBody):
-            self._opposite = tagged_facets(self._surface.mesh, support.facet_tags, support.tags)
+        self._opposite = opposite
         self._tributary: VertexAreas | None = None  # if a stiffness is that of Springs
         self.constants: dict[str, fem.Constant] = {}
         self.weight = self.scalar("weight", 1.0 if weight is None else weight)
