@@ -58,9 +58,11 @@ class Rubber:
         d = self.dim
         self.held.interpolate(lambda x: motion(x[:d]) - x[:d])
 
-    def contact(self, support: fc.Support, law: Any, **options: Any) -> fc.Contact:
-        """Of the top, by finite kinematics."""
-        surface = fc.ContactSurface(self.mesh, self.tags, TOP)
+    def contact(
+        self, support: fc.Support, law: Any, *, points_degree: int | None = None, **options: Any
+    ) -> fc.Contact:
+        """Of the top, by finite kinematics; ``points_degree``: of the rule on Γc."""
+        surface = fc.ContactSurface(self.mesh, self.tags, TOP, quadrature_degree=points_degree)
         options = {"kinematics": "finite", "weight": self.body.weight} | options
         return fc.Contact(self.displacement, surface, support, law, **options)
 

@@ -298,14 +298,18 @@ def rubbed(
 
 
 def like_rigid(ratio: float, mu: float, n: tuple[int, int] = (8, 4), kappa: float = 10.0) -> Solve:
-    """A block under a plate ratio times as stiff, pressed and dragged: forces of a rigid plate."""
+    """A block under a plate ratio times as stiff, pressed and dragged: forces of a rigid plate.
 
-    def rigid(method: str) -> Array:
+    Γc has as many points there: a facet under many has some for each of them.
+    """
+
+    def rigid(method: str, points: int) -> Array:
         block = rubber("quadrilateral", 1, n=(n[0], 4), size=(1.0, 1.0), E=E, nu=NU)
         shift = fem.Constant(block.mesh, np.zeros(2))
         plate = fc.HalfSpace((0.0, 1.0), (0.0, -1.0), displacement=shift)
         law = friction_law(mu, kappa * E * 4)
-        problem, contact = block.problem(plate, law, method=method, petsc_options=TIGHT)
+        options = {"contact": {"points_degree": 2 * points - 1}, "petsc_options": TIGHT}
+        problem, contact = block.problem(plate, law, method=method, **options)
         found = []
         for t in range(1, 5):
             shift.value[:] = 0.05 * max(t - 2, 0), -0.5 * DOWN * min(t, 2)
@@ -321,7 +325,8 @@ def like_rigid(ratio: float, mu: float, n: tuple[int, int] = (8, 4), kappa: floa
         for t in range(1, 5):
             made += both.lead(0.05 * max(t - 2, 0), 0.5 * DOWN * min(t, 2), 1)
             found.append(both.force)
-        return made, relative(found, rigid(method))
+        points = both.contact.quadrature.n_points // n[0]  # on one rank
+        return made, relative(found, rigid(method, points))
 
     return solve
 
