@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from pathlib import Path
 
 import basix
@@ -19,6 +20,7 @@ from fenics_contact.checks.given import check_measures
 from scenes.blocks import BOTTOM, TOP, block_mesh
 from scenes.comparing import raised_everywhere
 from scenes.sound import MESH, coulomb, pressed
+from scenes.stacks import LOWER, SIDES, UPPER, stack
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
@@ -150,16 +152,23 @@ def test_tags_of_another_mesh():
     )
 
 
+def told_of_doubles(make):
+    """What is warned of supports that are one."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        make()
+    return [str(one.message) for one in told if "same support" in str(one.message)]
+
+
 def doubled(scene, support, **options):
     """A contact of the bottom beside that with the floor, and what is warned of."""
     contacts = [
         scene.contact(coulomb(), name="floor"),
         scene.contact(coulomb(), name="other", support=support, **options),
     ]
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=contacts)
-    return [str(one.message) for one in told if "same support" in str(one.message)]
+    return told_of_doubles(
+        lambda: fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=contacts)
+    )
 
 
 def test_one_support_twice():
@@ -180,6 +189,19 @@ def test_two_supports_of_one_surface():
     assert not doubled(scene, scene.floor(displacement=moved))
     assert not doubled(scene, scene.floor(), gap=0.1)
     assert doubled(scene, scene.floor(), gap=0.0)
+
+
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+def test_two_bodies_over_one_surface(kinematics):
+    """The lowest of three blocks sees both others, one behind the other; then one of them twice."""
+    body = stack("quadrilateral", (2, 3, 4), (1.0, 1.0, 1.0), apart=0.1)
+    body.hold(SIDES, 0, 1)
+    for tags, n_told in (((10 + UPPER, 20 + UPPER), 0), ((10 + UPPER, 10 + UPPER), 1)):
+        contacts = [
+            body.contact(10 + LOWER, tag, fc.Frictionless(1e6), kinematics=kinematics, name=name)
+            for tag, name in zip(tags, ("near", "other"), strict=True)
+        ]
+        assert len(told_of_doubles(partial(body.problem, *contacts))) == n_told
 
 
 @pytest.mark.parametrize("force", [(None, 1.0), np.array([None, 1.0])])

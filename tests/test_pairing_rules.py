@@ -184,11 +184,13 @@ def cut_square(n, opening):
     return mesh, tagged(mesh, {FLOOR: lip(1), ROOF: lip(-1), SIDES: near(0, -1)})
 
 
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_interference_deeper_than_the_cells(cell):
+def test_interference_deeper_than_the_cells(cell, kinematics):
     """Blocks that overlap by 0.2, twice the height of their cells: they are opposite, all over."""
     body = stack(cell, (10, 10) if cell == "triangle" else (4, 5), (0.5, 0.5), apart=-0.2)
-    contact = joint(body, 1, fc.Frictionless(1e6))
+    contact = joint(body, 1, fc.Frictionless(1e6), kinematics=kinematics)
+    contact.evaluate()
     assert contact.n_unpaired == 0
     gap = contact.gather()["gap"]
     assert close(gap, np.full(len(gap), -0.2), 1e-12)

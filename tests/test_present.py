@@ -19,6 +19,7 @@ from fenics_contact.elasticity import NeoHookean
 from fenics_contact.systems.operator import ContactOperator
 from scenes.elasticity import displacement_space, hold, residual
 from scenes.meshes import mesh_of
+from scenes.stacks import FLOOR, ROOF, SIDES, joint, stack
 from scenes.tags import near, tagged
 from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, two_blocks
 from verification.extreme_bodies import Two
@@ -407,6 +408,33 @@ def test_bodies_that_just_touch_may_be_turned():
     steps = both.lead(0.0, 0.1, 2) + both.lead(0.05, 0.1, 2) + both.lead(0.05, 0.1, 36, 2 * np.pi)
     assert len(steps) == 40
     assert np.abs(both.force).max() < 1e-8
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_bodies_that_start_deep_in_each_other(cell):
+    """Two columns overlap by 0.2, twice the height of their cells; they have no way aside.
+
+    Closed form: both take the stretch l by the stress (G + λ/2) (1/l - l), which is that of the
+    springs, k (l - 0.8): their heights are 1/2. To 1e-9 of the force.
+    """
+    body = stack(cell, (10, 10), (0.5, 0.5), apart=-0.2)
+    u, k = body.u, 1e3
+    body.hold(SIDES, 0)
+    body.hold(FLOOR, 1)
+    body.hold(ROOF, 1)
+    contact = joint(body, 1, fc.Frictionless(k), kinematics="finite")
+    bulk = NeoHookean(u, 100.0, 0.3, "plane strain")
+    residual = bulk.residual(ufl.TestFunction(u.function_space))
+    problem = fc.ContactProblem(residual, u, bcs=body.bcs, contacts=[contact])
+    assert problem.initial_penetration == pytest.approx(0.2, abs=1e-12)
+    problem.solve()
+    problem.commit()
+    modulus = 100 / 2.6 + 0.5 * 30 / (1.3 * 0.4)  # G + λ/2
+    # (k + modulus) l² - 0.8 k l - modulus = 0
+    a, b = k + modulus, 0.8 * k
+    stretch = (b + np.sqrt(b**2 + 4 * a * modulus)) / (2 * a)
+    assert contact.n_unpaired == 0
+    assert contact.resultants().normal_force == pytest.approx(k * (stretch - 0.8), rel=1e-9)
 
 
 def slotted() -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:

@@ -242,7 +242,7 @@ def check_start(contacts: Sequence[Contact], size: float) -> float:
             )
         contact.check_input()
         contact.inputs.check_side(contact.values, gap_prescribed=contact.gap_prescribed)
-        gap = global_min(comm, contact.values.initial_gap)
+        gap = global_min(comm, contact.opposite.undeformed_gap(contact.values))
         if gap < -_TOUCHING * size and not contact.gap_prescribed:
             worst = max(worst, -gap)
             if comm.rank == 0:
@@ -285,7 +285,8 @@ def _n_doubled(one: Contact, other: Contact, size: float) -> int:
     for contact, rows in zip((one, other), shared, strict=True):
         points, values = contact.quadrature.point_rows()[rows], contact.values
         # Means, as rules may differ, and the order of points on a facet does.
-        places.append([a[points].mean(axis=1) for a in (values.initial_gap / size, values.normal)])
+        gap = contact.opposite.undeformed_gap(values) / size
+        places.append([a[points].mean(axis=1) for a in (gap, values.normal)])
         facing &= np.all(values.paired[points], axis=1)
     gaps, normals = (np.abs(a - b) for a, b in zip(*places, strict=True))
     same = (gaps <= _TOUCHING) & np.all(normals <= _TOUCHING, axis=1)

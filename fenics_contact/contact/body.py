@@ -161,6 +161,10 @@ class FollowedOpposite(BodyOpposite):
         traction = law.evaluate_traction()
         return PointTangent(self._present.tangent(by_felt, traction, self._parts.history))
 
+    def undeformed_gap(self, values: PointValues) -> Array:
+        """See `Opposite`."""
+        return self._present.undeformed_gap
+
     def turned(self, vectors: Array) -> Array:
         """See `Opposite`: of the committed bodies."""
         return self._present.turned(vectors)

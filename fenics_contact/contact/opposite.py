@@ -260,6 +260,14 @@ class Opposite(ABC):
 
     # ---- where it is -----------------------------------------------------------------------------
 
+    def undeformed_gap(self, values: PointValues) -> Array:
+        """Gap of the undeformed Γc, 0 where nothing is opposite, (n_points,) (length).
+
+        Args:
+            values: Of the last evaluation.
+        """
+        return values.initial_gap
+
     @abstractmethod
     def true_placement(self, values: PointValues) -> tuple[Array, Array]:
         """Gap and normal where the body has moved to: at X + u instead of X. Collective.

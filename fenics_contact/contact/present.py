@@ -117,6 +117,7 @@ class PresentPairs(Pairs):
         self.told = PointFields(quadrature, {"jump": d, "foot": d, "committed": d} | turns)
         self.degenerate = False
         self._where: tuple[Array, Array] | None = None
+        self._at_rest: tuple[Array, Array] | None = None
         self._committed: _Committed | None = None
         self._present: _Present | None = None
         self._at: Array | None = None
@@ -133,8 +134,11 @@ class PresentPairs(Pairs):
         """
         comm, here = self._mesh.comm, self._rays.here.facets
         if self._where is None:
+            assert self.search is not None
             place, _, _ = here.meet(self._rays.facet, x, normal)
             self._where = place, normal
+            met, deep = self.search.at_rest(place, x, normal)
+            self._at_rest = np.nan_to_num(met.distance), deep
         changed = self._at is None or not np.array_equal(self._at, self._u.x.array)
         if comm.allreduce(int(changed)) or self._present is None:
             self._at = self._u.x.array.copy()
@@ -143,7 +147,8 @@ class PresentPairs(Pairs):
 
     def _find(self, history: PointFields) -> None:
         """The partners at the present displacement. Collective."""
-        assert self._where is not None and self.search is not None and self.acts is not None
+        assert self._where is not None and self._at_rest is not None
+        assert self.search is not None and self.acts is not None
         here, facet, (place, undeformed) = self._rays.here.facets, self._rays.facet, self._where
         if self._committed is None:
             x, tangents = here.positions(facet, place, self._before)
@@ -154,6 +159,8 @@ class PresentPairs(Pairs):
         self.degenerate = bool(self._mesh.comm.allreduce(int(not _metric(tangents)[1].all())))
         normal = here.normals(facet, place, self._u)
         deep = np.maximum(self.search.largest(history.values("penetration")), 0.0)
+        if not global_max(self._mesh.comm, np.abs(self._before.x.array)) > 0:
+            deep = np.maximum(deep, self._at_rest[1])
         hits = self._rays.follow(
             facet, place, normal, self._u, deep, undeformed=undeformed, before=self._before
         )
@@ -232,6 +239,12 @@ class PresentPairs(Pairs):
         assert state.found_at is not None
         self._before.x.array[:] = state.found_at.x.array
         self._forget()
+
+    @property
+    def undeformed_gap(self) -> Array:
+        """See `Opposite.undeformed_gap`."""
+        assert self._at_rest is not None
+        return self._at_rest[0]
 
     def true_gap(self, values: PointValues) -> tuple[Array, Array]:
         """See `Opposite.true_placement`: it is that of the pairs themselves."""

@@ -116,13 +116,11 @@ class Pairing:
         """
         place, _, _ = self._here.meet(self._facet, x, normal)
         deep = np.maximum(self.largest(penetration), 0.0)
-        found = self.rays.follow(self._facet, place, normal, u, deep)
-        if u is None and self._support.release is None:
-            inside = self._inside(x, found.reason == BEHIND)
-            if self._comm.allreduce(np.count_nonzero(inside)):
-                deep[self._sides[0].first + self._facet[inside]] = np.inf
-                self._comm.Allreduce(MPI.IN_PLACE, deep, op=MPI.MAX)
-                found = self.rays.follow(self._facet, place, normal, u, deep)
+        if u is None:
+            found, start = self.at_rest(place, x, normal)
+            deep = np.maximum(deep, start)
+        else:
+            found = self.rays.follow(self._facet, place, normal, u, deep)
         paired = ~np.isnan(found.distance)
         gap = np.einsum("qd,qd->q", found.place - x, normal)
         gap[np.abs(gap) <= self.round_off] = 0.0
@@ -148,6 +146,28 @@ class Pairing:
         for item in (projection, at_pieces, at_points, keep):
             item.destroy()
         return matrix, gap, found.reason
+
+    def at_rest(self, place: Array, x: Array, normal: Array) -> tuple[Hits, Array]:
+        """What the points meet in the undeformed bodies. Collective.
+
+        Args:
+            place: Of the points on their facets, (n_points, d - 1).
+            x: Likewise, (n_points, d).
+            normal: From body to support, (n_points, d).
+
+        Returns:
+            That, and how deep the bodies are in each other at each of all facets of Γc (length).
+        """
+        none = np.zeros(len(self._sides[0].body))
+        found = self.rays.follow(self._facet, place, normal, None, none)
+        if self._support.release is None:
+            inside = self._inside(x, found.reason == BEHIND)
+            if self._comm.allreduce(np.count_nonzero(inside)):
+                deep = none.copy()
+                deep[self._sides[0].first + self._facet[inside]] = np.inf
+                self._comm.Allreduce(MPI.IN_PLACE, deep, op=MPI.MAX)
+                found = self.rays.follow(self._facet, place, normal, None, deep)
+        return found, np.maximum(self.largest(np.nan_to_num(-found.distance)), 0.0)
 
     def look_back(
         self, u: fem.Function | None, penetration: float, *, present: bool = False
