@@ -7,7 +7,23 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["check_instance", "is_number", "listed"]
+__all__ = ["check_cells", "check_instance", "is_number", "listed"]
+
+_CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
+
+
+def check_cells(name: str, kind: str) -> None:
+    """Refuse cells whose facets are not all alike, as those of prisms and pyramids.
+
+    Args:
+        name: Of the mesh.
+        kind: Of its cells, as DOLFINx calls it.
+
+    Raises:
+        ValueError: It says which cells are taken.
+    """
+    if kind not in _CELLS:
+        raise ValueError(f"{name} has cells of type {kind}; mesh with one of {_CELLS}")
 
 
 def is_number(value: Any) -> bool:

@@ -15,7 +15,7 @@ from dolfinx import fem, la
 from mpi4py import MPI
 
 from fenics_contact import compat
-from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.arguments import check_cells, check_instance, is_number
 from fenics_contact.parallel import collective_errors
 from fenics_contact.types import Array, Index
 
@@ -181,6 +181,7 @@ def _body(name: Hashable, part: Any) -> Body:
         )
     mesh, cell_tags, facet_tags = [*values, None, None][:3]
     check_instance(f"the mesh of body {name!r}", mesh, dolfinx.mesh.Mesh)
+    check_cells(f"the mesh of body {name!r}", mesh.topology.cell_name())
     d = mesh.topology.dim
     for what, tags, dim in (("cell_tags", cell_tags, d), ("facet_tags", facet_tags, d - 1)):
         if tags is None:

@@ -296,6 +296,16 @@ def test_a_shell_is_no_body():
     raised_everywhere(lambda: fc.ContactSurface(shell, tags, BOTTOM), ValueError, "dimension")
 
 
+def test_prisms_are_refused_by_name():
+    """Their facets are of two kinds, which DOLFINx gives no tags: no word of tags or arrays."""
+    unit = (np.zeros(3), np.ones(3))
+    mesh = dolfinx.mesh.create_box(COMM, unit, (1, 1, 1), dolfinx.mesh.CellType.prism)
+    none = np.zeros(0, dtype=np.int32)
+    tags = dolfinx.mesh.meshtags(mesh, 2, none, none)
+    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, 1), ValueError, "prism", "hexahedron")
+    raised_everywhere(lambda: fc.join_meshes([mesh]), ValueError, "prism", "hexahedron")
+
+
 @pytest.mark.parametrize(("cell", "degree"), GRID)
 def test_cells_and_nodes_of_facets(cell, degree):
     """Facet by facet as DOLFINx finds them; in the order asked for, whatever it is."""

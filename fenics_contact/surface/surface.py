@@ -15,7 +15,7 @@ from dolfinx import fem, la
 from petsc4py import PETSc
 
 from fenics_contact import compat
-from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.arguments import check_cells, check_instance, is_number
 from fenics_contact.compiling import compile_form, printed_as_ever
 from fenics_contact.parallel import gather_rows, global_max, global_min
 from fenics_contact.surface.mass import assembled
@@ -202,6 +202,7 @@ def tagged_facets(
             f"mesh has topological dimension {tdim} in a space of dimension "
             f"{mesh.geometry.dim}; contact needs a solid: 2 in 2 or 3 in 3 dimensions"
         )
+    check_cells("mesh", mesh.topology.cell_name())
     if facet_tags.dim != tdim - 1:
         raise ValueError(
             f"facet_tags are on entities of dimension {facet_tags.dim}; a mesh of dimension "
