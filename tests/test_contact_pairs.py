@@ -261,8 +261,11 @@ def test_rubber_between_plates() -> None:
         assert up(one) == pytest.approx(up(other), rel=1e-7)
 
 
-def fork() -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """A block 1 high and wide with a slot 0.1 wide from its top down to 0.2: mesh and tags."""
+def fork(seed: int | None = None) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
+    """A block 1 high and wide with a slot 0.1 wide from its top down to 0.2: mesh and tags.
+
+    Its cells by chance in another order, where a seed is given.
+    """
     serial = dolfinx.mesh.create_rectangle(
         MPI.COMM_SELF, [(0.0, 0.0), (1.0, 1.0)], (20, 10), CellType.quadrilateral
     )
@@ -270,6 +273,8 @@ def fork() -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
     cells = compat.geometry_dofmap(serial)
     middle = x[cells].mean(axis=1)
     cells = cells[(np.abs(middle[:, 0] - 0.5) > 0.05) | (middle[:, 1] < 0.2)]
+    if seed is not None:
+        cells = np.random.default_rng(seed).permutation(cells)
     used, number = np.unique(cells, return_inverse=True)
     mesh = mesh_of("quadrilateral", x[used], number.reshape(cells.shape))
     sides = {
@@ -311,6 +316,15 @@ def test_a_body_that_touches_itself() -> None:
     assert first.name == "1-1"
     # Γc may be the other leg, which is its mirror image.
     assert one > 0.05 and one == pytest.approx(other, rel=1e-7)
+
+
+def test_the_side_of_a_body_that_touches_itself_is_told_by_its_place() -> None:
+    """Γc is the left side of the slot, however cells are numbered and on any number of ranks."""
+    for seed in range(5):
+        mesh, _ = fork(seed)
+        u = fem.Function(displacement_space(mesh, 1))
+        (contact,) = fc.contact_pairs(u, fc.Frictionless(), 0.12, itself=True)
+        assert np.allclose(gathered(mesh.comm, contact.points)[:, 0], 0.45)
 
 
 def test_a_hole_faces_itself_all_around(caplog: pytest.LogCaptureFixture) -> None:

@@ -28,6 +28,8 @@ _DEEP = 0.5
 _FACING = 1e-6
 # Of the size of a facet: how far in front another one of the same body must be.
 _FRONT = -1e-9
+# Of the largest coordinate: places that are one.
+_SAME_PLACE = 1e-9
 # Facets that are searched from, and pairs that are measured, in one go, to bound the memory.
 _AT_ONCE, _TOGETHER = 2000, 200_000
 
@@ -148,7 +150,7 @@ def find_neighbours(
     found = []
     for a, b in np.unique(both, axis=0):
         rows = np.all(both == (a, b), axis=1)
-        sides = _sides(pairs[rows], len(every.label), same=bool(a == b))
+        sides = _sides(pairs[rows], every.middle, same=bool(a == b))
         far = np.full(len(every.label), np.inf)
         np.minimum.at(far, pairs[rows].ravel(), np.repeat(away[rows], 2))
         touched = np.union1d(*sides)
@@ -224,11 +226,12 @@ def _in_front(every: _Facets, f: Index, g: Index) -> Mask:
     return front
 
 
-def _sides(pairs: Index, n: int, *, same: bool) -> tuple[Index, Index]:
+def _sides(pairs: Index, middle: Array, *, same: bool) -> tuple[Index, Index]:
     """The facets on either side.
 
     Those of one body are divided, so that none faces another one of its own side; where that cannot
-    be they are all on both.
+    be they are all on both. Of what faces each other the facet of the lowest place, x first, is on
+    the first side: numbers of facets are others on other ranks.
     """
     if not same:
         return np.unique(pairs[:, 0]), np.unique(pairs[:, 1])
@@ -238,8 +241,10 @@ def _sides(pairs: Index, n: int, *, same: bool) -> tuple[Index, Index]:
     graph = scipy.sparse.coo_matrix((ones, number.T), (len(touched), len(touched))).tocsr()
     side = np.full(len(touched), -1)
     _, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    _, starts = np.unique(group, return_index=True)
-    for start in starts:
+    places = middle[touched] / (_SAME_PLACE * (np.abs(middle[touched]).max() or 1.0))
+    by_place = np.lexsort(np.round(places).T[::-1])
+    _, first = np.unique(group[by_place], return_index=True)
+    for start in by_place[first]:
         order, before = scipy.sparse.csgraph.breadth_first_order(graph, start, directed=False)
         side[start] = 0
         for node in order[1:]:
