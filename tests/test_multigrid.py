@@ -342,3 +342,31 @@ def test_monitors_outlive_the_choice_of_the_solver(monkeypatch):
     for name, unit in (("a name", 2.0), ("count", 1)):
         iterations = [it for it, norm, n, u in seen if (n, u) == (name, unit)]
         assert len(iterations) > step.iterations > 0  # and where a round begins
+
+
+def levels_of(pc):
+    """Matrices of all levels, the finest first, and the maps from each to the one above."""
+    top = pc.getMGLevels() - 1
+    matrices = [pc.getMGSmoother(n).getOperators()[0] for n in range(top, -1, -1)]
+    return matrices, [pc.getMGInterpolation(n) for n in range(top, 0, -1)]
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_levels_follow_their_matrix(cell):
+    """After a history every level is PᵀAP of the one above, by products of the whole: 1e-12.
+
+    They were set up once.
+    """
+    n = 24 if cell == "triangle" else 8
+    options = {"linear_solver": "multigrid", "condensation": False, "method": "lbfgs"}
+    made = Rub(cell=cell, mesh={"n": n}, **options)
+    walk(made, path=PATH)
+    assert made.problem.solver.equations.hierarchy.set_ups == 1
+    pc = made.problem.snes.getKSP().getPC()
+    matrices, maps = levels_of(pc)
+    assert len(maps) >= 1
+    for fine, coarse, prolongation in zip(matrices[:-1], matrices[1:], maps, strict=True):
+        product = fine.PtAP(prolongation)
+        size = product.norm()
+        product.axpy(-1.0, coarse)
+        assert product.norm() < 1e-12 * size

@@ -19,6 +19,7 @@ from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.systems.balance import Norms
 from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.hierarchy import Hierarchy
 from fenics_contact.systems.system import System
 from fenics_contact.types import Array
 
@@ -49,6 +50,8 @@ class Equations:
         solution: The state to start from and, after a method, the one found; dimensionless.
         function: For the residual.
         solvers: Linear solvers for H₀ (False) and the consistent tangent (True).
+        by_cycle: Whether H₀ is a V-cycle, which serves for its matrix as for the tangent.
+        hierarchy: Its levels.
         factorisations: Of sparse matrices, counted.
         overload: By what the load outdid friction where `friction_needed` looked last, if it did.
     """
@@ -74,6 +77,7 @@ class Equations:
         self.start = nothing
         self.rtol = self.round_rtol = 0.0
         self.solvers: dict[bool, PETSc.KSP] = {}
+        self.by_cycle, self.hierarchy = False, Hierarchy()
         self.factorisations = 0
         self.overload: Overload | None = None
         self._matrices: dict[bool, PETSc.Mat] = {}
@@ -161,14 +165,15 @@ class Equations:
     def matrix(self, consistent: bool) -> PETSc.Mat:
         """The matrix of H₀ or of the consistent tangent, made when first needed. Collective."""
         if consistent not in self._matrices:
-            matrix = self.system.matrix(symmetric=self.symmetric(consistent))
+            symmetric = self.symmetric(consistent or self.by_cycle)
+            matrix = self.system.matrix(symmetric=symmetric)
             self.system.prepare(self.solvers[consistent], matrix)
             self._matrices[consistent] = matrix
         return self._matrices[consistent]
 
     def forget_matrices(self) -> None:
         """Drop the matrices of H₀ and of the consistent tangent. Collective."""
-        self._matrices, self._filled = {}, set()
+        self._matrices, self._filled, self.hierarchy = {}, set(), Hierarchy()
         for ksp in self.solvers.values():
             ksp.reset()
         self.forget_h0()
@@ -182,9 +187,9 @@ class Equations:
         """Whether the matrix of H₀ is that of `make_h0`, or of the status since."""
         return self._h0_is_made
 
-    def make_h0(self) -> None:
-        """K + αK_n + φK_t, all of Γc closed and sticking (section 5). Collective."""
-        self.assemble(self.matrix(False), self.stiffnesses(everywhere=True))
+    def make_h0(self, *, everywhere: bool) -> None:
+        """K + αK_n + φK_t of a symmetric H₀ (section 5); see `stiffnesses`. Collective."""
+        self.assemble(self.matrix(False), self.stiffnesses(everywhere=everywhere))
         self._h0_is_made = True
 
     def forget_h0(self) -> None:
@@ -205,7 +210,12 @@ class Equations:
                 if mine.handle == matrix.handle:
                     self.solvers[consistent].reset()
                     self.solvers[consistent].setOperators(matrix)
-        self._filled |= {c for c, m in self._matrices.items() if m.handle == matrix.handle}
+        mine = {c for c, m in self._matrices.items() if m.handle == matrix.handle}
+        self._filled |= mine
+        if self.by_cycle and False in mine:
+            stiffness, operators = self.full.stiffness, self.full.operators
+            assert stiffness is not None
+            self.hierarchy.follow(self.solvers[False], matrix, stiffness, operators)
 
     def assemble_tangent(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
         """The consistent tangent of bulk and contact at ``x``. Collective."""

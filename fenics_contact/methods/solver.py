@@ -206,9 +206,10 @@ class Solver:
                 f"and tangent, or is none of PETSc's; use one of {', '.join(_SNES_TYPES)}"
             )
         quasi_newton = snes_type == PETSc.SNES.Type.QN
-        newton = linear.newton_options(self.system.linear_kind)
-        if not quasi_newton:
-            options.set(newton, prefix)
+        solver = self.system.linear_kind
+        newton = linear.newton_options(solver)
+        options.set(linear.quasi_newton_options(solver) if quasi_newton else newton, prefix)
+        equations.by_cycle = quasi_newton and solver == "multigrid"
         snes = self.snes = PETSc.SNES().create(self._comm)
         snes.setOptionsPrefix(prefix)
         snes.setSolution(equations.solution)

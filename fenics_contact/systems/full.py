@@ -31,9 +31,6 @@ class FullSystem(System):
         stiffness: The bulk's tangent over all unknowns, after `update_stiffness`.
     """
 
-    # One costs 1/15 to 1/35 of a factorisation, and pairs taken across changes of status are worth
-    # little.
-    iterations_per_round = 20
     mark: object = "all unknowns"
     ready = True
 
@@ -65,6 +62,15 @@ class FullSystem(System):
         self.stiffness: PETSc.Mat | None = None
         self._near_nullspace: PETSc.NullSpace | None = None
         self._body = body
+
+    @property
+    def iterations_per_round(self) -> int:
+        """See `System`. Pairs of L-BFGS taken across changes of status are worth little.
+
+        An iteration costs 1/15 to 1/35 of a factorisation, but several times as much as it takes
+        the levels of multigrid to follow.
+        """
+        return 10 if self.linear_kind == "multigrid" else 20
 
     @cached_property
     def size_to_factor(self) -> float:

@@ -37,6 +37,7 @@ __all__ = [
     "near_nullspace",
     "newton_options",
     "options",
+    "quasi_newton_options",
     "quicker",
     "refused_memory",
     "too_large",
@@ -78,6 +79,8 @@ _NEWTON: dict[str, Any] = {
     "snes_ksp_ew_rtolmax": 1e-2,
     "snes_lag_preconditioner": 4,
 }
+# SNES leaves it to `Hierarchy`, after the first time.
+_QUASI_NEWTON: dict[str, Any] = {"snes_lag_preconditioner": -2}
 
 
 def options(kind: str, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
@@ -102,6 +105,11 @@ def options(kind: str, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
     if symmetric:
         return found | {"ksp_type": "cg"}
     return found | {"ksp_type": "gmres", "ksp_pc_side": "right", "ksp_gmres_restart": 60}
+
+
+def quasi_newton_options(kind: str) -> dict[str, Any]:
+    """Options of L-BFGS: when SNES sets up H₀."""
+    return dict(_QUASI_NEWTON) if kind == "multigrid" else {}
 
 
 def newton_options(kind: str) -> dict[str, Any]:

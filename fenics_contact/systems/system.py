@@ -49,13 +49,11 @@ class System(ABC):
         farthest: Largest displacement whose round-off counts (length).
         label: Body or free support of every unknown of this rank, (n_local,).
         n_bodies: Their number.
-        iterations_per_round: Iterations of L-BFGS after which H₀ is made anew from the status.
         linear_kind: How linear systems are solved, one of `linear.KINDS`.
         mark: Of the coordinates that `forces` are in.
         ready: Whether `fill` can be called; else `update` comes first.
     """
 
-    iterations_per_round: int
     linear_kind = "direct"
     mark: object
     ready: bool
@@ -88,6 +86,11 @@ class System(ABC):
         self._operators: dict[int, tuple[int, ContactOperator]] = {}
         self._parts: tuple[list[int], Parts] | None = None
         self._touched: tuple[list[int], Array] | None = None
+
+    @property
+    @abstractmethod
+    def iterations_per_round(self) -> int:
+        """Iterations of L-BFGS after which H₀ is made anew from the status."""
 
     # ---- contact, and what has to be in balance --------------------------------------------------
 
