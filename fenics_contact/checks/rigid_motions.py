@@ -18,7 +18,7 @@ from petsc4py import PETSc
 from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import agreed, gather_rows, global_min, global_sum
+from fenics_contact.parallel import agreed, gather_rows, global_sum
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_cells
@@ -27,7 +27,7 @@ from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["RigidMotions", "unbalanced"]
+__all__ = ["RigidMotions", "rubbing", "unbalanced"]
 
 
 # Relative sizes below which an energy, a work or a share of a mode counts as zero. One clamped dof
@@ -35,13 +35,6 @@ __all__ = ["RigidMotions", "unbalanced"]
 _FREE = 1e-12
 _FELT = 1e-10
 _BALANCED = 1e-8
-# The share of what a load drives that counts as most of it.
-_MOST = 0.5
-# The share of a motion at Γc that may go along a Γc that grips: of a body tilted by up to 0.2.
-_ALONG = 0.05
-# How far bodies are set down into their supports, by the largest gap: round-off is to leave none of
-# the points that bear open, ten times the tolerance of the linear programme.
-_INTO = 1e-9
 # Directions by which the friction cone is enclosed in space: a polygon around the circle, so that a
 # balance that exists is never denied.
 _CONE_SIDES = 64
@@ -59,6 +52,8 @@ class RigidMotions:
         comm: The ranks.
         size: Diagonal of the mesh's bounding box (length).
         names: Name of every motion, those of the bodies first.
+        turns: Which of these turn a body, and the size of it by which the angle has to be
+            multiplied to be one of order one (length); 0 for the others.
         of_bodies: Their fields at this rank's unknowns, (n_bodies, n_per_body, n_local).
         free: Coefficients of the free motions, shape (n_free, n_motions).
         resultant: Work on them of the load that was checked last, but for those by which supports
@@ -97,23 +92,25 @@ class RigidMotions:
         self.size = float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
         self._space, self._centres = space, (low + high) / 2
         self._sizes = np.linalg.norm(high - low, axis=1)
+        self._displacement, self._unknowns, self._x = displacement, unknowns, x
         self.names: list[str] = []
-        modes: list[Array] = []
+        turns: list[float] = []
         for b in range(n_bodies):
             of = f" of body {b + 1}, near {np.round(self._centres[b], 6).tolist()}"
-            kinds = rigid_motions(x - self._centres[b], self._sizes[b])
-            for name, mode in kinds.items():
+            for name in rigid_motions(x[:0], 1.0):
                 self.names.append(name + (of if n_bodies > 1 else ""))
-                mine = np.where(body[:, None] == b, mode, 0.0).ravel()
-                modes.append(displacement.within(mine))
+                turns.append(self._sizes[b] if name.startswith("rotation") else 0.0)
+        n_modes, n_supports = len(self.names), len(supports)
         self.names += supports
-        self._turning = np.array([False] * len(modes) + list(turning), dtype=np.bool_)
-        none, still = np.zeros(len(supports)), np.zeros(unknowns.n_dofs)
-        of_supports = [unknowns.joined(still, row) for row in np.eye(len(supports))]
-        self._modes = np.array([unknowns.joined(mode, none) for mode in modes] + of_supports)
-        shape = n_bodies, len(modes) // n_bodies, unknowns.n_local
-        self.of_bodies = self._modes[: len(modes)].reshape(shape)
-        self.free: Array = np.zeros((0, len(modes)))
+        self.turns = np.array(turns + [0.0] * n_supports)
+        self._turning = np.array([False] * n_modes + list(turning), dtype=np.bool_)
+        still = np.zeros(unknowns.n_dofs)
+        of_supports = [unknowns.joined(still, row) for row in np.eye(n_supports)]
+        self._of_supports = np.array(of_supports).reshape(n_supports, unknowns.n_local)
+        self._modes = self._modes_at(x)
+        shape = n_bodies, n_modes // n_bodies, unknowns.n_local
+        self.of_bodies = self._modes[:n_modes].reshape(shape)
+        self.free: Array = np.zeros((0, n_modes))
         self.resultant: Array = np.zeros(0)
         self._free_fields: Array = np.zeros((0, unknowns.n_local))
         self._free_sizes = self._free_fields  # of their entries
@@ -125,6 +122,20 @@ class RigidMotions:
         self._jumps = weakref.WeakKeyDictionary()
         self._travels: weakref.WeakKeyDictionary[ContactOperator, Array]
         self._travels = weakref.WeakKeyDictionary()
+
+    def _modes_at(self, x: Array) -> Array:
+        """All motions, with the nodes of this rank at places, (n_motions, n_local)."""
+        modes = []
+        for b, (centre, size) in enumerate(zip(self._centres, self._sizes, strict=True)):
+            mine = self._body[: len(x), None] == b
+            for mode in rigid_motions(x - centre, size).values():
+                modes.append(self._over_unknowns(np.where(mine, mode, 0.0)))
+        return np.concatenate([modes, self._of_supports])
+
+    def _over_unknowns(self, displacement: Array) -> Array:
+        """A displacement of this rank's nodes, (n_nodes, gdim), with supports at rest."""
+        none = np.zeros(len(self._of_supports))
+        return self._unknowns.joined(self._displacement.within(displacement.ravel()), none)
 
     def find_free(self, stiffness: PETSc.Mat, constrained: Mask) -> None:
         """Find the motions with no bulk energy that no Dirichlet condition holds. Collective.
@@ -163,6 +174,46 @@ class RigidMotions:
             found = [operator.jump(c @ self._modes) for c in self.free]
             self._jumps[operator] = np.array(found).reshape(len(self.free), n_points, gdim)
         return self._jumps[operator]
+
+    @property
+    def fields(self) -> Array:
+        """The free motions at this rank's unknowns, of the undeformed bodies, (n_free, n_local)."""
+        return self._free_fields
+
+    def present_fields(self) -> Array:
+        """The same of the bodies where they are now, about the same centres."""
+        return np.asarray(self.free @ self._modes_at(self._places()), dtype=np.float64)
+
+    def _places(self) -> Array:
+        """Of this rank's nodes now, (n_nodes, gdim) (length)."""
+        n, d = self._x.shape
+        return self._x + self._displacement.u.x.array[: n * d].reshape(n, d)
+
+    def turned(self, coefficients: Array) -> Array:
+        """By how much unknowns change as bodies go on, and turn about their centres, from here.
+
+        What `present_fields` are to first order: rotations of any size.
+
+        Args:
+            coefficients: Of all motions, (n_motions,).
+
+        Returns:
+            Over this rank's unknowns, (n_local,).
+        """
+        x, (n_bodies, n_motions, _) = self._places(), self.of_bodies.shape
+        way, d = np.zeros_like(x), x.shape[1]
+        for b in range(n_bodies):
+            twist = np.zeros((d + 1, d + 1))  # of homogeneous coordinates
+            here = np.vstack([np.zeros(d), np.eye(d)])
+            kinds = np.array(list(rigid_motions(here, self._sizes[b]).values()))
+            by_motion = coefficients[b * n_motions : (b + 1) * n_motions]
+            at = np.tensordot(by_motion, kinds, axes=1)
+            twist[:d, d], twist[:d, :d] = at[0], (at[1:] - at[0]).T
+            change = scipy.linalg.expm(twist)[:d] - np.eye(d + 1)[:d]
+            mine = self._body[: len(x)] == b
+            way[mine] = (x[mine] - self._centres[b]) @ change[:, :d].T + change[:, d]
+        supports = coefficients[n_bodies * n_motions :] @ self._of_supports
+        return np.asarray(self._over_unknowns(way) + supports, dtype=np.float64)
 
     def work(self, operator: ContactOperator, force: Array) -> Array:
         """Of forces at a contact's points, and of what answers them, on the motions of the bodies.
@@ -274,7 +325,7 @@ class RigidMotions:
             area += contact.quadrature.weights.sum()
             if contact.law.has_normal_stiffness:
                 gram += (along * weights) @ along.T
-            gram += _rubbing(contact, modes, weights)
+            gram += rubbing(contact, modes, weights)
         mean = global_sum(self.comm, gram) / max(float(global_sum(self.comm, area)), 1e-300)
         sizes, vectors = np.linalg.eigh(mean)
         return agreed(self.comm, vectors[:, sizes < _FELT].T @ self.free)
@@ -294,91 +345,6 @@ class RigidMotions:
         But for those by which supports turn: what presses may have no moment.
         """
         return global_sum(self.comm, (self._free_fields @ forces)[self._straight()])
-
-    def approach(self, load: Array, operators: Sequence[ContactOperator]) -> Array | None:
-        """Rigid motion to where the load sets free bodies down, or to first touch. Collective.
-
-        A friction that counts slip from where nothing touched yet draws a body back by all that it
-        went along Γc, and one set down on an edge has to be turned: the load does not lead there.
-
-        Args:
-            load: External forces at this rank's unknowns (force).
-            operators: Of evaluated contacts, all of them open, over all unknowns.
-
-        Returns:
-            What to add to the unknowns, or None: nothing moves, or it meets nothing.
-        """
-        if not len(self.free):
-            return None
-        free = self._free_fields
-        drive = global_sum(self.comm, free @ load)
-        mass = global_sum(self.comm, free @ free.T)
-        if not np.abs(drive).max() > 0:
-            return None
-        landed = self._landed(drive / np.abs(drive).max(), mass, operators)
-        if landed is not None:
-            return landed @ free
-        coefficients = agreed(self.comm, np.linalg.solve(mass, drive))
-        coefficients /= np.abs(coefficients).max()
-        way = np.inf
-        for operator in operators:
-            values = operator.contact.values
-            jump = np.tensordot(coefficients, self.at_points(operator), axes=1)
-            closing = np.einsum("qd,qd->q", jump, values.normal)
-            nearing = closing > _FELT
-            ways = values.opening[nearing] / closing[nearing]
-            way = min(way, global_min(self.comm, ways, empty=np.inf))
-        return None if way == np.inf else way * coefficients @ free
-
-    def _landed(
-        self, drive: Array, mass: Array, operators: Sequence[ContactOperator]
-    ) -> Array | None:
-        """Where rigid bodies come to rest, with little way along a Γc that grips. Collective.
-
-        The load does there all the work that gaps allow, with small rotations: a linear programme.
-
-        Args:
-            drive: Work of the load on the free motions, relative, (n_free,).
-            mass: Products of these, (n_free, n_free).
-            operators: Of evaluated contacts.
-
-        Returns:
-            Coefficients of the free motions; None: such motions are none, are little of what the
-            load drives, as those in a corner are, or do not end.
-        """
-        if any(operator.contact.finite for operator in operators):
-            return None
-        grams: Array = np.zeros((2, len(drive), len(drive)))
-        rows = []
-        for operator in operators:
-            contact, values = operator.contact, operator.contact.values
-            weights, modes = contact.quadrature.weights, self.at_points(operator)
-            closing = np.einsum("mqd,qd->qm", modes, values.normal)
-            grams += [_rubbing(contact, modes, weights), (closing.T * weights) @ closing]
-            rows.append(np.column_stack([closing, values.opening])[contact.paired])
-        rubbing, pressing = global_sum(self.comm, grams)
-        felt = rubbing + pressing
-        if not np.trace(felt) > 0:
-            return None
-        felt += _FELT * np.trace(felt) * np.eye(len(felt))  # there are motions that nothing feels
-        shares, vectors = scipy.linalg.eigh(rubbing, felt)
-        ways = agreed(self.comm, vectors[:, shares < _ALONG])
-        limits = gather_rows(self.comm, np.concatenate(rows))
-        far = np.abs(limits[:, -1]).max(initial=0.0)
-        work = drive @ ways
-        if not far > 0 or not len(work):
-            return None
-        led = work @ np.linalg.solve(ways.T @ mass @ ways, work)
-        if not led > _MOST * (drive @ np.linalg.solve(mass, drive)):
-            return None
-        found = scipy.optimize.linprog(
-            -work,
-            A_ub=limits[:, :-1] @ ways,
-            b_ub=limits[:, -1] / far + _INTO,
-            bounds=(None, None),
-            options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
-        )
-        return far * (ways @ agreed(self.comm, found.x)) if found.status == 0 else None
 
     def check_balance(self, load: Array, operators: Sequence[ContactOperator]) -> None:
         """Refuse a load whose resultant no admissible contact forces can balance. Collective.
@@ -560,7 +526,7 @@ def _around(normal: Array) -> list[Array]:
     return [np.cos(a) * first + np.sin(a) * second for a in angles]
 
 
-def _rubbing(contact: Contact, modes: Array, weights: Array) -> Array:
+def rubbing(contact: Contact, modes: Array, weights: Array) -> Array:
     """Products along Γc, where it grips, of n motions by their jumps there, (n, n_points, gdim)."""
     if not contact.law.has_tangential:
         return np.zeros((len(modes), len(modes)))

@@ -203,6 +203,10 @@ class FollowedOpposite(BodyOpposite):
         """See `Opposite`: all is counted from the committed bodies."""
         return {}
 
+    def feet(self, values: PointValues) -> dict[str, Array]:
+        """See `Opposite`: the ways in the committed bodies."""
+        return {"jump": self._present.way}
+
     def committed_fields(self, fields: Mapping[str, Array]) -> dict[str, Array]:
         """See `Opposite`: vectors turned with the surface."""
         turned = {n: self.turned(fields[n]) for n in ("traction", "jump") if n in fields}

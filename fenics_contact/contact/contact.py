@@ -45,10 +45,12 @@ class Found:
     Attributes:
         points: All fields at this rank's points.
         history: Those of them that become history, as it has them.
+        counted: `PointFields.rows` that its slip is counted from; None: what was committed.
     """
 
     points: PointValues
     history: Mapping[str, Array]
+    counted: Array | None
 
 
 @dataclass(frozen=True)
@@ -235,6 +237,7 @@ class Contact(PointResults):
         self.acting = ActingLaw(law, self.opposite, self.quadrature)
         self._values: PointValues | None = None
         self._committed_values: PointValues | None = None
+        self._aloft: Array | None = None  # history rows as committed, where slip is counted anew
         if not self.rigid:
             self.pair()
         self.opposite.begins_anew()
@@ -544,6 +547,11 @@ class Contact(PointResults):
         Args:
             found: A state solved since, whose results these are to be.
         """
+        counted = self._aloft if found is None or found.counted is None else found.counted
+        if counted is not None:
+            self.history.set_rows(counted)
+        if found is None or found.counted is None:
+            self._aloft = None
         if self.multipliers is not None:
             self.multipliers.restore(self.history)
         self._values = self._committed_values if found is None else found.points
@@ -610,7 +618,21 @@ class Contact(PointResults):
             }
         if self.multipliers is not None:
             values |= self.multipliers.committed(points)
-        return Found(points, self.opposite.committed_fields(values))
+        counted = None if self._aloft is None else self.history.rows()
+        return Found(points, self.opposite.committed_fields(values), counted)
+
+    def set_down(self) -> None:
+        """Let slip be counted from the state evaluated last, up to which nothing touched.
+
+        `restore` takes it back. Collective.
+        """
+        if not self.law.has_friction:
+            return
+        if self._aloft is None:
+            self._aloft = self.history.rows()
+        kept = {name: self.history.values(name) for name in self.history.names}
+        self.history.commit(kept | self.opposite.feet(self.values))
+        self.forget()
 
     def begin(self) -> None:
         """Let slip be counted from the present ``u``, if nothing has been committed. Collective.
@@ -638,6 +660,7 @@ class Contact(PointResults):
             self.evaluate()
             found = self.found()
         values = dict(found.history)
+        self._aloft = None
         self.commits += 1
         self.history.commit(values)
         self._values = found.points  # results stay those of the solution, whatever its pairs
@@ -651,11 +674,13 @@ class Contact(PointResults):
     def committed(self) -> Committed:
         """The committed state, for `set_committed`."""
         rows, state = self.history.rows(), self.opposite.state()
+        rows = rows if self._aloft is None else self._aloft.copy()
         return Committed(rows, state, self.commits, self._committed_values)
 
     def set_committed(self, state: Committed) -> None:
         """Make a state the committed one again; `restore` drops what came after it. Collective."""
         self.history.set_rows(state.history)
+        self._aloft = None
         self.opposite.set_state(state.opposite)
         self.commits, self._committed_values = state.commits, state.points
 
@@ -668,6 +693,7 @@ class Contact(PointResults):
             anew: Whether pairs were found anew at its commits.
         """
         self.history.set_rows(history)
+        self._aloft = None
         self._committed_values = None
 
         def present() -> PointValues:

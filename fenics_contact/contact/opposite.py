@@ -444,6 +444,10 @@ class Opposite(ABC):
         """What the history has of displacements at `committed_jump`, by name. Collective."""
         return {"jump": self.committed_jump}
 
+    def feet(self, values: PointValues) -> dict[str, Array]:
+        """What the history has of displacements at an evaluated state, by name. Collective."""
+        return {"jump": values.foot}
+
     def committed_fields(self, fields: Mapping[str, Array]) -> dict[str, Array]:
         """What is found of a solution, as the history has it."""
         return dict(fields)

@@ -210,6 +210,12 @@ class PresentPairs(Pairs):
         values = {"gap": now.gap, "normal": now.normal, "slip": slip, "traction": start}
         self.felt.commit(values)
 
+    @property
+    def way(self) -> Array:
+        """V, (n_points, d) (length); see the module."""
+        assert self._present is not None
+        return self._present.way.copy()
+
     def turned(self, vectors: Array) -> Array:
         """Vectors of the committed bodies as they have turned since, (n_points, d)."""
         assert self._present is not None

@@ -159,6 +159,10 @@ class MovingOpposite(Opposite):
 
         return self._passage.through(x + self.committed_jump, x + values.jump, turned)
 
+    def feet(self, values: PointValues) -> dict[str, Array]:
+        """See `Opposite`."""
+        return {"jump": values.foot, "normal": values.framed_normal}
+
     def start(self) -> dict[str, Array]:
         """See `Opposite`: the foot, minus X, and the normal there."""
         self.update_data()
