@@ -622,7 +622,7 @@ class Contact(PointResults):
         return Found(points, self.opposite.committed_fields(values), counted)
 
     def set_down(self) -> None:
-        """Let slip be counted from the state evaluated last, up to which nothing touched.
+        """Let slip be counted from the state evaluated last, where points bore nothing before.
 
         `restore` takes it back. Collective.
         """
@@ -631,7 +631,9 @@ class Contact(PointResults):
         if self._aloft is None:
             self._aloft = self.history.rows()
         kept = {name: self.history.values(name) for name in self.history.names}
-        self.history.commit(kept | self.opposite.feet(self.values))
+        bore = (kept["normal_traction"] != 0.0)[:, None]
+        feet = self.opposite.feet(self.values)
+        self.history.commit(kept | {n: np.where(bore, kept[n], v) for n, v in feet.items()})
         self.forget()
 
     def begin(self) -> None:

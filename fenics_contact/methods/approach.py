@@ -20,9 +20,8 @@ __all__ = ["Approach"]
 _IDLE = 1e-3
 # The share of what a load drives that counts as most of it.
 _MOST = 0.5
-# The share of a motion at Γc that may go along a Γc that grips: of a body tilted by up to 0.2; and
-# of one that nothing but a corner bears.
-_ALONG = 0.05, np.inf
+# The share of a motion at Γc that may go along a Γc that grips: of a body tilted by up to 0.2.
+_ALONG = 0.05
 # How far bodies are set down into their supports, by the largest gap: round-off is to leave none of
 # the points that bear open, ten times the tolerance of the linear programme.
 _INTO = 1e-9
@@ -97,11 +96,14 @@ class Approach:
     def _set_down(self, load: Array) -> None:
         """Move bodies that touch nothing to where they rest, or to first touch. Collective.
 
-        Slip is counted from there: on its way a body touches nothing.
+        With finite kinematics slip is counted from there: points come down on other places of a
+        curved support than are closest from above. With small displacements it is counted from the
+        last commit as ever, and draws a body back by all that it went along Γc.
         """
         full = self._full
         aloft = full.state()
-        for along in _ALONG:
+        finite = all(contact.finite for contact in full.contacts)
+        for along in (_ALONG, np.inf) if finite else (_ALONG,):
             if self._lands(load, along):
                 break
             self._go(aloft)
@@ -114,7 +116,8 @@ class Approach:
         if not full.bulk.linear:
             full.update_stiffness()
         for contact in full.contacts:
-            contact.set_down()
+            if contact.finite:
+                contact.set_down()
 
     def _free(self, load: Array) -> _Free | None:
         """The free motions; None: the load drives none. Collective."""
