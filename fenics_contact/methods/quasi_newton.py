@@ -74,7 +74,8 @@ class QuasiNewton(SnesMethod):
         norms = equations.residual(solution, equations.function)
         borne = norms.force[norms.n_bodies :].max(initial=0.0)
         idle = borne < _IDLE * norms.total
-        if not equations.h0_is_made or (idle and self._refreshed):
+        # Multigrid follows at once, a factorisation is kept.
+        if equations.by_cycle or not equations.h0_is_made or (idle and self._refreshed):
             self._start(idle=idle)
         else:
             self._clear_pairs(consistent=self.consistent)
