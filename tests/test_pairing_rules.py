@@ -414,6 +414,80 @@ def test_a_narrow_indenter_does_not_pass(cell):
         assert close(-total, reaction(body, ROOF)[body.d - 1], 1e-7)
 
 
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+@pytest.mark.parametrize(("end", "fails"), [(1.5, False), (1.0, True)])
+def test_a_support_may_be_that_of_several_contacts(kinematics, end, fails):
+    """Two slabs under a block that reaches over the edge of the second between two points.
+
+    The verdict is the same with a contact for each slab as with one for both. It passes where the
+    first slab ends under that facet of Γc, whose other point it holds up, and the force is the same
+    to what is solved for, 1e-8; it fails where it ends two facets before.
+    """
+    forces = []
+    lines = [0.43 + 0.2 * np.arange(7), 0.5 + 0.2 * np.arange(4)]
+    for tags in ([[LOWER, BOTH]], [[LOWER], [BOTH]]):
+        slabs = [[np.linspace(*ends, 4), np.array([0, 0.5])] for ends in ((0, end), (1.6, 2.1))]
+        sides = {
+            FLOOR: near(1, 0),
+            BOTH: between(1, 0.5, above=False),
+            LOWER: lambda x, cell: between(1, 0.5, above=False)(x, cell) & (x[:, 0] < 1.55),
+            UPPER: between(1, 0.5, above=True),
+            ROOF: near(1, 1.1),
+        }
+        body = Bodies(boxes([*slabs, lines], sides), E, 0.3)
+        body.hold(FLOOR, 0, 1)
+        body.hold(ROOF, 0)
+        body.hold(ROOF, 1, value=-0.01)
+        contacts = [
+            body.contact(UPPER, tag, fc.Frictionless(), kinematics=kinematics, name=f"slab {i}")
+            for i, tag in enumerate(tags)
+        ]
+        problem = body.problem(*contacts)
+        if fails:
+            raised_everywhere(problem.solve, fc.NotConverged, "passes through")
+            continue
+        step = problem.solve()
+        assert step.verdict.unseen == {}
+        forces.append(sum(c.resultants().normal_force for c in contacts))
+    if not fails:
+        assert forces[0] > 1.0
+        assert forces[1] == pytest.approx(forces[0], rel=1e-8)
+
+
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+def test_a_pin_in_a_hole_is_not_held_by_the_contact_around_it(kinematics):
+    """Flush with the slabs around, narrower than points of Γc are apart, and of a contact alone."""
+    width, high = 0.04, np.linspace(0, 0.5, 3)
+    edges = (0.0, 0.9), (1.1, 2.0), (1 - width / 2, 1 + width / 2)
+    axes = [[np.linspace(*ends, n), high] for ends, n in zip(edges, (5, 5, 3), strict=True)]
+    axes += [[np.linspace(0.5, 1.5, 5), 0.5 + high]]
+    sides = {
+        FLOOR: near(1, 0),
+        LOWER: between(1, 0.5, above=False),
+        BOTH: lambda x, cell: between(1, 0.5, above=False)(x, cell) & (abs(x[:, 0] - 1) < width),
+        UPPER: between(1, 0.5, above=True),
+        ROOF: near(1, 1),
+    }
+    body = Bodies(boxes(axes, sides), E, 0.3)
+    body.hold(FLOOR, 0, 1)
+    body.hold(ROOF, 0)
+    body.hold(ROOF, 1, value=-0.01)
+    contacts = [
+        body.contact(UPPER, tag, fc.Frictionless(), quadrature=2, kinematics=kinematics, name=name)
+        for name, tag in (("slabs", LOWER), ("pin", BOTH))
+    ]
+    problem = body.problem(*contacts)
+    raised_everywhere(problem.solve, fc.NotConverged, "pin: the opposite body passes through")
+
+
+@pytest.mark.parametrize(("cell", "inside"), [("triangle", 2), ("hexahedron", 4)])
+def test_the_rim_of_a_surface(cell, inside):
+    """Of 4 facets along each side those inside have neighbours all around."""
+    body = stack(cell, (1, 4), (0.5, 0.5))
+    rim = joint(body, 1, fc.Frictionless(), swap=False).pairs.search.at_rim()
+    assert np.count_nonzero(~rim) == inside
+
+
 def test_touching_is_not_passing():
     """Not before the gap is closed, and not by less than a hundredth of the way."""
     for depth, fails in ((0.0, False), (9e-4, False), (1.1e-3, True)):

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.pairs import Holding
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_max
 from fenics_contact.types import Array
@@ -26,7 +27,10 @@ def unseen_penetration(
 
     Args:
         contact: The contact.
-        others: Further contacts, whose points see the opposite where it is their Γc.
+        others: Further contacts, whose points see the opposite where it is their Γc. Where Γc is
+            theirs as well, its end may reach over one body between two points while the other
+            holds it up: at the rim of Γc their closed points count, too. Inside, a body that no
+            point of its own contact meets, such as a pin in a hole of the other, is passed through.
         stiffness: Of the bodies by area, about E/h times the contact's weight (force/length by
             area): what bears less than a millionth of it times the depth holds nothing up.
 
@@ -36,14 +40,21 @@ def unseen_penetration(
     """
     if contact.rigid:
         return 0.0, np.zeros(contact.points.shape[1])
-    comm = contact.surface.mesh.comm
+    comm, every = contact.surface.mesh.comm, (contact, *others)
     return contact.pairs.unseen_penetration(
         contact.values,
-        contact.status != Status.OPEN,
-        max(global_max(comm, c.values.penetration) for c in (contact, *others)),
-        [c.pairs for c in others],
+        max(global_max(comm, c.values.penetration) for c in every),
+        [
+            Holding(
+                c.pairs.search,
+                c.values,
+                c.status != Status.OPEN,
+                stiffness / global_max(comm, c.values.weight),
+            )
+            for c in every
+            if c.pairs.search is not None
+        ],
         gap_prescribed=contact.gap_prescribed,
-        stiffness=stiffness / global_max(comm, contact.values.weight),
     )
 
 

@@ -18,7 +18,7 @@ from fenics_contact.surface.rays import REASONS
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["Pairs", "PairsState"]
+__all__ = ["Holding", "Pairs", "PairsState"]
 
 
 # Share of the approach of two bodies that is no penetration between the points yet.
@@ -36,6 +36,33 @@ class PairsState:
     n_unpaired: int
     distance: Array
     found_at: fem.Function | None
+
+
+@dataclass(frozen=True)
+class Holding:
+    """What of a contact with another body may hold its Γc up.
+
+    Attributes:
+        search: Its surfaces.
+        values: At its points.
+        closed: Which of them are.
+        stiffness: Of the bodies by area and by the contact's weight, about E/h (stress/length).
+    """
+
+    search: Pairing
+    values: PointValues
+    closed: Mask
+    stiffness: float
+
+    def facets(self, depth: float) -> Index:
+        """This rank's facets of Γc with points that hold a body up which is so deep.
+
+        One that turns about a point bears next to nothing there, and is not deep.
+        """
+        values = self.values
+        bears = np.linalg.norm(values.total_traction, axis=1) >= _BEARS * self.stiffness * depth
+        holds = self.closed & (bears | (values.penetration >= _UNSEEN * depth))
+        return np.unique(self.search.surface.facets[self.search.rays.facet[holds]])
 
 
 class Pairs:
@@ -200,22 +227,18 @@ class Pairs:
     def unseen_penetration(
         self,
         values: PointValues,
-        closed: Mask,
         deepest: float,
-        others: Sequence[Pairs],
+        holding: Sequence[Holding],
         *,
         gap_prescribed: bool,
-        stiffness: float,
     ) -> tuple[float, Array]:
         """See `unseen_penetration`. Collective.
 
         Args:
             values: At the points.
-            closed: Which of them are.
             deepest: Penetration at the deepest point of all contacts (length).
-            others: Pairs of the other contacts.
+            holding: Of this, then of all other contacts with a body, what may hold Γc up.
             gap_prescribed: Whether the gap was given apart from the geometry.
-            stiffness: Of the bodies by area, about E/h (stress/length).
         """
         comm, search = self._mesh.comm, self.search
         nowhere = 0.0, np.zeros(self._gdim)
@@ -229,16 +252,15 @@ class Pairs:
         deep = approach - distance - back.slack - allowed
         if not global_max(comm, deep, empty=-1.0) > 0:
             return nowhere
-        for pairs in (self, *others):  # what has points of its own that look back
-            if pairs.search is not None:
-                mutual = search.facets_among(pairs.search)[back.facet]
-                own = pairs.search.surface.facets
-                deep[mutual & np.isin(back.source, own)] = -1.0
-        # A body that turns about a point bears next to nothing there, and is not deep.
+        for each in holding:  # what has points of its own that look back
+            mutual = search.facets_among(each.search.facets)[back.facet]
+            deep[mutual & np.isin(back.source, each.search.surface.facets)] = -1.0
         depth = global_max(comm, np.where(deep > 0, approach - distance, 0.0))
-        bears = np.linalg.norm(values.total_traction, axis=1) >= _BEARS * stiffness * depth
-        holds = closed & (bears | (values.penetration >= _UNSEEN * depth))
-        deep[search.facets_near(holds)[back.facet]] = -1.0
+        own, *others = (each.facets(depth) for each in holding)
+        held = search.facets_near(own)
+        if others:
+            held |= search.at_rim() & search.facets_near(np.concatenate(others))
+        deep[held[back.facet]] = -1.0
         rows = np.column_stack([approach - distance, back.place])[deep > 0]
         rows = gather_rows(comm, rows)
         if not len(rows):

@@ -251,21 +251,30 @@ class Pairing:
         slack: Array = size * np.maximum(angle, flat).max(axis=1)
         return slack
 
-    def facets_near(self, chosen: Any) -> Any:
-        """Which of all facets of Γc share a node with chosen ones of this rank. Collective.
+    def facets_near(self, chosen: Index) -> Any:
+        """Which of all facets of Γc share a node with chosen ones, if of Γc. Collective.
 
         Args:
-            chosen: Mask over this rank's points of Γc.
+            chosen: Facets of this rank's mesh.
         """
-        here = self._sides[0]
-        facets = here.first + np.unique(self._facet[chosen])
-        facets = np.unique(np.concatenate(self._comm.allgather(facets)))
-        corners = np.concatenate(self._comm.allgather(self._here.corner_vertices()))
-        return np.isin(corners, corners[facets]).any(axis=1)
+        corners = self._corners()
+        return np.isin(corners, corners[self.facets_among(chosen)]).any(axis=1)
 
-    def facets_among(self, other: Pairing) -> Any:
-        """Which of all facets of Γc are of the opposite surface of another contact. Collective."""
-        mine = np.isin(self._quadrature.surface.facets, other.facets)
+    def at_rim(self) -> Any:
+        """Which of all facets of Γc have a side that is no other one's. Collective."""
+        corners = self._corners()
+        ends = [np.roll(corners, -i, axis=1) for i in range(self._d - 1)]
+        sides = np.sort(np.stack(ends, axis=2), axis=2).reshape(-1, self._d - 1)
+        _, number, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+        return (count[number.ravel()] == 1).reshape(corners.shape).any(axis=1)
+
+    def _corners(self) -> Any:
+        """Nodes at the corners of all facets of Γc, (n_facets, n_corners). Collective."""
+        return np.concatenate(self._comm.allgather(self._here.corner_vertices()))
+
+    def facets_among(self, facets: Index) -> Any:
+        """Which of all facets of Γc are among these of this rank's mesh. Collective."""
+        mine = np.isin(self.surface.facets, facets)
         return np.concatenate(self._comm.allgather(mine))
 
     def largest(self, values: Array) -> Array:
