@@ -18,6 +18,7 @@ from scenes.bodies import boxes
 from scenes.comparing import at_points, close, nodal, raised_everywhere
 from scenes.elasticity import residual
 from scenes.rubbing import PATH, Rub, cushion, walk
+from scenes.stacks import ROOF, floor, joint, stack
 from scenes.two_blocks import BOTTOM, LOWER, UPPER, E, two_blocks
 from scenes.two_blocks import TOP as LID
 
@@ -370,3 +371,30 @@ def test_levels_follow_their_matrix(cell):
         size = product.norm()
         product.axpy(-1.0, coarse)
         assert product.norm() < 1e-12 * size
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_pairs_that_follow_the_bodies(cell):
+    """Their matrices have another pattern each time, which no levels can follow: all are new.
+
+    Two blocks on a floor, pressed and pushed to and fro, L-BFGS; reference: factorisation, tight.
+    """
+
+    def make(**options):
+        body = stack(cell, (12, 15) if cell == "triangle" else (3, 4), (1.0, 1.0))
+        traction = fem.Constant(body.mesh, np.zeros(body.d))
+        body.F -= ufl.dot(traction, body.v) * body.ds(ROOF)
+        law = fc.Coulomb(friction=0.4)
+        contacts = [floor(body, law), joint(body, 1, law, kinematics="finite")]
+        problem = fc.ContactProblem(body.F, body.u, contacts=contacts, method="lbfgs", **options)
+        slips = []
+        for share in (0.0, 0.12, -0.1):
+            traction.value[[0, -1]] = 1e3 * share, -1e3
+            problem.solve()
+            problem.commit()
+            slips.append(contacts[1].resultants().slip)
+        return nodal(body.u), np.array(slips)
+
+    direct, multigrid = both(make)
+    for by_factors, by_cycles in zip(direct, multigrid, strict=True):
+        assert close(by_cycles, by_factors, SAME)

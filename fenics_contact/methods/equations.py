@@ -205,7 +205,9 @@ class Equations:
         """
         self.factorisations += self.system.fill(matrix, contacts)
         if self.system.pattern_changes:
-            # A factorisation of another pattern is no start, whatever the matrix says.
+            # A factorisation of another pattern is no start, whatever the matrix says, and levels
+            # do not follow: there may be other unknowns in contact, too.
+            self.hierarchy = Hierarchy()
             for consistent, mine in self._matrices.items():
                 if mine.handle == matrix.handle:
                     self.solvers[consistent].reset()
