@@ -9,7 +9,7 @@ not counted, and the compiling of forms stands apart. Errors are those of force,
 the displacement at the end of Γc against a finer mesh, of ``--reference`` cells a side and thrice
 the stiffness, so that the error of a finite stiffness is among those that are seen.
 
-    OMP_NUM_THREADS=1 python benchmarks/ball.py              # seven minutes
+    OMP_NUM_THREADS=1 python benchmarks/ball.py              # ten minutes
     OMP_NUM_THREADS=1 python benchmarks/ball.py --short
 """
 

@@ -6,8 +6,8 @@ as it chooses by itself. ``--runs`` names others: the linear solve by a factoris
 as it is told, and Newton's method as a user of DOLFINx writes it. All to 1e-9 of the forces, the
 script's linear solves to PETSc's 1e-5. Meshes and compiled forms are not counted.
 
-    OMP_NUM_THREADS=1 python benchmarks/large.py              # ten minutes
-    OMP_NUM_THREADS=1 python benchmarks/large.py --cells 69   # a million unknowns alone: eight
+    OMP_NUM_THREADS=1 python benchmarks/large.py              # seven minutes
+    OMP_NUM_THREADS=1 python benchmarks/large.py --cells 69   # a million unknowns alone: five
     OMP_NUM_THREADS=1 python benchmarks/large.py --cells 47 --ranks 1 2
 
 The force is compared with the finest mesh's, and with Hertz's F = 4/3 E* √R d^{3/2} for a

@@ -1,6 +1,6 @@
 """All benchmarks, one after another, each in a process of its own, and what they are to meet.
 
-    OMP_NUM_THREADS=1 python benchmarks/run.py                     # everything: half an hour
+    OMP_NUM_THREADS=1 python benchmarks/run.py                     # everything: 50 minutes
     OMP_NUM_THREADS=1 python benchmarks/run.py --short             # small problems
     OMP_NUM_THREADS=1 python benchmarks/run.py half_cylinder ball  # some; the others' parts stay
     OMP_NUM_THREADS=1 python benchmarks/run.py --docs              # into docs/benchmarks.md
@@ -30,7 +30,7 @@ from benchmarks import targets, timing
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
-HELPERS = ("__init__", "run", "timing", "costs", "targets")
+HELPERS = ("__init__", "run", "timing", "costs", "targets", "trade_page", "trade_scenes")
 # Long, and all but the first with pages of their own in docs/.
 BY_NAME_ONLY = ("bolted_joint", "methods", "nonlinear", "trade")
 STAMP = "stamp.json"

@@ -6,7 +6,7 @@ in DOLFINx, every step of Newton's method by GMRES with GAMG; and one linear sol
 factorisation and by multigrid. Residuals end below 1e-9 of the forces in all of them. Meshing is
 not counted, and the compiling of forms stands apart.
 
-    OMP_NUM_THREADS=1 python benchmarks/tagged.py            # five minutes
+    OMP_NUM_THREADS=1 python benchmarks/tagged.py            # four minutes
     OMP_NUM_THREADS=1 python benchmarks/tagged.py --short
 """
 

@@ -133,6 +133,13 @@ def test_failed_run_meets_no_target(tmp_path: Path) -> None:
     assert rows["time / one linear solve ≤ 2.5"] == "no"
 
 
+def test_what_is_run_is_a_script() -> None:
+    """Modules that the benchmarks share have no ``main`` and leave no table."""
+    texts = {path.stem: path.read_text() for path in (ROOT / "benchmarks").glob("*.py")}
+    scripts = {name for name, text in texts.items() if "def main(" in text}
+    assert scripts - {"run"} == set(texts) - set(run.HELPERS)
+
+
 def test_page_keeps_parts_of_earlier_runs(tmp_path: Path) -> None:
     """What has been run is joined, in order; what has not is left out, failures are told."""
     stamp = '{"machine": "m", "threads": "1", "date": "d", "seconds": 3, "load": 0.1, "failed": %d}'
