@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 import fenics_contact as fc
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.systems import linear
+from scenes.blocks import BOTTOM as FLOOR
 from scenes.blocks import GRID, LEFT, TOP, block, layers
 from scenes.bodies import boxes
 from scenes.comparing import at_points, close, nodal, raised_everywhere
@@ -80,6 +81,20 @@ def test_nothing_but_contact_holds_the_body(cell, method):
         problem, contact = scene.problem(law, [], method=method, **options)
         problem.solve()
         assert close(contact.resultants().force, -scene.vector(side=0.2, up=-1.0), 1e-9)
+        return nodal(scene.u)
+
+    direct, multigrid = both(make)
+    assert close(multigrid, direct, SAME)
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton"])
+def test_nothing_in_contact(method):
+    """A block without any contact: levels have nothing to follow."""
+
+    def make(**options):
+        scene = block("triangle", n=16, up=-1.0)
+        bcs = [*scene.rollers(), scene.hold(FLOOR, 1)]
+        fc.ContactProblem(scene.F, scene.u, bcs=bcs, method=method, **options).solve()
         return nodal(scene.u)
 
     direct, multigrid = both(make)

@@ -51,8 +51,9 @@ class Hierarchy:
         """
         pc, present = ksp.getPC(), (stiffness.handle, stiffness.stateGet())
         if self._rows is None:
-            touched = np.unique(np.concatenate([operator.touched for operator in operators]))
-            self._rows = _numbers(matrix, touched)
+            # Where there is no contact nothing changes.
+            touched = [np.empty(0, dtype=np.int32), *(operator.touched for operator in operators)]
+            self._rows = _numbers(matrix, np.unique(np.concatenate(touched)))
         block = matrix.createSubMatrix(self._rows, self._rows)
         if pc.getType() == PETSc.PC.Type.GAMG and self._block and present == self._stiffness:
             self._block.aypx(-1.0, block, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
