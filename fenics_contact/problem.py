@@ -379,7 +379,7 @@ class ContactProblem:
         if behind and not self.solver.is_current():
             self._complete_all()  # what it takes is about to go
         self.solver.equations.factorisations = 0
-        saved = self.full.state(), self._now
+        saved, diagonal = (self.full.state(), self._now), self.full.diagonal.copy()
         try:
             # A trial of a line search may overflow, and the convergence test and the verdict see
             # it: a warning, on the rank that has the point, must not become an error there alone.
@@ -398,6 +398,8 @@ class ContactProblem:
         except BaseException as error:
             fail_together(self._comm, error)
             self._go_back(*saved)
+            if not self.bulk.linear:  # that of cells near collapse would excuse any residual
+                self.full.diagonal = diagonal
             if not isinstance(error, NotConverged | ValueError):
                 self.solver.recover()
             raise

@@ -8,8 +8,18 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.blocks import TOP, block, kirchhoff
-from scenes.comparing import close, compiled, gathered, identical, owned, same_field
+from scenes.comparing import (
+    close,
+    compiled,
+    gathered,
+    identical,
+    nodal,
+    owned,
+    raised_everywhere,
+    same_field,
+)
 from scenes.elasticity import strain
+from scenes.rubber import rubber
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
@@ -276,6 +286,32 @@ def test_impossible_increment_of_a_nonlinear_body(method):
         results.append((gathered(COMM, owned(scene.u)), gathered(COMM, contact.traction)))
     for a, b in zip(*results, strict=True):
         assert close(a, b, 1e-7)
+
+
+def test_collapsed_cells_excuse_nothing_afterwards():
+    """Rubber pushed so far into a ball that its cells collapse; then on, as if nothing had been.
+
+    What round-off excuses is by the stiffness assembled last, and that of such cells is without
+    bounds: residuals of 1e-4 of the forces passed in the next increment. Reference: Newton's method
+    to 1e-12, without the failure; 1e-8 of the largest displacement, for 1e-9 of the forces.
+    """
+    found = []
+    for ways, options in (
+        ((0.1, 1.5, 0.12), {"method": "lbfgs", "linear_solver": "multigrid"}),
+        ((0.1, 0.12), {"method": "newton", "petsc_options": {"snes_rtol": 1e-12}}),
+    ):
+        body = rubber(degree=1, n=(12, 8))
+        ball = fc.Ball((0.0, 2.0), 1.0)
+        problem, _ = body.problem(ball, fc.Coulomb(0.3), **options)
+        for up in ways:
+            body.place(lambda x, up=up: x + up * np.array([[0.0], [1.0]]))
+            if up > 1.0:
+                raised_everywhere(problem.solve, fc.NotConverged)
+                continue
+            problem.solve()
+            problem.commit()
+        found.append(nodal(body.u))
+    assert close(*found, 1e-8)
 
 
 def test_unsymmetric_bulk():
