@@ -448,6 +448,7 @@ class ContactProblem:
         if stiffness_changed and self.bulk.linear:
             self._modulus.measure()
         cold = self._approach.lead(load, first=self.increment == 0)
+        solver.starts.carried = self._approach.carried
         if solver.chooses():
             return None
         solver.update_system(stiffness_changed)

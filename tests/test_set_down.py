@@ -15,7 +15,7 @@ from dolfinx import fem
 import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic, NeoHookean
 from scenes.blocks import BOTTOM, LEFT, TOP, block_mesh, dimension
-from scenes.comparing import close
+from scenes.comparing import close, gathered
 from scenes.elasticity import displacement_space, hold
 from scenes.stacks import FLOOR, ROOF, joint, stack
 
@@ -219,3 +219,89 @@ def test_a_block_that_is_pulled_up():
     with pytest.raises(ValueError, match="no contact force can balance the load"):
         problem.solve()
     assert not np.any(scene.u.x.array)
+
+
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+@pytest.mark.parametrize("bulk", BULKS)
+def test_one_block_hovers_over_another_that_bears(bulk, kinematics):
+    """The floor is up in the lower one by 1e-4 before the upper one comes.
+
+    Reference: the same where the upper one just touches, by the friction summed up, to 1e-6. They
+    took 3 to 10 iterations; set down only where nothing touched, all were refused.
+    """
+    if bulk == "rubber" and kinematics == "small":
+        return
+    found = []
+    for apart in (0.0, 0.4):
+        body = stack("triangle", (3, 4), (1.0, 1.0), apart=apart)
+        if bulk == "rubber":
+            body.F = NeoHookean(body.u, 1e3, 0.3, "plane strain").residual(
+                body.v, ufl.dx(body.mesh)
+            )
+        body.F -= ufl.dot(body.constant((0.05, -1.0)), body.v) * body.ds(ROOF)
+        law, options = fc.Coulomb(friction=0.3), {"kinematics": kinematics}
+        floor = fc.HalfSpace((0.0, 1e-4), (0.0, 1.0))
+        contacts = [body.contact(FLOOR, floor, law, **options), joint(body, 1, law, **options)]
+        step = fc.ContactProblem(body.F, body.u, contacts=contacts).solve()
+        assert step.iterations <= 20
+        found.append([contact.resultants().tangential_force for contact in contacts])
+    assert close(found[1], found[0], 1e-6)
+
+
+@pytest.mark.parametrize("bulk", BULKS)
+@pytest.mark.parametrize("gap", [0.0, 0.5])
+def test_a_block_goes_on_from_where_it_was_let_go(gap, bulk):
+    """Carried along by 5 on its floor, let go and pressed again.
+
+    Reference: where it was let go, to 1e-3 of the way, for friction holds it there as it is pressed
+    down. It began again from where it had hovered at first, 5 away, and its friction did not know.
+    """
+    scene = Hovering("quadrilateral", bulk, (0.0, 0.0))
+    shift = fem.Constant(scene.u.function_space.mesh, np.zeros(2))
+    floor = fc.HalfSpace((0.0, -gap), (0.0, 1.0), displacement=shift)
+    contact = scene.contact(floor)
+    problem = scene.problem(contact)
+    ways = []
+    for press, along in ((1.0, 0.0), (1.0, 5.0), (0.0, 5.0), (1.0, 5.0)):
+        scene.traction.value[:] = (0.0, -press)
+        shift.value[:] = (along, 0.0)
+        step = problem.solve()
+        problem.commit()
+        assert step.iterations <= 60
+        assert close(contact.resultants().force, [0.0, press], 1e-8, scale=1.0)
+        ways.append(contact.own_displacement()[:, 0])
+    comm = scene.u.function_space.mesh.comm
+    pressed, carried, released, again = gathered(comm, np.column_stack(ways)).T
+    assert close(carried - pressed, np.full(len(pressed), 5.0), 1e-9)
+    assert close(again, np.full(len(again), released.mean()), 1e-3)
+
+
+@pytest.mark.parametrize("bulk", BULKS)
+@pytest.mark.parametrize("shape", ["plane", "cylinder"])
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
+def test_supports_take_bodies_along(cell, shape, bulk):
+    """That nothing else holds, down and along by more than they are pressed in.
+
+    Reference: the same forces, to 1e-7, and the displacement of the support. Linear bodies were
+    refused, and on a cylinder all of them.
+    """
+    scene = Hovering(cell, bulk, (0.02, -1.0))
+    shift = fem.Constant(scene.u.function_space.mesh, np.zeros(scene.d))
+    centre = np.full(scene.d, 0.5)
+    centre[-1] = -3.1
+    under = {
+        "plane": lambda: fc.HalfSpace(scene.vector(0.0, -0.1), scene.vector(0.0, 1.0), shift),
+        "cylinder": lambda: fc.Cylinder(
+            centre, 3.0, None if scene.d == 2 else (0.0, 1.0, 0.0), displacement=shift
+        ),
+    }[shape]()
+    contact = scene.contact(under)
+    problem = scene.problem(contact)
+    found = []
+    for way in ((0.0, 0.0), (0.3, 0.0), (0.3, -0.7)):
+        shift.value[:] = scene.vector(*way)
+        assert problem.solve().iterations <= 40
+        problem.commit()
+        resultants = contact.resultants()
+        found.append([*resultants.force, resultants.tangential_force])
+    assert close(found[1:], found[:1] * 2, 1e-7)

@@ -621,19 +621,24 @@ class Contact(PointResults):
         counted = None if self._aloft is None else self.history.rows()
         return Found(points, self.opposite.committed_fields(values), counted)
 
-    def set_down(self) -> None:
+    def set_down(self, felt: Mask, *, released: bool) -> None:
         """Let slip be counted from the state evaluated last, where points bore nothing before.
 
         `restore` takes it back. Collective.
+
+        Args:
+            felt: Which points feel what was set down.
+            released: Whether nothing was borne by then: what some points bore is round-off.
         """
         if not self.law.has_friction:
             return
         if self._aloft is None:
             self._aloft = self.history.rows()
         kept = {name: self.history.values(name) for name in self.history.names}
-        bore = (kept["normal_traction"] != 0.0)[:, None]
+        anew = felt if released else felt & (kept["normal_traction"] == 0.0)
         feet = self.opposite.feet(self.values)
-        self.history.commit(kept | {n: np.where(bore, kept[n], v) for n, v in feet.items()})
+        counted = {n: np.where(anew[:, None], v, kept[n]) for n, v in feet.items()}
+        self.history.commit(kept | counted)
         self.forget()
 
     def begin(self) -> None:

@@ -12,12 +12,14 @@ from fenics_contact.checks.rigid_motions import RigidMotions, rubbing
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import agreed, gather_rows, global_max, global_min, global_sum
 from fenics_contact.systems.full import FullSystem
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Approach"]
 
 # Contact forces that sum up to less than this share of the load on a free motion are none yet.
 _IDLE = 1e-3
+# Less than this share of it is round-off of a body that was let go.
+_LEFT = 1e-8
 # The share of what a load drives that counts as most of it.
 _MOST = 0.5
 # The share of a motion at Γc that may go along a Γc that grips: of a body tilted by up to 0.2.
@@ -35,32 +37,46 @@ _TURN, _STEPS, _LAST = 0.2, 30, 1e-6
 
 @dataclass(frozen=True)
 class _Free:
-    """The free motions of bodies where they are now, and what they meet there.
+    """The free motions that nothing holds, of bodies where they are now, and what they meet there.
 
     Attributes:
+        which: Their numbers among all free motions, (n_free,).
         drive: Work of the load on them, by the largest, (n_free,).
         mass: Their products, (n_free, n_free).
         jumps: Of every contact what its points feel of them, (n_free, n_points, gdim).
     """
 
+    which: Index
     drive: Array
     mass: Array
     jumps: list[Array]
 
 
+def _feeling(jumps: Array) -> Mask:
+    """Which points feel any motions, by their jumps there, (n_free, n_points, gdim)."""
+    return np.asarray(np.abs(jumps).max(axis=(0, 2), initial=0.0) > _FELT)
+
+
 class Approach:
-    """Where bodies without contact come from and go to."""
+    """Where bodies without contact come from and go to.
+
+    Attributes:
+        carried: The state in which bodies have gone with supports that moved, as `lead` found it;
+            None: none has.
+    """
 
     def __init__(self, full: FullSystem, motions: RigidMotions) -> None:
         """Take the present state for the one that bodies begin in."""
         self._full, self._motions = full, motions
         self._rest = full.state()
+        self.carried: Array | None = None
 
     def lead(self, load: Array, *, first: bool) -> bool:
         """Set bodies that nothing holds yet down, or move them to first touch. Collective.
 
         One that was released before rests wherever that ended, turned perhaps by more than the load
-        will press it together: it starts again from where it began.
+        will press it together. With small displacements it starts again from where it began; with
+        finite ones it is set down from where it was left, for that may be far along its support.
 
         Args:
             load: External forces at this rank's unknowns (force).
@@ -70,22 +86,91 @@ class Approach:
             Whether nothing was borne before.
         """
         full, motions = self._full, self._motions
+        self.carried = None
         if not len(motions.free):
             return first
-        cold = first
         for contact in full.contacts:
             contact.evaluate()
-        # Of contact not the resultants: those of a body that friction has locked are zero.
-        forces = [c.measure @ np.abs(c.values.total_traction).sum(axis=1) for c in full.contacts]
-        borne = float(global_sum(full.unknowns.comm, sum(forces, 0.0)))
+        finite = all(contact.finite for contact in full.contacts)
         outside = np.abs(motions.resultants(load)).max(initial=0.0)
-        if borne < _IDLE * outside:
-            cold = True
+        borne = self._borne(committed=finite)
+        idle = borne < _IDLE * outside
+        if idle and not finite:
             self._go(np.where(full.constrained, full.state(), self._rest))
-        touching = [bool(np.any(c.status != Status.OPEN)) for c in full.contacts]
-        if not full.unknowns.comm.allreduce(any(touching)):
-            self._set_down(load)
-        return cold
+        which = self._untouched()
+        if len(which) < len(motions.free) and motions.turning:
+            # A support that turns freely is rolled by what its points slip, and first touch is a
+            # point that does not tell.
+            which = which[motions.of_any_body()[which]]
+        if finite and not first:
+            every = np.arange(len(motions.free))
+            carried = None if idle else self._carried()
+            if idle:
+                which = every
+            elif carried is not None:
+                # Bodies slip then by what they did: set down they slip by what has moved, too.
+                here = full.state()
+                self._move(every, carried)
+                self.carried = full.state()
+                if len(which) == len(every) and not len(self._untouched()):
+                    self._follow_stiffness()
+                    return False
+                self._go(here)
+        if len(which):
+            self._set_down(load, which, released=borne < _LEFT * outside)
+        return first or idle
+
+    def _borne(self, *, committed: bool) -> float:
+        """Sum of the sizes of contact forces, now or as they were committed. Collective.
+
+        Not their resultants: those of a body that friction has locked are zero. With finite
+        kinematics a support that moves away leaves nothing of what was borne.
+        """
+        total = 0.0
+        for contact in self._full.contacts:
+            points = contact.committed().points if committed else contact.values
+            if points is not None:
+                total += contact.measure @ np.abs(points.total_traction).sum(axis=1)
+        return float(global_sum(self._full.unknowns.comm, total))
+
+    def _carried(self) -> Array | None:
+        """How supports that have moved take bodies along. Collective.
+
+        Returns:
+            Coefficients of the free motions; None: no support has moved.
+        """
+        contacts, comm = self._full.contacts, self._full.unknowns.comm
+        n_free = len(self._motions.free)
+        gram: Array = np.zeros((n_free, n_free))
+        work: Array = np.zeros(n_free)
+        for contact, jumps in zip(contacts, self._felt(np.arange(n_free))[1], strict=True):
+            points, way = contact.committed().points, np.zeros(contact.points.shape)
+            if points is None:
+                continue
+            if contact.opposite.carries:
+                way, _ = contact.opposite.carried(points, points.total_traction)
+            if not contact.law.has_tangential:
+                jumps = np.sum(jumps * points.normal, axis=2, keepdims=True) * points.normal
+            weights = contact.measure * np.abs(points.arrays["normal_traction"])
+            gram += np.einsum("mqd,q,nqd->mn", jumps, weights, jumps)
+            work += np.einsum("mqd,q,qd->m", jumps, weights, way)
+        gram, work = global_sum(comm, gram), global_sum(comm, work)
+        if not np.abs(work).max() > 0:
+            return None
+        return agreed(comm, np.linalg.lstsq(gram, work, rcond=_FELT)[0])
+
+    def _untouched(self) -> Index:
+        """Free motions of what no closed point touches, by their numbers. Collective."""
+        contacts, motions = self._full.contacts, self._motions
+        touched: Array = np.zeros(len(motions.free))
+        for contact, jumps in zip(
+            contacts, self._felt(np.arange(len(motions.free)))[1], strict=True
+        ):
+            closed = contact.status != Status.OPEN
+            touched += (np.abs(jumps[:, closed]) > _FELT).any(axis=(1, 2))
+        touched = global_sum(self._full.unknowns.comm, touched)
+        # What turns about a point does not move there.
+        return np.flatnonzero(~(motions.together @ (touched > 0)))
 
     def _go(self, state: Array) -> None:
         """Make a state the present one. Collective."""
@@ -93,7 +178,7 @@ class Approach:
         for contact in self._full.contacts:
             contact.evaluate()
 
-    def _set_down(self, load: Array) -> None:
+    def _set_down(self, load: Array, which: Index, *, released: bool) -> None:
         """Move bodies that touch nothing to where they rest, or to first touch. Collective.
 
         With finite kinematics slip is counted from there: points come down on other places of a
@@ -104,42 +189,58 @@ class Approach:
         aloft = full.state()
         finite = all(contact.finite for contact in full.contacts)
         for along in (_ALONG, np.inf) if finite else (_ALONG,):
-            if self._lands(load, along):
+            if self._lands(load, which, along):
                 break
             self._go(aloft)
         else:
-            free = self._free(load)
+            free = self._free(load, which)
             way = None if free is None else self._to_first_touch(free)
             if way is None:
                 return
-            self._move(way)
-        if not full.bulk.linear:
-            full.update_stiffness()
-        for contact in full.contacts:
+            self._move(which, way)
+        self._follow_stiffness()
+        # A support comes to a body that others bear as one that is led there does: from where its
+        # increment starts.
+        if len(which) < len(self._motions.free) and not self._motions.of_any_body()[which].any():
+            return
+        for contact, jumps in zip(full.contacts, self._felt(which)[1], strict=True):
             if contact.finite:
-                contact.set_down()
+                contact.set_down(_feeling(jumps), released=released)
 
-    def _free(self, load: Array) -> _Free | None:
-        """The free motions; None: the load drives none. Collective."""
-        full, motions, comm = self._full, self._motions, self._full.unknowns.comm
+    def _follow_stiffness(self) -> None:
+        """Take that of a nonlinear bulk which has turned. Collective."""
+        if not self._full.bulk.linear:
+            self._full.update_stiffness()
+
+    def _felt(self, which: Index) -> tuple[Array, list[Array]]:
+        """The free motions of these numbers at this rank's unknowns, and at points. Collective.
+
+        Returns:
+            (n_free, n_local), and for every contact (n_free, n_points, gdim).
+        """
+        full, motions = self._full, self._motions
         if full.bulk.linear:  # to which small rotations alone are rigid
-            fields = motions.fields
-            jumps = [motions.at_points(operator) for operator in full.operators]
-        else:
-            fields = motions.present_fields()
-            jumps = [np.array([o.jump(field) for field in fields]) for o in full.operators]
+            jumps = [motions.at_points(operator)[which] for operator in full.operators]
+            return motions.fields[which], jumps
+        fields = motions.present_fields()[which]
+        return fields, [np.array([o.jump(field) for field in fields]) for o in full.operators]
+
+    def _free(self, load: Array, which: Index) -> _Free | None:
+        """The free motions of these numbers; None: the load drives none. Collective."""
+        comm = self._full.unknowns.comm
+        fields, jumps = self._felt(which)
         drive = global_sum(comm, fields @ load)
         most = np.abs(drive).max()
         mass = global_sum(comm, fields @ fields.T)
-        return _Free(drive / most, mass, jumps) if most > 0 else None
+        return _Free(which, drive / most, mass, jumps) if most > 0 else None
 
-    def _move(self, coefficients: Array) -> None:
-        """Let free motions go on from here, by their coefficients, (n_free,). Collective."""
+    def _move(self, which: Index, coefficients: Array) -> None:
+        """Let free motions of these numbers go on from here, by their coefficients. Collective."""
         full, motions = self._full, self._motions
         if full.bulk.linear:
-            way = coefficients @ motions.fields
+            way = coefficients @ motions.fields[which]
         else:
-            way = motions.turned(coefficients @ motions.free)
+            way = motions.turned(coefficients @ motions.free[which])
         self._go(full.state() + np.where(full.constrained, 0.0, way))
 
     def _to_first_touch(self, free: _Free) -> Array | None:
@@ -159,28 +260,35 @@ class Approach:
 
     # ---- to where a body rests -------------------------------------------------------------------
 
-    def _lands(self, load: Array, along: float) -> bool:
+    def _lands(self, load: Array, which: Index, along: float) -> bool:
         """Move rigid bodies to where they come to rest, if they do. Collective.
 
         One set down on an edge has to be turned: the load does not lead there.
 
         Args:
             load: As in `lead`.
+            which: Numbers of their free motions.
             along: The largest share of a motion that may go along a Γc that grips.
         """
         full, comm = self._full, self._full.unknowns.comm
-        gaps = [np.abs(c.values.gap[c.paired]).max(initial=0.0) for c in full.contacts]
+        free = self._free(load, which)
+        if free is None:
+            return False
+        gaps = [
+            np.abs(c.values.gap[c.paired & _feeling(jumps)]).max(initial=0.0)
+            for c, jumps in zip(full.contacts, free.jumps, strict=True)
+        ]
         far = global_max(comm, np.array(gaps))
         if not 0 < far < np.inf:
             return False
         linear = full.bulk.linear and not any(contact.finite for contact in full.contacts)
         turn = np.inf if linear else _TURN
         for _ in range(_STEPS):
-            free = self._free(load)
+            free = self._free(load, which)
             landed = None if free is None else self._landed(free, far, turn, along)
             if landed is None or free is None:
                 return False
-            self._move(landed)
+            self._move(which, landed)
             ways = [np.tensordot(landed, jumps, axes=1) for jumps in free.jumps]
             farthest = np.array([np.abs(way).max(initial=0.0) for way in ways])
             if linear or global_max(comm, farthest) <= _LAST * far:
@@ -210,7 +318,9 @@ class Approach:
             values, weights = contact.values, contact.quadrature.weights
             closing = np.einsum("mqd,qd->qm", jumps, values.normal)
             grams += [rubbing(contact, jumps, weights), (closing.T * weights) @ closing]
-            rows.append(np.column_stack([closing, values.gap])[contact.paired])
+            # Round-off of what was released may be in its support: it goes no deeper.
+            there = contact.paired & _feeling(jumps)
+            rows.append(np.column_stack([closing, np.maximum(values.gap, 0.0)])[there])
         rubs, presses = global_sum(comm, grams)
         felt = rubs + presses
         if not np.trace(felt) > 0:
@@ -228,7 +338,8 @@ class Approach:
         bounds, most = [limits[:, :-1] @ ways], [limits[:, -1] / far + _INTO]
         turning = motions.turns > 0
         if turn < np.inf and turning.any():
-            angles = (motions.free[:, turning] / motions.turns[turning]).T @ ways
+            turns = motions.free[free.which][:, turning] / motions.turns[turning]
+            angles = turns.T @ ways
             bounds += [angles, -angles]
             most += [np.full(2 * len(angles), turn / far)]
         found = scipy.optimize.linprog(

@@ -417,7 +417,7 @@ class Solver:
 
     def _forget_matrices(self) -> None:
         self.equations.forget_matrices()
-        self.starts.predict = False
+        self.starts.forget()
 
     # ---- solving ---------------------------------------------------------------------------------
 
@@ -469,7 +469,7 @@ class Solver:
         """
         equations = self.equations
         reason, attempts = int(_REASONS.DIVERGED_LINEAR_SOLVE), []
-        factored = self.starts.predict
+        factored = self.starts.factored
         starts = [s / equations.length for s in self.starts.of(ahead, rate, cold)]
         tries = [(start, self.method) for start in starts]
         goes_on = self.may_go_on()
@@ -505,15 +505,13 @@ class Solver:
                 suspected = True
                 tries.insert(number + 1, (starts[0], "alternating"))
         equations.set_state(equations.solution)
-        # With a linear bulk a start by the tangent comes first even where it is far off, which a
-        # load that falls to nothing does not forgive after continuation.
         own = self.methods.get(method)
-        by_newton = self._factors if own is None else own.by_newton and not self._full.bulk.linear
-        newton = by_newton and not self._quasi_newton
+        newton = (self._factors if own is None else own.by_newton) and not self._quasi_newton
         made = sum(attempt.iterations for attempt in attempts[-1:])
-        self.starts.predict = reason > 0 and newton and (factored or made > 0)
-        if self.starts.predict:
-            self.starts.keep()
+        if reason > 0 and newton and (factored or made > 0):
+            # With a linear bulk a start by the tangent comes first even where it is far off, which
+            # a load that falls to nothing does not forgive after continuation.
+            self.starts.keep(predict=own is None or not self._full.bulk.linear)
         return int(reason), attempts
 
     def _is_stiff(self) -> bool:
@@ -571,7 +569,7 @@ class Solver:
             self.change(anew=True)
         # After a history that was taken up and is at its end nothing has been assembled yet.
         self.update_system(self._full.update_stiffness())
-        self.starts.predict = False  # by the matrix that is about to be used
+        self.starts.forget()  # the matrix that is about to be used is another one
         self.system.begin(load)
         return linearised(self.equations, springs)
 

@@ -46,12 +46,15 @@ class Starts:
     """States to start from, by what is known of the last increment.
 
     Attributes:
-        predict: Whether the consistent tangent factored last is that of a solution.
+        factored: Whether the consistent tangent factored last is that of a solution.
+        predict: Whether a step on it may come first.
+        carried: The state in which bodies have gone with supports that moved; None: none has.
     """
 
     def __init__(self, equations: Equations) -> None:
         """Nothing is known yet."""
-        self.predict = False
+        self.factored = self.predict = False
+        self.carried: Array | None = None
         self._equations = equations
         self._moved: Array | None = None  # of the values prescribed, since the last increment
         self._borne: list[_Borne] = []  # by contact, in the solution found last
@@ -69,14 +72,23 @@ class Starts:
             change.array[:] = full.state() - before
             self._moved = change.array.copy() if change.norm() > 0 else None
 
-    def keep(self) -> None:
+    def forget(self) -> None:
+        """Another tangent is factored than that of the solution found last."""
+        self.factored = self.predict = False
+
+    def keep(self, *, predict: bool) -> None:
         """Take note of what contacts bear in the solution that was just found. Collective.
 
-        Supports that move by the next increment take those points along that stick, and no others.
+        Its tangent is factored. Supports that move by the next increment take those points along
+        that stick, and no others.
+
+        Args:
+            predict: See the attribute.
         """
+        self.factored, self.predict = True, predict
         self._borne = []
         contacts = self._equations.contacts
-        if self._equations.full.bulk.linear or not any(c.opposite.carries for c in contacts):
+        if not any(c.opposite.carries for c in contacts):
             return
         for contact in contacts:
             contact.evaluate()
@@ -88,10 +100,11 @@ class Starts:
 
         The present state; that state moved on by as much as the last increment moved it: in
         proportional loading that is the solution; that state with one step of Newton's method on
-        the tangent of the last solution; with a nonlinear bulk what `_followed` finds, or
-        `_carried` where no values prescribed have moved; and the state moved, or the present one,
-        with supports that turn freely rolled to where they are now: where all points would slip no
-        tangent tells by how much.
+        the tangent of the last solution; with a nonlinear bulk what `_followed` finds; `_carried`
+        where supports have moved and no values prescribed have; bodies that have gone with such
+        supports as rigid ones; and the state moved, or the present one, with supports that turn
+        freely rolled to where they are now: where all points would slip no tangent tells by how
+        much.
 
         At the present state itself no point has slipped yet, and all closed ones stick: from there
         Newton's method takes ten steps to let them slip again, one after another from the edge of
@@ -126,8 +139,8 @@ class Starts:
 
         add(present)
         # Where nothing was borne yet the last increment tells nothing of this one.
-        predicts = self.predict and not cold
-        self.predict = False
+        predicts, factored = self.predict and not cold, self.factored and not cold
+        self.forget()
         first = None
         if predicts and (self._moved is not None or equations.full.bulk.linear):
             step = self._predicted if self._moved is None else self._followed
@@ -142,10 +155,13 @@ class Starts:
                 moved = starts[add(self._followed(present, anew=True))]
             else:
                 moved = starts[first]
-        elif predicts and ahead and not equations.full.bulk.linear:
+        elif factored and ahead:
             carried = self._carried(present)
-            first = None if carried is None else add(carried)
+            if carried is not None:
+                first = add(carried)
         self._moved = None
+        if self.carried is not None and ahead:
+            add(system.part(self.carried))
         if ahead and any(c.free_angle is not None for c in equations.contacts):
             add(system.rolled(moved))
         if first is not None and residuals[first] <= _FAR * min(residuals):
