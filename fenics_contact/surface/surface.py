@@ -11,6 +11,7 @@ import basix.ufl
 import dolfinx.fem.petsc
 import numpy as np
 import numpy.typing as npt
+import scipy.spatial
 import ufl
 from dolfinx import fem, la
 from petsc4py import PETSc
@@ -50,6 +51,11 @@ _FINEST_RULE = {2: 78, 3: 6}
 #     tetrahedra, 2: 2: 1.00 and 1.00, 3: 0.97 and 0.99, 4: 0.91.
 # In the plane it is 0.997 or more up to 200 opposite facets, and pieces leave less than 1e-4.
 _NODES_PER_POINT = 1.25
+# By how many times as many opposite facets as by their longest sides are along one of Γc where they
+# are narrow: right angles in triangles alone make it 1.7.
+_NARROW = 2.0
+# Of the squared cosine of the angle between normals: from here on facets are compared.
+_FACING = 0.5
 
 
 class ContactSurface:
@@ -152,13 +158,46 @@ class ContactSurface:
     def _times_as_coarse(self, opposite: Indices) -> int:
         """How many facets of the opposite surface are as long as one of Γc, at least 1. Collective.
 
-        By the medians of both, in the undeformed bodies.
+        By the medians of both, in the undeformed bodies; where facets are long and narrow, across
+        those opposite.
         """
         d, sizes = self.mesh.topology.dim, []
         for facets in (self.facets, opposite):
             sizes.append(gather_rows(self.mesh.comm, self.mesh.h(d - 1, facets)[:, None]))
         ours, theirs = (np.median(size) if len(size) else np.inf for size in sizes)
-        return max(1, round(float(ours / theirs)))
+        times = float(ours / theirs)
+        if d == 3 and all(map(len, sizes)):
+            across = self._times_as_wide(opposite)
+            times = across if across > _NARROW * times else times
+        return max(1, round(times))
+
+    def _times_as_wide(self, opposite: Indices) -> float:
+        """How many opposite facets are as long as one of Γc where they are most, in space.
+
+        The median over Γc, of each with the facet that is closest to it. Collective.
+        """
+        rows = [gather_rows(self.mesh.comm, self._spreads(f)) for f in (self.facets, opposite)]
+        (middle, own), (others, theirs) = ((r[:, :3], r[:, 3:].reshape(-1, 3, 3)) for r in rows)
+        _, closest = scipy.spatial.cKDTree(others).query(middle)
+        (_, axes), (_, other_axes) = np.linalg.eigh(own), np.linalg.eigh(theirs)
+        # The first axis is the normal.
+        facing = np.einsum("fi,fi->f", axes[:, :, 0], other_axes[closest, :, 0]) ** 2 > _FACING
+        if not facing.any():
+            return 1.0
+        plane = axes[facing, :, 1:]
+        spreads = own[facing], theirs[closest][facing]
+        ours, opposed = (np.einsum("fia,fij,fjb->fab", plane, m, plane) for m in spreads)
+        most = np.linalg.eigvals(np.linalg.solve(opposed, ours)).real.max(axis=1)
+        return float(np.sqrt(np.median(most)))
+
+    def _spreads(self, facets: Indices) -> Array:
+        """Middles of facets in space, and Σ (x - middle)(x - middle)ᵀ over corners, (n, 12)."""
+        nodes = dolfinx.mesh.entities_to_geometry(self.mesh, 2, np.asarray(facets, dtype=np.int32))
+        corners = self.mesh.geometry.x[nodes.reshape(len(facets), -1)]
+        middle = corners.mean(axis=1) if len(facets) else np.zeros((0, 3))
+        arms = corners - middle[:, None]
+        spread = np.einsum("fki,fkj->fij", arms, arms)
+        return np.hstack([middle, spread.reshape(-1, 9)])
 
     def check_places(self, name: str) -> None:
         """Refuse a mesh whose nodes have moved since. Collective.
