@@ -109,6 +109,25 @@ def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float],
     return reference.Problem(body, contacts), made, load
 
 
+def _times_as_wide(here: Surface, there: Surface) -> float:
+    """How many opposite facets are as wide as one of Γc where they are narrowest; the median.
+
+    Each beside the one whose middle is closest and that looks its way or against it.
+    """
+    arms = [s.corners() - s.corners().mean(axis=1, keepdims=True) for s in (here, there)]
+    apart = here.corners().mean(axis=1)[:, None] - there.corners().mean(axis=1)
+    closest = np.linalg.norm(apart, axis=2).argmin(axis=1)
+    found = []
+    for own, other in zip(arms[0], arms[1][closest], strict=True):
+        plane, opposite = (np.linalg.svd(a)[2] for a in (own, other))
+        if (plane[2] @ opposite[2]) ** 2 <= 0.5:
+            continue
+        # Of x in the plane of Γc |own x| / |other x|, the largest.
+        right = np.linalg.qr(other @ plane[:2].T)[1]
+        found.append(np.linalg.norm(own @ plane[:2].T @ np.linalg.inv(right), 2))
+    return float(np.median(found)) if found else 1.0
+
+
 def contact_of(
     made: Made,
     contact: Scene,
@@ -133,7 +152,9 @@ def contact_of(
     if rule is None:
         rule = 2 * degree
         if there is not None:  # p + 1 points for every facet that is opposite, but for many
-            times = round(float(np.median(here.lengths()) / np.median(there.lengths())))
+            ratio = float(np.median(here.lengths()) / np.median(there.lengths()))
+            across = _times_as_wide(here, there) if d == 3 else 0.0
+            times = round(across if across > 2 * ratio else ratio)  # long and narrow ones across
             times = 1 if kind_of is reference.ContactModel and times < 6 else times
             rule = max(rule, min(2 * ((degree + 1) * times - 1), {2: 78, 3: 6}[d]))
     facet, xi, weights = here.rule(rule, scheme or "default")

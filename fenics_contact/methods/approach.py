@@ -199,9 +199,9 @@ class Approach:
                 return
             self._move(which, way)
         self._follow_stiffness()
-        # A support comes to a body that others bear as one that is led there does: from where its
-        # increment starts.
-        if len(which) < len(self._motions.free) and not self._motions.of_any_body()[which].any():
+        # A support pressed by a force comes to a body as one that is led there does, and may be led
+        # along by then: slip is counted from where its increment starts.
+        if not self._motions.of_any_body()[which].any():
             return
         for contact, jumps in zip(full.contacts, self._felt(which)[1], strict=True):
             if contact.finite:
