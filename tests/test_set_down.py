@@ -155,15 +155,20 @@ def test_two_blocks_over_a_floor(bulk):
     assert close(found[1], found[0], 1e-6) and close(found[2], found[0], 1e-6)
 
 
-def test_a_block_over_a_corner():
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
+def test_a_block_over_a_corner(cell):
     """Where its load is more than the floor's friction holds it goes on to the wall.
 
-    Reference: the load. It took 5 iterations; led to first touch by its load it found nothing.
+    Reference: the load, which in space also goes a little along the corner. It took 5 and 8
+    iterations; led to first touch by its load it found nothing, and in space round-off took it
+    along the corner to no end.
     """
-    scene = Hovering("triangle", "linear", (0.0, 0.0))
+    scene = Hovering(cell, "linear", (0.0, 0.0))
     v, load = ufl.TestFunction(scene.u.function_space), scene.vector(-0.6, -1.0)
+    load[1:-1] = 0.05
     scene.F -= ufl.dot(fem.Constant(scene.u.function_space.mesh, load), v) * ufl.dx
     sides = {"floor": (BOTTOM, (0.0, 1.0), 0.05), "wall": (LEFT, (1.0, 0.0), 0.3)}
+    sides = {name: (tag, scene.vector(*normal), gap) for name, (tag, normal, gap) in sides.items()}
     contacts = [
         scene.contact(fc.HalfSpace(-gap * np.array(normal), normal), 0.2, tag, name=name)
         for name, (tag, normal, gap) in sides.items()

@@ -328,13 +328,16 @@ class Approach:
         felt += _FELT * np.trace(felt) * np.eye(len(felt))  # there are motions that nothing feels
         shares, vectors = scipy.linalg.eigh(rubs, felt)
         ways = agreed(comm, vectors[:, shares < along])
+        limits = gather_rows(comm, np.concatenate(rows))
+        # What closes no gap, as to go along a corner, round-off of the load would take to no end.
+        _, closes, kept = np.linalg.svd(limits[:, :-1] @ ways, full_matrices=False)
+        ways = agreed(comm, ways @ kept[closes > _FELT * closes.max(initial=0.0)].T)
         work = drive @ ways
         if not len(work):
             return None
         led = work @ np.linalg.solve(ways.T @ free.mass @ ways, work)
         if not led > _MOST * (drive @ np.linalg.solve(free.mass, drive)):
             return None
-        limits = gather_rows(comm, np.concatenate(rows))
         bounds, most = [limits[:, :-1] @ ways], [limits[:, -1] / far + _INTO]
         turning = motions.turns > 0
         if turn < np.inf and turning.any():
