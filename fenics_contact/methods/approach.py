@@ -318,9 +318,8 @@ class Approach:
             values, weights = contact.values, contact.quadrature.weights
             closing = np.einsum("mqd,qd->qm", jumps, values.normal)
             grams += [rubbing(contact, jumps, weights), (closing.T * weights) @ closing]
-            # Round-off of what was released may be in its support: it goes no deeper.
             there = contact.paired & _feeling(jumps)
-            rows.append(np.column_stack([closing, np.maximum(values.gap, 0.0)])[there])
+            rows.append(np.column_stack([closing, values.gap])[there])
         rubs, presses = global_sum(comm, grams)
         felt = rubs + presses
         if not np.trace(felt) > 0:
@@ -338,18 +337,26 @@ class Approach:
         led = work @ np.linalg.solve(ways.T @ free.mass @ ways, work)
         if not led > _MOST * (drive @ np.linalg.solve(free.mass, drive)):
             return None
-        bounds, most = [limits[:, :-1] @ ways], [limits[:, -1] / far + _INTO]
+        gaps = limits[:, -1] / far + _INTO
+        bounds, most = [limits[:, :-1] @ ways], [gaps]
         turning = motions.turns > 0
         if turn < np.inf and turning.any():
             turns = motions.free[free.which][:, turning] / motions.turns[turning]
             angles = turns.T @ ways
             bounds += [angles, -angles]
             most += [np.full(2 * len(angles), turn / far)]
-        found = scipy.optimize.linprog(
-            -work,
-            A_ub=np.concatenate(bounds),
-            b_ub=np.concatenate(most),
-            bounds=(None, None),
-            options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
-        )
+        # What was let go, supports may have moved into: it goes out, or no deeper where it cannot.
+        for most[0] in (gaps, np.maximum(gaps, _INTO)):
+            found = scipy.optimize.linprog(
+                -work,
+                A_ub=np.concatenate(bounds),
+                b_ub=np.concatenate(most),
+                bounds=(None, None),
+                options={
+                    "primal_feasibility_tolerance": 1e-10,
+                    "dual_feasibility_tolerance": 1e-10,
+                },
+            )
+            if found.status == 0 or gaps.min() >= 0:
+                break
         return far * (ways @ agreed(comm, found.x)) if found.status == 0 else None
