@@ -153,9 +153,10 @@ def contact_of(
         rule = 2 * degree
         if there is not None:  # p + 1 points for every facet that is opposite, but for many
             ratio = float(np.median(here.lengths()) / np.median(there.lengths()))
-            across = _times_as_wide(here, there) if d == 3 else 0.0
+            finite = kind_of is not reference.ContactModel
+            across = _times_as_wide(here, there) if d == 3 and finite else 0.0
             times = round(across if across > 2 * ratio else ratio)  # long and narrow ones across
-            times = 1 if kind_of is reference.ContactModel and times < 6 else times
+            times = times if finite or times >= 6 else 1
             rule = max(rule, min(2 * ((degree + 1) * times - 1), {2: 78, 3: 6}[d]))
     facet, xi, weights = here.rule(rule, scheme or "default")
     weights = weights * scene.get("thickness", 1.0)

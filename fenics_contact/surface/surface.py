@@ -144,7 +144,8 @@ class ContactSurface:
         scheme = "vertex" if nodal and free else self.quadrature_scheme or "default"
         sparse = None
         if opposite is not None and self.quadrature_degree is None:
-            coarser, dim = self._times_as_coarse(opposite), self.mesh.geometry.dim
+            dim = self.mesh.geometry.dim
+            coarser = self._times_as_coarse(opposite, across=dim == 3 and not pieces)
             if pieces and coarser < _PIERCING:
                 coarser = 1
             wanted = coarser * (degree + 2) - 2
@@ -155,20 +156,23 @@ class ContactSurface:
                 sparse = Sparse(coarser, wanted)
         return SurfaceQuadrature(self, degree, scheme, sparse)
 
-    def _times_as_coarse(self, opposite: Indices) -> int:
+    def _times_as_coarse(self, opposite: Indices, *, across: bool) -> int:
         """How many facets of the opposite surface are as long as one of Γc, at least 1. Collective.
 
-        By the medians of both, in the undeformed bodies; where facets are long and narrow, across
-        those opposite.
+        By the medians of both, in the undeformed bodies.
+
+        Args:
+            opposite: This rank's.
+            across: Whether to count long and narrow ones across, in space.
         """
         d, sizes = self.mesh.topology.dim, []
         for facets in (self.facets, opposite):
             sizes.append(gather_rows(self.mesh.comm, self.mesh.h(d - 1, facets)[:, None]))
         ours, theirs = (np.median(size) if len(size) else np.inf for size in sizes)
         times = float(ours / theirs)
-        if d == 3 and all(map(len, sizes)):
-            across = self._times_as_wide(opposite)
-            times = across if across > _NARROW * times else times
+        if across and all(map(len, sizes)):
+            wide = self._times_as_wide(opposite)
+            times = wide if wide > _NARROW * times else times
         return max(1, round(times))
 
     def _times_as_wide(self, opposite: Indices) -> float:
