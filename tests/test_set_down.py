@@ -226,16 +226,15 @@ def test_a_block_that_is_pulled_up():
     assert not np.any(scene.u.x.array)
 
 
-@pytest.mark.parametrize("kinematics", ["small", "finite"])
-@pytest.mark.parametrize("bulk", BULKS)
+@pytest.mark.parametrize(
+    ("bulk", "kinematics"), [("linear", "small"), ("linear", "finite"), ("rubber", "finite")]
+)
 def test_one_block_hovers_over_another_that_bears(bulk, kinematics):
     """The floor is up in the lower one by 1e-4 before the upper one comes.
 
     Reference: the same where the upper one just touches, by the friction summed up, to 1e-6. They
     took 3 to 10 iterations; set down only where nothing touched, all were refused.
     """
-    if bulk == "rubber" and kinematics == "small":
-        return
     found = []
     for apart in (0.0, 0.4):
         body = stack("triangle", (3, 4), (1.0, 1.0), apart=apart)

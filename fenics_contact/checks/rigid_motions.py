@@ -180,19 +180,22 @@ class RigidMotions:
         """The free motions at this rank's unknowns, of the undeformed bodies, (n_free, n_local)."""
         return self._free_fields
 
-    @property
-    def together(self) -> Mask:
-        """Which two of the free motions are of one body, (n_free, n_free)."""
+    def _moved(self) -> tuple[Mask, Mask]:
+        """Which bodies every free motion moves, (n_free, n_bodies), and which supports."""
         n_bodies, n_motions, _ = self.of_bodies.shape
         moves, n_modes = self.free != 0.0, n_bodies * n_motions
         bodies = moves[:, :n_modes].reshape(-1, n_bodies, n_motions).any(axis=2)
-        parts = np.hstack([bodies, moves[:, n_modes:]]).astype(np.float64)
+        return bodies, moves[:, n_modes:]
+
+    def together(self) -> Mask:
+        """Which two of the free motions are of one body, (n_free, n_free)."""
+        parts = np.hstack(self._moved()).astype(np.float64)
         return np.asarray(parts @ parts.T > 0)
 
     def of_any_body(self) -> Mask:
         """Which of the free motions are not those of supports alone, (n_free,)."""
-        n_bodies, n_motions, _ = self.of_bodies.shape
-        return np.asarray(np.any(self.free[:, : n_bodies * n_motions] != 0.0, axis=1))
+        bodies, _ = self._moved()
+        return np.asarray(bodies.any(axis=1))
 
     def present_fields(self) -> Array:
         """The same of the bodies where they are now, about the same centres."""

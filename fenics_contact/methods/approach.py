@@ -170,7 +170,7 @@ class Approach:
             touched += (np.abs(jumps[:, closed]) > _FELT).any(axis=(1, 2))
         touched = global_sum(self._full.unknowns.comm, touched)
         # What turns about a point does not move there.
-        return np.flatnonzero(~(motions.together @ (touched > 0)))
+        return np.flatnonzero(~(motions.together() @ (touched > 0)))
 
     def _go(self, state: Array) -> None:
         """Make a state the present one. Collective."""
@@ -338,7 +338,7 @@ class Approach:
         if not led > _MOST * (drive @ np.linalg.solve(free.mass, drive)):
             return None
         gaps = limits[:, -1] / far + _INTO
-        bounds, most = [limits[:, :-1] @ ways], [gaps]
+        bounds, most = [limits[:, :-1] @ ways], []
         turning = motions.turns > 0
         if turn < np.inf and turning.any():
             turns = motions.free[free.which][:, turning] / motions.turns[turning]
@@ -346,11 +346,11 @@ class Approach:
             bounds += [angles, -angles]
             most += [np.full(2 * len(angles), turn / far)]
         # What was let go, supports may have moved into: it goes out, or no deeper where it cannot.
-        for most[0] in (gaps, np.maximum(gaps, _INTO)):
+        for deep in (gaps, np.maximum(gaps, _INTO)):
             found = scipy.optimize.linprog(
                 -work,
                 A_ub=np.concatenate(bounds),
-                b_ub=np.concatenate(most),
+                b_ub=np.concatenate([deep, *most]),
                 bounds=(None, None),
                 options={
                     "primal_feasibility_tolerance": 1e-10,
