@@ -295,6 +295,54 @@ def test_a_spoiled_history_of_finite_kinematics_is_found(spoil, scene):
     assert "equations" in outcome.kind
 
 
+# A block that a wall guides, with one point a facet: in a cavity these hover, and are set down.
+LOOSE = copy.deepcopy(TURNING) | {
+    "bulk": "rubber",
+    "drive": "force",
+    "holds": [[0, "left", [0], "still"]],
+    "stages": [
+        {"steps": 2, "normal": 1.0, "side": 0.01, "across": 0.0, "turn": 0.0},
+        {"steps": 1, "normal": 0.0, "side": 0.0, "across": 0.0, "turn": 0.0},
+        {"steps": 1, "normal": 1.0, "side": 0.01, "across": 0.0, "turn": 0.0},
+    ],
+}
+LOOSE["contacts"][0]["support"]["kind"] = "cylinder inside"
+LOOSE["contacts"][0]["quadrature"] = 1
+
+
+@serial
+def test_a_body_that_was_set_down_is_right():
+    outcome = played(LOOSE)
+    assert outcome.outcome == "right"
+    assert {"set down rigid", "set down inside", "set down aloft", "apart"} <= set(outcome.worst)
+
+
+def _deeper(u):
+    u[:, -1] -= 1e-4
+
+
+def _higher(u):
+    u[:, -1] += 1e-4
+
+
+def _wider(u):
+    u[:, -1] += 1e-4 * u[:, 2]
+
+
+@serial
+@pytest.mark.parametrize(
+    ("spoil", "check"), [(_deeper, "inside"), (_higher, "aloft"), (_wider, "rigid")]
+)
+def test_a_body_set_down_elsewhere_is_found(spoil, check):
+    def spoiled(record):
+        if record["contacts"][0]["set_down"] is not None:
+            spoil(record["contacts"][0]["set_down"])
+
+    outcome = played(LOOSE, spoiled=spoiled)
+    assert outcome.outcome == "wrong"
+    assert f"set down {check}" in outcome.kind
+
+
 @serial
 def test_slip_of_bodies_that_is_not_turned_is_found():
     """The committed traction stays in space while both bodies turn."""

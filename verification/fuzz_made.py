@@ -91,11 +91,17 @@ def tag_of(scene: Scene, body: int, side: str) -> int:
 
 
 class Made:
-    """A scene as mesh, forms and constants, on any number of ranks."""
+    """A scene as mesh, forms and constants, on any number of ranks.
+
+    Attributes:
+        set_down: Displacements from which slip is counted anew in this increment, by the names of
+            contacts; see `_displacement`.
+    """
 
     def __init__(self, scene: Scene, comm: MPI.Comm) -> None:
         """Make mesh, bulk form and conditions. Collective."""
         self.scene, self.comm = scene, comm
+        self.set_down: dict[str, np.ndarray] = {}
         self.length, self.force = scene["units"]
         x, cells, boxes = _arrays(scene)
         self.d = d = x.shape[1]
@@ -336,6 +342,8 @@ class Made:
                     **self.options(c),
                 )
             )
+        for contact in contacts:
+            _note_set_down(self, contact)
         self.contacts = contacts
         options, scene = {}, self.scene
         if "ration" in scene:
@@ -409,14 +417,29 @@ def _nodes(made: Made) -> tuple[Array, Array]:
     return box[:n], made.V.tabulate_dof_coordinates()[:n, : made.d]
 
 
+def _displacement(made: Made) -> np.ndarray:
+    """Box, place and displacement of all nodes, (n_nodes, 1 + 2 d). Collective."""
+    box, x = _nodes(made)
+    u = made.u.x.array.reshape(-1, made.d)[: len(box)]
+    return gathered(made.comm, np.column_stack([box, x, u]))
+
+
+def _note_set_down(made: Made, contact: fc.Contact) -> None:
+    """Let a scene know where bodies are from which slip at a contact is counted anew."""
+    set_down = contact.set_down
+
+    def noted(*given: Any, **options: Any) -> None:
+        made.set_down[contact.name] = _displacement(made)
+        set_down(*given, **options)
+
+    contact.set_down = noted  # type: ignore[method-assign]
+
+
 def _record(
     made: Made, problem: fc.ContactProblem, step: Any, stage: int, t: float
 ) -> dict[str, Any]:
     """What of a committed step is judged. Collective."""
     comm, d = made.comm, made.d
-    box, x = _nodes(made)
-    n = len(box)
-    u = gathered(comm, np.column_stack([box, x, made.u.x.array.reshape(-1, d)[:n]]))
     contacts = []
     for contact in problem.contacts:
         columns = [contact.points, contact.measure, contact.pressure, contact.tangential_traction]
@@ -447,12 +470,13 @@ def _record(
                 "motion": {i: float(c.value) for i, c in contact.free_motion.items()},
                 "unpaired": contact.n_unpaired,
                 "error": contact.accuracy.error if contact.accuracy else None,
+                "set_down": made.set_down.get(contact.name),
             }
         )
     return {
         "stage": stage,
         "load": t,
-        "u": u,
+        "u": _displacement(made),
         "contacts": contacts,
         "energy": step.energy,
         "rtol": problem.accuracy.rtol if problem.accuracy else 1e-9,
@@ -496,9 +520,13 @@ def history(
                 n: int = what["steps"],
                 file: Any = file,
             ) -> Any:
+                def apply(t: float) -> None:
+                    made.set_down.clear()
+                    made.apply(stage, t)
+
                 return fc.increments(
                     problem,
-                    lambda t: made.apply(stage, t),
+                    apply,
                     steps=n,
                     max_cuts=scene.get("cuts", 1),
                     checkpoint=file if stop is not None else None,
