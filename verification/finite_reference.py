@@ -736,6 +736,17 @@ class FiniteJudge(fuzz_judge.Judge):
             traction, normal = record["lambda_t"][row], record["lambda_at"][row]
         return FiniteState(old.jump, traction, record["lambda_n"][row], None, normal)
 
+    def _bulges(self, given: dict[str, Any]) -> float:
+        """A round support rises into a facet by L² / 8 R."""
+        bulges = super()._bulges(given)
+        if given["support"]["kind"] == "body":
+            return bulges
+        body = self.scene["bodies"][given["body"]]
+        radius = finite_scenes.place_of(self.scene, given).get("radius", np.inf)
+        length = max(s / n for s, n in zip(body["size"][:-1], body["n"][:-1], strict=True))
+        length *= self.scene["units"][0]
+        return float(bulges + length**2 / (8 * radius))
+
     def _check_energy(self, name: str, record: Any, *_: Any) -> None:
         """Friction takes energy, by the means of tractions at both ends (as the verdict has it)."""
 

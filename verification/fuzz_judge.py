@@ -346,9 +346,12 @@ class Judge:
             # Γc may be one point.
             size = np.ptp(contact.x, axis=0).max() or np.ptp(self.problem.body.places, axis=0).max()
             # Multipliers are linear over a facet; of a coarse one what it bulges stays inside.
-            given = self.scene["contacts"][self.problem.contacts.index(contact)]
-            bulges = self._bulge / self.scene["bodies"][given["body"]]["n"][0] ** 2
+            bulges = self._bulges(self.scene["contacts"][self.problem.contacts.index(contact)])
             self._check(name, "inside", deep, _INSIDE * size + bulges)
+
+    def _bulges(self, given: dict[str, Any]) -> float:
+        """By how much facets of a contact are not flat, or what they touch is not (length)."""
+        return float(self._bulge / self.scene["bodies"][given["body"]]["n"][0] ** 2)
 
     def _check_through(self, name: str, u: Array, found: list[dict], now: dict[str, Any]) -> None:
         """Whether the other body sees far more contact than Γc does: it has passed through."""
