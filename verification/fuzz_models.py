@@ -128,6 +128,25 @@ def _times_as_wide(here: Surface, there: Surface) -> float:
     return float(np.median(found)) if found else 1.0
 
 
+def _most_under_one(here: Surface, there: Surface) -> float:
+    """How many opposite facets are as long as one of Γc where they are most.
+
+    Under a facet are that with the closest middle and all to which it is the closest and that are
+    farther by half of its length at most.
+    """
+    ours, theirs = here.lengths(), there.lengths()
+    apart = np.linalg.norm(
+        here.corners().mean(axis=1)[:, None] - there.corners().mean(axis=1), axis=2
+    )
+    most = 0.0
+    for i, (own, row) in enumerate(zip(ours, apart, strict=True)):
+        under = (apart.argmin(axis=0) == i) & (row <= row.min() + own / 2)
+        under[row.argmin()] = True
+        lengths = np.sort(theirs[under])
+        most = max(most, own / lengths[(len(lengths) - 1) // 2])
+    return float(most)
+
+
 def contact_of(
     made: Made,
     contact: Scene,
@@ -153,6 +172,8 @@ def contact_of(
         rule = 2 * degree
         if there is not None:  # p + 1 points for every facet that is opposite, but for many
             ratio = float(np.median(here.lengths()) / np.median(there.lengths()))
+            graded = _most_under_one(here, there)
+            ratio = graded if graded > 1.5 * ratio else ratio
             finite = kind_of is not reference.ContactModel
             across = _times_as_wide(here, there) if d == 3 and finite else 0.0
             times = round(across if across > 2 * ratio else ratio)  # long and narrow ones across

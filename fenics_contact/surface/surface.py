@@ -54,6 +54,9 @@ _NODES_PER_POINT = 1.25
 # By how many times as many opposite facets as by their longest sides are along one of Γc where they
 # are narrow: right angles in triangles alone make it 1.7.
 _NARROW = 2.0
+# By how many times as many opposite facets under one of Γc as by the medians they are counted
+# there: less is found in meshes whose facets are meant to be alike.
+_GRADED = 1.5
 # Of the squared cosine of the angle between normals: from here on facets are compared.
 _FACING = 0.5
 
@@ -159,29 +162,37 @@ class ContactSurface:
     def _times_as_coarse(self, opposite: Indices, *, across: bool) -> int:
         """How many facets of the opposite surface are as long as one of Γc, at least 1. Collective.
 
-        By the medians of both, in the undeformed bodies.
+        By the medians of both, in the undeformed bodies; or where they are most under one of Γc.
 
         Args:
             opposite: This rank's.
             across: Whether to count long and narrow ones across, in space.
         """
-        d, sizes = self.mesh.topology.dim, []
-        for facets in (self.facets, opposite):
-            sizes.append(gather_rows(self.mesh.comm, self.mesh.h(d - 1, facets)[:, None]))
-        ours, theirs = (np.median(size) if len(size) else np.inf for size in sizes)
-        times = float(ours / theirs)
-        if across and all(map(len, sizes)):
-            wide = self._times_as_wide(opposite)
+        comm = self.mesh.comm
+        sides = [gather_rows(comm, self._spreads(facets)) for facets in (self.facets, opposite)]
+        if not all(map(len, sides)):
+            return 1
+        (middle, ours), (others, theirs) = ((side[:, :3], side[:, 3]) for side in sides)
+        times = float(np.median(ours) / np.median(theirs))
+        graded = _most_under_one(middle, ours, others, theirs)
+        times = graded if graded > _GRADED * times else times
+        if across:
+            wide = self._times_as_wide(*sides)
             times = wide if wide > _NARROW * times else times
         return max(1, round(times))
 
-    def _times_as_wide(self, opposite: Indices) -> float:
+    def _times_as_wide(self, here: Array, there: Array) -> float:
         """How many opposite facets are as long as one of Γc where they are most, in space.
 
-        The median over Γc, of each with the facet that is closest to it. Collective.
+        The median over Γc, of each with the facet that is closest to it.
+
+        Args:
+            here: Of all ranks, `_spreads` of Γc.
+            there: Those of the opposite facets.
         """
-        rows = [gather_rows(self.mesh.comm, self._spreads(f)) for f in (self.facets, opposite)]
-        (middle, own), (others, theirs) = ((r[:, :3], r[:, 3:].reshape(-1, 3, 3)) for r in rows)
+        (middle, own), (others, theirs) = (
+            (rows[:, :3], rows[:, 4:].reshape(-1, 3, 3)) for rows in (here, there)
+        )
         _, closest = scipy.spatial.cKDTree(others).query(middle)
         (_, axes), (_, other_axes) = np.linalg.eigh(own), np.linalg.eigh(theirs)
         # The first axis is the normal.
@@ -195,15 +206,17 @@ class ContactSurface:
         return float(np.sqrt(np.median(most)))
 
     def _spreads(self, facets: Indices) -> Array:
-        """Middles of facets in space, and Σ (x - middle)(x - middle)ᵀ over corners, (n, 12)."""
+        """Of facets middles, lengths, and Σ (x - middle)(x - middle)ᵀ over corners, (n, 13)."""
         if not len(facets):  # for which DOLFINx ends in a segmentation fault
-            return np.zeros((0, 12))
-        nodes = dolfinx.mesh.entities_to_geometry(self.mesh, 2, np.asarray(facets, dtype=np.int32))
-        corners = self.mesh.geometry.x[nodes.reshape(len(facets), -1)]
+            return np.zeros((0, 13))
+        mesh, dim = self.mesh, self.mesh.topology.dim - 1
+        facets = np.asarray(facets, dtype=np.int32)
+        nodes = dolfinx.mesh.entities_to_geometry(mesh, dim, facets)
+        corners = mesh.geometry.x[nodes.reshape(len(facets), -1)]
         middle = corners.mean(axis=1)
         arms = corners - middle[:, None]
         spread = np.einsum("fki,fkj->fij", arms, arms)
-        return np.hstack([middle, spread.reshape(-1, 9)])
+        return np.hstack([middle, mesh.h(dim, facets)[:, None], spread.reshape(-1, 9)])
 
     def check_places(self, name: str) -> None:
         """Refuse a mesh whose nodes have moved since. Collective.
@@ -523,6 +536,31 @@ class PointEvaluator:
         with np.errstate(invalid="ignore", divide="ignore"):
             values = weighted / self._weights[:, None]
         return {name: values[: self._n_owned, c].copy() for name, c in self._columns.items()}
+
+
+def _most_under_one(middle: Array, ours: Array, others: Array, theirs: Array) -> float:
+    """How many facets opposite are as long as one of Γc, where they are most.
+
+    Under a facet are the one that is closest to it, and all to which it is the closest and that are
+    no farther from it than that by half of its length; their median counts, as one alone may be a
+    sliver.
+
+    Args:
+        middle: Of all facets of Γc, (n, 3) (length).
+        ours: Their lengths, (n,).
+        others: Middles opposite, (m, 3).
+        theirs: Their lengths, (m,).
+    """
+    nearest, first = scipy.spatial.cKDTree(others).query(middle)
+    distance, owner = scipy.spatial.cKDTree(middle).query(others)
+    under = distance <= nearest[owner] + ours[owner] / 2
+    facet = np.concatenate([np.arange(len(middle)), owner[under]])
+    other = np.concatenate([first, np.flatnonzero(under)])
+    facet, other = np.unique(np.column_stack([facet, other]), axis=0).T
+    order = np.lexsort((theirs[other], facet))
+    _, start, count = np.unique(facet, return_index=True, return_counts=True)
+    median = theirs[other[order]][start + (count - 1) // 2]
+    return float(np.max(ours / median))
 
 
 def _vertex_rule(cell: str) -> tuple[Array, Array]:
