@@ -340,6 +340,28 @@ def test_points_that_go_through_a_body_are_seen(cell, ways, through):
     assert n == (points if through else 0)
 
 
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+@pytest.mark.parametrize(
+    ("ways", "through"),
+    [
+        ([(-0.1, 0.0), (1.2, 1.0)], True),  # out at the back, beside it
+        ([(-0.1, 0.0), (-0.1, 1.2), (1.2, 1.2)], False),  # round the edge
+        ([(0.05, 0.0), (0.05, 1.2)], False),  # dragged off the end, pressed as it was
+        ([(0.05, 0.0), (0.3, 1.2)], False),  # off over its edge, less deep than a cell is high
+    ],
+)
+def test_points_that_have_gone_through_and_aside_are_seen(cell, ways, through):
+    """Some of them: at the end their normals meet nothing of the body, before or behind them."""
+    pair = Pair(cell, fc.Coulomb(0.3, k_n=1e3, k_t=5e2), kinematics="finite")
+    for down, along in ways:
+        pair.contact.commit()
+        pair.place(pair.pressed(pair.nodes, down, along) @ turn(pair.d, 0.4).T)
+        pair.contact.evaluate()
+    assert not MPI.COMM_WORLD.allreduce(int(pair.contact.values.paired.any()))
+    passed = pair.contact.opposite.passed_through(pair.contact.values)
+    assert MPI.COMM_WORLD.allreduce(int(passed.any())) == through
+
+
 def test_bodies_that_touch_at_first_take_as_many_steps_in_any_place():
     """Gaps that are round-off are none: it closed some points, and held the first tangent by them.
 

@@ -265,35 +265,50 @@ class PresentPairs(Pairs):
 
         They are behind it, deeper than bodies may be in each other, nothing else of that body is
         opposite them, and they were in front: seen in parts of the increment, in which all goes
-        straight on. Collective.
+        straight on. Those whose normals meet nothing any more were as deep on the way. Collective.
         """
         assert self._present is not None and self._where is not None and self.search is not None
         now, before = self._present, self._before
+        here, there = self._rays.here, self._rays.there
         passed = np.zeros(len(now.gap), dtype=np.bool_)
-        some = now.hits.reason >= BEHIND
+        height = here.height[here.first + self._rays.facet]
+        behind = now.hits.reason >= BEHIND
+        lost = (now.hits.facet < 0) & ~behind & (height < self._largest_way())
+        some = behind | lost
         if not self._mesh.comm.allreduce(int(some.any())):
             return passed
-        here, body = self._rays.here.facets, self._rays.there.body
         facet, place = self._rays.facet[some], self._where[0][some]
+        lost, height, set_of = lost[some], height[some], here.facets
         # What counted as in front at the start may have been that deep.
-        depth = 2 * now.deep[self._rays.here.first + facet] + self.search.round_off
-        now_body = np.where(now.hits.facet >= 0, body[now.hits.facet], -1)[some]
+        depth = 2 * now.deep[here.first + facet] + self.search.round_off
+        now_body = np.where(now.hits.facet >= 0, there.body[now.hits.facet], -1)[some]
         earlier, later = before.copy(), before.copy()
-        gone = np.zeros(len(facet), dtype=np.bool_)
+        crossed, gone = (np.zeros(len(facet), dtype=np.bool_) for _ in range(2))
         for part in range(1, _PARTS + 1):
             share = part / _PARTS
             later.x.array[:] = (1 - share) * before.x.array + share * self._u.x.array
-            ray = here.normals(facet, place, later)
+            ray = set_of.normals(facet, place, later)
             hits = self._rays.follow(
                 facet, place, ray, later, now.deep, before=earlier, behind=True
             )
-            x, _ = here.positions(facet, place, earlier)
-            ahead = np.sum((hits.partner.before - x) * here.normals(facet, place, earlier), axis=1)
+            x, _ = set_of.positions(facet, place, earlier)
+            ahead = np.sum(
+                (hits.partner.before - x) * set_of.normals(facet, place, earlier), axis=1
+            )
             met = hits.facet >= 0
-            gone |= met & (ahead >= -depth) & (body[hits.facet] != now_body)
+            crossed |= met & (ahead >= -depth) & (there.body[hits.facet] != now_body)
+            thick = np.maximum(np.maximum(height, there.height[hits.facet]), depth)
+            gone |= crossed & (~lost | (met & (hits.distance < -thick)))
             earlier.x.array[:] = later.x.array
         passed[some] = gone
         return passed
+
+    def _largest_way(self) -> float:
+        """By how much two places can have come closer since the last commit. Collective."""
+        change = (self._u.x.array - self._before.x.array).reshape(
+            -1, self._u.function_space.dofmap.bs
+        )
+        return 2 * global_max(self._mesh.comm, np.linalg.norm(change, axis=1))
 
     def _look_back(self, depth: float) -> tuple[LookBack, Array]:
         """See `Pairs`: in the bodies as they are."""
