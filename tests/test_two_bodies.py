@@ -307,6 +307,44 @@ def test_the_fine_end_under_a_long_surface_is_told_of_in_space() -> None:
         assert all(times in text for times, text in zip(expected, texts, strict=True))
 
 
+def test_a_surface_that_slides_onto_finer_facets_is_warned_of() -> None:
+    """Once, where it comes to lie on 20 facets; nothing is said where it starts, on one as long.
+
+    Reference: the force by as many points as are told, of which more than 15 % are missing without.
+    """
+    forces = []
+    for given in (None, 78):
+        x = np.r_[np.linspace(0.0, 0.5, 21), np.arange(1.0, 20.1, 0.5)]
+        axes = [[x, np.linspace(0.0, 1.0, 9)], [np.array([2.0, 2.5]), np.linspace(1.0, 1.5, 5)]]
+        sides = {
+            BOTTOM: near(1, 0.0),
+            TOP: near(1, 1.5),
+            LOWER: between(1, 1.0, above=False),
+            UPPER: between(1, 1.0, above=True),
+        }
+        body = Bodies(boxes(axes, sides), E, 0.3)
+        side = body.constant()
+        body.hold(BOTTOM, 0, 1)
+        body.hold(TOP, 0, value=side)
+        body.hold(TOP, 1, value=-0.02)
+        law = fc.Frictionless(k_n=100 * E)
+        contact = body.contact(UPPER, LOWER, law, quadrature=given, kinematics="finite")
+        problem = body.problem(contact)
+        told = []
+        for side.value in (0.0, -1.0, -2.0, -2.0):
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                problem.solve()
+                problem.commit()
+            told.append([str(w.message) for w in caught if "times as short" in str(w.message)])
+        expected = [0, 0, 1, 0] if given is None else [0] * 4
+        assert [len(texts) for texts in told] == expected
+        if given is None:
+            assert "20 times as short" in told[2][0] and "quadrature_degree=78)" in told[2][0]
+        forces.append(contact.resultants().normal_force)
+    assert forces[0] < 0.85 * forces[1]
+
+
 @pytest.mark.parametrize("cell", CELLS)
 def test_points_are_as_many_as_the_opposite_facets_take(cell) -> None:
     """P + 1 on each side for every opposite facet, 10 here; a degree that is given is kept."""

@@ -173,6 +173,10 @@ class FollowedOpposite(BodyOpposite):
         """See `Opposite`."""
         return self._present.passed_through()
 
+    def times_as_long(self) -> Array:
+        """See `Opposite`."""
+        return self._present.times_as_long()
+
     @property
     def _update(self) -> str:
         """At a commit never: they follow all the time, whatever the support says."""

@@ -387,6 +387,13 @@ class Opposite(ABC):
         """
         raise ValueError(f'{self._parts.name}: there is none without kinematics="finite"')
 
+    def times_as_long(self) -> Array | None:
+        """How many times as long as the facet it meets is the one that a point is of, (n_points,).
+
+        0 of points that meet none; None where points do not see what lies opposite by themselves.
+        """
+        return None
+
     # ---- pairs -----------------------------------------------------------------------------------
 
     @property

@@ -303,6 +303,13 @@ class PresentPairs(Pairs):
         passed[some] = gone
         return passed
 
+    def times_as_long(self) -> Array:
+        """See `Opposite.times_as_long`."""
+        assert self._present is not None
+        met, here = self._present.hits.facet, self._rays.here
+        own = here.length[here.first + self._rays.facet]
+        return np.where(met >= 0, own / self._rays.there.length[met], 0.0)
+
     def _largest_way(self) -> float:
         """By how much two places can have come closer since the last commit. Collective."""
         change = (self._u.x.array - self._before.x.array).reshape(

@@ -46,6 +46,7 @@ class Side:
         facets: Those of this rank.
         first: Number of this rank's first facet among all.
         height: Of every facet's cell over it, (n,) (length).
+        length: The longest distance between two corners of the undeformed facet, (n,).
         body: Number of the connected part it bounds, (n,).
         vertices: Of its cell, global, (n, n_vertices).
         middle: Of the undeformed facet, (n, d).
@@ -66,6 +67,8 @@ class Side:
         self.vertices = np.concatenate(comm.allgather(own))
         self.body = np.concatenate(comm.allgather(body[facets.space.dofmap.list[facets.cells, 0]]))
         self.height = np.concatenate(comm.allgather(facets.heights()))
+        between = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=3)
+        self.length = np.concatenate(comm.allgather(between.max(axis=(1, 2), initial=0.0)))
         self.middle = gather_rows(comm, corners.mean(axis=1))
 
 

@@ -24,6 +24,7 @@ from fenics_contact.surface.mass import assembled
 from fenics_contact.types import Array, Indices
 
 __all__ = [
+    "FINEST_RULE",
     "ContactSurface",
     "PointEvaluator",
     "Sparse",
@@ -41,7 +42,7 @@ _PIERCING = 6
 # Degree of the finest rule that is taken unasked, by dimension: 40 points on a facet in the plane,
 # 16 in space. There pairs that are integrated piece by piece take 0.6 ms for an opposite facet at
 # degree 2, 2 at 6 and 15 at 14.
-_FINEST_RULE = {2: 78, 3: 6}
+FINEST_RULE = {2: 78, 3: 6}
 # Of one block on another in space, where points feel the opposite at themselves alone, force with
 # that rule over that with the finer side as Γc: by degree of the elements, and how many opposite
 # facets are as long as one of Γc, of which there are 1 and 2 x 2.
@@ -152,7 +153,7 @@ class ContactSurface:
             if pieces and coarser < _PIERCING:
                 coarser = 1
             wanted = coarser * (degree + 2) - 2
-            degree = max(degree, min(wanted, _FINEST_RULE[dim]))
+            degree = max(degree, min(wanted, FINEST_RULE[dim]))
             nodes_per_point = coarser * element_degree / (degree // 2 + 1)
             few = dim == 3 and not pieces and nodes_per_point > _NODES_PER_POINT
             if few and scheme == "default":
@@ -331,6 +332,7 @@ class SurfaceQuadrature:
     Attributes:
         surface: The `ContactSurface`.
         sparse: Whether, and by how much, there are too few points, where nobody asked for so few.
+        asked: Whether somebody has asked for that many.
         degree: Polynomial degree of the rule.
         ds: The measure of Γc with this rule.
         at_vertices: Whether the points are those of the rule "vertex".
@@ -347,6 +349,7 @@ class SurfaceQuadrature:
         if scheme == "vertex":
             degree = 1  # the rule of the vertices has no other
         self.surface, self.sparse = surface, sparse
+        self.asked = surface.quadrature_degree is not None or scheme != "default"
         self.degree = degree
         self.ds = surface.measure(degree, scheme)
         self._cell = surface.submesh.topology.cell_name()
