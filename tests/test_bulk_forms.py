@@ -7,7 +7,8 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.blocks import TOP, block, kirchhoff
+from fenics_contact.elasticity import LinearElastic
+from scenes.blocks import BOTTOM, LEFT, TOP, block, block_mesh, kirchhoff
 from scenes.comparing import (
     close,
     compiled,
@@ -18,7 +19,7 @@ from scenes.comparing import (
     raised_everywhere,
     same_field,
 )
-from scenes.elasticity import strain
+from scenes.elasticity import displacement_space, hold, strain
 from scenes.rubber import rubber
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
@@ -182,6 +183,27 @@ def test_axisymmetric(degree):
     assert same_field(
         scene.u, lambda x: np.vstack([nu * p / E * x[0], -p / E * x[1] - p / k_n]), 1e-9
     )
+
+
+@pytest.mark.parametrize("way", [(0.0, 0.0), (0.0, 1e3), (1e3, 0.0)])
+def test_a_mass_in_the_form_is_no_stiffness(way):
+    """As of inertia or a soft foundation, wherever the body is: 5 u of E = 1000, cells 1/4 high.
+
+    Reference: k_n = 5 E/h by the elastic part, to 1e-3, of which the mass of a cell is 3e-5; with
+    the way from the origin in it E was 0.3, 16 and 35 % too large.
+    """
+    mesh, tags = block_mesh("quadrilateral", n=4)
+    mesh.geometry.x[:, :2] += way
+    u = fem.Function(displacement_space(mesh, 1))
+    v = ufl.TestFunction(u.function_space)
+    F = LinearElastic(u, 1000.0, 0.3, "plane strain").residual(v)
+    F += fem.Constant(mesh, 5.0) * ufl.dot(u, v) * ufl.dx
+    law = fc.Frictionless(k_n=fc.Scaled(5.0))
+    surface = fc.ContactSurface(mesh, tags, BOTTOM)
+    contact = fc.Contact(u, surface, fc.HalfSpace(way, (0.0, 1.0)), law)
+    fc.ContactProblem(F, u, bcs=[hold(u, tags, LEFT, 0)], contacts=[contact]).solve()
+    k_n = gathered(COMM, contact.values.parameters["k_n"])
+    assert close(k_n, np.full(len(k_n), 5.0 * 1000.0 * 4), 1e-3)
 
 
 @pytest.mark.parametrize("kind", ["function", "ufl"])

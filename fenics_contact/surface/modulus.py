@@ -35,7 +35,8 @@ def cell_modulus(
     gives G, stretch u = (0, y, 0) gives M = λ + 2G; then E = G (3M - 4G)/(M - G). Exact for
     isotropic solids and plane strain; within some per cent for plane stress; the stiffness along
     y for others.
-    Both fields have no radial part, so that they serve axisymmetric forms too.
+    Both fields have no radial part, so that they serve axisymmetric forms too. They are zero on the
+    mean of each cell: a mass or a foundation in the form would measure the way from the origin.
 
     In a mixed form the stiffness of the volume is not that of displacements alone: E is 3 G, that
     of an incompressible body.
@@ -60,7 +61,8 @@ def cell_modulus(
     for direction in range(2):
         field = fem.Function(space)
         field.x.array[dofs[1 :: len(u)]] = x[:, direction]
-        form += ufl.replace(ufl.Form(cells), {test: q[direction] * field, trial: field})
+        local = field - _means(field)
+        form += ufl.replace(ufl.Form(cells), {test: q[direction] * local, trial: local})
     shear, stretch, volume = assembled(compile_form(form)).reshape(-1, 3).T
     shear, stretch = shear / volume, stretch / volume
     isotropic = stretch > 1.2 * shear  # λ > -0.8 G: else no isotropic solid, and E is the stretch's
@@ -72,6 +74,20 @@ def cell_modulus(
     G, M = shear[isotropic], stretch[isotropic]
     modulus.x.array[isotropic] = G * ((3 * M - 4 * G) / (M - G))
     return modulus
+
+
+def _means(field: fem.Function) -> fem.Function:
+    """Its mean on every cell. Collective."""
+    space = field.function_space
+    means = fem.Function(fem.functionspace(space.mesh, ("DG", 0, field.ufl_shape)))
+    q = ufl.TestFunction(means.function_space)
+    dx = ufl.dx(space.mesh)
+    one = ufl.as_vector([1.0] * len(field))
+    volume = fem.Function(means.function_space)
+    assembled(compile_form(ufl.inner(field, q) * dx), means.x)
+    assembled(compile_form(ufl.inner(one, q) * dx), volume.x)
+    means.x.array[:] /= volume.x.array
+    return means
 
 
 def modulus_over_height(
