@@ -480,6 +480,10 @@ def test_bad_arguments() -> None:
         ({"surface_on": 2}, ["surface_on is 2", "list"]),
         ({"facet_tags": joined.facets}, ["together"]),
         ({"name": "joint"}, ["name is given"]),
+        ({"itself": "yes"}, ["itself is 'yes'", "True"]),
+        ({"itself": 1}, ["itself is 1", "True"]),
+        ({"support": fc.HalfSpace((0, 0), (0, 1))}, ["support given", "make a Contact"]),
+        ({"surface": None, "opposite": 2}, ["surface and opposite given"]),
         ({"kinematics": "large"}, ["'large'"]),
         ({"update": "often"}, ["'often'"]),
     ):

@@ -94,7 +94,7 @@ def contact_pairs(
         ValueError: An argument is none of these, a cell has no tag, or facets are no part of the
             boundary; and what `Contact` refuses.
     """
-    _check(law, distance, bodies, facet_tags, tags, options)
+    _check(law, distance, bodies, facet_tags, tags, itself, options)
     space = Displacement(u, None, "contact_pairs").u.function_space
     mesh, comm = space.mesh, space.mesh.comm
     names, of_cell = _bodies(space, bodies)
@@ -135,7 +135,13 @@ def contact_pairs(
 
 
 def _check(
-    law: object, distance: Any, bodies: Any, facet_tags: Any, tags: Any, options: dict[str, Any]
+    law: object,
+    distance: Any,
+    bodies: Any,
+    facet_tags: Any,
+    tags: Any,
+    itself: Any,
+    options: dict[str, Any],
 ) -> None:
     """Refuse what has no sense."""
     if not callable(law) or isinstance(law, type):
@@ -149,6 +155,16 @@ def _check(
         )
     if (facet_tags is None) != (tags is None):
         raise ValueError("facet_tags and tags belong together; give both, or none for all facets")
+    if not isinstance(itself, bool | np.bool_):
+        raise ValueError(
+            f"itself is {itself!r}; give True where a body may touch itself, else False"
+        )
+    own = [name for name in ("surface", "support", "opposite") if name in options]
+    if own:
+        raise ValueError(
+            f"{' and '.join(own)} given; contact_pairs finds both sides of every contact itself: "
+            "leave it out, or make a Contact of these sides"
+        )
     if "name" in options:
         raise ValueError("name is given; contacts have the names of their bodies: leave it out")
 
