@@ -307,10 +307,42 @@ class RigidMotions:
         lacks = [np.any(was & ~now) for was, now in zip(known, bearing, strict=bool(known))]
         if self.comm.allreduce(not known or any(lacks)) == 0:
             return True
-        held = not self._loose(operators, closed_only=True).size
+        every = np.arange(len(self.free))
+        held = not self._loose(operators, every, closed_only=True).size
         if held:
             self._holding, self._holders = bearing, weakref.WeakSet(operators)
         return held
+
+    def to_stick(self, operators: Sequence[ContactOperator]) -> list[Mask]:
+        """Which points to hold, of those that slip, lest tangents let a body go. Collective.
+
+        The tangent of friction is none along it. As few as can be, of those that bear most. Motions
+        by which supports turn are not looked at.
+
+        Args:
+            operators: Of evaluated contacts, over all unknowns.
+
+        Returns:
+            A mask of the points of each.
+        """
+        rows, ways = self._straight(), []
+        loose = self._loose(operators, rows, closed_only=True, slips=True)
+        for operator in operators:
+            contact, modes = operator.contact, self.at_points(operator)[rows]
+            along = np.einsum("lm,mqd,qd->ql", loose, modes, _slip(contact))
+            bears = contact.measure * np.abs(contact.values.normal_traction)
+            ways.append(np.sqrt(bears)[:, None] * along)
+        numbers = np.cumsum([0] + [len(way) for way in ways])
+        hold = np.zeros(numbers[-1], dtype=bool)
+        if len(loose):
+            felt = gather_rows(self.comm, np.concatenate(ways))
+            _, most, order = scipy.linalg.qr(felt.T, mode="economic", pivoting=True)
+            sizes = np.abs(np.diag(most))
+            few = order[: len(sizes)][sizes > _FELT * sizes.max(initial=0.0)]
+            first = sum(self.comm.allgather(len(hold))[: self.comm.rank])
+            mine = agreed(self.comm, few) - first
+            hold[mine[(mine >= 0) & (mine < len(hold))]] = True
+        return np.split(hold, numbers[1:-1])
 
     def check_held(self, operators: Sequence[ContactOperator]) -> None:
         """Refuse a free motion that no contact feels, even if all of Γc were closed. Collective.
@@ -318,7 +350,7 @@ class RigidMotions:
         Raises:
             ValueError: It names the motion.
         """
-        loose = self._loose(operators, closed_only=False)
+        loose = self._loose(operators, np.arange(len(self.free)), closed_only=False) @ self.free
         if loose.size:
             motions = "; ".join(self.describe(row) for row in loose)
             finite = any(operator.contact.finite for operator in operators)
@@ -328,13 +360,27 @@ class RigidMotions:
                 "on it, or friction"
             )
 
-    def _loose(self, operators: Sequence[ContactOperator], closed_only: bool) -> Array:
-        """Free motions that no contact feels, (n_loose, n_modes). Collective."""
-        n_free = len(self.free)
+    def _loose(
+        self,
+        operators: Sequence[ContactOperator],
+        rows: Index,
+        *,
+        closed_only: bool,
+        slips: bool = False,
+    ) -> Array:
+        """What no contact feels of some free motions, (n_loose, n_rows). Collective.
+
+        Args:
+            operators: Of evaluated contacts, over all unknowns.
+            rows: Numbers of the free motions to look at.
+            closed_only: Whether the points that are closed now alone feel any.
+            slips: Whether those that slip feel no motion along their friction.
+        """
+        n_free = len(rows)
         gram, area = np.zeros((n_free, n_free)), 0.0
         for operator in operators:
             contact, values = operator.contact, operator.contact.values
-            modes = self.at_points(operator)
+            modes = self.at_points(operator)[rows]
             along = np.einsum("mqd,qd->mq", modes, values.normal)
             weights = contact.quadrature.weights
             if closed_only:
@@ -342,10 +388,13 @@ class RigidMotions:
             area += contact.quadrature.weights.sum()
             if contact.law.has_normal_stiffness:
                 gram += (along * weights) @ along.T
+            if slips:
+                way = _slip(contact)
+                modes = modes - np.einsum("mqd,qd->mq", modes, way)[:, :, None] * way
             gram += rubbing(contact, modes, weights)
         mean = global_sum(self.comm, gram) / max(float(global_sum(self.comm, area)), 1e-300)
         sizes, vectors = np.linalg.eigh(mean)
-        return agreed(self.comm, vectors[:, sizes < _FELT].T @ self.free)
+        return agreed(self.comm, vectors[:, sizes < _FELT].T)
 
     def _straight(self) -> Index:
         """Numbers of the free motions but for those by which supports turn."""
@@ -541,6 +590,14 @@ def _around(normal: Array) -> list[Array]:
     second = np.cross(normal, first)
     angles = 2 * np.pi * np.arange(_CONE_SIDES) / _CONE_SIDES
     return [np.cos(a) * first + np.sin(a) * second for a in angles]
+
+
+def _slip(contact: Contact) -> Array:
+    """Along the friction of the points that slip against it, of length 1 or 0, (n_points, gdim)."""
+    traction = contact.values.traction
+    size = np.linalg.norm(traction, axis=1)
+    slips = (contact.status == Status.SLIP) & (size > 0) & contact.law.has_friction
+    return np.asarray(traction * (slips / np.where(slips, size, 1.0))[:, None], dtype=np.float64)
 
 
 def rubbing(contact: Contact, modes: Array, weights: Array) -> Array:

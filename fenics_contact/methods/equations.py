@@ -7,9 +7,11 @@ that the same scene takes the same iterations in any units.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from itertools import chain
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from petsc4py import PETSc
 
 from fenics_contact.checks.chattering import StatusWatch
@@ -222,12 +224,7 @@ class Equations:
     def assemble_tangent(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
         """The consistent tangent of bulk and contact at ``x``. Collective."""
         self.evaluate(x)
-        # Until enough points are closed to hold the body its tangent is singular: take H₀ of the
-        # whole surface, as for the start of the quasi-Newton iteration.
-        if self.held():
-            self.assemble(matrix, self.tangents())
-        else:
-            self.assemble(matrix, self.stiffnesses(everywhere=True))
+        self.assemble(matrix, self.holding_tangents())
 
     def evaluate(self, x: PETSc.Vec) -> None:
         """Evaluate bulk and contacts at ``x``, where the residual was computed last. Collective."""
@@ -242,6 +239,31 @@ class Equations:
     def held(self) -> bool:
         """Whether the closed points hold all free motions. Collective."""
         return self.motions.held(self.full.operators)
+
+    def holding_tangents(self) -> Iterable[PETSc.Mat]:
+        """`tangents`, or more where they would let a body go anywhere. Collective."""
+        if self.held():
+            # Where all slips, what nothing but friction holds is loose along Γc.
+            stick = self.motions.to_stick(self.full.operators)
+            return chain(self.tangents(), self._springs([(0.0, points) for points in stick]))
+        if self._driven():
+            # H₀ of the whole surface, as for the start of the quasi-Newton iteration.
+            return self.stiffnesses(everywhere=True)
+        # A body is let go: to be held that firmly it would hardly spring back.
+        weak = [(_OPEN_SHARE, _OPEN_SHARE)] * len(self.contacts)
+        return chain(self.tangents(), self._springs(weak))
+
+    def _driven(self) -> bool:
+        """Whether the load on the free motions is felt beside the residual. Collective."""
+        driving = np.abs(self.motions.resultants(self.full.load)).max(initial=0.0)
+        return bool(driving > _OPEN_SHARE * self.norms.total)
+
+    def _springs(
+        self, shares: Iterable[tuple[npt.ArrayLike, npt.ArrayLike]]
+    ) -> Iterator[PETSc.Mat]:
+        """By every contact's share of its normal and its tangential stiffness at the points."""
+        for operator, (normal, tangential) in zip(self.system.operators, shares, strict=True):
+            yield operator.springs(operator.contact.springs(normal, tangential))
 
     def tangents(self) -> Iterator[PETSc.Mat]:
         """Consistent tangents of the contacts, which are evaluated. Collective."""

@@ -209,9 +209,7 @@ class Starts:
             for contact in full.contacts:
                 contact.evaluate()
             matrix = equations.matrix(True)
-            held = equations.held()
-            parts = equations.tangents() if held else equations.stiffnesses(everywhere=True)
-            equations.assemble(matrix, parts)
+            equations.assemble(matrix, equations.holding_tangents())
         assert full.stiffness is not None
         full.stiffness.mult(change, image)
         tractions = None if anew else self._tractions()

@@ -1,0 +1,114 @@
+"""Bodies that nothing but contact holds stay where their load leaves them, and where all slips.
+
+The tangent along friction is none: a body all of whose points slip is loose along its support, and
+one without a load has an equilibrium wherever it is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+
+import fenics_contact as fc
+from fenics_contact.elasticity import LinearElastic, NeoHookean
+from scenes.blocks import BOTTOM, TOP, block_mesh, dimension
+from scenes.comparing import close, gathered
+from scenes.elasticity import displacement_space
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+BULKS = {"linear": LinearElastic, "rubber": NeoHookean}
+
+
+class Free:
+    """A block of the size 1 on a floor that moves along, its traction on the top."""
+
+    def __init__(self, cell, bulk, n=3, friction=0.3, size=1.0, modulus=1e3, gap=0.0, **options):
+        """Make it of n cells along a side, in units of length and stress."""
+        d, self.size, self.unit = dimension(cell), size, modulus / 1e3
+        mesh, tags = block_mesh(cell, n=n)
+        mesh.geometry.x[:] *= size
+        self.u = fem.Function(displacement_space(mesh, 1))
+        v = ufl.TestFunction(self.u.function_space)
+        body = BULKS[bulk](self.u, modulus, 0.3, {2: "plane strain", 3: "3D"}[d])
+        self.traction = fem.Constant(mesh, np.zeros(d))
+        self.shift = fem.Constant(mesh, np.zeros(d))
+        F = body.residual(v, ufl.dx(mesh))
+        F -= ufl.dot(self.traction, v) * ufl.ds(mesh, subdomain_data=tags)(TOP)
+        point, normal = np.zeros(d), np.zeros(d)
+        point[-1], normal[-1] = -gap * size, 1.0
+        self.contact = fc.Contact(
+            self.u,
+            fc.ContactSurface(mesh, tags, BOTTOM),
+            fc.HalfSpace(point, normal, displacement=self.shift),
+            fc.Coulomb(friction=friction),
+            **options,
+        )
+        self.problem = fc.ContactProblem(F, self.u, contacts=[self.contact])
+
+    def go(self, side, press, along=0.0):
+        """Solve an increment: its iterations, and how far Γc is along the floor by its size."""
+        self.traction.value[[0, -1]] = side * self.unit, -press * self.unit
+        self.shift.value[0] = along * self.size
+        step = self.problem.solve()
+        self.problem.commit()
+        force = self.contact.resultants().force / (
+            self.unit * self.size ** (len(self.shift.value) - 1)
+        )
+        assert close(force[[0, -1]], [-side, press], 1e-8, scale=1.0)
+        comm = self.u.function_space.mesh.comm
+        place = gathered(comm, self.contact.own_displacement()[:, :1]) / self.size
+        return step.iterations, place.mean()
+
+
+@pytest.mark.parametrize(
+    ("bulk", "kinematics"), [("linear", "small"), ("linear", "finite"), ("rubber", "finite")]
+)
+@pytest.mark.parametrize("along", [0.0, 5.0])
+@pytest.mark.parametrize("side", [0.0, 0.1, 0.2])
+@pytest.mark.parametrize("gap", [0.0, 0.5])
+def test_a_block_that_is_let_go_stays(gap, side, along, bulk, kinematics):
+    """Pressed, pushed and carried along, let go, and pressed again.
+
+    Reference: where the floor has carried it, to 1e-3, the strain by which it springs back. Rubber
+    drifted by 0.1 to 35 of its size, in up to 65 iterations, and with small displacements a linear
+    block went back by all of the way.
+    """
+    scene = Free("quadrilateral", bulk, gap=gap, kinematics=kinematics)
+    first, _ = scene.go(side, 1.0)
+    scene.go(side, 1.0, along)
+    released, place = scene.go(0.0, 0.0, along)
+    assert abs(place - along) < 1e-3
+    assert first <= 10 and released <= 10
+    _, place = scene.go(side, 1.0, along)
+    assert abs(place - along) < 2e-3
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-4])
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron", "hexahedron"])
+def test_rubber_that_is_let_go_stays_in_any_units(cell, size):
+    """In the plane and in space; reference: as above."""
+    units = {"size": size, "modulus": 1e3 / size**2}
+    scene = Free(cell, "rubber", n=2, gap=0.1, kinematics="finite", **units)
+    scene.go(0.1, 1.0)
+    _, pushed = scene.go(0.2, 1.0)
+    released, place = scene.go(0.0, 0.0)
+    assert abs(place) < 1e-3 and abs(place - pushed) < 1e-3
+    assert released <= 15
+
+
+@pytest.mark.parametrize("bulk", BULKS)
+@pytest.mark.parametrize("friction", [0.02, 0.1])
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_all_points_slip(n, friction, bulk):
+    """Outwards, under a block that is pressed: only their sum holds it along the floor.
+
+    Reference: the load, and the place, to the strain of 1e-3. Rubber took up to 67 iterations, or
+    was refused.
+    """
+    scene = Free("quadrilateral", bulk, n=n, friction=friction, kinematics="finite")
+    for side, press in ((0.0, 1.0), (0.5 * friction, 1.0), (0.0, 0.0)):
+        iterations, place = scene.go(side, press)
+        assert iterations <= 30
+        assert abs(place) < 1e-3
