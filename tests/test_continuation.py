@@ -31,6 +31,20 @@ def test_the_same_solution(cell, degree):
     assert close(*states, 1e-6)
 
 
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_a_start_that_is_a_solution(cell):
+    """The same increment once more: there is nothing to iterate on. Reference: the state, to 1e-9.
+
+    It was led away from by soft contact, and where a support had carried a body, not back.
+    """
+    scene, problem, _ = pressed(cell, fc.Coulomb(0.3, k_n=2e4, k_t=1e4), "continuation", n=3)
+    problem.solve()
+    problem.commit()
+    before = nodal(scene.u)
+    assert problem.solve().iterations == 0
+    assert close(nodal(scene.u), before, 1e-9)
+
+
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize(("factor", "friction"), [(1e6, 0.0), (1e8, 0.0), (1e4, 0.3), (1e6, 0.3)])
 def test_stiff_contact_from_a_cold_start(method, factor, friction):

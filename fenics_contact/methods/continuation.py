@@ -5,7 +5,8 @@ solution of one that is a little softer: the points that are closed, stick and s
 of the next one, and for a given status the equations are linear, or nearly so. Where a step of the
 stiffness does not succeed, a smaller one may. Where none does, the branch of solutions may end, as
 it can with friction, and the alternation finds another. Soft contact that cannot bear the load says
-nothing of stiffer contact, which given displacements squeeze more: it is passed over.
+nothing of stiffer contact, which given displacements squeeze more: it is passed over. A start that
+is as near to the solution as that of a softer problem would be is not softened.
 """
 
 from __future__ import annotations
@@ -71,7 +72,11 @@ class Continuation(OwnMethod):
             lambda x, J: this._equations.assemble_tangent(x, J), lambda: this._test()
         )
         self._whole = [float(c.stiffness_factor.value) for c in equations.contacts]
-        share = min(1.0, 1.0 / max(equations.hardness(), 1.0))
+        soft = min(1.0, 1.0 / max(equations.hardness(), 1.0))
+        # From a start as near as they are solved to, softer problems only lead away.
+        equations.residual(equations.solution, equations.function)
+        near = soft < 1.0 and equations.solved(_COARSE)
+        share = 1.0 if near else soft
         iterations, solved, factor, kept = 0, 0.0, _FACTOR, equations.solution.copy()
         passed_over = False  # whether ``kept`` is no solution at ``solved``
         try:
@@ -82,6 +87,9 @@ class Continuation(OwnMethod):
                 self.by_newton = reason > 0
                 if reason <= 0:
                     kept.copy(equations.solution)
+                    if near:
+                        near, share = False, soft
+                        continue
                     if solved and not passed_over and factor > _LEAST_FACTOR:
                         factor = np.sqrt(factor)
                         share = min(1.0, factor * solved)
