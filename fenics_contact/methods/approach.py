@@ -66,17 +66,20 @@ class Approach:
     """
 
     def __init__(self, full: FullSystem, motions: RigidMotions) -> None:
-        """Take the present state for the one that bodies begin in."""
+        """Nothing has moved yet.
+
+        Args:
+            full: The system on all unknowns.
+            motions: Rigid motions of the bodies.
+        """
         self._full, self._motions = full, motions
-        self._rest = full.state()
         self.carried: Array | None = None
 
     def lead(self, load: Array, *, first: bool) -> bool:
         """Set bodies that nothing holds yet down, or move them to first touch. Collective.
 
-        One that was released before rests wherever that ended, turned perhaps by more than the load
-        will press it together. With small displacements it starts again from where it began; with
-        finite ones it is set down from where it was left, for that may be far along its support.
+        One that was released before is set down from where it was left, for that may be far along
+        its support.
 
         Args:
             load: External forces at this rank's unknowns (force).
@@ -95,16 +98,14 @@ class Approach:
         outside = np.abs(motions.resultants(load)).max(initial=0.0)
         borne = self._borne(committed=finite)
         idle = borne < _IDLE * outside
-        if idle and not finite:
-            self._go(np.where(full.constrained, full.state(), self._rest))
         which = self._untouched()
         if len(which) < len(motions.free) and motions.turning:
             # A support that turns freely is rolled by what its points slip, and first touch is a
             # point that does not tell.
             which = which[motions.of_any_body()[which]]
-        if finite and not first:
+        if not first:
             every = np.arange(len(motions.free))
-            carried = None if idle else self._carried()
+            carried = self._carried() if finite and not idle else None
             if idle:
                 which = every
             elif carried is not None:
