@@ -13,9 +13,11 @@ from dolfinx import fem
 
 import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic, NeoHookean
-from scenes.blocks import BOTTOM, TOP, block_mesh, dimension
+from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block_mesh, dimension
+from scenes.bodies import boxes
 from scenes.comparing import close, gathered
-from scenes.elasticity import displacement_space
+from scenes.elasticity import displacement_space, hold
+from scenes.tags import between, near
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
 BULKS = {"linear": LinearElastic, "rubber": NeoHookean}
@@ -113,3 +115,39 @@ def test_all_points_slip(n, friction, bulk):
         iterations, place = scene.go(side, press)
         assert iterations <= 30
         assert abs(place) < 1e-3
+
+
+def test_blocks_of_rubber_that_are_let_go_touch():
+    """Not more than by round-off of where they were pressed together, which is no fault.
+
+    Reference: the other block. One was refused for a depth of 1e-11 between two points of Γc.
+    """
+    upper, lower = np.linspace(0, 1, 3), np.linspace(-1, 2, 7)
+    mesh, tags = boxes(
+        [[lower, np.linspace(-1.1, -0.1, 3)], [upper - 0.06, upper]],
+        {
+            BOTTOM: between(1, 0.0, above=True),
+            TOP: near(1, 1.0),
+            LEFT: between(1, -0.1, above=False),
+            RIGHT: near(1, -1.1),
+        },
+        simplex=True,
+    )
+    u = fem.Function(displacement_space(mesh, 1))
+    v, traction = ufl.TestFunction(u.function_space), fem.Constant(mesh, np.zeros(2))
+    F = NeoHookean(u, 1e3, 0.3, "plane strain").residual(v, ufl.dx(mesh))
+    F -= ufl.dot(traction, v) * ufl.ds(mesh, subdomain_data=tags)(TOP)
+    contact = fc.Contact(
+        u,
+        fc.ContactSurface(mesh, tags, BOTTOM),
+        fc.DeformableBody(tags, LEFT),
+        fc.Coulomb(friction=0.3),
+        kinematics="finite",
+    )
+    bcs = [hold(u, tags, RIGHT, i, 0.0) for i in range(2)]
+    problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
+    for side, press in ((0.081, 1.0), (0.135, 1.0), (0.0, 0.0)):
+        traction.value[:] = side, -press
+        problem.solve()
+        problem.commit()
+    assert np.abs(contact.gap).max(initial=0.0) < 1e-3

@@ -14,6 +14,9 @@ from fenics_contact.types import Array
 
 __all__ = ["passing", "unseen_penetration"]
 
+# Less than this share of the penetration where the increment starts is none.
+_LEFT = 1e-6
+
 
 def unseen_penetration(
     contact: Contact, others: Sequence[Contact] = (), *, stiffness: float = 0.0
@@ -41,9 +44,13 @@ def unseen_penetration(
     if contact.rigid:
         return 0.0, np.zeros(contact.points.shape[1])
     comm, every = contact.surface.mesh.comm, (contact, *others)
+    deepest = max(global_max(comm, c.values.penetration) for c in every)
+    # Where a load is gone there is round-off of what it had pressed together.
+    before = [c.committed().points for c in every]
+    was = max((global_max(comm, points.penetration) for points in before if points), default=0.0)
     return contact.pairs.unseen_penetration(
         contact.values,
-        max(global_max(comm, c.values.penetration) for c in every),
+        max(deepest, _LEFT * was),
         [
             Holding(
                 c.pairs.search,
