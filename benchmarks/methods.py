@@ -1,10 +1,12 @@
-"""The five methods on three scenes with friction: iterations, factorisations and time.
+"""The five methods on five scenes with friction: iterations, factorisations and time.
 
     python benchmarks/methods.py
 
 Scenes: the half-cylinder of the demo (μ = 0.2, ten increments), the cylinder dragged over a block
 (μ = 0.3, ten increments), and in space a ball pressed into a block and dragged (μ = 0.3, five
-increments), each at moderate and at high contact stiffness. Without the fallback: a method that
+increments), each at moderate and at high contact stiffness; and with finite kinematics a linear
+elastic block dragged over a slab (μ = 0.3, twenty increments), in the plane and in space, by the
+methods that may be had there, at two moderate stiffnesses. Without the fallback: a method that
 fails is seen to fail, at the increment that is given. Writes a table in Markdown and a CSV; times
 are of the solves alone, medians of ``--repeat`` runs (of one, beyond five seconds), without what is
 compiled once.
@@ -15,6 +17,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import dolfinx
 import numpy as np
@@ -25,12 +28,13 @@ from mpi4py import MPI
 import fenics_contact as fc
 from benchmarks import timing
 from demos import ironing
-from scenes import problems
+from scenes import bodies, problems
 from scenes.elasticity import displacement_space, hold
-from scenes.tags import plane, sides
+from scenes.tags import between, near, plane, sides
 
 METHODS = ("lbfgs", "newton", "continuation", "alternating", "primal_dual")
 STIFFNESSES = (10.0, 1000.0)
+FAR_METHODS, FAR_STIFFNESSES = ("lbfgs", "newton", "continuation"), (1.0, 10.0)
 # Runs that take longer are not repeated (s).
 ONCE = 5.0
 Loading = tuple[fc.ContactProblem, Callable[[float], None], int]
@@ -99,18 +103,49 @@ def dragged(
     return fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method=method, fallback=False)
 
 
+def dragged_block(method: str | None, stiffness: float, *, d: int = 2) -> Loading:
+    """A block 0.5 wide pressed into a slab 1 wide and dragged by a quarter, not to its end."""
+    n, m = ((24, 13), (12, 7))[d - 2]  # no two nodes of the two are at one place
+    across = [np.linspace(0, 1, n + 1)] * (d - 1), [np.linspace(0.1, 0.6, m + 1)] * (d - 1)
+    upright = np.linspace(0, 0.5, n // 2 + 1), np.linspace(0.5, 1, m + 1)
+    floor, lower, upper, top = 1, 2, 3, 4
+    faces = {
+        floor: near(d - 1, 0.0),
+        lower: between(d - 1, 0.5, above=False),
+        upper: between(d - 1, 0.5, above=True),
+        top: near(d - 1, 1.0),
+    }
+    axes = [[*sideways, up] for sideways, up in zip(across, upright, strict=True)]
+    made = bodies.Bodies(bodies.boxes(axes, faces), 1000.0, 0.3, degree=4 - d)
+    side, down = made.constant(), made.constant()
+    made.hold(floor, *range(d))
+    made.hold(top, 0, value=side)
+    made.hold(top, *range(1, d - 1))
+    made.hold(top, d - 1, value=down)
+    k = fc.Scaled(stiffness)
+    contact = made.contact(upper, lower, fc.Coulomb(0.3, k, k), kinematics="finite")
+    problem = made.problem(contact, method=method, fallback=False)
+
+    def load(t: float) -> None:
+        side.value, down.value = 0.25 * max(t - 0.25, 0.0) / 0.75, -0.03 * min(4 * t, 1.0)
+
+    return problem, load, 20
+
+
 SCENES = {
-    "half-cylinder": half_cylinder,
-    "dragged cylinder": dragged_cylinder,
-    "dragged ball": dragged_ball,
+    "half-cylinder": (half_cylinder, METHODS, STIFFNESSES),
+    "dragged cylinder": (dragged_cylinder, METHODS, STIFFNESSES),
+    "dragged ball": (dragged_ball, METHODS, STIFFNESSES),
+    "dragged block": (dragged_block, FAR_METHODS, FAR_STIFFNESSES),
+    "dragged block, space": (partial(dragged_block, d=3), FAR_METHODS, FAR_STIFFNESSES),
 }
 
 
 def measure(repeats: int) -> Iterator[dict[str, object]]:
     """Run all scenes; one row for each method and stiffness."""
-    for scene, make in SCENES.items():
-        for stiffness in STIFFNESSES:
-            for method in METHODS:
+    for scene, (make, methods, stiffnesses) in SCENES.items():
+        for stiffness in stiffnesses:
+            for method in methods:
                 times, outcome, iterations, factorisations = [], "converged", 0, 0
                 for _ in range(repeats):
                     if max(times, default=0.0) > ONCE:
@@ -145,7 +180,7 @@ def main() -> None:
     for row in measure(1 if arguments.short else arguments.repeat):
         rows.append(row)
         print(*row.values(), sep="  ", flush=True)
-    title = "Five methods on three scenes with friction"
+    title = "Five methods on five scenes with friction"
     timing.write(arguments.output, "methods", title, rows)
 
 

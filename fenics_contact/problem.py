@@ -138,9 +138,10 @@ class ContactProblem:
                 factorisation costs as much as dozens of iterations, and condensed, where it costs
                 as much as ten, "newton", with "continuation" for the first increment, and again
                 "newton" where that is stuck; "newton" for a nonlinear bulk, too, whose tangent
-                changes. Where friction meets contact 50 to 1e5 times as stiff as the bulk
-                "primal_dual" comes before them, if it can be had. With a mixed function the
-                equations are those of a saddle point: "alternating" is refused there.
+                changes, and for bodies whose partners do, with finite kinematics. Where
+                friction meets contact 50 to 1e5 times as stiff as the bulk "primal_dual" comes
+                before them, if it can be had. With a mixed function the equations are those of a
+                saddle point: "alternating" is refused there.
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
                 paper has 0; 1 needs a third of the iterations once a point sticks.

@@ -13,6 +13,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from benchmarks.methods import dragged_block
 from scenes.blocks import CELLS
 from scenes.bodies import Bodies, boxes
 from scenes.elasticity import hold, residual
@@ -359,7 +360,7 @@ def test_points_are_as_many_as_the_opposite_facets_take(cell) -> None:
     assert degrees == [{2: 38, 3: 6}[d], 2, 3]  # 2n - 2 has n points a side; 6 is the limit
 
 
-def _pressed_by(cell, times, *, degree=1, own=LOWER, kinematics="finite", given=None):
+def _pressed_by(cell, times, *, degree=1, own=LOWER, kinematics="finite", given=None, **options):
     """A block of one cell under one of ``times`` along each side, moved down on it by a tenth."""
     mesh, tags = two_blocks(cell, (1, times))
     d = mesh.geometry.dim
@@ -374,7 +375,7 @@ def _pressed_by(cell, times, *, degree=1, own=LOWER, kinematics="finite", given=
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         F = residual(u, ufl.TestFunction(u.function_space), E, 0.3)
-        problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
+        problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], **options)
     texts = [str(w.message) for w in caught if "times as long" in str(w.message)]
     return problem, contact, texts
 
@@ -453,6 +454,32 @@ def test_long_and_narrow_facets_are_counted_across(here, there, told) -> None:
         problem.solve()
         forces.append(contact.resultants().normal_force)
     assert forces[0] == pytest.approx(forces[1], rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("kinematics", "solver", "method"),
+    [
+        ("finite", "direct", "newton"),
+        ("finite", "multigrid", "lbfgs"),
+        ("small", "direct", "lbfgs"),
+    ],
+)
+def test_method_of_linear_bodies_by_default(kinematics, solver, method) -> None:
+    """Newton's where partners change with every step; by multigrid a tangent is set up anew."""
+    options = {"kinematics": kinematics, "linear_solver": solver, "condensation": False}
+    problem, _, _ = _pressed_by("hexahedron", 2, **options)
+    assert problem.solve().attempts[0].method == method
+
+
+def test_a_linear_block_is_dragged_by_newtons_method() -> None:
+    """Over 6 facets of a slab, springs of 10 E/h, without another method and without cuts.
+
+    Reference: 139 iterations, less than 200; L-BFGS takes 793 and gives up at the tenth increment.
+    """
+    problem, load, steps = dragged_block(None, 10.0)
+    taken = list(fc.increments(problem, load, steps=steps, max_cuts=0))
+    assert len(taken) == steps and {step.method for step in taken} == {"newton"}
+    assert sum(step.iterations for step in taken) < 200
 
 
 def test_no_warning_of_a_coarse_surface_where_little_is_missing() -> None:

@@ -313,7 +313,7 @@ class RigidMotions:
             self._holding, self._holders = bearing, weakref.WeakSet(operators)
         return held
 
-    def to_stick(self, operators: Sequence[ContactOperator]) -> list[Mask]:
+    def to_stick(self, operators: Sequence[ContactOperator]) -> list[Mask] | None:
         """Which points to hold, of those that slip, lest tangents let a body go. Collective.
 
         The tangent of friction is none along it. As few as can be, of those that bear most. Motions
@@ -323,10 +323,12 @@ class RigidMotions:
             operators: Of evaluated contacts, over all unknowns.
 
         Returns:
-            A mask of the points of each.
+            A mask of the points of each; None: nothing lets a body go.
         """
         rows, ways = self._straight(), []
         loose = self._loose(operators, rows, closed_only=True, slips=True)
+        if not len(loose):
+            return None
         for operator in operators:
             contact, modes = operator.contact, self.at_points(operator)[rows]
             along = np.einsum("lm,mqd,qd->ql", loose, modes, _slip(contact))
@@ -334,14 +336,13 @@ class RigidMotions:
             ways.append(np.sqrt(bears)[:, None] * along)
         numbers = np.cumsum([0] + [len(way) for way in ways])
         hold = np.zeros(numbers[-1], dtype=bool)
-        if len(loose):
-            felt = gather_rows(self.comm, np.concatenate(ways))
-            _, most, order = scipy.linalg.qr(felt.T, mode="economic", pivoting=True)
-            sizes = np.abs(np.diag(most))
-            few = order[: len(sizes)][sizes > _FELT * sizes.max(initial=0.0)]
-            first = sum(self.comm.allgather(len(hold))[: self.comm.rank])
-            mine = agreed(self.comm, few) - first
-            hold[mine[(mine >= 0) & (mine < len(hold))]] = True
+        felt = gather_rows(self.comm, np.concatenate(ways))
+        _, most, order = scipy.linalg.qr(felt.T, mode="economic", pivoting=True)
+        sizes = np.abs(np.diag(most))
+        few = order[: len(sizes)][sizes > _FELT * sizes.max(initial=0.0)]
+        first = sum(self.comm.allgather(len(hold))[: self.comm.rank])
+        mine = agreed(self.comm, few) - first
+        hold[mine[(mine >= 0) & (mine < len(hold))]] = True
         return np.split(hold, numbers[1:-1])
 
     def check_held(self, operators: Sequence[ContactOperator]) -> None:

@@ -245,6 +245,8 @@ class Equations:
         if self.held():
             # Where all slips, what nothing but friction holds is loose along Γc.
             stick = self.motions.to_stick(self.full.operators)
+            if stick is None:
+                return self.tangents()
             return chain(self.tangents(), self._springs([(0.0, points) for points in stick]))
         if self._driven():
             # H₀ of the whole surface, as for the start of the quasi-Newton iteration.

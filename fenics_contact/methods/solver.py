@@ -196,8 +196,7 @@ class Solver:
         self.condensed = self._choose_condensation()
         self._full.linear_kind = self._choose_linear_solver()
         self._set_system()
-        cheap = self.condensed or not self._full.bulk.linear
-        self.method = settings.method or ("newton" if cheap else "lbfgs")
+        self.method = settings.method or self._choose_method()
         options.set(self._main_options(), prefix)
         snes_type = options.get(prefix + "snes_type")
         if snes_type is not None and snes_type not in _SNES_TYPES:
@@ -282,6 +281,17 @@ class Solver:
             logger.info("iterating on all unknowns: %s", obstacle)
         self._obstacle = obstacle
         return obstacle is None
+
+    def _choose_method(self) -> str:
+        """Newton's where a tangent is cheap, or another one is due with every step.
+
+        Pairs that follow the bodies go from facet to facet, and of no older tangent is much left.
+        By multigrid another one has to be set up.
+        """
+        full = self._full
+        follows = any(contact.opposite.follows for contact in full.contacts)
+        anew = not full.bulk.linear or (follows and full.linear_kind != "multigrid")
+        return "newton" if self.condensed or anew else "lbfgs"
 
     def _choose_linear_solver(self) -> str:
         """How to solve systems over all unknowns, one of `linear.KINDS`. Collective."""
