@@ -300,6 +300,14 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "Let the finer surface be Γc, or give its `quadrature_degree`, as is told. Earlier "
             "increments, before the warning, are as they were.",
         ),
+        "opposite surface ends": (
+            "With finite kinematics a point of Γc bears or not, as its normal meets the other body "
+            "or passes its end. Facets that an end divides bear much of the force, and one point "
+            "more or less counts there: blocks lacked up to 18 %, or bore too much. "
+            "[](finite.md) has what was measured.",
+            "Let the body whose surface is the smaller one have Γc, so that all of its points meet "
+            "the other; or finer facets, or a larger `quadrature_degree`.",
+        ),
         "have no opposite": (
             "More than half of Γc looks past the other body.",
             "Tags of Γc and of the opposite, `search_distance`, `release`.",

@@ -40,7 +40,9 @@ class Energy:
             round within it, or where the state is none that smaller increments lead to.
         sliding: The most that friction could have taken, by the sizes of tractions and slip.
         imbalance: Work minus elastic minus the work of all tractions on Γc: zero by equilibrium
-            at both ends, up to the solver's tolerance.
+            at both ends, up to the solver's tolerance. Not between bodies with finite kinematics,
+            whose points have other partners at both ends: what they felt of the one before is not
+            what the force on it does. It gets less with smaller increments.
     """
 
     work: float

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from fenics_contact.checks.few_points import warn_of_few_points
+from fenics_contact.checks.few_points import warn_of_divided_facets, warn_of_few_points
 from fenics_contact.checks.kinematics import Linearisation, linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.passing import passing
@@ -56,7 +56,7 @@ class Judge:
         self._contacts, self._comm = full.contacts, full.unknowns.comm
         self._imposed = motions.size
         self._told: set[str] = set()
-        self._pierced: set[str] = set()
+        self._few: set[tuple[str, str]] = set()
         space = full.displacement.u.function_space
         gdim = space.mesh.geometry.dim
         n_nodes = space.dofmap.index_map.size_global
@@ -145,10 +145,12 @@ class Judge:
                 )
 
     def warn_of_few_points(self) -> None:
-        """Say once of every contact that it has slid onto facets too short for it. Collective."""
+        """Say once of every contact where points are too few for where it is. Collective."""
         for contact in self._contacts:
-            if contact.name not in self._pierced and warn_of_few_points(contact):
-                self._pierced.add(contact.name)
+            for say in (warn_of_few_points, warn_of_divided_facets):
+                told = contact.name, say.__name__
+                if told not in self._few and say(contact):
+                    self._few.add(told)
 
     def _passing(self) -> dict[str, tuple[float, list[float]]]:
         """How deep bodies pass through between the points, by contact. Collective."""
