@@ -242,7 +242,7 @@ class Equations:
 
     def holding_tangents(self) -> Iterable[PETSc.Mat]:
         """`tangents`, or more where they would let a body go anywhere. Collective."""
-        if self.held():
+        if self.held() and not self._touches():
             # Where all slips, what nothing but friction holds is loose along Γc.
             stick = self.motions.to_stick(self.full.operators)
             if stick is None:
@@ -259,6 +259,19 @@ class Equations:
         """Whether the load on the free motions is felt beside the residual. Collective."""
         driving = np.abs(self.motions.resultants(self.full.load)).max(initial=0.0)
         return bool(driving > _OPEN_SHARE * self.norms.total)
+
+    def _touches(self) -> bool:
+        """Whether points that are closed bear next to nothing of the load on the free motions.
+
+        Those of a body that was set down are closed by round-off, some of many. Collective.
+        """
+        driving = np.abs(self.motions.resultants(self.full.load)).max(initial=0.0)
+        if not driving > 0:
+            return False
+        borne = sum(
+            float(c.measure @ np.abs(c.values.total_traction).sum(axis=1)) for c in self.contacts
+        )
+        return bool(global_sum(self._comm, borne) < _OPEN_SHARE * driving)
 
     def _springs(
         self, shares: Iterable[tuple[npt.ArrayLike, npt.ArrayLike]]
