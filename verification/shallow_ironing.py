@@ -67,7 +67,7 @@ def settings() -> dict[str, Setting]:
         "size 0.4": sized(0.4, 126),
         "size 0.283": coarse,
         "size 0.141": sized(0.141, 360),
-        "size 0.1": sized(0.1, 500, 1.0),
+        "size 0.1": sized(0.1, 500),
     }
     varied = {
         "augmented": replace(coarse, enforcement="augmented"),
@@ -81,7 +81,8 @@ def settings() -> dict[str, Setting]:
         "die 100 times stiffer": replace(coarse, die=100 * BASE.die),
     }
     runs |= {f"{name}, size 0.283": setting for name, setting in varied.items()}
-    return runs
+    degrees = {"degree 1, size 0.141": (1, sized(0.141, 360)), "degree 3, size 0.283": (3, coarse)}
+    return runs | {name: replace(made, degree=degree) for name, (degree, made) in degrees.items()}
 
 
 # ---- one run -------------------------------------------------------------------------------------
