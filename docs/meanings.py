@@ -303,7 +303,7 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "opposite surface ends": (
             "With finite kinematics a point of Γc bears or not, as its normal meets the other body "
             "or passes its end. Facets that an end divides bear much of the force, and one point "
-            "more or less counts there: blocks lacked up to 18 %, or bore too much. "
+            "more or less counts there: blocks lacked 8 and 13 % of the force. "
             "[](finite.md) has what was measured.",
             "Let the body whose surface is the smaller one have Γc, so that all of its points meet "
             "the other; or finer facets, or a larger `quadrature_degree`.",
