@@ -314,6 +314,16 @@ def test_a_turned_patch_bears_a_uniform_pressure():
     assert np.abs(along).max(initial=0.0) <= 1e-12
 
 
+def _led(cell, ways):
+    """Two bodies turned by 0.4 radians, the upper one led down and along from commit to commit."""
+    pair = Pair(cell, fc.Coulomb(0.3, k_n=1e3, k_t=5e2), kinematics="finite")
+    for down, along in ways:
+        pair.contact.commit()
+        pair.place(pair.pressed(pair.nodes, down, along) @ turn(pair.d, 0.4).T)
+        pair.contact.evaluate()
+    return pair
+
+
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 @pytest.mark.parametrize(
     ("ways", "through"),
@@ -329,11 +339,7 @@ def test_a_turned_patch_bears_a_uniform_pressure():
 )
 def test_points_that_go_through_a_body_are_seen(cell, ways, through):
     """Those that go straight through its surface in an increment, turned bodies as any."""
-    pair = Pair(cell, fc.Coulomb(0.3, k_n=1e3, k_t=5e2), kinematics="finite")
-    for down, along in ways:
-        pair.contact.commit()
-        pair.place(pair.pressed(pair.nodes, down, along) @ turn(pair.d, 0.4).T)
-        pair.contact.evaluate()
+    pair = _led(cell, ways)
     passed = np.flatnonzero(pair.contact.opposite.passed_through(pair.contact.values))
     n = MPI.COMM_WORLD.allreduce(len(passed))
     points = MPI.COMM_WORLD.allreduce(len(pair.contact.points))
@@ -352,11 +358,7 @@ def test_points_that_go_through_a_body_are_seen(cell, ways, through):
 )
 def test_points_that_have_gone_through_and_aside_are_seen(cell, ways, through):
     """Some of them: at the end their normals meet nothing of the body, before or behind them."""
-    pair = Pair(cell, fc.Coulomb(0.3, k_n=1e3, k_t=5e2), kinematics="finite")
-    for down, along in ways:
-        pair.contact.commit()
-        pair.place(pair.pressed(pair.nodes, down, along) @ turn(pair.d, 0.4).T)
-        pair.contact.evaluate()
+    pair = _led(cell, ways)
     assert not MPI.COMM_WORLD.allreduce(int(pair.contact.values.paired.any()))
     passed = pair.contact.opposite.passed_through(pair.contact.values)
     assert MPI.COMM_WORLD.allreduce(int(passed.any())) == through

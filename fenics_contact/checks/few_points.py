@@ -60,9 +60,9 @@ def warn_of_divided_facets(contact: Contact) -> bool:
     Args:
         contact: At an evaluated state.
     """
-    comm, points = contact.surface.mesh.comm, contact.quadrature.point_rows()
-    if contact.opposite.times_as_long() is None:
+    if not contact.opposite.follows:
         return False
+    comm, points = contact.surface.mesh.comm, contact.quadrature.point_rows()
     paired = contact.values.paired[points]
     divided = paired.any(axis=1) & ~paired.all(axis=1)
     force = (contact.measure * contact.pressure)[points].sum(axis=1)

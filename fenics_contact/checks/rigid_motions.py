@@ -413,6 +413,10 @@ class RigidMotions:
         """
         return global_sum(self.comm, (self._free_fields @ forces)[self._straight()])
 
+    def driving(self, load: Array) -> float:
+        """The largest of the `resultants` of a load, by size. Collective."""
+        return float(np.abs(self.resultants(load)).max(initial=0.0))
+
     def check_balance(self, load: Array, operators: Sequence[ContactOperator]) -> None:
         """Refuse a load whose resultant no admissible contact forces can balance. Collective.
 

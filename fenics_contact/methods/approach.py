@@ -95,8 +95,8 @@ class Approach:
         for contact in full.contacts:
             contact.evaluate()
         finite = all(contact.finite for contact in full.contacts)
-        outside = np.abs(motions.resultants(load)).max(initial=0.0)
-        borne = self._borne(committed=finite)
+        outside = motions.driving(load)
+        borne = full.borne(committed=finite)
         idle = borne < _IDLE * outside
         which = self._untouched()
         if len(which) < len(motions.free) and motions.turning:
@@ -120,19 +120,6 @@ class Approach:
         if len(which):
             self._set_down(load, which, released=borne < _LEFT * outside)
         return first or idle
-
-    def _borne(self, *, committed: bool) -> float:
-        """Sum of the sizes of contact forces, now or as they were committed. Collective.
-
-        Not their resultants: those of a body that friction has locked are zero. With finite
-        kinematics a support that moves away leaves nothing of what was borne.
-        """
-        total = 0.0
-        for contact in self._full.contacts:
-            points = contact.committed().points if committed else contact.values
-            if points is not None:
-                total += contact.measure @ np.abs(points.total_traction).sum(axis=1)
-        return float(global_sum(self._full.unknowns.comm, total))
 
     def _carried(self) -> Array | None:
         """How supports that have moved take bodies along. Collective.

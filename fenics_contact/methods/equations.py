@@ -260,21 +260,15 @@ class Equations:
 
     def _driven(self) -> bool:
         """Whether the load on the free motions is felt beside the residual. Collective."""
-        driving = np.abs(self.motions.resultants(self.full.load)).max(initial=0.0)
-        return bool(driving > _OPEN_SHARE * self.norms.total)
+        return self.motions.driving(self.full.load) > _OPEN_SHARE * self.norms.total
 
     def _touches(self) -> bool:
         """Whether points that are closed bear next to nothing of the load on the free motions.
 
         Those of a body that was set down are closed by round-off, some of many. Collective.
         """
-        driving = np.abs(self.motions.resultants(self.full.load)).max(initial=0.0)
-        if not driving > 0:
-            return False
-        borne = sum(
-            float(c.measure @ np.abs(c.values.total_traction).sum(axis=1)) for c in self.contacts
-        )
-        return bool(global_sum(self._comm, borne) < _OPEN_SHARE * driving)
+        driving = self.motions.driving(self.full.load)
+        return driving > 0 and self.full.borne() < _OPEN_SHARE * driving
 
     def _springs(
         self, shares: Iterable[tuple[npt.ArrayLike, npt.ArrayLike]]

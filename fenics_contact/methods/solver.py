@@ -289,8 +289,7 @@ class Solver:
         By multigrid another one has to be set up.
         """
         full = self._full
-        follows = any(contact.opposite.follows for contact in full.contacts)
-        anew = not full.bulk.linear or (follows and full.linear_kind != "multigrid")
+        anew = not full.bulk.linear or (full.follows and full.linear_kind != "multigrid")
         return "newton" if self.condensed or anew else "lbfgs"
 
     def _choose_linear_solver(self) -> str:

@@ -41,7 +41,7 @@ def obstacle_to_condensation(
         obstacle = "the bulk is not linear in u"
     elif full.displacement.mixed:
         obstacle = "displacements are a part of what is solved for"
-    elif any(contact.opposite.follows for contact in full.contacts):
+    elif full.follows:
         obstacle = "pairs follow the bodies wherever they go"
     elif named:
         obstacle = f"the options name a linear solver ({', '.join(named)})"

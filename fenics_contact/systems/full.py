@@ -10,7 +10,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
-from fenics_contact.parallel import global_max
+from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.systems import linear
@@ -179,6 +179,24 @@ class FullSystem(System):
         forces = [motion.force for c in self.contacts for motion in c.motions]
         return self.unknowns.joined(residual, -np.array(forces))
 
+    def borne(self, *, committed: bool = False) -> float:
+        """Sum of the sizes of contact forces, now or as they were committed. Collective.
+
+        Not their resultants: those of a body that friction has locked are zero. With finite
+        kinematics a support that moves away leaves nothing of what was borne.
+        """
+        total = 0.0
+        for contact in self.contacts:
+            points = contact.committed().points if committed else contact.values
+            if points is not None:
+                total += contact.measure @ np.abs(points.total_traction).sum(axis=1)
+        return float(global_sum(self.unknowns.comm, total))
+
+    @property
+    def follows(self) -> bool:
+        """Whether pairs of any contact follow the bodies."""
+        return any(contact.opposite.follows for contact in self.contacts)
+
     @property
     def pattern_changes(self) -> bool:
         """Whether what `fill` makes has another pattern each time.
@@ -188,9 +206,7 @@ class FullSystem(System):
         it, a new pattern a tenth; in the plane that is the larger part.
         """
         couples = self.gdim == 3 and any(c.couples for c in self.contacts)
-        return any(c.opposite.follows for c in self.contacts) or (
-            couples and self.linear_kind == "direct"
-        )
+        return self.follows or (couples and self.linear_kind == "direct")
 
     def matrix(self, *, symmetric: bool) -> PETSc.Mat:
         """A new matrix for `fill`. Collective.
