@@ -103,7 +103,9 @@ def dragged(
     return fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method=method, fallback=False)
 
 
-def dragged_block(method: str | None, stiffness: float, *, d: int = 2) -> Loading:
+def dragged_block(
+    method: str | None, stiffness: float, *, d: int = 2, fallback: bool = False
+) -> Loading:
     """A block 0.5 wide pressed into a slab 1 wide and dragged by a quarter, not to its end."""
     n, m = ((24, 13), (12, 7))[d - 2]  # no two nodes of the two are at one place
     across = [np.linspace(0, 1, n + 1)] * (d - 1), [np.linspace(0.1, 0.6, m + 1)] * (d - 1)
@@ -124,7 +126,7 @@ def dragged_block(method: str | None, stiffness: float, *, d: int = 2) -> Loadin
     made.hold(top, d - 1, value=down)
     k = fc.Scaled(stiffness)
     contact = made.contact(upper, lower, fc.Coulomb(0.3, k, k), kinematics="finite")
-    problem = made.problem(contact, method=method, fallback=False)
+    problem = made.problem(contact, method=method, fallback=fallback)
 
     def load(t: float) -> None:
         side.value, down.value = 0.25 * max(t - 0.25, 0.0) / 0.75, -0.03 * min(4 * t, 1.0)

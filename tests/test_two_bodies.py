@@ -505,20 +505,21 @@ def test_method_of_linear_bodies_by_default(kinematics, solver, method) -> None:
     assert problem.solve().attempts[0].method == method
 
 
-def test_a_linear_block_is_dragged_by_newtons_method() -> None:
-    """Over 6 facets of a slab, springs of 10 E/h, without another method and without cuts.
+def test_a_linear_block_is_dragged_over_a_slab() -> None:
+    """Over 6 facets, springs of 10 E/h, by the package's own choice and without cuts.
 
-    References: 139 iterations in 20 increments, less than 200; L-BFGS takes 793 and gives up at
-    the tenth. The imbalance of energies, of partners that change, is 0.65 of that in 10
-    increments, less than 0.8.
+    References: 124 iterations in 20 increments, less than 150. Newton's method to its own end took
+    117 to 206, for one increment in which it wanders from partner to partner by round-off, and so
+    by ranks; L-BFGS takes 793 and gives up at the tenth. The imbalance of energies, of partners
+    that change, is 0.65 of that in 10 increments, less than 0.8.
     """
     imbalances = []
     for steps in (10, 20):
-        problem, load, _ = dragged_block(None, 10.0)
+        problem, load, _ = dragged_block(None, 10.0, fallback=True)
         taken = list(fc.increments(problem, load, steps=steps, max_cuts=0))
-        assert len(taken) == steps and {step.method for step in taken} == {"newton"}
+        assert len(taken) == steps and all(step.attempts[0].method == "newton" for step in taken)
         imbalances.append(sum(abs(step.energy.imbalance) for step in taken))
-    assert sum(step.iterations for step in taken) < 200
+    assert sum(step.iterations for step in taken) < 150
     assert imbalances[1] < 0.8 * imbalances[0]
 
 

@@ -40,7 +40,7 @@ __all__ = ["METHODS", "Settings", "Solver"]
 
 logger = logging.getLogger("fenics_contact")
 
-# Iterations that Newton's method gets where it is slow, see `Solver._hurries`.
+# Iterations that Newton's method gets where it may be slow, see `Solver._hurries`.
 _ENOUGH = 15
 # Increments expected where nothing is said.
 _EXPECTED = 4
@@ -540,9 +540,10 @@ class Solver:
         """Whether Newton's method gets few iterations before stiffness is led up from soft.
 
         With friction on a nonlinear bulk points go from stick to slip one after another, each by a
-        factorisation, while the residual falls slowly.
+        factorisation, while the residual falls slowly. Where pairs follow the bodies it may wander
+        from partner to partner without falling at all, for how long depends on round-off.
         """
-        slow = not (self._full.bulk.linear or self.equations.has_potential)
+        slow = not (self._full.bulk.linear or self.equations.has_potential) or self._full.follows
         return slow and not self._quasi_newton and self.may_go_on()
 
     def _outcome(self, reason: int) -> str:
