@@ -54,18 +54,21 @@ def _turned(tool, matrix, side, up):
 
 
 @pytest.mark.parametrize(
-    ("shape", "enforcement"),
+    ("cell", "shape", "enforcement"),
     [
-        ("ball", "penalty"),
-        ("ball", "augmented"),
-        ("profile", "penalty"),
-        ("facets", "penalty"),
+        ("triangle", "ball", "penalty"),
+        ("triangle", "ball", "augmented"),
+        ("triangle", "profile", "penalty"),
+        ("tetrahedron", "ball", "penalty"),
+        ("tetrahedron", "ball", "augmented"),
+        ("tetrahedron", "profile", "penalty"),
+        ("tetrahedron", "facets", "penalty"),
     ],
 )
-@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
 def test_turning_the_whole_scene_only_turns_the_answer(cell, shape, enforcement):
     """Pressed and dragged, then all turned by 1.2 rad in four increments, then dragged on.
 
+    Not on 24 segments, where a point at a corner finds either of two answers, as steps have it.
     In space about an axis oblique to the normal. Tractions are those of the scene that was not
     turned, turned: 1e-9 of the largest, with multipliers whose rounds end there 1e-7.
     """
