@@ -34,9 +34,11 @@ def may_take_long(*, refused: bool) -> None:
 def touched_again(level, small, *, accuracy=None, cell="triangle", **options):
     """Press with ``level``, release, touch with ``small``, shear by a fifth of that: the forces.
 
-    The material is such that the heavy load compresses it by 1 %.
+    The material is such that the heavy load compresses it by 1 %. It stays where it is released,
+    off its first place: forces of that displacement have the round-off that is returned last.
     """
-    scene = block(cell, n=4, E=100 * level)
+    E = 100 * level
+    scene = block(cell, n=4, E=E)
     problem, contact = scene.problem(fc.Coulomb(0.3), [], contact={"accuracy": accuracy}, **options)
     found = []
     for up, side in ((-level, 0.0), (0.0, 0.0), (-small, 0.0), (-small, 0.2 * small)):
@@ -45,7 +47,9 @@ def touched_again(level, small, *, accuracy=None, cell="triangle", **options):
         problem.commit()
         force = contact.resultants().force
         found.append(np.array([force[0], force[-1]]))
-    return found
+        if up == 0.0:
+            left = COMM.allreduce(np.abs(scene.u.x.array).max(initial=0.0), MPI.MAX)
+    return found, np.finfo(float).eps * E * left
 
 
 @pytest.mark.parametrize("accuracy", [None, "draft", "standard", "fine"])
@@ -53,25 +57,27 @@ def touched_again(level, small, *, accuracy=None, cell="triangle", **options):
 def test_a_light_touch_after_a_heavy_one(level, accuracy):
     """The forces of earlier increments are no measure of those of this one.
 
-    One that is 1e11 times lighter, near the round-off of what was before, may be refused.
+    One that is 1e11 times lighter, near the round-off of what was before, may be refused. If not
+    its forces are right to ten times the round-off of where the body was left.
     """
     may_take_long(refused=level >= 1e7)
     small = 1e-4
     try:
-        pressed, _, touched, sheared = touched_again(level, small, accuracy=accuracy)
+        (pressed, _, touched, sheared), rounded = touched_again(level, small, accuracy=accuracy)
     except fc.NotConverged:
         assert level >= 1e7
         return
     rtol = 1e-8 if accuracy is None else fc.Accuracy.of(accuracy).rtol * 10
     assert abs(pressed[1] - level) <= rtol * level
-    assert np.abs(touched - [0, small]).max() <= rtol * small
-    assert np.abs(sheared - [-0.2 * small, small]).max() <= rtol * small
+    allowed = rtol * small + 10 * rounded
+    assert np.abs(touched - [0, small]).max() <= allowed
+    assert np.abs(sheared - [-0.2 * small, small]).max() <= allowed
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("condensation", [None, False])
 def test_a_light_touch_by_every_method(method, condensation):
-    *_, sheared = touched_again(1e3, 1e-4, method=method, condensation=condensation)
+    (*_, sheared), _ = touched_again(1e3, 1e-4, method=method, condensation=condensation)
     assert np.abs(sheared - [-0.2e-4, 1e-4]).max() <= 1e-8 * 1e-4
 
 
