@@ -66,8 +66,8 @@ class Setting:
         increments: While the die is dragged until t = 2.
         until: t at which to end.
         pressing: Increments while the die is pressed.
-        stiffness: Multiple of E/h of the die, of which k_n and k_t are. Its E is 10 times that of
-            the slab, its h 0.4 times: 1 of it is 25 E/h of the slab, where 10 is usual.
+        stiffness: Multiple of E/h of the die with ``finer`` at 0.4, of which k_n and k_t are. Its E
+            is 10 times that of the slab: 1 of it is 25 E/h of the slab, where 10 is usual.
         enforcement: "penalty" or "augmented".
         degree: Of the displacement.
         quadrature: Degree of the rule on Γc; by default the package's.
@@ -76,6 +76,7 @@ class Setting:
         height: Of the slab below its surface [mm].
         die: Young's modulus of the die [MPa].
         friction: μ.
+        finer: Size of the die's cells by that of the slab's.
     """
 
     size: float = 0.2
@@ -91,16 +92,18 @@ class Setting:
     height: float = HEIGHT
     die: float = DIE_E
     friction: float = MU
+    finer: float = FINER
 
 
 def make_mesh(
-    size: float, height: float = HEIGHT
+    size: float, height: float = HEIGHT, finer: float = FINER
 ) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags, dolfinx.mesh.MeshTags]:
     """Both bodies in one mesh, and the tags of its cells and facets. Collective.
 
     Args:
         size: Of the slab's cells down to 0.5 below its surface, growing from there on.
         height: Of the slab, whose surface stays where it is.
+        finer: See `Setting`.
     """
     gmsh.initialize()
     try:
@@ -142,7 +145,7 @@ def make_mesh(
             def cell_size(dim: int, tag: int, x: float, y: float, z: float, lc: float) -> float:
                 if y <= HEIGHT:
                     return size * (1.0 + max(0.0, HEIGHT - 0.5 - y))
-                return size * (FINER + 0.5 * max(0.0, y - SHOULDER))
+                return size * (finer + 0.5 * max(0.0, y - SHOULDER))
 
             gmsh.model.mesh.setSizeCallback(cell_size)
             gmsh.model.mesh.generate(2)
@@ -162,7 +165,7 @@ def solve(
     setting: Setting,
 ) -> tuple[list[dict[str, float]], fc.ContactProblem, NeoHookean, int]:
     """Press and drag; forces after each increment. Collective."""
-    mesh, cells, facets = make_mesh(setting.size, setting.height)
+    mesh, cells, facets = make_mesh(setting.size, setting.height, setting.finer)
     V = fem.functionspace(mesh, ("Lagrange", setting.degree, (2,)))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
     modulus = fem.Function(fem.functionspace(mesh, ("DG", 0)))
@@ -176,10 +179,11 @@ def solve(
         fem.dirichletbc(value, fem.locate_dofs_topological(V, 1, facets.find(tag)), V)
         for tag, value in ((BOTTOM, bottom), (TOP, top))
     ]
-    # E/h of the stiff die, which is 25 times that of the slab, by E of the softer body and h of Γc.
-    own, other, unit = SIDE, SURFACE, DIE_E / min(setting.die, SLAB_E)
-    if setting.side == "slab":
-        own, other, unit = SURFACE, SIDE, unit / FINER
+    # E/h of the stiff die, by E of the softer body and h of Γc.
+    unit = DIE_E / min(setting.die, SLAB_E) / FINER
+    own, other = (SIDE, SURFACE) if setting.side == "die" else (SURFACE, SIDE)
+    if own == SIDE:
+        unit *= setting.finer
     k = fc.Scaled(setting.stiffness * unit)
     contact = fc.Contact(
         u,

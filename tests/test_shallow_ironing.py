@@ -117,6 +117,16 @@ def test_the_page_says_what_was_found() -> None:
         assert made(study.results()) in text, made.__name__
 
 
+@pytest.mark.parametrize("times", ["twice", "half"])
+@pytest.mark.parametrize("quantity", page.QUANTITIES)
+def test_meshes_apart_move_no_more_than_the_error(quantity: str, times: str) -> None:
+    """The die's alone, coarser and finer than where both are refined together."""
+    rows = study.results()
+    moved = page.differences(rows, quantity)[f"cells of the die {times} as large{page.COARSE}"]
+    _, error = page.converged(rows, quantity)
+    assert 0.0 < abs(moved) < error
+
+
 def test_the_demo_has_the_spread_that_is_published() -> None:
     """Least and largest of the five."""
     for i, key in enumerate([(1.0, "V"), (1.5, "V"), (1.5, "H")]):

@@ -73,6 +73,8 @@ def settings() -> dict[str, Setting]:
         "augmented": replace(coarse, enforcement="augmented"),
         "a third of the stiffness": replace(coarse, stiffness=coarse.stiffness / 3),
         "Γc of slab": replace(coarse, side="slab"),
+        "cells of the die twice as large": replace(coarse, finer=2 * coarse.finer),
+        "cells of the die half as large": replace(coarse, finer=coarse.finer / 2),
         "80 increments of pressing": replace(coarse, pressing=80, until=1.0),
         "quadrature of degree 16": replace(coarse, quadrature=16),
         "360 increments of sliding": replace(coarse, increments=360),
