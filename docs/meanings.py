@@ -214,6 +214,11 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "A displacement is that of a body which nothing holds.",
             "Dirichlet conditions; units of stiffness and loads.",
         ),
+        "is thrown out: it has gone": (
+            "A body that nothing but contact holds was pushed out of sight of all others in one "
+            "step of the iteration, and is in equilibrium there, without any force.",
+            "Smaller increments; bodies that touch at first; a weak spring.",
+        ),
         "turned inside out": (
             "det(I + grad u) ≤ 0 at a point of a nonlinear bulk.",
             "Smaller increments, finer cells there.",

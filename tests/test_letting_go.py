@@ -12,9 +12,10 @@ import ufl
 from dolfinx import fem
 
 import fenics_contact as fc
+from fenics_contact.checks.strays import strays
 from fenics_contact.elasticity import LinearElastic, NeoHookean
 from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block_mesh, dimension
-from scenes.bodies import boxes
+from scenes.bodies import Bodies, boxes
 from scenes.comparing import close, gathered
 from scenes.elasticity import displacement_space, hold
 from scenes.tags import between, near
@@ -180,3 +181,66 @@ def test_a_block_that_was_let_go_is_set_down_on_a_slab():
     step = scene.go(0.0, 1.0, (0.2, -0.2))
     assert step.iterations <= 10
     assert close(scene.contact.resultants().force, [0.0, 1.0], 1e-8, scale=1.0)
+
+
+def _between_two(
+    n: int, m: int, modulus: float = 1e3
+) -> tuple[fc.ContactProblem, fem.Constant, Bodies]:
+    """Three blocks of rubber, n, m and m + 2 cells wide, 0.01 apart, the highest moved down."""
+    across = [np.linspace(*ends, k + 1) for ends, k in (((0, 1), n), ((0.2, 0.8), m))]
+    across.append(np.linspace(0.3, 0.7, m + 3))
+    upright = [np.linspace(*ends, 3) for ends in ((0, 0.3), (0.31, 0.51), (0.52, 0.72))]
+    faces = {
+        1: near(1, 0.0),
+        2: between(1, 0.3, above=False),
+        3: between(1, 0.31, above=True),
+        4: between(1, 0.51, above=False),
+        5: between(1, 0.52, above=True),
+        6: near(1, 0.72),
+    }
+    made = boxes(list(zip(across, upright, strict=True)), faces)
+    blocks = Bodies(made, modulus, 0.3)
+    blocks.F = NeoHookean(blocks.u, modulus, 0.3, "plane strain").residual(blocks.v)
+    down = blocks.constant()
+    blocks.hold(1, 0, 1)
+    blocks.hold(6, 0)
+    blocks.hold(6, 1, value=down)
+    law = fc.Coulomb(0.6)
+    contacts = [
+        blocks.contact(own, opposite, law, name=name, kinematics="finite")
+        for own, opposite, name in ((3, 2, "lower joint"), (5, 4, "upper joint"))
+    ]
+    return blocks.problem(*contacts), down, blocks
+
+
+@pytest.mark.parametrize(("n", "m"), [(8, 4), (8, 5)])
+def test_no_block_is_thrown_out_from_between_two_others(n, m):
+    """A step of the iteration threw the middle one out sideways, and all was in balance, at zero.
+
+    References: what presses on it from both sides is equal, for it has no load, and as much, to
+    5 %, as where it is not thrown out, of other cells: 0.0264 to 0.0267 E. Without cuts.
+    """
+    problem, down, _ = _between_two(n, m)
+    (step,) = fc.increments(problem, down, 0.0, -0.05, steps=1, max_cuts=0)
+    upper, lower = (step.contacts[f"{name} joint"].force for name in ("upper", "lower"))
+    assert close(upper, lower, 1e-6)
+    assert close(upper[1], 0.0265 * 1e3, 0.05)
+
+
+def test_a_body_that_is_thrown_out_is_told_of():
+    """By name, with its way and that of all else; not one that goes as far as others do.
+
+    References: the displacements given: the middle one 2 aside, where it touches nothing; the
+    highest one at rest, or 1 up.
+    """
+    problem, _, blocks = _between_two(6, 4)
+    u, before = problem.u, problem.full.state()
+    for way, names in ((0.0, ["body 2"]), (1.0, [])):
+        u.interpolate(lambda x, way=way: np.vstack([2.0 * (x[1] < 0.515), way * (x[1] > 0.515)]))
+        blocks.displace(lambda x: 0.0 * x[:2], lambda x: x[:, 1] < 0.305)
+        for contact in problem.contacts:
+            contact.evaluate()
+        forces = problem.full.contact_forces()
+        found = strays(problem.full, problem.motions, forces, before)
+        assert [name.split(",")[0] for name in found] == names
+        assert all(close(np.array(ways), [2.0, 0.0], 1e-12) for ways in found.values())

@@ -12,6 +12,7 @@ from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.passing import passing
 from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.second_route import SecondRoute
+from fenics_contact.checks.strays import strays
 from fenics_contact.checks.verdict import Balance, Verdict, check_laws
 from fenics_contact.parallel import global_max, global_sum, warn
 from fenics_contact.systems.forces import Forces
@@ -82,6 +83,7 @@ class Judge:
         bulk: Array,
         *,
         start: Array,
+        before: Array,
         rtol: float,
         laws: bool = True,
         respond: Respond | None = None,
@@ -92,6 +94,7 @@ class Judge:
             system: The unknowns on which the residual is looked at.
             bulk: Residual of the bulk on these.
             start: Norms of `System.terms` where the increment began, (n_bodies,).
+            before: The state in which the increment began.
             rtol: Residual that passes, as a share of the forces.
             laws: Whether to check the laws, too. If not, tractions are those evaluated last,
                 whatever has become of the laws' data since.
@@ -127,6 +130,9 @@ class Judge:
             kinematics_allowed=self.kinematics,
             displacement=global_max(self._comm, np.abs(self._full.displacement.u.x.array))
             / self._imposed,
+            strays=strays(self._full, self._motions, contacts, before)
+            if laws and system is self._full
+            else {},
             inverted=self._full.bulk.is_inverted(),
             routes=self._second_route.compare() if self._second_route and laws else {},
         )

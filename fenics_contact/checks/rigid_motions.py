@@ -197,6 +197,11 @@ class RigidMotions:
         bodies, _ = self._moved()
         return np.asarray(bodies.any(axis=1))
 
+    def loose(self) -> Mask:
+        """Which bodies a free motion moves, (n_bodies,)."""
+        bodies, _ = self._moved()
+        return np.asarray(bodies.any(axis=0))
+
     def present_fields(self) -> Array:
         """The same of the bodies where they are now, about the same centres."""
         return np.asarray(self.free @ self._modes_at(self._places()), dtype=np.float64)

@@ -78,6 +78,8 @@ class Verdict:
         kinematics_allowed: What passes; where it is finite no displacement passes that is more than
             ten times as large as the mesh, and as the motions and gaps that are imposed.
         displacement: The largest one, relative to these.
+        strays: Bodies that nothing touches any more, how far they have gone, and how far anything
+            else has (length), by their names; see `strays`.
         created: Share of the energy exchanged that friction has given; see `Energy.created`.
         inverted: Whether cells of a nonlinear bulk are turned inside out.
         routes: By contact the largest difference of its nodal forces from those that DOLFINx
@@ -95,6 +97,7 @@ class Verdict:
     kinematics: dict[str, Linearisation] = field(default_factory=dict)
     kinematics_allowed: float = np.inf
     displacement: float = 0.0
+    strays: dict[str, tuple[float, float]] = field(default_factory=dict)
     created: float = 0.0
     inverted: bool = False
     routes: dict[str, Balance] = field(default_factory=dict)
@@ -219,6 +222,12 @@ class Verdict:
                 f"a displacement is {self.displacement:.2g} times as large as the mesh: nothing "
                 "holds a body there, or stiffness and loads are in other units than lengths; or "
                 "accept it: ContactProblem(kinematics=inf)"
+            )
+        for name, (way, others) in self.strays.items():
+            found.append(
+                f"{name} is thrown out: it has gone {way:.2g} and touches nothing, where nothing "
+                f"else has moved by more than {others:.2g}; load in smaller steps (increments() "
+                "cuts them by itself), bring bodies to touch first, or hold it by a weak spring"
             )
         if self.inverted:
             found.append(

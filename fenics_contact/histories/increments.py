@@ -322,8 +322,10 @@ def _history(
                 if not isinstance(failure, NotConverged):
                     raise
                 failed += failure.attempts
-                # What passes through between the points does so in smaller increments, too.
-                if at.cuts == max_cuts or failure.verdict.unseen:
+                # What passes through between the points does so in smaller increments, too, unless
+                # bodies are thrown about.
+                pierced = failure.verdict.unseen and not failure.verdict.strays
+                if at.cuts == max_cuts or pierced:
                     failure.attempts = tuple(failed)
                     problem.complete()
                     raise

@@ -17,6 +17,7 @@ from petsc4py import PETSc
 from fenics_contact.checks.chattering import StatusWatch
 from fenics_contact.checks.overload import Overload, find_overload
 from fenics_contact.checks.rigid_motions import RigidMotions
+from fenics_contact.checks.strays import strays
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.systems.balance import Norms
@@ -50,6 +51,7 @@ class Equations:
         watch: What becomes of the status of the points from iteration to iteration.
         norms: Norms where `residual` was computed last.
         start: Norms of `System.terms` where the increment began, (n_bodies,).
+        began: State of `full` there.
         rtol: Residual that ends the whole solution, as a share of the forces.
         round_rtol: That of the present round of multipliers, if larger.
         solution: The state to start from and, after a method, the one found; dimensionless.
@@ -90,6 +92,7 @@ class Equations:
         self._h0_is_made = False
         self._hardness: tuple[Any, float] | None = None  # of what, and how much
         self.system: System = full
+        self.began: Array = full.state()
         self.solution, self.function = full.vector(), full.vector()
 
     def take(self, system: System) -> None:
@@ -109,14 +112,15 @@ class Equations:
     def residual(self, x: PETSc.Vec, f: PETSc.Vec) -> Norms:
         """Compute the residual at ``x`` into ``f``, and its norms, kept too. Collective.
 
-        It is not a number where cells are turned inside out, supports have turned too far, or Γc
-        has no tangent plane.
+        It is not a number where cells are turned inside out, supports have turned too far, Γc has
+        no tangent plane, or bodies are thrown out of sight of all others.
         """
         self.set_state(x)
         contacts = self.system.contact_forces()
         total = sum(contacts, self.system.bulk_force())
         system = self.system
-        if self._bulk.is_inverted() or system.is_twisted() or system.is_degenerate():
+        thrown = system is self.full and strays(self.full, self.motions, contacts, self.began)
+        if thrown or self._bulk.is_inverted() or system.is_twisted() or system.is_degenerate():
             total[:] = np.nan  # a line search takes a shorter step
         self.norms = self.system.norms(total, contacts, self.start)
         total[self.system.constrained] = 0.0
