@@ -455,7 +455,7 @@ class ContactProblem:
         solver.update_system(stiffness_changed)
         self.full.farthest = solver.system.farthest = self._judge.begin()
         solver.system.begin(load)
-        solver.equations.began = self._committed
+        solver.equations.began = self._committed if cold else None
         with solver.system.acting():
             reason, attempts, rounds = solver.solve(
                 ahead=ahead,
@@ -637,7 +637,7 @@ class ContactProblem:
             system,
             bulk,
             start=equations.start,
-            before=self._committed,
+            began=equations.began,
             rtol=equations.rtol,
             laws=laws,
             respond=self.solver.respond if kinematics else None,

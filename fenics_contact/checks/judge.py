@@ -83,7 +83,7 @@ class Judge:
         bulk: Array,
         *,
         start: Array,
-        before: Array,
+        began: Array | None,
         rtol: float,
         laws: bool = True,
         respond: Respond | None = None,
@@ -94,7 +94,7 @@ class Judge:
             system: The unknowns on which the residual is looked at.
             bulk: Residual of the bulk on these.
             start: Norms of `System.terms` where the increment began, (n_bodies,).
-            before: The state in which the increment began.
+            began: The state in which the increment began; None: something was borne in it.
             rtol: Residual that passes, as a share of the forces.
             laws: Whether to check the laws, too. If not, tractions are those evaluated last,
                 whatever has become of the laws' data since.
@@ -130,7 +130,7 @@ class Judge:
             kinematics_allowed=self.kinematics,
             displacement=global_max(self._comm, np.abs(self._full.displacement.u.x.array))
             / self._imposed,
-            strays=strays(self._full, self._motions, contacts, before)
+            strays=strays(self._full, self._motions, contacts, began)
             if laws and system is self._full
             else {},
             inverted=self._full.bulk.is_inverted(),

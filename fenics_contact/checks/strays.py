@@ -23,23 +23,25 @@ _STILL = 1e-6
 
 
 def strays(
-    full: FullSystem, motions: RigidMotions, contacts: Sequence[Array], before: Array
+    full: FullSystem, motions: RigidMotions, contacts: Sequence[Array], began: Array | None
 ) -> dict[str, tuple[float, float]]:
     """Bodies that have gone away, and on which no force acts. Collective.
 
     Such a body is in equilibrium wherever it is, and a step of an iteration that throws it out of
-    sight of all others leaves no residual.
+    sight of all others leaves no residual. A wedge that was pressed in may come out as far.
 
     Args:
         full: The system at its present state.
         motions: Rigid motions of the bodies.
         contacts: Forces of each at this rank's unknowns.
-        before: The state in which the increment began.
+        began: The state in which the increment began; None: something was borne in it.
 
     Returns:
         By its name how far a body has gone, and how far anything else has (length). With rigid
-        supports, whose points may go any way, nothing is looked at.
+        supports, whose points may go any way, and where something was borne, nothing is looked at.
     """
+    if began is None:
+        return {}
     loose = motions.loose()
     if not loose.any() or not all(contact.opposite.follows for contact in full.contacts):
         return {}
@@ -50,7 +52,7 @@ def strays(
     gone = loose & (borne <= _NOTHING * full.bulk.scale * motions.size)
     if not gone.any():
         return {}
-    change, bodies = full.state() - before, motions.of_bodies[:, : full.gdim]
+    change, bodies = full.state() - began, motions.of_bodies[:, : full.gdim]
     sums = global_sum(comm, np.column_stack([bodies @ change, bodies[:, 0].sum(axis=1)]))
     ways = sums[:, :-1] / sums[:, -1:]
     # Of a body that has gone away it is the change of its shape, or its turn.

@@ -51,7 +51,7 @@ class Equations:
         watch: What becomes of the status of the points from iteration to iteration.
         norms: Norms where `residual` was computed last.
         start: Norms of `System.terms` where the increment began, (n_bodies,).
-        began: State of `full` there.
+        began: State of `full` there; None: something was borne.
         rtol: Residual that ends the whole solution, as a share of the forces.
         round_rtol: That of the present round of multipliers, if larger.
         solution: The state to start from and, after a method, the one found; dimensionless.
@@ -92,7 +92,7 @@ class Equations:
         self._h0_is_made = False
         self._hardness: tuple[Any, float] | None = None  # of what, and how much
         self.system: System = full
-        self.began: Array = full.state()
+        self.began: Array | None = None
         self.solution, self.function = full.vector(), full.vector()
 
     def take(self, system: System) -> None:
