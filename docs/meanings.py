@@ -223,12 +223,11 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "det(I + grad u) ≤ 0 at a point of a nonlinear bulk.",
             "Smaller increments, finer cells there.",
         ),
-        "passes through Γc between its points": (
-            "A corner or middle of the opposite body is on the other side, where Γc has no point. "
-            "Smaller increments do not help, and the increment is not cut.",
-            "Let the finer surface be Γc, refine it there, or add a second contact with the "
-            "surfaces "
-            "swapped.",
+        "penetrates between the quadrature points": (
+            "A place of either surface lies deeper in what is opposite than the points of Γc around "
+            "it resist: an edge, a corner or an obstacle narrower than the points are apart.",
+            "Let the finer surface be Γc, refine it there, give a larger `quadrature_degree`, or "
+            "add a second contact with the surfaces swapped.",
         ),
         "the distance of the Obstacle changes": (
             "`Obstacle(distance=...)` is no distance where contact is.",
@@ -238,9 +237,11 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "A point is so deep in a curved support that it is about to leave on the other side.",
             'A larger k_n, or `enforcement="augmented"`.',
         ),
-        "has gone through Γc": (
-            "The support is on the other side of Γc after one increment.",
-            "Smaller increments; `increments` cuts by itself.",
+        "has crossed what lies opposite": (
+            "In one increment a place of Γc entered the obstacle or the other body on one side and "
+            "left it, or is about to, on another; or it came in where no point of Γc resists.",
+            "Smaller increments (`increments` cuts by itself); all sides that may touch in Γc and in "
+            "the opposite surface.",
         ),
         "rad in one increment": (
             "The support turns by more than a right angle in one increment, with friction.",

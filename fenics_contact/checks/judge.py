@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from dolfinx import fem
 
 from fenics_contact.checks.few_points import warn_of_divided_facets, warn_of_few_points
 from fenics_contact.checks.kinematics import Linearisation, linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
-from fenics_contact.checks.passing import passing
 from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.second_route import SecondRoute
 from fenics_contact.checks.strays import strays
+from fenics_contact.checks.tunnelling import TunnellingCheck
 from fenics_contact.checks.verdict import Balance, Verdict, check_laws
 from fenics_contact.parallel import global_max, global_sum, warn
 from fenics_contact.systems.forces import Forces
@@ -56,6 +57,7 @@ class Judge:
         self._second_route = SecondRoute(full.contacts) if second_route else None
         self._contacts, self._comm = full.contacts, full.unknowns.comm
         self._imposed = motions.size
+        self._tunnelling = TunnellingCheck(full.contacts)
         self._told: set[str] = set()
         self._few: set[tuple[str, str]] = set()
         space = full.displacement.u.function_space
@@ -87,6 +89,7 @@ class Judge:
         rtol: float,
         laws: bool = True,
         respond: Respond | None = None,
+        before: fem.Function | None = None,
     ) -> tuple[Verdict, Forces]:
         """Recompute residual, balance and laws at evaluated contacts. Collective.
 
@@ -99,6 +102,8 @@ class Judge:
             laws: Whether to check the laws, too. If not, tractions are those evaluated last,
                 whatever has become of the laws' data since.
             respond: To look at what small displacements leave out; None: it is not looked at.
+            before: The displacement at the last commit, to look at the paths of the increment;
+                None: they are not looked at.
 
         Returns:
             The verdict, and the forces at the unknowns, reactions included.
@@ -119,13 +124,9 @@ class Judge:
             laws={c.name: check_laws(c) for c in self._contacts} if laws else {},
             enforcement={c.name: c.enforcement_error() for c in augmented},
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
+            obstacles={c.name: ObstacleCheck.of(c) for c in self._contacts if laws and c.rigid},
             # Of the opposite only what Γc meets is known before u is complete.
-            unseen=self._passing() if system is self._full else {},
-            obstacles={
-                c.name: ObstacleCheck.of(c)
-                for c in self._contacts
-                if laws and (c.rigid or c.opposite.follows)
-            },
+            tunnelling=self._tunnelling.evaluate(before) if system is self._full else {},
             kinematics=self._linearisation(respond) if respond else {},
             kinematics_allowed=self.kinematics,
             displacement=global_max(self._comm, np.abs(self._full.displacement.u.x.array))
@@ -157,11 +158,6 @@ class Judge:
                 told = contact.name, say.__name__
                 if told not in self._few and say(contact):
                     self._few.add(told)
-
-    def _passing(self) -> dict[str, tuple[float, list[float]]]:
-        """How deep bodies pass through between the points, by contact. Collective."""
-        by_area = self._cell_size ** (1 - self._full.gdim)
-        return passing(self._contacts, self._full.bulk.scale * by_area)
 
     def _linearisation(self, respond: Respond) -> dict[str, Linearisation]:
         """What taking displacements as small changes at this state, by contact. Collective."""

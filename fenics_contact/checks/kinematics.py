@@ -15,7 +15,7 @@ import numpy as np
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_max, global_min, global_sum
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Mask
 
 __all__ = ["Deviation", "LinearSprings", "Linearisation", "linearisation"]
 
@@ -25,6 +25,8 @@ _NEGLIGIBLE = 1e-3
 # Slide, as a share of the smallest facet, and difference of the displacements on Γc, as a share of
 # its size, below which pairs in the deformed bodies are those of before.
 _SLID, _TURNED = 1e-2, 1e-3
+# Round-off of a gap, relative to the coordinates that it is the difference of.
+_ROUND_OFF = 1e-12
 
 
 @dataclass(frozen=True)
@@ -107,44 +109,69 @@ class Linearisation:
 
 @dataclass(frozen=True)
 class Deviation:
-    """How gap and normal differ from the linearised ones at the bearing points of a contact.
+    """How gap and normal at the points differ from the linearised ones.
 
     Attributes:
-        gap: True gap minus s - u_n where points are closed, 0 elsewhere, (n_points,) (length).
-        turn: Change of the unit normal there, (n_points, gdim).
+        gap: True gap minus s - u_n where points are closed, the true gap where points that are open
+            penetrate, 0 elsewhere, (n_points,) (length).
+        turn: Change of the unit normal of closed points, (n_points, gdim).
+        normal: The true unit normal, (n_points, gdim).
+        lost: Closed points that have nothing opposite any more, (n_points,).
+        closing: Open points that penetrate where the bodies have moved to, (n_points,).
     """
 
     gap: Array
     turn: Array
+    normal: Array
+    lost: Mask
+    closing: Mask
 
     @classmethod
     def of(cls, contact: Contact) -> Deviation:
         """At the evaluated state of a contact; nothing where it could not be told. Collective."""
         values, closed = contact.values, contact.status != Status.OPEN
-        none = cls(np.zeros(len(closed)), np.zeros_like(values.normal))
+        zero, nothing = np.zeros(len(closed)), np.zeros(len(closed), dtype=np.bool_)
+        none = cls(zero, np.zeros_like(values.normal), values.normal, nothing, nothing)
         flat = contact.finite or contact.support.is_flat
         if flat or not (contact.rigid or _moves(contact)):
             return none
         change, normal = contact.opposite.deviation(values)
         if not contact.rigid:
             # It jumps from point to point; what is answered to is a function on Γc.
-            smooth = contact.traces(np.nan_to_num(change))
-            change = np.where(np.isnan(change), np.nan, smooth)
-        told = closed & np.isfinite(normal).all(axis=1)
-        turn = np.where(told[:, None], normal - values.normal, 0.0)
+            paired = contact.paired & ~np.isnan(change)
+            smooth = contact.traces(np.where(paired, change, 0.0))
+            change = np.where(paired, smooth, change)
+        told = np.isfinite(normal).all(axis=1)
+        turn = np.where((told & closed)[:, None], normal - values.normal, 0.0)
         if contact.gap_prescribed:
-            return cls(none.gap, turn)
-        # A point that has left the opposite bears nothing in truth.
-        change = np.where(np.isnan(change), values.penetration, change)
-        return cls(np.where(told, change, 0.0), turn)
+            return cls(zero, turn, values.normal, nothing, nothing)
+        true = np.where(contact.paired, values.gap, 0.0) + change
+        size = np.linalg.norm(values.x, axis=1) + contact.quadrature.facet_sizes
+        closing = told & ~closed & (true < -_ROUND_OFF * size)
+        lost = told & closed & np.isnan(change)
+        gap = np.where(told & closed & ~lost, change, np.where(closing, true, 0.0))
+        return cls(gap, turn, normal, lost, closing)
 
-    def shift(self, contact: Contact) -> Array:
-        """Displacement at the points that closes the linearised gap as much, (n_points, gdim)."""
-        return -self.gap[:, None] * contact.values.normal
+    def springs(self, contact: Contact) -> LinearSprings:
+        """The springs of the contact where the bodies have moved to: lost ones and new ones."""
+        springs = LinearSprings.of(contact)
+        k_n = np.where(self.closing, contact.normal_stiffness, 0.0)
+        added = k_n[:, None, None] * np.einsum("qi,qj->qij", self.normal, self.normal)
+        kept = np.where(self.lost[:, None, None], 0.0, springs.stiffness)
+        return LinearSprings(kept + added, springs.stretch)
 
-    def turned(self, contact: Contact) -> Array:
-        """Change of the traction by the turn of the normal, (n_points, gdim) (stress)."""
-        return contact.values.normal_traction[:, None] * self.turn
+    def added(self, contact: Contact, springs: LinearSprings) -> Array:
+        """Change of the tractions while displacements stay, (n_points, gdim) (stress).
+
+        Args:
+            contact: The contact.
+            springs: What `springs` gave.
+        """
+        traction, values = contact.traction, contact.values
+        turned = values.normal_traction[:, None] * self.turn
+        along = np.where(self.closing[:, None], self.normal, values.normal)
+        change = turned + springs.change(-self.gap[:, None] * along)
+        return np.where(self.lost[:, None], -traction, change)
 
 
 def _borne_by_springs(contact: Contact) -> Array:
@@ -169,12 +196,12 @@ def _borne_by_springs(contact: Contact) -> Array:
 def _moves(contact: Contact) -> bool:
     """Whether bodies slide or turn by enough for a search anew to find anything. Collective."""
     comm, values = contact.surface.mesh.comm, contact.values
-    rows = contact.quadrature.point_rows()
     d = values.normal.shape[1]
-    facets = contact.quadrature.weights[rows].sum(axis=1) ** (1 / (d - 1))
-    smallest = global_min(comm, facets, empty=np.inf)
-    slid = global_max(comm, np.linalg.norm(values.slide, axis=1))
+    smallest = global_min(comm, contact.quadrature.facet_sizes, empty=np.inf)
     x, u = values.x, contact.own_displacement()
+    # A point without an opposite may find one wherever it goes.
+    slide = np.where(contact.paired[:, None], values.slide, u)
+    slid = global_max(comm, np.linalg.norm(slide, axis=1))
     spread = np.zeros((2, d))
     for i in range(d):
         for row, field in zip(spread, (x[:, i], u[:, i]), strict=True):
@@ -201,19 +228,18 @@ def linearisation(
     for contact, deviation in zip(contacts, deviations, strict=True):
         comm, measure = contact.surface.mesh.comm, contact.measure
         d = contact.points.shape[1]
-        sums = global_sum(comm, [measure @ (contact.pressure > 0)])
-        size = float(sums[0]) ** (1 / (d - 1)) or 1.0
-        largest = global_max(comm, np.abs(contact.traction))
-        if not largest > 0:
-            continue
-        turn = global_max(comm, np.abs(deviation.turn))
+        sums = global_sum(comm, [measure @ (contact.pressure > 0), measure.sum()])
+        size = float(sums[0] or sums[1]) ** (1 / (d - 1)) or 1.0
+        largest = global_max(comm, np.linalg.norm(contact.traction, axis=1))
+        turn = largest * global_max(comm, np.linalg.norm(deviation.turn, axis=1))
         push = modulus / size * global_max(comm, np.abs(deviation.gap))
-        matters |= not (turn <= _NEGLIGIBLE and push <= _NEGLIGIBLE * largest)
+        lost = global_max(comm, np.linalg.norm(contact.traction[deviation.lost], axis=1))
+        matters |= not max(turn, push, lost) <= _NEGLIGIBLE * largest
     if not matters:
         return {c.name: Linearisation() for c in contacts}
-    springs = [LinearSprings.of(c) for c in contacts]
-    triples = zip(deviations, contacts, springs, strict=True)
-    added = [d.turned(c) + s.change(d.shift(c)) for d, c, s in triples]
+    pairs = list(zip(deviations, contacts, strict=True))
+    springs = [d.springs(c) for d, c in pairs]
+    added = [d.added(c, s) for (d, c), s in zip(pairs, springs, strict=True)]
     jumps = respond([s.stiffness for s in springs], added)
     return {
         c.name: _relative(c, traction + s.change(jump))
@@ -229,6 +255,8 @@ def _relative(contact: Contact, change: Array) -> Linearisation:
     along = np.sum(change * contact.values.normal, axis=1) / largest
     squares = [measure @ along**2, measure @ (contact.pressure / largest) ** 2]
     changed, whole = np.sqrt(global_sum(comm, squares))
+    # Where the contact bears nothing all of what it ought to bear is missing.
+    size = size or float(global_sum(comm, measure @ np.linalg.norm(change, axis=1)))
     force = float(np.abs(sums[1]).max()) / size if size else 0.0
     pressure = float(changed / whole) if whole else 0.0
     return Linearisation(force, pressure, not contact.rigid)

@@ -24,32 +24,27 @@ _TURN = np.pi / 2 + 1e-9
 
 @dataclass(frozen=True)
 class ObstacleCheck:
-    """Of one contact with a rigid support, or with a body that goes far; the same on every rank.
+    """Of one contact with a rigid obstacle; the same on every rank.
 
     Attributes:
         slope: Length of the gradient of the distance at closed points, where it is farthest from 1.
         depth: With finite kinematics the largest penetration, by the distance from there to the
             centre of curvature of the support.
-        passed: Likewise a place of the undeformed Γc that has gone through the support to its other
-            side in this increment; None: there is none.
         turn: By which the support has turned in this increment where there is friction (radians).
     """
 
     slope: float
     depth: float
-    passed: list[float] | None
     turn: float = 0.0
 
     @classmethod
     def of(cls, contact: Contact) -> ObstacleCheck:
         """At the evaluated state of a contact. Collective."""
         comm, closed = contact.surface.mesh.comm, contact.status != Status.OPEN
-        if not contact.rigid:
-            return cls(1.0, 0.0, _passed(contact))
         slopes = contact.opposite.slope(contact.values)[closed]
         ends = global_min(comm, slopes, empty=1.0), global_max(comm, slopes, empty=1.0)
         slope = max(ends, key=lambda value: abs(value - 1.0))
-        depth, passed = 0.0, None
+        depth = 0.0
         if contact.finite and not contact.support.is_flat:
             curvature = contact.opposite.curvature()[closed]
             sunk = contact.values.penetration[closed]
@@ -58,10 +53,9 @@ class ObstacleCheck:
             bend = np.full(len(sunk), np.inf)
             bend[known] = np.linalg.eigvalsh(curvature[known]).max(axis=1, initial=0.0)
             depth = global_max(comm, sunk * bend)
-            passed = _passed(contact)
         rubs = contact.law.has_friction and comm.allreduce(int(closed.any())) > 0
         turn = abs(contact.opposite.turned_by(contact.values)) if rubs else 0.0
-        return cls(slope, depth, passed, turn)
+        return cls(slope, depth, turn)
 
     def failures(self, contact: str) -> list[str]:
         """What does not hold, in words."""
@@ -78,11 +72,6 @@ class ObstacleCheck:
                 "and about to come out on its other side; take a larger k_n, or "
                 'enforcement="augmented"'
             )
-        if self.passed is not None:
-            found.append(
-                f"{contact}: the support has gone through Γc, at {np.round(self.passed, 6)}, in "
-                "one increment; load in smaller steps"
-            )
         if not self.turn <= _TURN:
             found.append(
                 f"{contact}: the support turns by {self.turn:.3g} rad in one increment, in which "
@@ -90,10 +79,3 @@ class ObstacleCheck:
                 "right angle in each"
             )
         return found
-
-
-def _passed(contact: Contact) -> list[float] | None:
-    """A place of the undeformed Γc that has gone through the support. Collective."""
-    passed = contact.opposite.passed_through(contact.values)
-    gone = contact.surface.mesh.comm.allgather(contact.points[passed].tolist())
-    return next((places[0] for places in gone if places), None)

@@ -9,6 +9,7 @@ import numpy as np
 
 from fenics_contact.checks.kinematics import Linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
+from fenics_contact.checks.tunnelling import Tunnelling
 from fenics_contact.contact.contact import Contact
 from fenics_contact.markup import shown
 from fenics_contact.parallel import global_max
@@ -71,9 +72,9 @@ class Verdict:
         laws: Largest violations by contact and by law, relative; see `check_laws`.
         enforcement: `Contact.enforcement_error` of the contacts with multipliers, by name.
         enforcement_tolerance: What passes, by name.
-        unseen: How deep the opposite body passes through Γc between its points (length), and where,
-            by the names of the contacts where it does; see `unseen_penetration`.
         obstacles: What is found of supports that are rigid or go far, by contact.
+        tunnelling: Penetration that the points of a contact do not resist, and places that have
+            crossed what lies opposite, by contact; see `Tunnelling`.
         kinematics: What taking displacements as small changes, relative, by contact.
         kinematics_allowed: What passes; where it is finite no displacement passes that is more than
             ten times as large as the mesh, and as the motions and gaps that are imposed.
@@ -92,8 +93,8 @@ class Verdict:
     laws: dict[str, dict[str, float]] = field(default_factory=dict)
     enforcement: dict[str, float] = field(default_factory=dict)
     enforcement_tolerance: dict[str, float] = field(default_factory=dict)
-    unseen: dict[str, tuple[float, list[float]]] = field(default_factory=dict)
     obstacles: dict[str, ObstacleCheck] = field(default_factory=dict)
+    tunnelling: dict[str, Tunnelling] = field(default_factory=dict)
     kinematics: dict[str, Linearisation] = field(default_factory=dict)
     kinematics_allowed: float = np.inf
     displacement: float = 0.0
@@ -236,12 +237,8 @@ class Verdict:
             )
         for contact, obstacle in self.obstacles.items():
             found += obstacle.failures(contact)
-        for contact, (depth, place) in self.unseen.items():
-            found.append(
-                f"{contact}: the opposite body passes through Γc between its points, {depth:.3e} "
-                f"deep near {np.round(place, 6).tolist()}; let the finer surface be Γc, refine Γc "
-                "there, or add a second contact with the surfaces swapped"
-            )
+        for contact, tunnelling in self.tunnelling.items():
+            found += tunnelling.failures(contact)
         return found
 
 

@@ -18,7 +18,7 @@ from fenics_contact.contact.values import PointValues
 from fenics_contact.parallel import global_max
 from fenics_contact.supports.base import Placement
 from fenics_contact.supports.deformable import DeformableBody
-from fenics_contact.types import Array, Mask
+from fenics_contact.types import Array
 
 __all__ = ["BodyOpposite", "FollowedOpposite"]
 
@@ -65,7 +65,8 @@ class BodyOpposite(Opposite):
     def deviation(self, values: PointValues) -> tuple[Array, Array]:
         """See `Opposite`."""
         gap, normal = self.true_placement(values)
-        return gap - self.pairs.linear_gap(values), normal
+        linear = np.where(self.pairs.paired, self.pairs.linear_gap(values), 0.0)
+        return gap - linear, normal
 
     @property
     def pairs_anew(self) -> bool:
@@ -168,10 +169,6 @@ class FollowedOpposite(BodyOpposite):
     def turned(self, vectors: Array) -> Array:
         """See `Opposite`: of the committed bodies."""
         return self._present.turned(vectors)
-
-    def passed_through(self, values: PointValues) -> Mask:
-        """See `Opposite`."""
-        return self._present.passed_through()
 
     def times_as_long(self) -> Array:
         """See `Opposite`."""

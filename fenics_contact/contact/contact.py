@@ -31,6 +31,7 @@ from fenics_contact.laws.base import Law
 from fenics_contact.supports.base import SampledSupport, Support
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.displacement import Displacement, check_kind
+from fenics_contact.surface.facet_places import FacetPlaces
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import ContactSurface, tagged_facets
 from fenics_contact.types import Array, Mask
@@ -513,6 +514,11 @@ class Contact(PointResults):
     def traces(self) -> TraceProjection:
         """The projection on functions on Γc that displacements can answer to. Collective."""
         return TraceProjection(self.quadrature, self.displacement.degree)
+
+    @cached_property
+    def facet_places(self) -> FacetPlaces:
+        """Places between the points, on the facets of Γc. Collective."""
+        return FacetPlaces(self.quadrature, self.u.function_space, self.points)
 
     # ---- state -----------------------------------------------------------------------------------
 

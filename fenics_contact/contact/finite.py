@@ -36,6 +36,7 @@ __all__ = [
     "View",
     "check_places",
     "check_rigid",
+    "is_known_everywhere",
 ]
 
 
@@ -335,13 +336,18 @@ def check_places(name: str, place: Callable[[Any], Placement], mesh: Any) -> Non
     Raises:
         ValueError: It says what to give.
     """
-    anywhere = fem.Constant(mesh, np.zeros(mesh.geometry.dim))
-    placement = place(anywhere)
-    parts = placement.gap, ufl.as_vector(placement.direction)
-    fixed = [extract_type(e, (ufl.SpatialCoordinate, ufl.Coefficient)) for e in parts]
-    if any(fixed) or anywhere not in extract_constants(placement.gap):
+    if not is_known_everywhere(place, mesh):
         raise ValueError(
             f"{name}: the support is given on the undeformed Γc, and finite kinematics need it at "
             "every place: give an Obstacle(distance=lambda x: ...), with all coordinates taken "
             "from its argument, or another rigid support by numbers and constants"
         )
+
+
+def is_known_everywhere(place: Callable[[Any], Placement], mesh: Any) -> bool:
+    """Whether gap and normal follow from the place alone, wherever it is (UFL)."""
+    anywhere = fem.Constant(mesh, np.zeros(mesh.geometry.dim))
+    placement = place(anywhere)
+    parts = placement.gap, ufl.as_vector(placement.direction)
+    fixed = [extract_type(e, (ufl.SpatialCoordinate, ufl.Coefficient)) for e in parts]
+    return not any(fixed) and anywhere in extract_constants(placement.gap)

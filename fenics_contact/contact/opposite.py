@@ -24,6 +24,7 @@ from petsc4py import PETSc
 
 from fenics_contact.contact.inputs import Inputs, check_given
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
+from fenics_contact.contact.obstacle_sampler import ObstacleSampler
 from fenics_contact.contact.pairs import Pairs, PairsState
 from fenics_contact.contact.point_data import PointData
 from fenics_contact.contact.point_law import AnyKinematics, PointLaw, PointTangent
@@ -35,7 +36,7 @@ from fenics_contact.supports.base import Placement, Support
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import SurfaceQuadrature
-from fenics_contact.types import Array, Mask
+from fenics_contact.types import Array
 
 __all__ = ["Opposite", "OppositeState", "Parts"]
 
@@ -94,6 +95,8 @@ class Opposite(ABC):
         carries: Whether it is a support that takes along what sticks to it by any amount.
         pairs_anew: Whether pairs are found anew, on the deformed bodies, at every commit.
         degenerate: Whether Γc has lost its tangent plane somewhere, where pairs follow the bodies.
+        sampler: What evaluates a rigid obstacle anywhere; None where it is known on Γc alone, or
+            the opposite is another body.
         local_map: Sparse map from ``u`` to what derivatives at the points are by, where that is
             another than ``pairs.jump_map``; None: there is none.
     """
@@ -102,6 +105,7 @@ class Opposite(ABC):
     is_rigid = True
     follows = False
     carries = False
+    sampler: ObstacleSampler | None = None
 
     def __init__(
         self,
@@ -287,6 +291,8 @@ class Opposite(ABC):
     def deviation(self, values: PointValues) -> tuple[Array, Array]:
         """True gap less the linearised one, and the true normal; see `true_placement`. Collective.
 
+        Of a point that has no opposite in the linearised kinematics it is the true gap.
+
         Between facets that do not match it jumps from point to point. Nothing deviates where the
         true gap is not known.
         """
@@ -376,16 +382,18 @@ class Opposite(ABC):
             f'{self._parts.name}: there is none without kinematics="finite" and a rigid support'
         )
 
-    def passed_through(self, values: PointValues) -> Mask:
-        """Points that have gone through what lies opposite since the last commit, (n_points,).
+    def rotation_in_increment(self, values: PointValues) -> Callable[[Array, Array | float], Array]:
+        """Turns places by shares of the rotation of the obstacle since the last commit.
 
-        Of points that go straight on, and a support that turns evenly, with finite kinematics.
-        Collective.
+        Collective; what it returns is not.
 
-        Raises:
-            ValueError: Displacements are taken as small.
+        Args:
+            values: Of the last evaluation.
+
+        Returns:
+            A function of places, (n, gdim) (length), and shares, (n,) or one for all.
         """
-        raise ValueError(f'{self._parts.name}: there is none without kinematics="finite"')
+        return lambda places, share: places
 
     def times_as_long(self) -> Array | None:
         """How many times as long as the facet it meets is the one that a point is of, (n_points,).

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,21 +9,15 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.contact.values import PointValues
-from fenics_contact.parallel import gather_rows, global_max, global_sum, warn
+from fenics_contact.parallel import global_sum, warn
 from fenics_contact.supports.base import Support
 from fenics_contact.supports.deformable import DeformableBody
-from fenics_contact.surface.pairing import LookBack, Pairing
+from fenics_contact.surface.pairing import Pairing
 from fenics_contact.surface.rays import REASONS
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["Holding", "Pairs", "PairsState"]
-
-
-# Share of the approach of two bodies that is no penetration between the points yet.
-_UNSEEN = 0.01
-# A pressure below this share of what the depth would take of the bodies, E/h times it, is none.
-_BEARS = 1e-6
+__all__ = ["Pairs", "PairsState"]
 
 
 @dataclass(frozen=True)
@@ -36,33 +29,6 @@ class PairsState:
     n_unpaired: int
     distance: Array
     found_at: fem.Function | None
-
-
-@dataclass(frozen=True)
-class Holding:
-    """What of a contact with another body may hold its Γc up.
-
-    Attributes:
-        search: Its surfaces.
-        values: At its points.
-        closed: Which of them are.
-        stiffness: Of the bodies by area and by the contact's weight, about E/h (stress/length).
-    """
-
-    search: Pairing
-    values: PointValues
-    closed: Mask
-    stiffness: float
-
-    def facets(self, depth: float) -> Index:
-        """This rank's facets of Γc with points that hold a body up which is so deep.
-
-        One that turns about a point bears next to nothing there, and is not deep.
-        """
-        values = self.values
-        bears = np.linalg.norm(values.total_traction, axis=1) >= _BEARS * self.stiffness * depth
-        holds = self.closed & (bears | (values.penetration >= _UNSEEN * depth))
-        return np.unique(self.search.surface.facets[self.search.rays.facet[holds]])
 
 
 class Pairs:
@@ -97,7 +63,6 @@ class Pairs:
         self.distance: fem.Function | None = None
         self.acts: fem.Function | None = None
         self.found_at: fem.Function | None = None
-        self._looking_back: LookBack | None = None
         if isinstance(support, DeformableBody):
             self.search = Pairing(support, quadrature, u.function_space)
             self.distance = fem.Function(quadrature.space(), name="distance")
@@ -114,7 +79,6 @@ class Pairs:
         """
         assert self.search and self.distance and self.acts
         opposite, distance, why = self.search.pair(x, normal, u, depth)
-        self._forget_look_back()
         self.found_at = None if u is None else u.copy()
         self.distance.x.array[: len(distance)] = np.nan_to_num(distance)
         self.distance.x.scatter_forward()
@@ -162,7 +126,6 @@ class Pairs:
         if self.jump_map is state.jump_map:
             return
         assert self.distance and self.acts
-        self._forget_look_back()
         self.jump_map, self.paired = state.jump_map, state.paired
         self.n_unpaired, self.found_at = state.n_unpaired, state.found_at
         self.number += 1  # what was made of the pairs in between is of others
@@ -201,69 +164,3 @@ class Pairs:
             self._u,
             self.own_displacement(),
         )
-
-    def _look_back(self, depth: float) -> tuple[LookBack, Array]:
-        """What the opposite sees of Γc, and by how much that has come closer. Collective.
-
-        Args:
-            depth: The largest of Γc in the opposite (length).
-        """
-        assert self.search is not None
-        if self._looking_back is None:
-            self._looking_back = self.search.look_back(self.found_at, depth)
-        back = self._looking_back
-        assert back.approach is not None
-        product = back.approach.createVecLeft()
-        back.approach.mult(self._u.x.petsc_vec, product)
-        approach = product.array_r.copy()
-        product.destroy()
-        return back, approach
-
-    def _forget_look_back(self) -> None:
-        if self._looking_back is not None and self._looking_back.approach is not None:
-            self._looking_back.approach.destroy()
-        self._looking_back = None
-
-    def unseen_penetration(
-        self,
-        values: PointValues,
-        deepest: float,
-        holding: Sequence[Holding],
-        *,
-        gap_prescribed: bool,
-    ) -> tuple[float, Array]:
-        """See `unseen_penetration`. Collective.
-
-        Args:
-            values: At the points.
-            deepest: Penetration at the deepest point of all contacts (length).
-            holding: Of this, then of all other contacts with a body, what may hold Γc up.
-            gap_prescribed: Whether the gap was given apart from the geometry.
-        """
-        comm, search = self._mesh.comm, self.search
-        nowhere = 0.0, np.zeros(self._gdim)
-        if search is None:
-            return nowhere
-        back, approach = self._look_back(global_max(comm, self.depth(values.normal_displacement)))
-        distance = back.distance
-        if gap_prescribed:
-            distance = search.largest(values.initial_gap)[back.facet]
-        allowed = max(deepest, _UNSEEN * global_max(comm, np.abs(approach)), search.round_off)
-        deep = approach - distance - back.slack - allowed
-        if not global_max(comm, deep, empty=-1.0) > 0:
-            return nowhere
-        for each in holding:  # what has points of its own that look back
-            mutual = search.facets_among(each.search.facets)[back.facet]
-            deep[mutual & np.isin(back.source, each.search.surface.facets)] = -1.0
-        depth = global_max(comm, np.where(deep > 0, approach - distance, 0.0))
-        own, *others = (each.facets(depth) for each in holding)
-        held = search.facets_near(own)
-        if others:
-            held |= search.at_rim() & search.facets_near(np.concatenate(others))
-        deep[held[back.facet]] = -1.0
-        rows = np.column_stack([approach - distance, back.place])[deep > 0]
-        rows = gather_rows(comm, rows)
-        if not len(rows):
-            return nowhere
-        worst = rows[np.argmax(rows[:, 0])]
-        return float(worst[0]), worst[1:]

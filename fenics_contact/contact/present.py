@@ -34,8 +34,7 @@ from fenics_contact.laws.base import Kinematics, Law, Response
 from fenics_contact.parallel import global_max
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.fields import PointFields
-from fenics_contact.surface.pairing import LookBack
-from fenics_contact.surface.rays import BEHIND, Hits
+from fenics_contact.surface.rays import Hits
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.types import Array, Mask
 
@@ -46,8 +45,6 @@ __all__ = ["PresentKinematics", "PresentPairs"]
 _NO_WEIGHT = 1e-14
 # Determinant of the metric of unit vectors below which they span nothing.
 _FLAT = 1e-20
-# Parts of an increment, in each of which a point is seen to go through at most one surface.
-_PARTS = 8
 
 
 @dataclass(frozen=True)
@@ -77,7 +74,6 @@ class _Present:
         way: V, (n_points, d) (length).
         rotation: R, (n_points, d, d).
         stretch: Of the surface from the committed to the present one, Rᵀ F, (n_points, d, d).
-        deep: How deep the bodies were in each other at the last commit, at all facets (length).
     """
 
     along: Array
@@ -87,7 +83,6 @@ class _Present:
     way: Array
     rotation: Array
     stretch: Array
-    deep: Array
 
 
 class PresentPairs(Pairs):
@@ -174,9 +169,7 @@ class PresentPairs(Pairs):
         gradient += normal[:, :, None] * before.normal[:, None, :]
         rotation = _polar(gradient)
         stretch = np.einsum("qji,qjk->qik", rotation, gradient)
-        self._present = _Present(
-            _reciprocal(tangents), normal, gap, hits, way, rotation, stretch, deep
-        )
+        self._present = _Present(_reciprocal(tangents), normal, gap, hits, way, rotation, stretch)
         self._set_pairs(hits.matrix(self._u.function_space), paired)
         if self.number == 1:
             self._warn_of_unpaired(hits.reason)
@@ -260,68 +253,12 @@ class PresentPairs(Pairs):
         """See `Pairs.linear_gap`: nothing is linearised."""
         return self.true_gap(values)[0]
 
-    def passed_through(self) -> Mask:
-        """Points that have gone through the opposite since the last commit, (n_points,).
-
-        They are behind it, deeper than bodies may be in each other, nothing else of that body is
-        opposite them, and they were in front: seen in parts of the increment, in which all goes
-        straight on. Those whose normals meet nothing any more were as deep on the way. Collective.
-        """
-        assert self._present is not None and self._where is not None and self.search is not None
-        now, before = self._present, self._before
-        here, there = self._rays.here, self._rays.there
-        passed = np.zeros(len(now.gap), dtype=np.bool_)
-        height = here.height[here.first + self._rays.facet]
-        behind = now.hits.reason >= BEHIND
-        lost = (now.hits.facet < 0) & ~behind & (height < self._largest_way())
-        some = behind | lost
-        if not self._mesh.comm.allreduce(int(some.any())):
-            return passed
-        facet, place = self._rays.facet[some], self._where[0][some]
-        lost, height, set_of = lost[some], height[some], here.facets
-        # What counted as in front at the start may have been that deep.
-        depth = 2 * now.deep[here.first + facet] + self.search.round_off
-        now_body = np.where(now.hits.facet >= 0, there.body[now.hits.facet], -1)[some]
-        earlier, later = before.copy(), before.copy()
-        crossed, gone = (np.zeros(len(facet), dtype=np.bool_) for _ in range(2))
-        for part in range(1, _PARTS + 1):
-            share = part / _PARTS
-            later.x.array[:] = (1 - share) * before.x.array + share * self._u.x.array
-            ray = set_of.normals(facet, place, later)
-            hits = self._rays.follow(
-                facet, place, ray, later, now.deep, before=earlier, behind=True
-            )
-            x, _ = set_of.positions(facet, place, earlier)
-            ahead = np.sum(
-                (hits.partner.before - x) * set_of.normals(facet, place, earlier), axis=1
-            )
-            met = hits.facet >= 0
-            crossed |= met & (ahead >= -depth) & (there.body[hits.facet] != now_body)
-            thick = np.maximum(np.maximum(height, there.height[hits.facet]), depth)
-            gone |= crossed & (~lost | (met & (hits.distance < -thick)))
-            earlier.x.array[:] = later.x.array
-        passed[some] = gone
-        return passed
-
     def times_as_long(self) -> Array:
         """See `Opposite.times_as_long`."""
         assert self._present is not None
         met, here = self._present.hits.facet, self._rays.here
         own = here.length[here.first + self._rays.facet]
         return np.where(met >= 0, own / self._rays.there.length[met], 0.0)
-
-    def _largest_way(self) -> float:
-        """By how much two places can have come closer since the last commit. Collective."""
-        change = (self._u.x.array - self._before.x.array).reshape(
-            -1, self._u.function_space.dofmap.bs
-        )
-        return 2 * global_max(self._mesh.comm, np.linalg.norm(change, axis=1))
-
-    def _look_back(self, depth: float) -> tuple[LookBack, Array]:
-        """See `Pairs`: in the bodies as they are."""
-        assert self.search is not None
-        back = self.search.look_back(self._u, depth, present=True)
-        return back, np.zeros_like(back.distance)
 
     # ---- derivatives -----------------------------------------------------------------------------
 

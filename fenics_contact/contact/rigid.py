@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -17,14 +18,15 @@ from fenics_contact.contact.finite import (
     SampledView,
     check_places,
     check_rigid,
+    is_known_everywhere,
 )
+from fenics_contact.contact.obstacle_sampler import ObstacleSampler
 from fenics_contact.contact.opposite import Opposite, Parts
-from fenics_contact.contact.passage import Passage
 from fenics_contact.contact.point_law import PointLaw, PointTangent
 from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues
 from fenics_contact.supports.base import Placement, SampledSupport
-from fenics_contact.types import Array, Mask
+from fenics_contact.types import Array
 
 __all__ = ["MovingOpposite", "RigidOpposite"]
 
@@ -47,6 +49,7 @@ class RigidOpposite(Opposite):
             placement = at_rest.at(frame.into(x))
         super().__init__(parts, parts.new_pairs(), jump, placement, at_rest)
         self._deformed = DeformedPlaces(parts.quadrature, jump, placement)
+        self.sampler = _sampler(parts)
 
     def true_placement(self, values: PointValues) -> tuple[Array, Array]:
         """See `Opposite`."""
@@ -69,7 +72,7 @@ class MovingOpposite(Opposite):
         Raises:
             ValueError: Its place is not known everywhere, or it is not rigid.
         """
-        inputs, support, quadrature = parts.inputs, parts.support, parts.quadrature
+        inputs, quadrature = parts.inputs, parts.quadrature
         mesh = quadrature.surface.mesh
         frame, jump = Frame(inputs.shift, inputs.rotation), parts.new_jump()
         at_rest, self._moved = _sampled_places(parts, frame, jump)
@@ -95,8 +98,7 @@ class MovingOpposite(Opposite):
         self._view = SampledView(exact, quadrature, jump, turns=turns, friction=friction)
         self.in_form = FiniteKinematics(exact, parts.multipliers)
         self.at_points = FiniteKinematics(self._view, parts.multipliers)
-        numbers = support if isinstance(support, SampledSupport) else None
-        self._passage = Passage(quadrature, numbers or place)
+        self.sampler = _sampler(parts)
 
     @property
     def _free(self) -> list[int]:
@@ -147,17 +149,13 @@ class MovingOpposite(Opposite):
         by_place = -np.stack(turns, axis=1)
         return np.asarray(by_place + by_place.swapaxes(1, 2)) / 2
 
-    def passed_through(self, values: PointValues) -> Mask:
+    def rotation_in_increment(self, values: PointValues) -> Callable[[Array, Array | float], Array]:
         """See `Opposite`."""
-        x, rotation, angle = values.x, self._parts.support.rotation, self.turned_by(values)
-
-        def turned(places: Array, share: float) -> Array:
-            if rotation is None:
-                return places
-            about = values.arrays["about"]
-            return about + rotation.turned(places - about, share * angle)
-
-        return self._passage.through(x + self.committed_jump, x + values.jump, turned)
+        rotation, angle = self._parts.support.rotation, self.turned_by(values)
+        if rotation is None:
+            return super().rotation_in_increment(values)
+        about = values.arrays["about"][:1]  # the same at all points
+        return lambda places, share: about + rotation.turned(places - about, share * angle)
 
     def feet(self, values: PointValues) -> dict[str, Array]:
         """See `Opposite`."""
@@ -166,13 +164,25 @@ class MovingOpposite(Opposite):
     def start(self) -> dict[str, Array]:
         """See `Opposite`: the foot, minus X, and the normal there."""
         self.update_data()
-        gap, normal = self._passage.sample(self.data.values["x"] + self.committed_jump)
+        assert self.sampler is not None
+        gap, normal = self.sampler.sample(self.data.values["x"] + self.committed_jump)
         return {"jump": self.committed_jump + gap[:, None] * normal, "normal": normal}
 
 
 def _placed(parts: Parts, x: Any, shift: Any) -> Placement:
     """Where a rigid support is, seen from x (UFL)."""
     return parts.support.place(x, shift, lambda v: parts.inputs.to_ufl("support", v))
+
+
+def _sampler(parts: Parts) -> ObstacleSampler | None:
+    """What evaluates the obstacle anywhere; None where gap or normal are given on Γc alone."""
+    support = parts.support
+    if isinstance(support, SampledSupport):
+        return ObstacleSampler(parts.quadrature, support)
+    mesh = parts.quadrature.surface.mesh
+    if parts.gap is not None or not is_known_everywhere(lambda z: _placed(parts, z, None), mesh):
+        return None
+    return ObstacleSampler(parts.quadrature, lambda z: _placed(parts, z, None))
 
 
 def _sampled_places(

@@ -280,9 +280,11 @@ def _linear_parts(
         # that forces are made of.
         way = solve([s.change(s.stretch) for s in springs])
         found["enforcement"] = differences(way, [s.stretch for s in springs])
-        deviations = [Deviation.of(contact) for contact in contacts]
-        triples = zip(deviations, contacts, springs, strict=True)
-        added = [d.turned(c) + s.change(d.shift(c)) for d, c, s in triples]
+    deviations = [Deviation.of(contact) for contact in contacts]
+    pairs = list(zip(deviations, contacts, strict=True))
+    springs = [d.springs(c) for d, c in pairs]
+    added = [d.added(c, s) for (d, c), s in zip(pairs, springs, strict=True)]
+    with problem.linearised([s.stiffness for s in springs]) as solve:
         way = solve(added)
         tractions = zip(added, operators, springs, strict=True)
         changes = [t + s.change(o.jump(way)) for t, o, s in tractions]

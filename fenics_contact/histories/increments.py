@@ -322,10 +322,7 @@ def _history(
                 if not isinstance(failure, NotConverged):
                     raise
                 failed += failure.attempts
-                # What passes through between the points does so in smaller increments, too, unless
-                # bodies are thrown about.
-                pierced = failure.verdict.unseen and not failure.verdict.strays
-                if at.cuts == max_cuts or pierced:
+                if at.cuts == max_cuts:
                     failure.attempts = tuple(failed)
                     problem.complete()
                     raise

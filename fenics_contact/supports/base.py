@@ -157,11 +157,11 @@ class Rotation:
         across = ufl.as_matrix([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         return ufl.Identity(3) + s * across + (1 - c) * ufl.dot(across, across)
 
-    def turned(self, vectors: Array, angle: float) -> Array:
-        """Vectors turned by an angle given by a number, (n, gdim)."""
-        c, s = np.cos(angle), np.sin(angle)
+    def turned(self, vectors: Array, angle: float | Array) -> Array:
+        """Vectors turned by an angle (radians), one for all or one for each, (n, gdim)."""
+        c, s = (np.reshape(f(angle), (-1, 1)) for f in (np.cos, np.sin))
         if self.axis is None:
-            return vectors @ np.array([[c, s], [-s, c]])
+            return np.asarray(c * vectors + s * self.rate(vectors))
         axis = self.unit_axis(3)
         along = np.outer(vectors @ axis, axis)
         return np.asarray(along + c * (vectors - along) + s * np.cross(axis, vectors))

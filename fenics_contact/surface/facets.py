@@ -156,6 +156,26 @@ class FacetSet:
         every = np.arange(len(self.cells))
         return np.repeat(every, len(places)), np.tile(places, (len(every), 1))
 
+    def lattice(self) -> tuple[Index, Array]:
+        """Every facet with its corners, the middles of its edges and its own middle.
+
+        Returns:
+            The facets, (n,), and reference coordinates on them, (n, d - 1).
+        """
+        places = np.vstack([self._corners, self._middle])
+        if self._d == 3:
+            edges = (self._corners + np.roll(self._corners, -1, axis=0)) / 2
+            places = np.vstack([places, edges])
+        every = np.arange(len(self.cells))
+        return np.repeat(every, len(places)), np.tile(places, (len(every), 1))
+
+    def clipped(self, reference: Array) -> Array:
+        """Reference coordinates of the places, (n, d - 1), moved onto the facet."""
+        inside = np.clip(reference, 0.0, 1.0)
+        if self.simplex:
+            inside /= np.maximum(inside.sum(axis=1, keepdims=True), 1.0)
+        return inside
+
     def corner_vertices(self) -> Index:
         """Global numbers of the facets' vertices, see `vertices`, (n_facets, n_corners)."""
         return np.take_along_axis(self.vertices(), self._at_corners, axis=1)

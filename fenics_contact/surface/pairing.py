@@ -33,42 +33,37 @@ from fenics_contact.surface.projection import (
     facing_pairs,
     polynomials,
 )
-from fenics_contact.surface.rays import BEHIND, Hits, Rays, Side, interpolation_matrix
+from fenics_contact.surface.rays import BEHIND, Hits, Rays, Side
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.types import Array, Index
 
-__all__ = ["LookBack", "Pairing"]
+__all__ = ["Pairing", "PresentHits"]
 
 
 # Of a distance, by the size of the coordinates that it is the difference of.
 _ROUND_OFF = 16 * np.finfo(float).eps
-# What equations solved to round-off leave of displacements, by their size.
-_SOLVED = 10 * _ROUND_OFF
 # Angle between the normals of a facet and of the surface at its corner (radian), up to which the
 # facets stand for a smooth surface.
 _SMOOTH = 0.5
 
 
 @dataclass(frozen=True)
-class LookBack:
-    """What of Γc lies opposite corners and middles of the opposite's facets, on this rank.
+class PresentHits:
+    """What the normals of the deformed Γc meet of the opposite surface.
 
     Attributes:
-        place: Of the corner or middle, undeformed, (n, d).
-        source: Its facet of this rank's mesh, (n,).
-        facet: The facet of Γc that it sees, among those of all ranks, (n,).
-        distance: Between the two undeformed bodies along the normal of the opposite, (n,).
-        slack: By how much flat facets of curved surfaces may overlap (length), (n,).
-        approach: From displacements to what the distance loses, (n, n_dofs); None: the distance
-            is the present one.
+        u: Values of the displacement.
+        facet, reference: Facet of this rank and reference coordinates of every place: the points,
+            then those of `FacetSet.lattice`.
+        normal: Outward unit normals there, (n, d).
+        hits: What they meet.
     """
 
-    place: Array
-    source: Any
-    facet: Any
-    distance: Array
-    slack: Array
-    approach: PETSc.Mat | None
+    u: Array
+    facet: Index
+    reference: Array
+    normal: Array
+    hits: Hits
 
 
 class Pairing:
@@ -97,6 +92,9 @@ class Pairing:
         self._here, self._there = rays.here.facets, rays.there.facets
         self._sides, self._facet, self._space = (rays.here, rays.there), rays.facet, space
         self.facets, self.surface = rays.facets, quadrature.surface
+        self._place: Array | None = None
+        self._present: PresentHits | None = None
+        self._faceting: dict[int, Array] = {}
 
     def pair(
         self, x: Array, normal: Array, u: fem.Function | None, penetration: Array
@@ -114,7 +112,7 @@ class Pairing:
             *in the undeformed bodies*, so that s - u_n is the present one; NaN without opposite.
             And why there is none, one of `rays.REASONS`, (n_points,).
         """
-        place, _, _ = self._here.meet(self._facet, x, normal)
+        place = self._located(x, normal)
         deep = np.maximum(self.largest(penetration), 0.0)
         if u is None:
             found, start = self.at_rest(place, x, normal)
@@ -169,64 +167,16 @@ class Pairing:
                 found = self.rays.follow(self._facet, place, normal, None, deep)
         return found, np.maximum(self.largest(np.nan_to_num(-found.distance)), 0.0)
 
-    def look_back(
-        self, u: fem.Function | None, penetration: float, *, present: bool = False
-    ) -> LookBack:
-        """Follow the normals of the opposite back to Γc. Collective.
+    def faceting(self, side: Side) -> Array:
+        """How far each of all facets may be from a smooth or a flat surface (length). Collective.
 
-        Args:
-            u: Displacement of the bodies; none: they are undeformed.
-            penetration: The largest between them (length).
-            present: By the normals and distances at ``u``, not those of the undeformed bodies.
+        Of the undeformed surface: it is measured once.
         """
-        here, there = self._sides
-        facet, place = self._there.corners()
-        undeformed = self._there.normals(facet, place)
-        ray = self._there.normals(facet, place, u) if present else undeformed
-        deep = np.full(len(there.body), penetration)
-        found = self.rays.follow(facet, place, ray, u, deep, back=True, undeformed=undeformed)
-        x, _ = self._there.positions(facet, place)
-        kept = np.flatnonzero(found.facet >= 0)
-        distance = found.distance if present else np.einsum("qd,qd->q", found.place - x, ray)
-        hit = found.facet[kept]
-        slack = self._slack(here)[hit] + self._slack(there)[there.first + facet[kept]]
-        if present and u is not None:
-            slack += _SOLVED * global_max(self._comm, np.abs(u.x.array))
-        return LookBack(
-            x[kept],
-            self.facets[facet[kept]],
-            hit,
-            distance[kept],
-            slack,
-            None if present else self._approach(facet, place, ray, kept, found),
-        )
+        if id(side) not in self._faceting:
+            self._faceting[id(side)] = self._measure_faceting(side)
+        return self._faceting[id(side)]
 
-    def _approach(
-        self, facet: Index, place: Array, ray: Array, kept: Index, found: Hits
-    ) -> PETSc.Mat:
-        """See `LookBack`: of the kept ones of the corners and middles. Collective."""
-        nodes, weights = self._there.interpolation(facet, place)
-        n, space = len(facet), self._there.space
-        own = interpolation_matrix(space, n, np.arange(n), nodes, weights)
-        opposite = found.matrix(space)
-        own.axpy(-1.0, opposite, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        first, _ = own.getOwnershipRange()
-        columns = first + self._d * kept[:, None] + np.arange(self._d)
-        along = PETSc.Mat().createAIJ(
-            ((len(kept), None), (n * self._d, None)),
-            csr=(
-                np.arange(0, columns.size + 1, self._d, dtype=PETSc.IntType),
-                columns.ravel().astype(PETSc.IntType),
-                ray[kept].ravel(),
-            ),
-            comm=self._comm,
-        )
-        approach = along.matMult(own)
-        for item in (along, own, opposite):
-            item.destroy()
-        return approach
-
-    def _slack(self, side: Side) -> Array:
+    def _measure_faceting(self, side: Side) -> Array:
         """How far from a smooth or a flat surface each of all facets may be (length). Collective.
 
         Twice the height of the arc over its chord, by the angles between neighbours, and by those
@@ -251,32 +201,6 @@ class Pairing:
         slack: Array = size * np.maximum(angle, flat).max(axis=1)
         return slack
 
-    def facets_near(self, chosen: Index) -> Any:
-        """Which of all facets of Γc share a node with chosen ones, if of Γc. Collective.
-
-        Args:
-            chosen: Facets of this rank's mesh.
-        """
-        corners = self._corners()
-        return np.isin(corners, corners[self.facets_among(chosen)]).any(axis=1)
-
-    def at_rim(self) -> Any:
-        """Which of all facets of Γc have a side that is no other one's. Collective."""
-        corners = self._corners()
-        ends = [np.roll(corners, -i, axis=1) for i in range(self._d - 1)]
-        sides = np.sort(np.stack(ends, axis=2), axis=2).reshape(-1, self._d - 1)
-        _, number, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
-        return (count[number.ravel()] == 1).reshape(corners.shape).any(axis=1)
-
-    def _corners(self) -> Any:
-        """Nodes at the corners of all facets of Γc, (n_facets, n_corners). Collective."""
-        return np.concatenate(self._comm.allgather(self._here.corner_vertices()))
-
-    def facets_among(self, facets: Index) -> Any:
-        """Which of all facets of Γc are among these of this rank's mesh. Collective."""
-        mine = np.isin(self.surface.facets, facets)
-        return np.concatenate(self._comm.allgather(mine))
-
     def largest(self, values: Array) -> Array:
         """The largest of the points' values on each of all facets of Γc. Collective."""
         largest = np.full(len(self._here.cells), -np.inf)
@@ -298,11 +222,36 @@ class Pairing:
             The distance, (n_points,) (length), NaN where there is no opposite; unit normals,
             (n_points, d).
         """
-        place, _, _ = self._here.meet(self._facet, x, along)
-        normal = self._here.normals(self._facet, place, u)
-        deep = np.maximum(self.largest(penetration), 0.0)
-        found = self.rays.follow(self._facet, place, normal, u, deep)
-        return found.distance, normal
+        n = len(self._located(x, along))
+        found = self.present_hits(x, along, u, penetration)
+        return found.hits.distance[:n], found.normal[:n].copy()
+
+    def present_hits(
+        self, x: Array, along: Array, u: fem.Function, penetration: Array
+    ) -> PresentHits:
+        """What the present normals of Γc meet, at points and between; once a state. Collective.
+
+        Args: see `true_gap`.
+        """
+        known = self._present is not None and np.array_equal(self._present.u, u.x.array)
+        if self._comm.allreduce(int(not known)) or self._present is None:
+            facet, reference = self._here.lattice()
+            facet = np.concatenate([self._facet, facet])
+            reference = np.concatenate([self._located(x, along), reference])
+            normal = self._here.normals(facet, reference, u)
+            undeformed = self._here.normals(facet, reference)
+            deep = np.maximum(self.largest(penetration), 0.0)
+            hits = self.rays.follow(
+                facet, reference, normal, u, deep, undeformed=undeformed, before=u
+            )
+            self._present = PresentHits(u.x.array.copy(), facet, reference, normal, hits)
+        return self._present
+
+    def _located(self, x: Array, along: Array) -> Array:
+        """Reference coordinates of the points on their facets, (n_points, d - 1)."""
+        if self._place is None:
+            self._place, _, _ = self._here.meet(self._facet, x, along)
+        return self._place
 
     def linear_gap(
         self,
@@ -328,7 +277,7 @@ class Pairing:
         Returns:
             (n_points,) (length), NaN where there is no opposite.
         """
-        place, _, _ = self._here.meet(self._facet, x, along)
+        place = self._located(x, along)
         deep = np.maximum(self.largest(penetration), 0.0)
         found = self.rays.follow(self._facet, place, along, at, deep)
         matrix = found.matrix(self._space)

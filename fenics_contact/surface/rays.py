@@ -139,18 +139,6 @@ class _Admission:
         return counts
 
 
-class _Behind:
-    """All that lies behind a point counts, however deep."""
-
-    def __init__(self, n: int) -> None:
-        """Nothing has been met by n points."""
-        self.reason = np.full(n, _NOTHING)
-
-    def __call__(self, point: Any, facet: Any, place: Array, distance: Array) -> Any:
-        """Which hits count."""
-        return distance < 0
-
-
 @dataclass(frozen=True)
 class Partner:
     """What moves with the places met, (n, …); zeros where nothing was.
@@ -238,7 +226,6 @@ class Rays:
         back: bool = False,
         undeformed: Array | None = None,
         before: fem.Function | None = None,
-        behind: bool = False,
     ) -> Hits:
         """Follow rays from places on Γc to the opposite, or back from there. Collective.
 
@@ -251,7 +238,6 @@ class Rays:
             back: From the opposite to Γc.
             undeformed: The rays in the undeformed bodies, (n, d), where they are others.
             before: An earlier displacement, in which partners are asked for as well.
-            behind: Meet what lies behind the places, all of it, in place of what is opposite.
         """
         comm = self._comm
         sides = (self.there, self.here) if back else (self.here, self.there)
@@ -264,11 +250,7 @@ class Rays:
         x, ray, start, normal, number = (
             np.concatenate(parts) for parts in zip(*comm.allgather(sent), strict=True)
         )
-        admission: _Admission | _Behind
-        if behind:
-            admission = _Behind(len(x))
-        else:
-            admission = _Admission(self._support, sides, number, start, normal, deep)
+        admission = _Admission(self._support, sides, number, start, normal, deep)
         hit, where, distance = target.facets.search(x, ray, u, admission)
         comm.Allreduce(MPI.IN_PLACE, admission.reason, op=MPI.MAX)
         # The nearest over the ranks is met; of equals the lowest rank's.

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
@@ -104,6 +105,18 @@ class FullSystem(System):
         self.u.x.scatter_forward()
         self.displacement.follow()
         self.set_motions(state)
+
+    def displacement_at(self, state: Array) -> fem.Function:
+        """The displacement of a state of this rank's unknowns, a copy. Collective."""
+        n = self.unknowns.n_dofs
+        whole = fem.Function(self.u.function_space)
+        whole.x.array[:n] = self.bulk.from_units(state[:n])
+        whole.x.scatter_forward()
+        if not self.displacement.mixed:
+            return whole
+        u = fem.Function(self.displacement.u.function_space)
+        u.x.array[:] = whole.x.array[self.displacement.dofs]
+        return u
 
     @cached_property
     def _cell_size(self) -> float:

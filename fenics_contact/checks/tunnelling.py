@@ -1,0 +1,652 @@
+"""Penetration and tunnelling at the deformed positions: between points of Γc, and on their paths.
+
+The contact law acts at the quadrature points of Γc, in the kinematics that the contact was given.
+Here the geometry is taken where it is at the end of an increment, X + u, on all of Γc:
+
+- *Depth.* At points, corners, middles of edges and of facets the penetration must not exceed that
+  of the nearby points, which the law resists, by more than the tangent planes seen from these
+  points explain.
+- *Path.* On its way through the increment no such place may enter the obstacle on one side and
+  leave it, or be about to, on the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+
+from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.obstacle_sampler import ObstacleSampler
+from fenics_contact.contact.values import Status
+from fenics_contact.parallel import gather_rows, global_max, global_sum
+from fenics_contact.surface.crossings import MovingFacets, find_crossings
+from fenics_contact.surface.rays import Hits, Rays, Side
+from fenics_contact.types import Array, Index, Mask
+
+__all__ = ["OpposingBodyProbe", "RigidObstacleProbe", "Tunnelling", "TunnellingCheck"]
+
+# Penetration, as a share of the facet, up to which tangent planes at its points explain more
+# than these points resist: of a tilted facet the corner is 0.2 of it away from the nearest point.
+# Less of it where no point resists anything.
+_PREDICTED_DEPTH, _PREDICTED_UNRESISTED = 0.15, 0.05
+# Penetration, as a share of the facet, that two quadrature rules may differ by.
+_DEPTH_RESOLUTION = 0.02
+# Cosine of the angle between the normals of opposite sides of an obstacle: 120 degrees and more.
+_OPPOSITE_SIDES = -0.5
+# A path is sampled at this many places for each facet's length, and at so many at most.
+_SAMPLES_PER_FACET, _MOST_SAMPLES = 4, 64
+# Bisections of a part of a path in which the normal turns to the opposite side.
+_BISECTIONS = 20
+# Steps along a facet towards the place that is deepest in an obstacle.
+_DESCENT_STEPS = 8
+
+
+@dataclass(frozen=True)
+class ResistedDepth:
+    """How deep points are that the law resists, by the vertices of the facets that meet there.
+
+    Attributes:
+        vertices: Their global numbers, ascending, (n,).
+        depth: The largest penetration of the points on the facets around, (n,) (length).
+    """
+
+    vertices: Index
+    depth: Array
+
+    @classmethod
+    def of(cls, comm: MPI.Comm, vertices: Sequence[Index], depth: Sequence[Array]) -> ResistedDepth:
+        """Of facets of all ranks. Collective.
+
+        Args:
+            comm: The ranks.
+            vertices: Of facets of this rank their corners, (n, n_corners) each.
+            depth: Of these facets, (n,) each (length).
+        """
+        number: Any = np.zeros(0, dtype=np.int64)
+        value: Any = np.zeros(0)
+        for corners, deep in zip(vertices, depth, strict=True):
+            number = np.append(number, corners[deep > 0].ravel())
+            value = np.append(value, np.repeat(deep[deep > 0], corners.shape[1]))
+        number, value = (np.concatenate(comm.allgather(rows)) for rows in (number, value))
+        unique, place = np.unique(number, return_inverse=True)
+        largest = np.zeros(len(unique))
+        np.maximum.at(largest, place, value)
+        return cls(unique, largest)
+
+    def at(self, vertices: Index) -> Array:
+        """The largest at the corners of facets, (n, n_corners): (n,) (length), 0 if none."""
+        if not len(self.vertices):
+            return np.zeros(len(vertices))
+        place = np.minimum(np.searchsorted(self.vertices, vertices), len(self.vertices) - 1)
+        found = np.where(self.vertices[place] == vertices, self.depth[place], 0.0)
+        return np.asarray(found.max(axis=1, initial=0.0))
+
+
+@dataclass(frozen=True)
+class Tunnelling:
+    """Penetration of one contact that its points do not resist; the same on every rank.
+
+    Attributes:
+        depth: Penetration at the place where it is largest beyond what is allowed (length).
+        allowed: What is allowed there (length).
+        place: That place of the undeformed surface, (gdim,) (length); None: there is none.
+        crossed: A place that has crossed the obstacle in the increment; None: there is none.
+    """
+
+    depth: float = 0.0
+    allowed: float = 0.0
+    place: list[float] | None = None
+    crossed: list[float] | None = None
+
+    @classmethod
+    def of(cls, comm: MPI.Comm, probe: Probe, resisted: ResistedDepth) -> Tunnelling:
+        """Judge the places of one contact. Collective.
+
+        Args:
+            comm: The ranks.
+            probe: Of the contact.
+            resisted: By the points of all contacts.
+        """
+        depth, allowed = probe.depth(resisted)
+        worst = _worst(comm, depth - allowed, np.column_stack([depth, allowed, probe.x]))
+        crossed = _worst(comm, np.where(probe.crossed(allowed), 1.0, -1.0), probe.x)
+        return cls(
+            depth=0.0 if worst is None else float(worst[0]),
+            allowed=0.0 if worst is None else float(worst[1]),
+            place=None if worst is None else [float(x) for x in worst[2:]],
+            crossed=None if crossed is None else [float(x) for x in crossed],
+        )
+
+    def failures(self, contact: str) -> list[str]:
+        """What does not hold, in words."""
+        found = []
+        if self.place is not None:
+            found.append(
+                f"{contact}: what lies opposite penetrates between the quadrature points of Γc, by "
+                f"{self.depth:.3e} near {np.round(self.place, 6).tolist()} in the undeformed body, "
+                f"where the points around explain {self.allowed:.3e}; refine Γc there or give "
+                "ContactSurface a larger quadrature_degree; between two bodies let the finer "
+                "surface be Γc, or add a second contact with the surfaces swapped"
+            )
+        if self.crossed is not None:
+            found.append(
+                f"{contact}: in one increment a part of Γc has crossed what lies opposite, at "
+                f"{np.round(self.crossed, 6).tolist()} in the undeformed body; load in smaller "
+                "steps (increments() cuts them by itself), and include in Γc and in the opposite "
+                "surface all sides that may touch"
+            )
+        return found
+
+
+class TunnellingCheck:
+    """Looks at the contacts of a problem, again where they have moved by enough to find anything.
+
+    No distance changes by more than the way. A place that was clear of a penetration that matters
+    by more than it has moved since needs no second probe.
+    """
+
+    def __init__(self, contacts: Sequence[Contact]) -> None:
+        """Take the contacts; of a gap that is prescribed the geometry is not looked at."""
+        self._contacts = [
+            c
+            for c in contacts
+            if not c.gap_prescribed and (not c.rigid or c.opposite.sampler is not None)
+        ]
+        # The last probe whose state was committed, and the last one, with the displacement then.
+        self._committed: dict[str, tuple[Array, Probe]] = {}
+        self._last: dict[str, tuple[Array, Probe]] = {}
+
+    def evaluate(self, before: fem.Function | None) -> dict[str, Tunnelling]:
+        """Judge the contacts, evaluated at the end of an increment, by their names. Collective.
+
+        Args:
+            before: The displacement at the last commit; None: paths are not followed.
+        """
+        if not self._contacts:
+            return {}
+        comm = self._contacts[0].surface.mesh.comm
+        probes, moved = {}, []
+        for contact in self._contacts:
+            name = contact.name
+            known = self._known(comm, name, before)
+            if known is not None and known.is_valid_for(contact):
+                probes[name] = known
+                continue
+            probe: Probe = (
+                RigidObstacleProbe(contact, known)
+                if contact.rigid
+                else OpposingBodyProbe(contact, before, known)
+            )
+            probes[name] = probe
+            moved.append(name)
+            self._last[name] = contact.u.x.array.copy(), probe
+        if not moved:
+            return {name: Tunnelling() for name in probes}
+        parts = [part for probe in probes.values() for part in probe.resisted]
+        vertices, depth = zip(*parts, strict=True)
+        resisted = ResistedDepth.of(comm, vertices, depth)
+        return {
+            name: Tunnelling.of(comm, probe, resisted) if name in moved else Tunnelling()
+            for name, probe in probes.items()
+        }
+
+    def _known(self, comm: MPI.Comm, name: str, before: fem.Function | None) -> Any:
+        """The last probe of a committed state, if the history went on from there. Collective."""
+        if before is None:
+            return None
+        last = self._last.get(name)
+        same = last is not None and np.array_equal(last[0], before.x.array)
+        if comm.allreduce(int(not same)) == 0 and last is not None:
+            self._committed[name] = last
+        return self._committed[name][1] if name in self._committed else None
+
+
+def _worst(comm: MPI.Comm, excess: Array, rows: Array) -> Array | None:
+    """The row, over all ranks, whose excess is largest, if it is positive. Collective."""
+    chosen = excess > 0
+    if not comm.allreduce(int(chosen.any())):
+        return None
+    found = gather_rows(comm, np.column_stack([excess, rows])[chosen])
+    worst: Array = found[np.lexsort(found.T[::-1])][-1, 1:]
+    return worst
+
+
+class Probe(Protocol):
+    """Places of the surfaces of a contact where the bodies have moved to.
+
+    Attributes:
+        x: Where they are on the undeformed surfaces, (n, gdim) (length).
+        resisted: Corners of facets of this rank, (m, n_corners), and the penetration of their
+            points that the law resists, (m,) (length).
+    """
+
+    x: Array
+    resisted: list[tuple[Index, Array]]
+
+    def is_valid_for(self, contact: Contact) -> bool:
+        """Whether nothing can be found at the present state that was not there. Collective."""
+
+    def depth(self, resisted: ResistedDepth) -> tuple[Array, Array]:
+        """Penetration at the places, and what is allowed there, (n,) (length). Collective."""
+
+    def crossed(self, allowed: Array) -> Mask:
+        """Which places have crossed what lies opposite in the increment, (n,). Collective."""
+
+
+class RigidObstacleProbe:
+    """Places of Γc in the frame of a rigid obstacle, at both ends of an increment.
+
+    Attributes:
+        x: Where the places are on the undeformed Γc, (n, gdim) (length).
+        resisted: See `Probe`.
+    """
+
+    def __init__(self, contact: Contact, known: RigidObstacleProbe | None = None) -> None:
+        """Sample the obstacle at the places and, on each facet, where it is deepest. Collective.
+
+        Args:
+            contact: With a rigid obstacle.
+            known: An earlier probe, from which on paths were not followed yet.
+        """
+        opposite, values = contact.opposite, contact.values
+        assert opposite.sampler is not None
+        self._contact = contact
+        self._places = places = contact.facet_places
+        self._sampler: ObstacleSampler = opposite.sampler
+        self._comm = contact.surface.mesh.comm
+        self._now = values.x + values.jump
+        self._gap, self._normal = self._sampler.sample(self._now)
+        self._facet, self._reference = self._deepest()
+        self.x, _ = places.facets.positions(self._facet, self._reference)
+        self._z = self._at(self._now)
+        self._distance, _ = self._sampler.sample(self._z)
+        self._data = self._sampler.data()
+        self._start = values.x + opposite.committed_jump
+        if known is not None and not opposite.turns:
+            self._start = known._now
+        closed = contact.status != Status.OPEN
+        deep = np.where(closed, np.maximum(values.penetration, -self._gap), 0.0)[places.rows]
+        self.resisted = [(places.facets.corner_vertices(), deep.max(axis=1, initial=0.0))]
+
+    def _at(self, field: Array) -> Array:
+        """A point field at the places."""
+        return self._places.values(field, self._facet, self._reference)
+
+    def _deepest(self) -> tuple[Index, Array]:
+        """The places, and those that the obstacle comes closest to between them. Collective.
+
+        From every place the tangential part of the way to the obstacle is followed along the facet:
+        alternating projections, which end at the closest places of facet and obstacle.
+        """
+        places, size = self._places, self._places.size
+        facet, at = places.facet, places.reference
+        found = [(facet, at)]
+        distance, normal = self._sampler.sample(places.values(self._now, facet, at))
+        units = np.vstack([np.zeros(at.shape[1]), np.eye(at.shape[1])])
+        # The distance changes by no more than the way: farther obstacles do not reach the facet.
+        going = distance < size[facet]
+        for _ in range(_DESCENT_STEPS):
+            if not self._comm.allreduce(int(going.any())):
+                break
+            facet, at, distance, normal = facet[going], at[going], distance[going], normal[going]
+            origin, *ends = (
+                places.values(self._now, facet, np.broadcast_to(unit, at.shape)) for unit in units
+            )
+            tangents = np.stack([end - origin for end in ends], axis=2)
+            step = np.maximum(distance, 0.1 * size[facet])[:, None] * normal
+            moved = at + np.einsum("nij,nj->ni", np.linalg.pinv(tangents), step)
+            moved = places.facets.clipped(moved)
+            deeper, normal = self._sampler.sample(places.values(self._now, facet, moved))
+            going = deeper < distance - 1e-3 * size[facet]
+            at, distance = moved, deeper
+            found.append((facet[going], at[going]))
+        facets, references = zip(*found, strict=True)
+        return np.concatenate(facets), np.concatenate(references)
+
+    def is_valid_for(self, contact: Contact) -> bool:
+        """See `Probe`: of an obstacle that neither turns nor changes its shape."""
+        data, then = self._sampler.data(), self._data
+        known = data is not None and then is not None and not contact.opposite.turns
+        known = known and np.array_equal(data, then)  # type: ignore[arg-type]
+        moved = self._at(contact.values.x + contact.values.jump) - self._z
+        clear = _DEPTH_RESOLUTION * self._places.size[self._facet] + self._distance
+        # A point that the law resists has not entered unseen.
+        known = known and bool(np.all(np.linalg.norm(moved, axis=1) <= clear))
+        return self._comm.allreduce(int(not known)) == 0
+
+    def depth(self, resisted: ResistedDepth) -> tuple[Array, Array]:
+        """See `Probe`."""
+        places = self._places
+        deep = resisted.at(places.facets.corner_vertices())[self._facet]
+        rows = places.rows[self._facet]
+        planes = _below(
+            self._z,
+            self._now[rows] + self._gap[rows][..., None] * self._normal[rows],
+            -self._normal[rows],
+        )
+        size = places.size[self._facet]
+        return -self._distance, _allowed(deep, planes, size, size)
+
+    def crossed(self, allowed: Array) -> Mask:
+        """See `Probe`.
+
+        In the increment a place goes straight on, as does the obstacle, which turns evenly.
+        """
+        opposite, comm = self._contact.opposite, self._comm
+        found = np.zeros(len(self._facet), dtype=np.bool_)
+        rotate = opposite.rotation_in_increment(self._contact.values)
+        start = self._at(self._start)
+        end = rotate(self._z, 1.0)  # in the frame of the start, which does not turn
+        straight = np.linalg.norm(end - start, axis=1)
+        length = straight + np.linalg.norm(end - self._z, axis=1)
+        # A distance changes by no more than the way: what is farther away was not touched.
+        some = np.flatnonzero(~(self._distance > length))
+        start, end, length = start[some], end[some], length[some]
+        samples = _SAMPLES_PER_FACET * length / self._places.size[self._facet[some]]
+        n = int(np.ceil(np.clip(global_max(comm, samples, empty=0.0), 1, _MOST_SAMPLES)))
+        if not comm.allreduce(len(some)):
+            return found
+
+        def at(share: Array | float, rows: Index | slice = slice(None)) -> tuple[Array, ...]:
+            t = np.broadcast_to(share, len(start))[rows]
+            place = rotate(start[rows] + t[:, None] * (end[rows] - start[rows]), -t)
+            return place, *self._sampler.sample(place)
+
+        crossed = np.zeros(len(some), dtype=np.bool_)
+        place, distance, normal = at(0.0)
+        entry_place, entry_normal = place, normal
+        for k in range(1, n + 1):
+            was = place, distance, normal
+            place, distance, normal = at(k / n)
+            enters = (was[1] >= 0) & (distance < 0)
+            hidden = (was[1] >= 0) & (distance >= 0) & (_dot(was[2], normal) < _OPPOSITE_SIDES)
+            hidden &= was[1] + distance <= np.linalg.norm(place - was[0], axis=1) * (1 + 1e-9)
+            turned = enters & (_dot(was[2], normal) < -_OPPOSITE_SIDES)
+            inside, outer, at_entry = self._bisect(at, (k - 1) / n, k / n, was, turned | hidden)
+            crossed |= hidden & inside
+            entry_place = np.where(enters[:, None], was[0], entry_place)
+            entry_normal = np.where(enters[:, None], was[2], entry_normal)
+            entry_place = np.where(turned[:, None], outer, entry_place)
+            entry_normal = np.where(turned[:, None], at_entry, entry_normal)
+            way = place - entry_place
+            through = (was[1] < 0) | (distance < 0)
+            through &= _dot(entry_normal, normal) < _OPPOSITE_SIDES
+            crossed |= through & (_dot(way, entry_normal) > 0) & (_dot(way, normal) < 0)
+        found[some] = crossed
+        return found
+
+    def _bisect(self, at: Any, low: float, high: float, was: Any, chosen: Mask) -> Any:
+        """Where paths come inside of the obstacle, of the chosen ones. Collective.
+
+        Args:
+            at: Place, distance and normal at a share of the paths.
+            low: Share from which on the normal turns.
+            high: Share up to which it does.
+            was: Place, distance and normal at the former.
+            chosen: The paths.
+
+        Returns:
+            Whether a place inside was found, and place and normal at the last one before, of all.
+        """
+        inside = np.zeros(len(chosen), dtype=np.bool_)
+        place, normal = was[0].copy(), was[2].copy()
+        rows = np.flatnonzero(chosen)
+        if not self._comm.allreduce(len(rows)):
+            return inside, place, normal
+        a: Array = np.full(len(rows), low)
+        b: Array = np.full(len(rows), high)
+        far = np.linalg.norm(at(high, rows)[0] - place[rows], axis=1)
+        for _ in range(_BISECTIONS):
+            middle = (a + b) / 2
+            share = np.zeros(len(chosen))
+            share[rows] = middle
+            here, distance, turned = at(share, rows)
+            # Into the half in which the obstacle is entered, or the normal turns.
+            before = (distance >= 0) & (_dot(normal[rows], turned) > _OPPOSITE_SIDES)
+            inside[rows] |= distance < 0
+            a, b = np.where(before, middle, a), np.where(before, b, middle)
+            place[rows] = np.where(before[:, None], here, place[rows])
+            normal[rows] = np.where(before[:, None], turned, normal[rows])
+            inside[rows] |= distance <= far * 2.0 ** (2 - _BISECTIONS)
+        return inside, place, normal
+
+
+class OpposingBodyProbe:
+    """Places of Γc and of the opposite surface, both where their bodies have moved to.
+
+    Attributes:
+        x: Where they are on the undeformed surfaces, those of Γc first, (n, gdim) (length).
+        resisted: See `Probe`: on the facets of Γc, and on those opposite.
+    """
+
+    def __init__(
+        self, contact: Contact, before: fem.Function | None, known: OpposingBodyProbe | None = None
+    ) -> None:
+        """Follow the present normals of both surfaces to the other one. Collective.
+
+        Args:
+            contact: With another body.
+            before: The displacement at the last commit; None: paths are not followed.
+            known: An earlier probe, from which on paths were not followed yet.
+        """
+        search = contact.pairs.search
+        assert search is not None
+        self._search, self._u = search, contact.u.copy()
+        self._before = before if known is None else known._u
+        self._comm = contact.surface.mesh.comm
+        self._rows = contact.quadrature.point_rows()
+        values = contact.values
+        found = search.present_hits(values.x, values.normal, contact.u, values.depth)
+        deepest = global_max(self._comm, values.depth)
+        self._here = _Side(search.rays.here, self._u, found.facet, found.reference)
+        self._there = _Side(search.rays.there, self._u, *search.rays.there.facets.lattice())
+        self._hits, self._back = found.hits, self._there.trace_back(search.rays, deepest)
+        self.x = np.concatenate([self._here.undeformed, self._there.undeformed])
+        n = contact.quadrature.n_points
+        gap, partner = self._hits.distance[:n], self._hits.facet[:n]
+        closed = contact.status != Status.OPEN
+        deep = np.where(closed, np.maximum(values.penetration, -np.nan_to_num(gap)), 0.0)
+        met = closed & (partner >= 0)
+        self.resisted = [
+            (
+                self._here.side.facets.corner_vertices(),
+                deep[self._rows].max(axis=1, initial=0.0),
+            ),
+            (self._there.corners[partner[met]], deep[met]),
+        ]
+        # What lies aside of the normals may be nearer than what they meet.
+        depth, allowed = self.depth(ResistedDepth.of(self._comm, [], []))
+        self._clear = -global_max(self._comm, np.maximum(depth, 0.0) - allowed)
+
+    def is_valid_for(self, contact: Contact) -> bool:
+        """See `Probe`: by the largest displacements on both surfaces since."""
+        ways = [side.at(contact.u) - side.place for side in (self._here, self._there)]
+        common = _mean(self._comm, np.concatenate(ways))
+        most = (global_max(self._comm, np.linalg.norm(way - common, axis=1)) for way in ways)
+        return bool(sum(most) <= self._clear)
+
+    def depth(self, resisted: ResistedDepth) -> tuple[Array, Array]:
+        """See `Probe`."""
+        here, there, hits, back = self._here, self._there, self._hits, self._back
+        on = np.concatenate([here.number, back.facet])  # the facet of Γc, of those of all ranks
+        opposite = np.concatenate([hits.facet, there.number])
+        resisted_here, resisted_there = (
+            np.where(number >= 0, resisted.at(side.corners)[number], 0.0)
+            for side, number in ((here, on), (there, opposite))
+        )
+        deep = np.maximum(resisted_here, resisted_there)
+        edges = np.sqrt(self.x.shape[1] - 1)  # lengths are those of diagonals in space
+        size, other = here.side.length[on] / edges, there.side.length[opposite] / edges
+        slack = self._search.faceting(here.side)[on] + self._search.faceting(there.side)[opposite]
+        distance = np.concatenate([hits.distance, back.distance])
+        met = ~np.isnan(distance)
+        # A place opposite stands for the one of Γc that its normal meets.
+        foot = there.place + np.nan_to_num(back.distance)[:, None] * there.normal
+        planes = _below(np.concatenate([here.place, foot]), *(p[on] for p in self._planes()))
+        planes[on < 0] = -np.inf
+        smaller = np.where(met, np.minimum(size, other), np.where(on >= 0, size, other))
+        allowed = _allowed(deep, planes, size, smaller) + np.where(met, slack, 0.0)
+        return np.where(met, -distance, 0.0), allowed
+
+    def _planes(self) -> tuple[Array, Array]:
+        """The tangent planes that the points of every facet of all ranks see. Collective.
+
+        Returns:
+            Places of the partners, (n_facets, n_points, gdim) (length), NaN where there is none,
+            and outward unit normals there.
+        """
+        n, here = self._rows.size, self._here
+        ray, tangents = here.normal[:n], self._hits.partner.tangents[:n]
+        through = here.place[:n] + self._hits.distance[:n, None] * ray
+        normal = _across(tangents)
+        normal *= -np.sign(_dot(normal, ray))[:, None]
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        normal /= np.where(length > 0, length, 1.0)
+        through, normal = (gather_rows(self._comm, v[self._rows]) for v in (through, normal))
+        return through, normal
+
+    def crossed(self, allowed: Array) -> Mask:
+        """See `Probe`.
+
+        A place has crossed if it came in through a facet and is deeper below it than is allowed at
+        the end, or has left the body through its opposite side.
+        """
+        if self._before is None:
+            return np.zeros(len(allowed), dtype=np.bool_)
+        here, there, n = self._here, self._there, len(self._here.facet)
+        # What both surfaces have in common of their motion crosses nothing.
+        shift = _mean(self._comm, here.place - here.at(self._before))
+        found = [
+            one.crossed(self._before, shift, other, allowed[part])
+            for one, other, part in ((here, there, slice(n)), (there, here, slice(n, None)))
+        ]
+        return np.concatenate(found)
+
+
+class _Side:
+    """Places of one of two surfaces in their deformed bodies.
+
+    Attributes:
+        side: The surface.
+        facet, reference: Facet of this rank and reference coordinates of every place.
+        number: Of the facet among those of all ranks, (n,).
+        corners: Vertices at the corners of the facets of all ranks, (n_facets, n_corners).
+        undeformed, place: Where the places are, (n, gdim) (length).
+        normal: Outward unit normals of the deformed surface there, (n, gdim).
+    """
+
+    def __init__(self, side: Side, u: fem.Function, facet: Index, reference: Array) -> None:
+        """Locate the places. Collective.
+
+        Args:
+            side: The surface.
+            u: The displacement.
+            facet: See the attributes.
+            reference: See the attributes.
+        """
+        self._u, self.side = u, side
+        self.facet, self.reference, self.number = facet, reference, side.first + facet
+        self._comm = side.facets.space.mesh.comm
+        self.corners: Index = np.concatenate(self._comm.allgather(side.facets.corner_vertices()))
+        self.undeformed, self.place = self.at(None), self.at(u)
+        self.normal = side.facets.normals(facet, reference, u)
+
+    def at(self, u: fem.Function | None) -> Array:
+        """The places in the bodies displaced by u, (n, gdim) (length)."""
+        return self.side.facets.positions(self.facet, self.reference, u)[0]
+
+    def trace_back(self, rays: Rays, deepest: float) -> Hits:
+        """What the normals of the opposite surface meet of Γc. Collective.
+
+        Args:
+            rays: Between both surfaces.
+            deepest: Penetration between them (length).
+        """
+        return rays.follow(
+            self.facet,
+            self.reference,
+            self.normal,
+            self._u,
+            np.full(len(self.side.body), deepest),
+            back=True,
+            undeformed=self.side.facets.normals(self.facet, self.reference),
+        )
+
+    def moving(self, before: fem.Function, shift: Array) -> MovingFacets:
+        """The facets of this rank in the increment, its start moved by a shift."""
+        facets = self.side.facets
+        flat = facets.moved_corners(None)
+        across = _across(np.swapaxes(flat[:, 1 : flat.shape[2]] - flat[:, :1], 1, 2))
+        return MovingFacets(
+            facets.moved_corners(before) + shift,
+            facets.moved_corners(self._u),
+            np.sign(_dot(across, facets.mean_normals())),
+            facets.vertices(),
+        )
+
+    def crossed(self, before: fem.Function, shift: Array, other: _Side, allowed: Array) -> Mask:
+        """Which places have crossed the other surface, (n,). Collective."""
+        vertices = self.side.facets.vertices()[self.facet]
+        start = self.at(before) + shift
+        facets = other.moving(before, shift)
+        met = find_crossings(self._comm, start, self.place, vertices, facets)
+        found = np.zeros(len(self.facet), dtype=np.bool_)
+        if not len(met.place):
+            return found
+        first = np.append(True, np.diff(met.place) > 0)
+        last = np.append(np.diff(met.place) > 0, True)
+        place, leaves = met.place[last], ~met.inward[last]
+        # Of a place that was inside from the start, through the side that its own normal met.
+        entry = np.where(met.inward[first][:, None], met.normal[first], -self.normal[place])
+        through = leaves & (_dot(entry, met.normal[last]) < _OPPOSITE_SIDES)
+        found[place] = through | (~leaves & (met.depth[last] > allowed[place]))
+        return found
+
+
+def _mean(comm: MPI.Comm, vectors: Array) -> Array:
+    """Mean of the vectors of all ranks, (gdim,); zero if there are none. Collective."""
+    sums = global_sum(comm, [*vectors.sum(axis=0), len(vectors)])
+    return np.asarray(sums[:-1] / max(sums[-1], 1.0))
+
+
+def _across(tangents: Array) -> Array:
+    """Vectors across tangents (n, gdim, gdim - 1), of any length and sign, (n, gdim)."""
+    if tangents.shape[1] == 2:
+        return np.column_stack([tangents[:, 1, 0], -tangents[:, 0, 0]])
+    return np.asarray(np.cross(tangents[:, :, 0], tangents[:, :, 1]), dtype=np.float64)
+
+
+def _below(place: Array, through: Array, normal: Array) -> Array:
+    """How deep places are below the lowest of planes, (n,) (length); -inf without any.
+
+    Args:
+        place: (n, d).
+        through: A place of each plane, (n, m, d), NaN where there is none.
+        normal: Its outward unit normal, (n, m, d).
+    """
+    depth = -np.einsum("nqd,nqd->nq", place[:, None] - through, normal)
+    return np.where(np.isnan(depth), -np.inf, depth).max(axis=1, initial=-np.inf)
+
+
+def _allowed(resisted: Array, planes: Array, facet: Array, smaller: Array) -> Array:
+    """Penetration that is allowed at places, (n,) (length).
+
+    Args:
+        resisted: That of the points around, (n,).
+        planes: That by the tangent planes which these points see, (n,).
+        facet: Size of the facet of Γc, (n,).
+        smaller: Size of the smaller facet that meets there, (n,).
+    """
+    share = np.where(resisted > 0, _PREDICTED_DEPTH, _PREDICTED_UNRESISTED)
+    predicted = np.minimum(planes, resisted + share * facet)
+    return np.maximum(resisted, predicted) + _DEPTH_RESOLUTION * smaller
+
+
+def _dot(one: Array, other: Array) -> Array:
+    """Products of vectors, (n,)."""
+    return np.asarray(np.einsum("ni,ni->n", one, other))

@@ -1,0 +1,209 @@
+"""Where places that move cross facets that move, in the course of an increment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.spatial
+
+from fenics_contact.parallel import gather_rows
+from fenics_contact.surface.projection import near_pairs
+from fenics_contact.types import Array, Index, Mask
+
+__all__ = ["Crossings", "MovingFacets", "find_crossings"]
+
+# A path is looked at in this many parts for each facet's length, and in so many at most; in each a
+# facet is crossed at most once.
+_PARTS_PER_FACET, _MOST_PARTS = 4, 64
+_BISECTIONS = 40
+# How far outside of a facet, in its own coordinates, a path may cross it: neighbours overlap.
+_OVERLAP = 1e-9
+
+
+@dataclass(frozen=True)
+class MovingFacets:
+    """Facets of this rank at both ends of an increment, taken as flat.
+
+    Attributes:
+        start, end: Corners in their order around the facet, (m, n_corners, d) (length).
+        sign: By which the normal of the corners' order points out of the body, (m,).
+        vertices: Global numbers of the vertices of their cells, (m, n_vertices).
+    """
+
+    start: Array
+    end: Array
+    sign: Array
+    vertices: Index
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """Crossings of this rank's places, ascending by place and time.
+
+    Attributes:
+        place: Number of the place on this rank, (n,).
+        time: Share of the increment, (n,).
+        inward: Whether the place comes into the body through the facet, (n,).
+        normal: Outward unit normal of the facet at that time, (n, d).
+        depth: How deep the place is at the end below the plane of the facet, (n,) (length).
+    """
+
+    place: Index
+    time: Array
+    inward: Mask
+    normal: Array
+    depth: Array
+
+
+def find_crossings(
+    comm: Any, start: Array, end: Array, vertices: Index, facets: MovingFacets
+) -> Crossings:
+    """Find which facets of all ranks the places of this rank cross. Collective.
+
+    Places and corners of facets go straight on. Facets with which a place shares a vertex are
+    left out: a body does not cross itself there.
+
+    Args:
+        comm: The ranks.
+        start: Of the places, (n, d) (length).
+        end: Of the places, (n, d) (length).
+        vertices: Global numbers of the vertices of the cell of each place, (n, n_vertices).
+        facets: Those of this rank.
+    """
+    first = comm.exscan(len(start)) or 0
+    d = start.shape[1]
+    starts, ends = (gather_rows(comm, rows) for rows in (start, end))
+    mine = _crossings(starts, ends, np.concatenate(comm.allgather(vertices)), facets)
+    found = gather_rows(comm, mine)
+    number = found[:, 0].astype(np.int64) - first
+    own = (number >= 0) & (number < len(start))
+    found, number = found[own], number[own]
+    order = np.lexsort((found[:, 1], number))
+    found = found[order]
+    return Crossings(number[order], found[:, 1], found[:, 2] > 0, found[:, 4 : 4 + d], found[:, 3])
+
+
+def _crossings(start: Array, end: Array, vertices: Index, facets: MovingFacets) -> Array:
+    """Rows of place, time, inward, depth and normal, of facets of this rank."""
+    d = start.shape[1]
+    nothing: Array = np.zeros((0, 4 + d))
+    if not (len(start) and len(facets.start)):
+        return nothing
+    # Balls around the ways: of the places, and of the facets, whose corners they hold.
+    centre, radius = _ball(np.stack([start, end], axis=1))
+    corners = np.concatenate([facets.start, facets.end], axis=1)
+    middle, reach = _ball(corners)
+    tree = scipy.spatial.cKDTree(middle)
+    # Most paths are far from all facets: only those that come near are compared one by one.
+    place: Any
+    facet: Any
+    place, facet = near_pairs(tree, centre, radius + reach.max())
+    near = np.linalg.norm(centre[place] - middle[facet], axis=1) <= radius[place] + reach[facet]
+    near &= ~(vertices[place][:, :, None] == facets.vertices[facet][:, None, :]).any(axis=(1, 2))
+    place, facet = place[near], facet[near]
+    if not len(place):
+        return nothing
+    pieces = [[0, 1]] if d == 2 else [[0, 1, 2], [0, 2, 3]][: facets.start.shape[1] - 2]
+    way = np.linalg.norm(end - start, axis=1).max() + np.linalg.norm(
+        facets.end - facets.start, axis=2
+    ).max(initial=0.0)
+    size = np.linalg.norm(facets.end[:, 1] - facets.end[:, 0], axis=1).min()
+    n = int(np.clip(np.ceil(_PARTS_PER_FACET * way / size), 1, _MOST_PARTS))
+    found = [nothing]
+    for piece in pieces:
+        moving = _Pairs(
+            start[place],
+            end[place],
+            facets.start[facet][:, piece],
+            facets.end[facet][:, piece],
+            facets.sign[facet],
+        )
+        was = moving.side(0.0)
+        for k in range(1, n + 1):
+            now = moving.side(k / n)
+            rows = np.flatnonzero((was >= 0) != (now >= 0))
+            if len(rows):
+                time = moving.bisect(rows, (k - 1) / n, k / n)
+                met = moving.meets(rows, time)
+                rows, time = rows[met], time[met]
+                inward = was[rows] >= 0
+                normal, depth = moving.normal(rows, time), -moving.distance(rows)
+                columns = place[rows], time, np.where(inward, 1.0, -1.0), depth, normal
+                found.append(np.column_stack(columns))
+            was = now
+    return np.concatenate(found)
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Places and flat facets, pair by pair: corners (n, d, d)."""
+
+    start: Array
+    end: Array
+    corners_start: Array
+    corners_end: Array
+    sign: Array
+
+    def _at(self, time: Array | float, rows: Index | slice) -> tuple[Array, Array]:
+        """Arms from the first corner to the place, (n, d), and tangents, (n, d - 1, d)."""
+        t: Array = np.reshape(time, (-1, 1))
+        place = (1 - t) * self.start[rows] + t * self.end[rows]
+        t = t[:, :, None]
+        corners = (1 - t) * self.corners_start[rows] + t * self.corners_end[rows]
+        return place - corners[:, 0], corners[:, 1:] - corners[:, :1]
+
+    def _across(self, tangents: Array, rows: Index | slice) -> Array:
+        """Outward normals, of any length."""
+        across: Any
+        if tangents.shape[1] == 1:
+            across = np.stack([tangents[:, 0, 1], -tangents[:, 0, 0]], axis=1)
+        else:
+            across = np.cross(tangents[:, 0], tangents[:, 1])
+        return np.asarray(self.sign[rows][:, None] * across)
+
+    def side(self, time: Array | float, rows: Index | slice = slice(None)) -> Array:
+        """Positive in front of the facet, negative behind it."""
+        arm, tangents = self._at(time, rows)
+        return np.asarray(np.sum(arm * self._across(tangents, rows), axis=1))
+
+    def normal(self, rows: Index, time: Array) -> Array:
+        """Outward unit normals, (n, d)."""
+        across = self._across(self._at(time, rows)[1], rows)
+        length = np.linalg.norm(across, axis=1, keepdims=True)
+        return np.asarray(across / np.maximum(length, np.finfo(float).tiny))
+
+    def distance(self, rows: Index) -> Array:
+        """From the plane of the facet at the end, (n,) (length)."""
+        arm, _ = self._at(1.0, rows)
+        return np.asarray(np.sum(arm * self.normal(rows, np.ones(len(rows))), axis=1))
+
+    def bisect(self, rows: Index, low: float, high: float) -> Array:
+        """When the plane is crossed, (n,)."""
+        a: Array = np.full(len(rows), low)
+        b: Array = np.full(len(rows), high)
+        front = self.side(low, rows) >= 0
+        for _ in range(_BISECTIONS):
+            middle = (a + b) / 2
+            same = (self.side(middle, rows) >= 0) == front
+            a, b = np.where(same, middle, a), np.where(same, b, middle)
+        return b
+
+    def meets(self, rows: Index, time: Array) -> Mask:
+        """Whether the place is on the facet then."""
+        arm, tangents = self._at(time, rows)
+        gram = np.einsum("nid,njd->nij", tangents, tangents)
+        size = np.trace(gram, axis1=1, axis2=2)
+        regular = np.abs(np.linalg.det(gram)) > 1e-24 * size ** gram.shape[1]
+        gram[~regular] = np.eye(gram.shape[1])
+        right = np.einsum("nid,nd->ni", tangents, arm)
+        at = np.linalg.solve(gram, right[:, :, None])[:, :, 0]
+        inside = np.all(at >= -_OVERLAP, axis=1) & (at.sum(axis=1) <= 1 + _OVERLAP)
+        return np.asarray(regular & inside)
+
+
+def _ball(points: Array) -> tuple[Array, Array]:
+    """Centres, (n, d), and radii, (n,), of balls around points, (n, k, d)."""
+    centre = (points.min(axis=1) + points.max(axis=1)) / 2
+    return centre, np.linalg.norm(points - centre[:, None], axis=2).max(axis=1)

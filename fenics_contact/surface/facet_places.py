@@ -1,0 +1,72 @@
+"""Places on the facets of Γc between its quadrature points, and point fields evaluated there."""
+
+from __future__ import annotations
+
+import numpy as np
+from dolfinx import fem
+
+from fenics_contact.compat import geometry_element
+from fenics_contact.surface.facets import FacetSet, tabulate
+from fenics_contact.surface.projection import polynomials
+from fenics_contact.surface.surface import SurfaceQuadrature
+from fenics_contact.types import Array, Index
+
+__all__ = ["FacetPlaces"]
+
+
+class FacetPlaces:
+    """The points of Γc, and corners, middles of edges and middles of its facets.
+
+    A field that is known at the quadrature points is evaluated elsewhere on a facet by the
+    polynomial that its points carry: exactly, where it is of the degree of the displacement.
+
+    Attributes:
+        facets: Γc as a set of facets.
+        rows: The points of every facet of this rank, (n_facets, n_points_per_facet).
+        facet: Facet of this rank of every place, (n,), the points first, in the order of `rows`.
+        reference: Reference coordinates of every place on its facet, (n, gdim - 1).
+        size: Length of every facet of this rank, in space the root of its area, (n_facets,)
+            (length).
+    """
+
+    def __init__(self, quadrature: SurfaceQuadrature, space: fem.FunctionSpace, x: Array) -> None:
+        """Locate the points on their facets. Collective.
+
+        Args:
+            quadrature: The points of Γc.
+            space: Of the displacement.
+            x: Undeformed places of this rank's points, (n_points, gdim) (length).
+        """
+        self.facets = FacetSet(space, quadrature.surface.facets)
+        self.rows = quadrature.point_rows()
+        n_facets, n_points = self.rows.shape
+        d = space.mesh.geometry.dim
+        self.size = quadrature.weights[self.rows].sum(axis=1) ** (1.0 / (d - 1))
+        facet = np.repeat(np.arange(n_facets), n_points)
+        normal = self.facets.mean_normals()
+        at, _, _ = self.facets.meet(facet, x[self.rows.ravel()], normal[facet])
+        more, corners = self.facets.lattice()
+        self.facet, self.reference = np.append(facet, more), np.concatenate([at, corners])
+        # No higher degree than that of geometry and displacement: many points are fitted then.
+        degree = max(space.ufl_element().degree, geometry_element(space.mesh).degree)
+        n_basis = (degree + 1) ** (d - 1)
+        if d == 3 and self.facets.simplex:
+            n_basis = (degree + 1) * (degree + 2) // 2
+        self._basis = polynomials(d, self.facets.simplex, min(n_points, n_basis))
+        table = tabulate(self._basis, 0, at)[0, :, :, 0].reshape(n_facets, n_points, -1)
+        self._coefficients = np.linalg.pinv(table) if n_facets else table.swapaxes(1, 2)
+
+    def values(self, field: Array, facet: Index, reference: Array) -> Array:
+        """A point field at places on facets.
+
+        Args:
+            field: At this rank's points, (n_points, ...).
+            facet: Facet of this rank of every place, (n,).
+            reference: Reference coordinates on it, (n, gdim - 1).
+
+        Returns:
+            (n, ...), in the unit of the field.
+        """
+        table = tabulate(self._basis, 0, reference)[0, :, :, 0]
+        weights = np.einsum("nb,nbq->nq", table, self._coefficients[facet])
+        return np.asarray(np.einsum("nq,nq...->n...", weights, field[self.rows[facet]]))

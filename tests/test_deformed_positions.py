@@ -1,0 +1,279 @@
+"""What happens where the model does not look: at the deformed positions, off the points of Γc.
+
+Every scene is a state that the equations of its own kinematics hold in, at a force that is zero or
+far too small; the reference is the geometry: what overlaps, or has passed through, is no solution.
+Held against it are scenes of the same kind in which nothing overlaps.
+"""
+
+import numpy as np
+import pytest
+import ufl
+
+import fenics_contact as fc
+from scenes.bodies import Bodies, boxes
+from scenes.comparing import raised_everywhere
+from scenes.tags import between, near
+
+pytestmark = pytest.mark.mpi
+E = 1000.0
+BOTTOM, TOP, FLOOR, HELD, SIDES = range(1, 6)
+KINEMATICS = pytest.mark.parametrize("kinematics", ["small", "finite"])
+
+
+def block(low=0.0, bend=None, length=1.0, n=(8, 4)):
+    """A block over [0, length] that stands at a height; its top is held or led."""
+    axes = [[np.linspace(0.0, length, n[0] + 1), low + np.linspace(0.0, 0.5, n[1] + 1)]]
+    sides = {BOTTOM: near(1, low), TOP: near(1, low + 0.5)}
+    return Bodies(boxes(axes, sides, bend=bend), E, 0.3)
+
+
+def fails(problem, *words):
+    """The next increment fails, on all ranks, for this reason."""
+    raised_everywhere(problem.solve, fc.NotConverged, *words)
+
+
+def plate(half):
+    """A plate about y = 0, of twice that thickness."""
+    return fc.Obstacle(distance=lambda x: abs(x[1]) - half)
+
+
+@pytest.mark.parametrize("half", [0.01, 1e-4])
+@pytest.mark.parametrize("steps", [1, 2])
+def test_a_thin_plate_is_not_crossed(half, steps):
+    """Led 1.5 through it, in one increment and in two: neither a point nor a sample is inside."""
+    body = block(low=0.5)
+    down = body.constant()
+    body.hold(TOP, 0)
+    body.hold(TOP, 1, value=down)
+    contact = body.contact(BOTTOM, plate(half), fc.Frictionless(), kinematics="finite")
+    problem = body.problem(contact)
+    down.value = -1.5 / steps
+    fails(problem, "has crossed")
+    down.value = -0.4  # above it still
+    assert problem.solve().verdict.failures == []
+
+
+def test_a_thin_plate_is_not_crossed_slowly():
+    """Springs so soft that a point comes to the plate's other side while it is pressed."""
+    body = block()
+    up = body.constant(np.zeros(2))
+    body.hold(TOP, 0, 1)
+    obstacle = fc.Obstacle(distance=lambda x: abs(x[1] + 0.01) - 0.01, displacement=up)
+    contact = body.contact(BOTTOM, obstacle, fc.Frictionless(k_n=E), kinematics="finite")
+    problem = body.problem(contact)
+    forces = []
+    with pytest.raises(fc.NotConverged, match="has crossed"):
+        for up.value[1] in 0.003 * np.arange(30):
+            problem.solve()
+            problem.commit()
+            forces.append(contact.resultants().normal_force)
+    assert len(forces) > 3
+    assert np.all(np.diff(forces) > 0)
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+def test_a_blade_is_not_turned_through_a_body(steps):
+    """By one radian: beneath it at first, above at last, and no point was in it at either end."""
+
+    def blade(x):
+        tip, grip = ufl.as_vector((1.5, -0.3)), ufl.as_vector((-1.0, -0.3))
+        arm, along = x - grip, tip - grip
+        share = ufl.dot(arm, along) / ufl.dot(along, along)
+        share = ufl.conditional(share < 0, 0.0, ufl.conditional(share > 1, 1.0, share))
+        off = arm - share * along
+        return ufl.sqrt(ufl.dot(off, off)) - 0.01
+
+    body = block()
+    body.hold(TOP, 0, 1)
+    angle = body.constant()
+    obstacle = fc.Obstacle(distance=blade, rotation=fc.Rotation(angle, (-1.0, -0.3)))
+    problem = body.problem(body.contact(BOTTOM, obstacle, fc.Frictionless(), kinematics="finite"))
+    with pytest.raises(fc.NotConverged, match=r"has crossed|penetrates"):
+        for angle.value in np.linspace(0.0, 1.0, steps + 1)[1:]:
+            problem.solve()
+            problem.commit()
+
+
+@KINEMATICS
+@pytest.mark.parametrize("at", [0.5, 0.53, 0.5625, 0.46])
+def test_a_ball_between_two_points_is_seen(kinematics, at):
+    """A ball of a fifth of a facet, pressed in by more than its diameter at any place of it."""
+    body = block()
+    body.hold(TOP, 0, 1)
+    up = body.constant(np.zeros(2))
+    ball = fc.Ball((at, -0.0125), 0.0125, displacement=up)
+    problem = body.problem(body.contact(BOTTOM, ball, fc.Frictionless(), kinematics=kinematics))
+    up.value[1] = -0.01
+    assert problem.solve().verdict.failures == []
+    problem.commit()
+    with pytest.raises(fc.NotConverged, match=r"has crossed|penetrates|too large"):
+        for up.value[1] in (0.01, 0.02, 0.03):
+            problem.solve()
+            problem.commit()
+
+
+@pytest.mark.parametrize("kind", ["rests", "hovers"])
+def test_open_points_are_looked_at(kind):
+    """A raised part is driven over a bump, small displacements: its points stay open in the model.
+
+    With finite kinematics the same body is lifted off, or meets the bump.
+    """
+
+    def step(x):
+        x = x.copy()
+        rise = np.clip((x[:, 0] - 0.9) / 0.2, 0.0, 1.0)
+        x[:, 1] += 0.2 * rise * (1 - x[:, 1] / 0.5)
+        return x
+
+    rests = kind == "rests"
+    body = block(bend=step if rests else None, low=0.0 if rests else 0.05, length=2.0, n=(20, 5))
+    along = body.constant()
+    body.hold(TOP, 1, value=-0.005 if rests else 0.0)
+    body.hold(TOP, 0, value=along)
+    floor = [[5, 0], [3.2, 0], [2.9, 0.12], [2.6, 0.25], [2.3, 0.12], [2, 0], [1, 0], [-3, 0]]
+    contact = body.contact(BOTTOM, fc.RigidProfile(np.array(floor, dtype=float)), fc.Frictionless())
+    problem = body.problem(contact)
+    with pytest.raises(fc.NotConverged, match=r"too large to be taken as small|penetrates|crossed"):
+        for along.value in np.linspace(0.0, 0.8, 21):
+            problem.solve()
+            problem.commit()
+
+
+@KINEMATICS
+@pytest.mark.parametrize("way", [0.3, 0.7, 2.5])
+def test_a_body_does_not_enter_another_from_aside(kinematics, way):
+    """A hovering block, whose underside is Γc, is led into a post, or over it and beyond."""
+    axes = [
+        [np.linspace(0.0, 1.0, 9), 0.3 + np.linspace(0.0, 0.5, 5)],
+        [np.linspace(0.0, 3.0, 13), np.linspace(-0.5, 0.0, 3)],
+        [np.linspace(1.5, 1.8, 4), np.linspace(0.0, 0.5, 5)],
+    ]
+
+    def post(x, cell):
+        return near(0, 1.5)(x, cell) | near(0, 1.8)(x, cell) | near(1, 0.5)(x, cell)
+
+    sides = {
+        BOTTOM: near(1, 0.3),
+        TOP: near(1, 0.8),
+        FLOOR: between(1, 0.0, above=False),
+        HELD: near(1, -0.5),
+        6: between(1, 0.0, above=True),
+        SIDES: post,
+    }
+    body = Bodies(boxes(axes, sides), E, 0.3)
+    along = body.constant()
+    body.hold(HELD, 0, 1)
+    body.hold(6, 0, 1)
+    body.hold(TOP, 1)
+    body.hold(TOP, 0, value=along)
+    opposite = fc.DeformableBody(body.tags, (FLOOR, SIDES))
+    problem = body.problem(body.contact(BOTTOM, opposite, fc.Frictionless(), kinematics=kinematics))
+    along.value = way
+    if way < 0.5:  # short of it
+        assert problem.solve().verdict.failures == []
+    else:
+        fails(problem, "crossed")
+
+
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+def test_what_slides_off_the_other_body_does_not_bear(enforcement):
+    """Half off its plate in one increment, small displacements: refused.
+
+    In steps of a tenth the force is that of finite kinematics, 10 %: each is of its own pairs.
+    """
+    forces = []
+    for kinematics, steps in (("small", 1), ("small", 10), ("finite", 10)):
+        axes = [
+            [np.linspace(0.0, 2.0, 17), np.linspace(0.0, 0.5, 5)],
+            [np.linspace(1.0, 2.0, 9), 0.5 + np.linspace(0.0, 0.5, 5)],
+        ]
+        sides = {
+            HELD: near(1, 0.0),
+            FLOOR: between(1, 0.5, above=False),
+            BOTTOM: between(1, 0.5, above=True),
+            TOP: near(1, 1.0),
+        }
+        body = Bodies(boxes(axes, sides), E, 0.3)
+        along = body.constant()
+        body.hold(HELD, 0, 1)
+        body.hold(TOP, 1, value=-0.01)
+        body.hold(TOP, 0, value=along)
+        contact = body.contact(
+            BOTTOM, FLOOR, fc.Frictionless(), kinematics=kinematics, enforcement=enforcement
+        )
+        problem = body.problem(contact)
+        problem.solve()
+        problem.commit()
+        if steps == 1:
+            along.value = 0.5
+            fails(problem, "too large to be taken as small")
+            continue
+        for along.value in np.linspace(0.0, 0.5, steps + 1)[1:]:
+            problem.solve()
+            problem.commit()
+        forces.append(contact.resultants().normal_force)
+    assert forces[0] == pytest.approx(forces[1], rel=0.1)
+
+
+@KINEMATICS
+def test_a_pin_is_seen_beside_what_closes_the_next_facet(kinematics):
+    """A slab holds the facets around up, and a narrow pin enters between the points of one."""
+    width = 0.04
+    axes = [
+        [np.linspace(0.0, 2.0, 5), np.linspace(0.0, 0.5, 3)],
+        [np.linspace(0.0, 0.9, 4), 0.5 + np.linspace(0.0, 0.5, 3)],
+        [1.25 + width * np.linspace(-0.5, 0.5, 3), 0.5 + np.linspace(0.0, 0.5, 4)],
+    ]
+    sides = {
+        BOTTOM: between(1, 0.5, above=False),
+        FLOOR: between(1, 0.5, above=True),
+        HELD: near(1, 0.0),
+        TOP: near(1, 1.0),
+    }
+    body = Bodies(boxes(axes, sides), E, 0.3)
+    body.hold(HELD, 0, 1)
+    body.hold(TOP, 0)
+    body.hold(TOP, 1, value=-5e-3)
+    problem = body.problem(
+        body.contact(BOTTOM, FLOOR, fc.Frictionless(), kinematics=kinematics, quadrature=2)
+    )
+    fails(problem, "penetrates", "1.2")
+
+
+@KINEMATICS
+@pytest.mark.parametrize("both", [False, True])
+def test_crossed_ridges_are_seen(kinematics, both):
+    """Their edges cross, no point of a flank meets the other body: from one side and from both."""
+    lines, rise = np.linspace(0.0, 1.0, 5), np.linspace(0.0, 0.5, 3)
+
+    def ridges(x):
+        x = x.copy()
+        lower = 0.45 * (1 - abs(2 * x[:, 1] - 1)) * x[:, 2] / 0.5
+        upper = -0.45 * (1 - abs(2 * x[:, 0] - 1)) * (1.9 - x[:, 2]) / 0.5
+        x[:, 2] += np.where(x[:, 2] < 0.9, lower, upper)
+        return x
+
+    sides = {
+        BOTTOM: between(2, 0.5, above=False),
+        FLOOR: between(2, 1.4, above=True),
+        HELD: near(2, 0.0),
+        TOP: near(2, 1.9),
+    }
+    body = Bodies(
+        boxes([[lines, lines, rise], [lines, lines, 1.4 + rise]], sides, bend=ridges), E, 0.3
+    )
+    down = body.constant()
+    body.hold(HELD, 0, 1, 2)
+    body.hold(TOP, 0, 1)
+    body.hold(TOP, 2, value=down)
+    faces = [(BOTTOM, FLOOR), (FLOOR, BOTTOM)][: 1 + both]
+    contacts = [
+        body.contact(*face, fc.Frictionless(), kinematics=kinematics, name=f"side {i}")
+        for i, face in enumerate(faces)
+    ]
+    problem = body.problem(*contacts)
+    down.value = 0.1  # apart
+    assert problem.solve().verdict.failures == []
+    problem.commit()
+    down.value = -0.05
+    fails(problem, "penetrates")
