@@ -75,7 +75,7 @@ GROUPS: list[tuple[str, list[str], str]] = [
     ),
     (
         "Bulk form",
-        ["systems.bulk", "elasticity"],
+        ["systems.bulk", "systems.measures", "elasticity"],
         "F is the residual of the bulk in the function that is solved for and one test function, "
         "loads "
         "included, contact not.",

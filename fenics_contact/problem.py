@@ -18,7 +18,6 @@ from fenics_contact.arguments import is_number, listed
 from fenics_contact.checks.energy import EnergyState
 from fenics_contact.checks.given import (
     check_contacts,
-    check_measures,
     check_start,
     check_values,
     constrained_unknowns,
@@ -198,7 +197,6 @@ class ContactProblem:
         self.increment = 0
         self.prefix = prefix
         self._comm = u.function_space.mesh.comm
-        check_measures(F, self._comm)
         n_motions = sum(len(contact.motions) for contact in self.contacts)
         self.unknowns = Unknowns(u.function_space, n_motions)
         self._n_owned = self.unknowns.n_dofs

@@ -16,7 +16,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import output
-from fenics_contact.checks.given import check_measures
+from fenics_contact.systems.measures import check_measures
 from scenes.blocks import BOTTOM, TOP, block_mesh
 from scenes.comparing import raised_everywhere
 from scenes.sound import MESH, coulomb, pressed

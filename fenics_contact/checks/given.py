@@ -5,12 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import ufl
 from dolfinx import fem
-from mpi4py import MPI
 
 from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
@@ -22,7 +20,6 @@ from fenics_contact.types import Array, Mask
 
 __all__ = [
     "check_contacts",
-    "check_measures",
     "check_start",
     "check_values",
     "constrained_unknowns",
@@ -32,7 +29,6 @@ __all__ = [
 
 logger = logging.getLogger("fenics_contact")
 
-_MEASURES = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
 # Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
 _TOUCHING = 1e-12
 # Round-off of coordinates that leaves too little of what is next to them, relative to the mesh.
@@ -74,41 +70,6 @@ def find_displacement(u: fem.Function, contacts: Sequence[Contact]) -> Displacem
     if not isinstance(u, fem.Function):
         return Displacement(u, None, "problem")  # refuses it
     return Displacement.only(u, "problem")
-
-
-def check_measures(form: ufl.Form, comm: MPI.Comm) -> None:
-    """Refuse integrals over tags that their measure does not know; warn of tags of nothing.
-
-    Either is zero without a word from DOLFINx: a load that is not there. Collective.
-
-    Raises:
-        ValueError: A measure has no tags. On all ranks.
-    """
-    for integral in form.integrals():
-        ids, data = integral.subdomain_id(), integral.subdomain_data()
-        measure = _MEASURES.get(integral.integral_type(), integral.integral_type())
-        for tag in ids if isinstance(ids, tuple) else (ids,):
-            if isinstance(tag, str):  # everywhere
-                continue
-            if data is None:
-                raise ValueError(
-                    f"F has an integral over {measure}({tag}) whose measure has no tags, so that "
-                    f'it is zero; make it by {measure} = ufl.Measure("{measure}", domain=mesh, '
-                    "subdomain_data=tags)"
-                )
-            if not comm.allreduce(_n_tagged(data, int(tag))):
-                warn(
-                    comm,
-                    f"F has an integral over {measure}({tag}), and nothing on the mesh has this "
-                    "tag: it is zero",
-                )
-
-
-def _n_tagged(data: Any, tag: int) -> int:
-    """How many of this rank's entities have a tag: of MeshTags, or of (tag, entities) pairs."""
-    if hasattr(data, "find"):
-        return len(data.find(tag))
-    return sum(len(entities) for number, entities in data if number == tag)
 
 
 def constrained_unknowns(

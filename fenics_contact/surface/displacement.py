@@ -38,6 +38,7 @@ class Displacement:
         dofs: Of every dof of ``u`` on this rank, ghosts too, its number in ``whole``; None: the
             same.
         degree: Of the elements of ``u``.
+        first: Number of its first component among those of ``whole``.
     """
 
     def __init__(self, u: Any, mesh: Any, name: str) -> None:
@@ -57,12 +58,14 @@ class Displacement:
         check_kind(u, name)
         if isinstance(u, fem.Function):
             self.whole = self.u = u
-            self._part = None
+            self._part, self.first = None, 0
             _check_unmixed(u, name)
         else:
             self.whole, self._part = _parts(u, name)
             space, self.dofs = collapsed(self.whole.function_space.sub(self._part))
             self.u = fem.Function(space, name="u")
+            before = ufl.split(self.whole)[: self._part]
+            self.first = sum(int(np.prod(part.ufl_shape, dtype=int)) for part in before)
             self.follow()
         self.degree = _degree(self.u, mesh or self.u.function_space.mesh, name)
 

@@ -31,42 +31,47 @@ def cell_modulus(
 ) -> fem.Function:
     """Young's modulus of every cell as the bulk form itself has it. Collective.
 
-    The energy of two homogeneous strains is measured cell by cell: simple shear u = (0, x, 0)
-    gives G, stretch u = (0, y, 0) gives M = λ + 2G; then E = G (3M - 4G)/(M - G). Exact for
-    isotropic solids and plane strain; within some per cent for plane stress; the stiffness along
-    y for others.
-    Both fields have no radial part, so that they serve axisymmetric forms too. They are zero on the
-    mean of each cell: a mass or a foundation in the form would measure the way from the origin.
+    Two uniform gradients of the displacement are put into the form cell by cell: simple shear
+    u = (0, x, 0) gives G, stretch u = (0, y, 0) gives M = λ + 2G; then E = G (3M - 4G)/(M - G).
+    Exact for isotropic solids and plane strain; within some per cent for plane stress; the
+    stiffness along y for others.
+
+    Only what the form makes of the gradient of u and of that of its test function counts. Terms in
+    u or v themselves (mass, foundation, damping by velocity) are no stiffness of the material and
+    are left out, whatever their size: E of a form with inertia is that of the form without. So are
+    second gradients, and u_r/r of axisymmetric forms, which both strains have none of. Damping by
+    strain rates is stiffness here, as in the tangent.
 
     In a mixed form the stiffness of the volume is not that of displacements alone: E is 3 G, that
     of an incompressible body.
 
     Args:
-        bulk_tangent: Bilinear form of the bulk, by (trial, test) of what is solved for.
+        bulk_tangent: Bilinear form of the bulk, by (trial, test) of what is solved for, its
+            derivatives expanded.
         displacement: In it, where a nonlinear bulk is linearised.
         weight: Factor of the volume measure that the bulk form carries (thickness, 2πr).
 
     Returns:
         A function, one value per cell (stress).
     """
-    space, u = displacement.whole.function_space, displacement.u
-    cells = [i for i in bulk_tangent.integrals() if i.integral_type() == "cell"]
-    test, trial = bulk_tangent.arguments()
-    # Both energies and the volume as the components of one form: compiled and assembled at once.
-    three = fem.functionspace(space.mesh, ("DG", 0, (3,)))
-    q = ufl.TestFunction(three)
-    form = weight * q[2] * ufl.dx(space.mesh)
-    x = u.function_space.tabulate_dof_coordinates()
-    dofs = np.arange(u.x.array.size) if displacement.dofs is None else displacement.dofs
+    mesh, (test, trial) = displacement.u.function_space.mesh, bulk_tangent.arguments()
+    modulus = fem.Function(fem.functionspace(mesh, ("DG", 0)), name="modulus")
+    two = fem.functionspace(mesh, ("DG", 0, (2,)))
+    q, cells = ufl.TestFunction(two), ufl.Form(bulk_tangent.integrals_by_type("cell"))
+    both = ufl.Form([])
     for direction in range(2):
-        field = fem.Function(space)
-        field.x.array[dofs[1 :: len(u)]] = x[:, direction]
-        local = field - _means(field)
-        form += ufl.replace(ufl.Form(cells), {test: q[direction] * local, trial: local})
-    shear, stretch, volume = assembled(compile_form(form)).reshape(-1, 3).T
-    shear, stretch = shear / volume, stretch / volume
+        gradient = np.zeros((*test.ufl_shape, mesh.geometry.dim))
+        gradient[displacement.first + 1, direction] = 1.0
+        uniform = ufl.as_tensor(gradient.tolist())
+        strained = {ufl.grad(test): q[direction] * uniform, ufl.grad(trial): uniform}
+        rest = {argument: ufl.zero(argument.ufl_shape) for argument in (test, trial)}
+        both += ufl.replace(cells, strained | rest)
+    if both.empty():
+        return modulus
+    # A form of its own: one with data of subdomains, as the user's may be, takes no other measures.
+    volume = assembled(compile_form(weight * ufl.TestFunction(modulus.function_space) * ufl.dx))
+    shear, stretch = assembled(compile_form(both)).reshape(-1, 2).T / volume
     isotropic = stretch > 1.2 * shear  # λ > -0.8 G: else no isotropic solid, and E is the stretch's
-    modulus = fem.Function(fem.functionspace(space.mesh, ("DG", 0)), name="modulus")
     if displacement.mixed:
         modulus.x.array[:] = 3 * shear
         return modulus
@@ -74,20 +79,6 @@ def cell_modulus(
     G, M = shear[isotropic], stretch[isotropic]
     modulus.x.array[isotropic] = G * ((3 * M - 4 * G) / (M - G))
     return modulus
-
-
-def _means(field: fem.Function) -> fem.Function:
-    """Its mean on every cell. Collective."""
-    space = field.function_space
-    means = fem.Function(fem.functionspace(space.mesh, ("DG", 0, field.ufl_shape)))
-    q = ufl.TestFunction(means.function_space)
-    dx = ufl.dx(space.mesh)
-    one = ufl.as_vector([1.0] * len(field))
-    volume = fem.Function(means.function_space)
-    assembled(compile_form(ufl.inner(field, q) * dx), means.x)
-    assembled(compile_form(ufl.inner(one, q) * dx), volume.x)
-    means.x.array[:] /= volume.x.array
-    return means
 
 
 def modulus_over_height(

@@ -24,6 +24,7 @@ from fenics_contact.parallel import all_finite, collective_errors, global_max, g
 from fenics_contact.surface.dependence import Dependence
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.mass import assembled
+from fenics_contact.systems.measures import check_measures, share_subdomain_data
 from fenics_contact.types import Array, Indices
 
 __all__ = ["Bulk"]
@@ -40,7 +41,7 @@ class Bulk:
     """The bulk residual F(u; v), without contact.
 
     Attributes:
-        form: The residual, UFL.
+        form: The residual, UFL, with one object of tags for each kind of measure.
         space: Of ``u``.
         displacement: What of ``u`` is one.
         units: Of every dof of this rank, ghosts too: values over units are what all others see, and
@@ -101,6 +102,8 @@ class Bulk:
                     f"F has {other.name!r}, a part of u as w.sub(i) gives it, which its derivative "
                     "by u does not know; take the parts of ufl.split(w)"
                 )
+        check_measures(form, u.function_space.mesh.comm)
+        form = share_subdomain_data(form)
         self._u, self.displacement = u, displacement
         self.units: Array | None = None
         self.form, self.space = form, u.function_space

@@ -1,0 +1,84 @@
+"""The measures of a bulk form: over which tags they are, and how DOLFINx takes them together."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import ufl
+from mpi4py import MPI
+
+from fenics_contact.parallel import warn
+
+__all__ = ["check_measures", "share_subdomain_data"]
+
+_MEASURES = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
+_EVERYWHERE = "everywhere"  # UFL's word for an integral over all cells, or all facets of a kind
+
+
+def check_measures(form: ufl.Form, comm: MPI.Comm) -> None:
+    """Refuse measures without the tags that they are over, or with two objects of tags. Collective.
+
+    It warns of tags of nothing. An integral over a tag that is not known is zero without a word
+    from DOLFINx: a load that is not there.
+
+    Raises:
+        ValueError: A measure has no tags, or two of one kind have different ones. On all ranks.
+    """
+    shared = _subdomain_data(form)
+    for integral in form.integrals():
+        kind, data = integral.integral_type(), integral.subdomain_data()
+        tag = integral.subdomain_id()
+        measure = _MEASURES.get(kind, kind)
+        if data is not None and data is not shared[kind]:
+            raise ValueError(
+                f"F has integrals over {measure} with two objects of tags, and DOLFINx takes one "
+                "for each kind of measure: put the tags of both into one MeshTags (or list), and "
+                f'make all of them by {measure} = ufl.Measure("{measure}", domain=mesh, '
+                "subdomain_data=tags)"
+            )
+        if tag == _EVERYWHERE:
+            continue
+        if data is None:
+            raise ValueError(
+                f"F has an integral over {measure}({tag}) whose measure has no tags, so that "
+                f'it is zero; make it by {measure} = ufl.Measure("{measure}", domain=mesh, '
+                "subdomain_data=tags)"
+            )
+        if not comm.allreduce(_n_tagged(data, int(tag))):
+            warn(
+                comm,
+                f"F has an integral over {measure}({tag}), and nothing on the mesh has this "
+                "tag: it is zero",
+            )
+
+
+def share_subdomain_data(form: ufl.Form) -> ufl.Form:
+    """Return the same form with the tags of each kind of measure in all integrals of that kind.
+
+    DOLFINx takes the sum of a plain ``dx`` and one with tags in some releases (0.9 does not); an
+    integral over all cells is the same with the tags as without.
+    """
+    shared = _subdomain_data(form)
+    return ufl.Form(
+        [
+            integral.reconstruct(subdomain_data=shared.get(integral.integral_type()))
+            for integral in form.integrals()
+        ]
+    )
+
+
+def _subdomain_data(form: ufl.Form) -> dict[str, Any]:
+    """The tags of every kind of integral that has any, of the first one that has them."""
+    found: dict[str, Any] = {}
+    for integral in form.integrals():
+        data = integral.subdomain_data()
+        if data is not None:
+            found.setdefault(integral.integral_type(), data)
+    return found
+
+
+def _n_tagged(data: Any, tag: int) -> int:
+    """How many of this rank's entities have a tag: of MeshTags, or of (tag, entities) pairs."""
+    if hasattr(data, "find"):
+        return len(data.find(tag))
+    return sum(len(entities) for number, entities in data if number == tag)

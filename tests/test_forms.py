@@ -1,0 +1,310 @@
+"""Bulk forms as their users write them: over tags of every kind, of two materials, and in time.
+
+A form over tags is the same as one with coefficients by cell, to 1e-9: the solver's 1e-13 of the
+forces, with room for the tangent's condition. The stiffness of contact is the default, a multiple
+of E/h as it is measured in the form.
+"""
+
+import basix.ufl
+import dolfinx
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.elasticity import LinearElastic, NeoHookean
+from scenes.blocks import BOTTOM, LEFT, TOP, block_mesh
+from scenes.comparing import at_points, close, nodal, raised_everywhere
+from scenes.elasticity import displacement_space, hold, strain, stress
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+COMM = MPI.COMM_WORLD
+TIGHT = {"snes_rtol": 1e-13}
+LOWER, UPPER = 1, 2
+# By tag: Young's modulus, and the force per volume to the side.
+E, PULL = {LOWER: 1000.0, UPPER: 4000.0}, {LOWER: 0.0, UPPER: 0.2}
+NU = 0.3
+
+
+class Layers:
+    """A block of two layers, its cells and facets tagged, which a pressure presses on a floor.
+
+    Attributes:
+        dx, ds: Measures with the tags, and without.
+        E, pull: Coefficients by cell, whose form with plain measures is the reference.
+    """
+
+    def __init__(self, element=None, **mesh_arguments):
+        """Make mesh, tags and functions; ``element``: of a mixed function."""
+        self.mesh, self.facets = block_mesh("quadrilateral", n=4, **mesh_arguments)
+        d = self.mesh.topology.dim
+        cells = np.arange(self.mesh.topology.index_map(d).size_local, dtype=np.int32)
+        middle = dolfinx.mesh.compute_midpoints(self.mesh, d, cells)[:, 1]
+        layer = np.where(middle < 0.5, LOWER, UPPER).astype(np.int32)
+        self.cells = dolfinx.mesh.meshtags(self.mesh, d, cells, layer)
+        if element is None:
+            self.w = self.u = fem.Function(displacement_space(self.mesh, 1))
+            self.v, self.p, self.q = ufl.TestFunction(self.u.function_space), None, None
+        else:
+            self.w = fem.Function(fem.functionspace(self.mesh, element))
+            tests = ufl.TestFunctions(self.w.function_space)
+            parts = zip(ufl.split(self.w), tests, strict=True)
+            (self.p, self.q), (self.u, self.v) = sorted(
+                parts, key=lambda part: len(part[0].ufl_shape)
+            )
+            self.part = ufl.split(self.w).index(self.u)
+        self.dx = ufl.Measure("dx", self.mesh, subdomain_data=self.cells)
+        self.ds = ufl.Measure("ds", self.mesh, subdomain_data=self.facets)
+        self.E, self.pull = self.by_cell(E), self.by_cell(PULL)
+        self.pressure = fem.Constant(self.mesh, 2.0)
+
+    def by_cell(self, values):
+        """A function of the tags of cells."""
+        f = fem.Function(fem.functionspace(self.mesh, ("DG", 0)))
+        f.x.array[self.cells.indices] = [values[tag] for tag in self.cells.values]
+        f.x.scatter_forward()
+        return f
+
+    def work(self, E):
+        """Density of the work of the stresses."""
+        return ufl.inner(stress(self.u, E, NU), strain(self.v))
+
+    def loads(self, dx, ds):
+        """Work of the loads: a force on the upper layer, and the pressure on the top."""
+        return PULL[UPPER] * self.v[0] * dx - self.pressure * self.v[1] * ds
+
+    def plain(self, ds=None):
+        """The reference: no tags but those of the top, which there is no other way to say."""
+        ds = self.ds(TOP) if ds is None else ds
+        F = self.work(self.E) * ufl.dx - self.pull * self.v[0] * ufl.dx
+        return F + self.pressure * self.v[1] * ds
+
+    def solved(self, F, law=None, **options):
+        """Displacements at the nodes, and k_n at the points of Γc."""
+        if self.w is self.u:
+            bcs = [hold(self.u, self.facets, LEFT, 0)]
+        else:
+            part = self.w.function_space.sub(self.part).sub(0)
+            dofs = fem.locate_dofs_topological(part, 1, self.facets.find(LEFT))
+            bcs = [fem.dirichletbc(fem.Constant(self.mesh, 0.0), dofs, part)]
+        surface = fc.ContactSurface(self.mesh, self.facets, BOTTOM)
+        floor = fc.HalfSpace((0.0, 0.0), (0.0, 1.0))
+        contact = fc.Contact(self.u, surface, floor, law or fc.Coulomb(0.3))
+        problem = fc.ContactProblem(
+            F, self.w, bcs=bcs, contacts=[contact], petsc_options=TIGHT, **options
+        )
+        problem.solve()
+        return nodal(problem.displacement.u), at_points(contact, contact.values.parameters["k_n"])
+
+
+def two_measures_with_one_data(s):
+    """Each with its tag and its rule; the loads by a third."""
+    one, other = (
+        ufl.Measure("dx", s.mesh, subdomain_data=s.cells, subdomain_id=tag, metadata=rule)
+        for tag, rule in ((LOWER, {"quadrature_degree": 2}), (UPPER, {"quadrature_degree": 4}))
+    )
+    F = s.work(E[LOWER]) * one + s.work(E[UPPER]) * other
+    return F - s.loads(s.dx(UPPER), s.ds(TOP))
+
+
+def pairs(s):
+    """Cells and facets as lists of (number, entities), as ``form`` of DOLFINx takes them."""
+    s.mesh.topology.create_connectivity(2, 1)
+    to_cell, to_facet = s.mesh.topology.connectivity(1, 2), s.mesh.topology.connectivity(2, 1)
+    behind = [(f, to_cell.links(f)[0]) for f in s.facets.find(TOP)]
+    sides = [(cell, list(to_facet.links(cell)).index(f)) for f, cell in behind]
+    top = np.array(sides, dtype=np.int32).ravel()
+    dx = ufl.Measure(
+        "dx", s.mesh, subdomain_data=[(tag, s.cells.find(tag)) for tag in (LOWER, UPPER)]
+    )
+    ds = ufl.Measure("ds", s.mesh, subdomain_data=[(TOP, top)])
+    F = s.work(E[LOWER]) * dx(LOWER) + s.work(E[UPPER]) * dx(UPPER)
+    return F - s.loads(dx(UPPER), ds(TOP))
+
+
+def two_materials(s, dx=None):
+    """By the tags of one measure."""
+    dx = s.dx if dx is None else dx
+    return s.work(E[LOWER]) * dx(LOWER) + s.work(E[UPPER]) * dx(UPPER)
+
+
+# As they are met in scripts: name, and the form.
+WAYS = {
+    "two materials": lambda s: two_materials(s) - s.loads(s.dx(UPPER), s.ds(TOP)),
+    "without a mesh": lambda s: (
+        two_materials(s, ufl.Measure("dx", subdomain_data=s.cells))
+        - s.loads(ufl.Measure("dx", subdomain_data=s.cells)(UPPER), s.ds(TOP))
+    ),
+    "two measures with one data": two_measures_with_one_data,
+    "pairs of number and entities": pairs,
+    "several tags at once": lambda s: (
+        s.work(E[LOWER]) * s.dx((LOWER, UPPER))
+        + s.work(E[UPPER] - E[LOWER]) * s.dx(UPPER)
+        - s.loads(s.dx(UPPER), s.ds(TOP))
+    ),
+    "a sum of measures": lambda s: (
+        s.work(s.E) * (s.dx(LOWER) + s.dx(UPPER)) - s.loads(s.dx(UPPER), s.ds(TOP))
+    ),
+    "one measure with data, all cells": lambda s: (
+        s.work(s.E) * s.dx - s.loads(s.dx(UPPER), s.ds(TOP))
+    ),
+    "plain beside tagged": lambda s: s.work(s.E) * ufl.dx - s.loads(s.dx(UPPER), s.ds(TOP)),
+    "plain facets beside tagged": lambda s: (
+        s.plain() + fem.Constant(s.mesh, 0.0) * ufl.dot(s.u, s.v) * ufl.ds
+    ),
+    "by an energy": lambda s: (
+        ufl.derivative(
+            sum(
+                0.5 * ufl.inner(stress(s.u, E[tag], NU), strain(s.u)) * s.dx(tag)
+                for tag in (LOWER, UPPER)
+            ),
+            s.u,
+            s.v,
+        )
+        - s.loads(s.dx(UPPER), s.ds(TOP))
+    ),
+    "bodies of the package": lambda s: (
+        LinearElastic(s.u, E[LOWER], NU, "plane strain").residual(s.v, s.dx(LOWER))
+        + LinearElastic(s.u, E[UPPER], NU, "plane strain").residual(s.v, s.dx(UPPER))
+        - s.loads(s.dx(UPPER), s.ds(TOP))
+    ),
+}
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("way", WAYS)
+def test_ways_to_write_one_form(way):
+    """Each is the form with coefficients by cell."""
+    s = Layers()
+    u, k_n = s.solved(WAYS[way](s))
+    reference = Layers()
+    expected, stiffness = reference.solved(reference.plain())
+    assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)
+    # Of the lower layer, on cells a quarter high; to the round-off of its smoothing.
+    assert close(k_n, np.full(k_n.shape, 10 * E[LOWER] * 4), 1e-9)
+
+
+VECTOR, SCALAR = (
+    basix.ufl.element("P", "quadrilateral", degree, shape=shape)
+    for degree, shape in ((2, (2,)), (1, ()))
+)
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("parts", [(VECTOR, SCALAR), (SCALAR, VECTOR)], ids=["u, p", "p, u"])
+def test_two_materials_beside_a_pressure(parts):
+    """Of a mixed function, wherever the displacement is in it: E is 3 G."""
+    element = basix.ufl.mixed_element(parts)
+    found = []
+    for tagged in (True, False):
+        s = Layers(element)
+
+        def work(E, s=s):
+            G, lame = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
+            density = 2 * G * ufl.inner(strain(s.u), strain(s.v)) - s.p * ufl.div(s.v)
+            return density - s.q * (ufl.div(s.u) + s.p / lame)
+
+        if tagged:
+            F = work(E[LOWER]) * s.dx(LOWER) + work(E[UPPER]) * s.dx(UPPER)
+            F -= s.loads(s.dx(UPPER), s.ds(TOP))
+        else:
+            F = work(s.E) * ufl.dx - s.pull * s.v[0] * ufl.dx + s.pressure * s.v[1] * s.ds(TOP)
+        found.append(s.solved(F))
+    (u, k_n), (expected, stiffness) = found
+    assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)
+    assert close(k_n, np.full(k_n.shape, 10 * 3 * E[LOWER] / (2 * (1 + NU)) * 4), 1e-9)
+
+
+def test_two_rubbers():
+    """A nonlinear bulk over tags, with a rule of its own for each."""
+    found = []
+    for tagged in (True, False):
+        s = Layers()
+        rules = [
+            s.dx(tag, metadata={"quadrature_degree": 4})
+            if tagged
+            else ufl.dx(metadata={"quadrature_degree": 4})
+            for tag in E
+        ]
+        if tagged:
+            rubbers = [NeoHookean(s.u, E[tag], NU, "plane strain") for tag in E]
+            F = sum(r.residual(s.v, dx) for r, dx in zip(rubbers, rules, strict=True))
+            F -= s.loads(s.dx(UPPER), s.ds(TOP))
+        else:
+            F = NeoHookean(s.u, s.E, NU, "plane strain").residual(s.v, rules[0])
+            F += s.pressure * s.v[1] * s.ds(TOP) - s.pull * s.v[0] * ufl.dx
+        s.pressure.value = 50.0
+        found.append(s.solved(F))
+    (u, k_n), (expected, stiffness) = found
+    assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)
+
+
+def test_joined_bodies():
+    """A material for each body over ``joined.body``, two bodies in contact, against `by_body`."""
+    found = []
+    for tagged in (True, False):
+        lower, upper = (block_mesh("quadrilateral", n=n) for n in (2, 3))
+        upper[0].geometry.x[:, 1] += 1.0
+        joined = fc.join_meshes(
+            {
+                name: (mesh, None, tags)
+                for name, (mesh, tags) in {"lower": lower, "upper": upper}.items()
+            }
+        )
+        mesh, moduli = joined.mesh, {"lower": 1000.0, "upper": 4000.0}
+        u = fem.Function(displacement_space(mesh, 1))
+        v = ufl.TestFunction(u.function_space)
+        dx = ufl.Measure("dx", mesh, subdomain_data=joined.cells)
+        ds = ufl.Measure("ds", mesh, subdomain_data=joined.facets)
+        if tagged:
+            F = sum(
+                LinearElastic(u, fem.Constant(mesh, modulus), NU, "plane strain").residual(
+                    v, dx(joined.body(name))
+                )
+                for name, modulus in moduli.items()
+            )
+        else:
+            F = LinearElastic(u, joined.by_body(moduli), NU, "plane strain").residual(v)
+        F += fem.Constant(mesh, 2.0) * v[1] * ds(joined.facet("upper", TOP))
+        bcs = [hold(u, joined.facets, joined.facet("lower", BOTTOM), i) for i in range(2)]
+        bcs.append(hold(u, joined.facets, joined.facet("upper", LEFT), 0))
+        surface = fc.ContactSurface(mesh, joined.facets, joined.facet("upper", BOTTOM))
+        below = fc.DeformableBody(joined.facets, joined.facet("lower", TOP))
+        contact = fc.Contact(u, surface, below, fc.Coulomb(0.3))
+        fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], petsc_options=TIGHT).solve()
+        found.append((nodal(u), at_points(contact, contact.values.parameters["k_n"])))
+    (u, k_n), (expected, stiffness) = found
+    assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)
+
+
+def test_jumps_beside_tagged_cells():
+    """Integrals over interior facets have tags of their own, or none."""
+    found = []
+    for tagged in (True, False):
+        s = Layers(ghost_mode=dolfinx.mesh.GhostMode.shared_facet)
+        jumps = ufl.inner(ufl.jump(ufl.grad(s.u)), ufl.jump(ufl.grad(s.v))) * ufl.dS(s.mesh)
+        F = WAYS["two materials"](s) if tagged else s.plain()
+        found.append(s.solved(F + fem.Constant(s.mesh, 10.0) * jumps))
+    (u, k_n), (expected, stiffness) = found
+    assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)
+
+
+@pytest.mark.parametrize("kind", ["dx", "ds"])
+def test_two_objects_of_tags(kind):
+    """DOLFINx takes one for each kind of measure: said in words, before anything is compiled."""
+    s = Layers()
+    tags = s.cells if kind == "dx" else s.facets
+    copy = dolfinx.mesh.meshtags(s.mesh, tags.dim, tags.indices, tags.values)
+    F = s.plain()
+    for data in (tags, copy):
+        F += s.v[0] * ufl.Measure(kind, s.mesh, subdomain_data=data)(UPPER)
+    raised_everywhere(lambda: s.solved(F), ValueError, f"integrals over {kind} with two objects")
+
+
+def test_a_tag_without_tags_beside_tagged_cells():
+    """A measure without tags is named, whatever others have."""
+    s = Layers()
+    F = WAYS["two materials"](s) + s.v[0] * ufl.dx(s.mesh)(UPPER)
+    raised_everywhere(lambda: s.solved(F), ValueError, f"an integral over dx({UPPER})", "no tags")
