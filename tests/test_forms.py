@@ -308,3 +308,62 @@ def test_a_tag_without_tags_beside_tagged_cells():
     s = Layers()
     F = WAYS["two materials"](s) + s.v[0] * ufl.dx(s.mesh)(UPPER)
     raised_everywhere(lambda: s.solved(F), ValueError, f"an integral over dx({UPPER})", "no tags")
+
+
+# ---- in time -------------------------------------------------------------------------------------
+
+DENSITY, BETA, GAMMA = 2.0, 0.25, 0.5
+
+
+def newmark(u, v, dt):
+    """Acceleration and velocity at the end of a time step that begins at rest (UFL)."""
+    return u / (BETA * dt**2), GAMMA * u / (BETA * dt)
+
+
+def bulks(kind, mesh, u, v):
+    """Work of the stresses of the lower layer's modulus, and what its integrals carry."""
+    if kind == "rubber":
+        rubber = NeoHookean(u, E[LOWER], NU, "plane strain")
+        return rubber.residual(v), rubber.weight
+    body = LinearElastic(u, E[LOWER], NU, kind)
+    return body.residual(v), body.weight
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("kind", ["plane strain", "axisymmetric", "3D", "rubber"])
+def test_inertia_is_no_stiffness(kind):
+    """E in a form by Newmark's method is that of the material at any time step: 1e-9, round-off.
+
+    Beside mass there are damping by velocity, a foundation, and a term of first order. Mass is from
+    1e-12 to 1e18 times as large as stiffness; as part of E it had been 12 % and -30 %.
+    """
+    mesh, tags = block_mesh("tetrahedron" if kind == "3D" else "triangle", n=2)
+    d = mesh.geometry.dim
+    u = fem.Function(displacement_space(mesh, 1))
+    v, dt = ufl.TestFunction(u.function_space), fem.Constant(mesh, 1.0)
+    elastic, weight = bulks(kind, mesh, u, v)
+    acceleration, velocity = newmark(u, v, dt)
+    wind = fem.Constant(mesh, np.ones(d))
+    F = elastic + weight * ufl.dot(DENSITY * acceleration + 3.0 * velocity + 5.0 * u, v) * ufl.dx
+    F += weight * 0.1 * ufl.dot(ufl.grad(u) * wind, v) * ufl.dx
+    surface = fc.ContactSurface(mesh, tags, BOTTOM)
+    floor = fc.HalfSpace(np.zeros(d), np.eye(d)[-1])
+    found = []
+    for exponent in range(-8, 8, 3):
+        dt.value = 10.0**exponent
+        contact = fc.Contact(u, surface, floor, fc.Coulomb(0.3, fc.Scaled(5.0)), weight=weight)
+        fc.ContactProblem(F, u, contacts=[contact])
+        found.append(at_points(contact, contact.values.parameters["k_n"]))
+    # A cell is half of the block high.
+    assert close(found, np.full_like(found, 5.0 * E[LOWER] * 2), 1e-9)
+
+
+def test_inertia_beside_a_pressure():
+    """The same of a mixed function, whose E is 3 G."""
+    s = Layers(basix.ufl.mixed_element([VECTOR, SCALAR]))
+    dt, G = fem.Constant(s.mesh, 1e-5), E[LOWER] / (2 * (1 + NU))
+    F = 2 * G * ufl.inner(strain(s.u), strain(s.v)) * ufl.dx - s.p * ufl.div(s.v) * ufl.dx
+    F += DENSITY * ufl.dot(newmark(s.u, s.v, dt)[0], s.v) * ufl.dx
+    F -= s.q * (ufl.div(s.u) + s.p / E[LOWER]) * ufl.dx - s.pressure * s.v[1] * s.ds(TOP)
+    _, k_n = s.solved(F)
+    assert close(k_n, np.full(k_n.shape, 10 * 3 * G * 4), 1e-9)

@@ -26,7 +26,10 @@ _NOTHING = 1e-8
 class Energy:
     """Energies of one increment (force times length; in 2D per thickness), equal on every rank.
 
-    Works are means of the forces at both ends of the increment times the way between them.
+    Works are means of the forces at both ends of the increment times the way between them. The
+    loads are F at u = 0, internal forces the rest of F. In a form with inertia both have a part of
+    the inertial forces, and ``work`` and ``elastic`` are neither the work of the loads nor the
+    elastic energy; their difference, and all other attributes, mean what they say.
 
     Attributes:
         work: Work of the loads, of Dirichlet values and of moving supports.
