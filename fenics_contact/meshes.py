@@ -58,25 +58,32 @@ def _check(model: Any, gdim: int) -> None:
         )
     for dim, what in ((gdim, "cells"), (gdim - 1, "facets")):
         types: set[int] = set()
-        tags = np.empty(0, dtype=np.uint64)
+        groups: dict[int, list[int]] = {}
         for _, group in model.getPhysicalGroups(dim):
             for entity in model.getEntitiesForPhysicalGroup(dim, group):
-                kinds, numbers, _ = model.mesh.getElements(dim, entity)
-                types.update(kinds)
-                tags = np.concatenate([tags, *numbers])
+                groups.setdefault(entity, []).append(group)
+        n_grouped = 0
+        for entity in groups:
+            kinds, numbers, _ = model.mesh.getElements(dim, entity)
+            types.update(kinds)
+            n_grouped += sum(len(some) for some in numbers)
         n_all = sum(len(some) for some in model.mesh.getElements(dim)[1])
         if dim == gdim and n_all == 0:
             raise ValueError(
                 f"the gmsh model has no cells: call gmsh.model.mesh.generate({gdim}) before"
             )
-        if np.unique(tags).size < tags.size:
+        shared = next((some for some in groups.values() if len(some) > 1), None)
+        if shared:
+            names = [f"{group} {model.getPhysicalName(dim, group)!r}" for group in shared]
             raise ValueError(
-                f"some {what} of the gmsh model are in two physical groups; they have one tag "
-                "only: make groups that do not overlap"
+                f"some {what} of the gmsh model are in two physical groups, "
+                f"{' and '.join(names)}, and they have one tag only: leave them in one of these, "
+                f"and name both where both are meant, as ContactSurface(mesh, tags, {shared}) and "
+                f"dx({tuple(shared)}) do"
             )
-        if dim == gdim and tags.size < n_all:
+        if dim == gdim and n_grouped < n_all:
             raise ValueError(
-                f"{n_all - tags.size} of the {n_all} cells of the gmsh model are in no physical "
+                f"{n_all - n_grouped} of the {n_all} cells of the gmsh model are in no physical "
                 f"group, and would be missing: add gmsh.model.addPhysicalGroup({gdim}, [...])"
             )
         if len(types) > 1:

@@ -109,11 +109,12 @@ def test_what_is_refused(model: Any) -> None:
         model.mesh.generate(2)
     refused("in no physical group")
     group(2, [1, 2], RIGHT)
-    refused("cells", "two physical groups")
+    refused("cells", "two physical groups", f"{LEFT} ''", f"{RIGHT} ''", f"dx({LEFT, RIGHT})")
     if COMM.rank == 0:
         model.removePhysicalGroups([(2, LEFT)])
         group(1, lines_at(0), TOP)
-    refused("facets", "two physical groups")
+        model.setPhysicalName(1, TOP, "lid")
+    refused("facets", "two physical groups", f"{TOP} 'lid'", f"mesh, tags, {[BOTTOM, TOP]}")
     if COMM.rank == 0:
         model.removePhysicalGroups([(1, TOP)])
     fc.model_to_mesh(model, COMM, gdim=2)

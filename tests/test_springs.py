@@ -10,8 +10,9 @@ from petsc4py import PETSc
 import fenics_contact as fc
 from fenics_contact.checks.verdict import check_laws
 from scenes.blocks import BOTTOM, CELLS, LEFT, TOP, block, block_mesh, dimension
-from scenes.comparing import close, gathered, raised_everywhere
+from scenes.comparing import close, gathered, nodal, raised_everywhere
 from scenes.elasticity import displacement_space
+from scenes.tags import sides
 from scenes.two_blocks import LOWER, UPPER, two_blocks
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
@@ -19,6 +20,7 @@ COMM = MPI.COMM_WORLD
 
 VERTEX = {"quadrature_scheme": "vertex"}
 K_N, K_T = 7.0, 3.0
+TIGHT = {"snes_rtol": 1e-13}
 
 
 def turned(d: int) -> np.ndarray:
@@ -216,6 +218,52 @@ def test_a_foundation_without_tangential_stiffness_has_no_tangential_state():
     assert np.all(gathered(COMM, contact.status) == fc.Status.SLIP)
     assert "traction" not in contact.history and "traction" not in contact.values.arrays
     assert not np.any(gathered(COMM, contact.tangential_traction))
+
+
+@pytest.mark.parametrize("tension", [True, False])
+def test_a_foundation_that_is_not_everywhere(tension):
+    """Nothing by UFL on half of Γc is as Γc without that half: forces and displacements, 1e-8."""
+    found = []
+    for everywhere in (True, False):
+        scene = block("quadrilateral", n=4, up=-2.0)
+        law = fc.Foundation(50.0, 20.0, tension=tension)
+        if everywhere:
+            x = ufl.SpatialCoordinate(scene.mesh)
+            k_n, k_t = (ufl.conditional(ufl.lt(x[0], 0.5), k, 0.0) for k in (50.0, 20.0))
+            law = fc.Foundation(k_n, k_t, tension=tension)
+        else:
+            left = {1: lambda x: np.isclose(x[1], 0.0) & (x[0] < 0.5 + 1e-9)}
+            scene.surface = fc.ContactSurface(scene.mesh, sides(scene.mesh, left), 1)
+        problem, _ = scene.problem(law, [scene.hold(LEFT, 0)], petsc_options=TIGHT)
+        step = problem.solve()
+        assert max(step.verdict.laws["contact"].values()) <= 1e-10
+        force = step.contacts["contact"]
+        found.append((nodal(scene.u), np.append(force.force, force.max_pressure)))
+    for one, other in zip(*found, strict=True):
+        assert close(one, other, 1e-8)
+
+
+@pytest.mark.parametrize("tension", [True, False])
+@pytest.mark.parametrize("constant", [False, True])
+def test_a_foundation_that_is_not_there(tension, constant):
+    """Stiffness zero, as a number or by a constant: no force, and nothing that bears a load.
+
+    Reference: a block hung up at its top is free of stress: u = 0 exactly. Pressed with nothing to
+    hold it, it is refused by the load that nothing bears.
+    """
+    scene = block("quadrilateral")
+    k = fem.Constant(scene.mesh, 0.0) if constant else 0.0
+    held = [scene.hold(TOP, i) for i in range(2)]
+    problem, _ = scene.problem(fc.Foundation(k, tension=tension), held)
+    step = problem.solve()
+    assert step.contacts["contact"].normal_force == 0.0
+    assert not np.any(gathered(COMM, scene.u.x.array))
+    problem, _ = scene.problem(fc.Foundation(k, tension=tension), [scene.hold(LEFT, 0)])
+    scene.load(up=-1.0)
+    raised_everywhere(problem.solve, ValueError, "no contact force can balance", "along y")
+    if constant:  # again, once there is something
+        k.value = 50.0
+        assert problem.solve().contacts["contact"].normal_force == pytest.approx(1.0, abs=1e-7)
 
 
 @pytest.mark.parametrize("what", ["pull", "normal", "tangential"])

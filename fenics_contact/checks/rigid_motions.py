@@ -456,7 +456,7 @@ class RigidMotions:
         # A history often has one direction of load and one support: what balanced it does again.
         data = [resultant / np.abs(resultant).max()]
         for contact in contacts:
-            data += [contact.values.normal, contact.values.grip]
+            data += [contact.values.normal, _bearing_normals(contact), contact.values.grip]
             data += [np.array([contact.pairs.number])]
         known = len(data) == len(self._balanced) and all(map(_alike, data, self._balanced))
         if self.comm.allreduce(not known) == 0:
@@ -513,9 +513,8 @@ class RigidMotions:
             else:  # Tresca, foundation: the tangential force does not need the normal one
                 directions = [np.where(friction > 0, t, 0.0) for t in around]
         if law.has_normal_stiffness:
-            directions.append(-normal)
-        if law.has_tension:
-            directions.append(normal)
+            pushes = -_bearing_normals(contact)
+            directions += [pushes, -pushes] if law.has_tension else [pushes]
         modes = self.at_points(operator)[rows]
         rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
         return gather_rows(self.comm, np.concatenate(rays).reshape(-1, len(rows)))
@@ -590,6 +589,13 @@ def _plain(rows: Array) -> Array:
         done.append(pivot)
     rows[np.abs(rows) < _FELT] = 0.0
     return rows / np.abs(rows).max(axis=1, initial=1.0)[:, None] if rows.size else rows
+
+
+def _bearing_normals(contact: Contact) -> Array:
+    """Normals at the points, zero where k_n is: there is no foundation there, (n_points, gdim)."""
+    values = contact.values
+    bears = np.asarray(values.parameters.get("k_n", 1.0)) > 0
+    return np.where(bears[..., None], values.normal, 0.0)
 
 
 def _around(normal: Array) -> list[Array]:

@@ -34,12 +34,15 @@ class Frictionless(Law):
 
 @dataclass(frozen=True)
 class Foundation(Law):
-    """An elastic foundation: r_n = -k_n (u_n - s) and τ = -k_t u_t, both from the start.
+    """An elastic foundation, bond or tie: r_n = -k_n (u_n - s) and τ = -k_t u_t, from the start.
 
-    The stiffness is physical here, that of a layer between body and support (paper, 2.1).
+    The stiffness is physical here, that of a layer between body and support (paper, 2.1). It may
+    be zero where there is none. ``Foundation(k, k)`` is a *tie*: it bonds the body to the support,
+    or two bodies to each other, whose meshes need not match, normally and tangentially; with k
+    from 100 E/h on it is nearly rigid.
 
     Args to the constructor:
-        k_n: Normal stiffness (stress/length); see `Frictionless`.
+        k_n: Normal stiffness (stress/length), zero or greater; see `Frictionless`.
         k_t: Tangential stiffness (stress/length), likewise; zero by default.
         tension: True: the foundation is bonded to the body, and pulls as it pushes. False: it acts
             where the gap is closed and nowhere else; with k_t there is no potential then, since τ
@@ -72,8 +75,8 @@ class Foundation(Law):
 
     @property
     def positive(self) -> frozenset[str]:
-        """See `Law.positive`: k_t may be zero."""
-        return frozenset({"k_n"})
+        """See `Law.positive`: both may be zero, where there is no layer."""
+        return frozenset()
 
     def parameters(self) -> dict[str, Any]:
         """See `Law.parameters`."""
