@@ -132,7 +132,8 @@ class Contact(PointResults):
                 footnote 1): a number, constant or UFL. The support's motion is added to it, and
                 belongs into ``displacement`` of the support: a constant in the gap that is changed
                 opens and closes it, as an interference that grows does, and no more. Friction feels
-                nothing of what moves along Γc with it, and does no work on it.
+                nothing of what moves along Γc with it, and does no work on it. 0 is for bodies that
+                touch all over at first, whose facets alone leave gaps.
             weight: Factor of the surface measure where the bulk form carries one: a thickness, or
                 2πr for axisymmetric problems.
             modulus: Young's modulus near Γc (stress), a number or function with one value per

@@ -38,8 +38,8 @@ class Foundation(Law):
 
     The stiffness is physical here, that of a layer between body and support (paper, 2.1). It may
     be zero where there is none. ``Foundation(k, k)`` is a *tie*: it bonds the body to the support,
-    or two bodies to each other, whose meshes need not match, normally and tangentially; with k
-    from 100 E/h on it is nearly rigid.
+    or two bodies to each other, whose meshes need not match. ``Contact(gap=0)`` with it, or gaps
+    between facets are pulled shut. With `Scaled(10)` it opens as a tenth of a cell does.
 
     Args to the constructor:
         k_n: Normal stiffness (stress/length), zero or greater; see `Frictionless`.

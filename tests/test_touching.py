@@ -1,0 +1,83 @@
+"""Bodies that touch all over a curved surface and are meshed apart: gaps of facets are none.
+
+Two rings, one in the other, under pressure inside or outside. Reference: Lamé's stress of the one
+ring that both make, at the radius where they touch.
+"""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.elasticity import LinearElastic
+from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block_mesh
+from scenes.comparing import gathered
+from scenes.elasticity import displacement_space, hold
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+COMM = MPI.COMM_WORLD
+INNER, MIDDLE, OUTER = 1.0, 1.5, 2.0
+TIE = fc.Foundation(fc.Scaled(10.0), fc.Scaled(10.0))
+
+
+def ring(n, inside, outside):
+    """A quarter of a ring of straight quadrilaterals, n along it."""
+    mesh, tags = block_mesh("quadrilateral", n=(n, 4))
+    angle, height = mesh.geometry.x[:, :2].T.copy() * [[np.pi / 2], [outside - inside]]
+    radius = inside + height
+    mesh.geometry.x[:, 0], mesh.geometry.x[:, 1] = radius * np.sin(angle), radius * np.cos(angle)
+    return mesh, None, tags
+
+
+def pressed(n, law, *, side=-1.0, **options):
+    """Mean of the pressure between the rings over Lamé's, and its standard deviation over the mean.
+
+    Args:
+        n: Facets of the inner ring, which has Γc, and of the outer one.
+        law: Between them.
+        side: Traction on the inner surface along its normal.
+        options: Of the contact.
+    """
+    parts = {"inner": ring(n[0], INNER, MIDDLE), "outer": ring(n[1], MIDDLE, OUTER)}
+    joined = fc.join_meshes(parts)
+    u = fem.Function(displacement_space(joined.mesh, 1))
+    v = ufl.TestFunction(u.function_space)
+    ds = ufl.Measure("ds", joined.mesh, subdomain_data=joined.facets)
+    normal = ufl.FacetNormal(joined.mesh)
+    F = LinearElastic(u, 1000.0, 0.3, "plane strain").residual(v)
+    F -= side * ufl.dot(normal, v) * ds(joined.facet("inner", BOTTOM))
+    planes = [(joined.facet(b, tag), i) for b in parts for tag, i in ((LEFT, 0), (RIGHT, 1))]
+    bcs = [hold(u, joined.facets, *plane) for plane in planes]
+    surface = fc.ContactSurface(joined.mesh, joined.facets, joined.facet("inner", TOP))
+    opposite = fc.DeformableBody(joined.facets, joined.facet("outer", BOTTOM))
+    contact = fc.Contact(u, surface, opposite, law, **options)
+    fc.ContactProblem(F, u, bcs=bcs, contacts=[contact]).solve()
+    p, weights = gathered(COMM, contact.pressure), gathered(COMM, contact.measure)
+    mean = weights @ p / weights.sum()
+    scatter = np.sqrt(weights @ (p - mean) ** 2 / weights.sum())
+    exact = INNER**2 / (OUTER**2 - INNER**2) * (OUTER**2 / MIDDLE**2 - 1)
+    return mean / (-side * exact), scatter / mean
+
+
+@pytest.mark.parametrize("n", [(13, 20), (20, 13)])
+def test_rings_that_touch(n):
+    """With ``gap=0`` the mean is Lamé's to half a per cent; by the gaps of facets to 20 % at best.
+
+    It scatters by less than 1 % where the coarser ring has Γc, and by 19 % where the finer one has,
+    at facets beyond the corners of the coarser; without ``gap=0`` by 150 % and more.
+    """
+    mean, scatter = pressed(n, fc.Frictionless(), gap=0)
+    assert mean == pytest.approx(1.0, abs=5e-3)
+    assert scatter < (0.01 if n[0] < n[1] else 0.2)
+    mean, scatter = pressed(n, fc.Frictionless())
+    assert abs(mean - 1.0) > 0.2 and scatter > 1.5
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_rings_that_are_tied(side):
+    """A foundation of 10 E/h with ``gap=0`` ties them, pressed and pulled: as one, 0.5 and 1 %."""
+    mean, scatter = pressed((13, 20), TIE, side=side, gap=0)
+    assert mean == pytest.approx(1.0, abs=5e-3)
+    assert abs(scatter) < 0.01
