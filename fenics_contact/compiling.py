@@ -15,7 +15,14 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
-__all__ = ["Waiting", "compile_expression", "compile_form", "printed_as_ever", "waiting"]
+__all__ = [
+    "Waiting",
+    "compile_by_rule",
+    "compile_expression",
+    "compile_form",
+    "printed_as_ever",
+    "waiting",
+]
 
 logger = logging.getLogger("fenics_contact")
 # Seconds: what takes less was in the cache; when a user wonders.
@@ -32,6 +39,19 @@ def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:
     compiled = fem.form(form, entity_maps=entity_maps or None)
     waiting.add(time.perf_counter() - start)
     return compiled
+
+
+def compile_by_rule(form: ufl.Form) -> list[fem.Form]:
+    """Compile a UFL form in parts that add up to it, of one kind of integral and one rule each.
+
+    Collective. Of two integrals over a tag with different quadrature rules DOLFINx 0.9 assembles
+    one, without a word, where one of them is over other tags, too (DOLFINx issue 3735).
+    """
+    parts: dict[tuple[str, str], list[ufl.Integral]] = {}
+    for integral in form.integrals():
+        rule = repr(sorted(integral.metadata().items()))
+        parts.setdefault((integral.integral_type(), rule), []).append(integral)
+    return [compile_form(ufl.Form(part)) for part in parts.values()]
 
 
 def compile_expression(expression: Any, points: npt.NDArray[np.float64]) -> fem.Expression:

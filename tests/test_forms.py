@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic, NeoHookean
-from scenes.blocks import BOTTOM, LEFT, TOP, block_mesh
+from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block_mesh
 from scenes.comparing import at_points, close, nodal, raised_everywhere
 from scenes.elasticity import displacement_space, hold, strain, stress
 
@@ -236,6 +236,32 @@ def test_two_rubbers():
             F = NeoHookean(s.u, s.E, NU, "plane strain").residual(s.v, rules[0])
             F += s.pressure * s.v[1] * s.ds(TOP) - s.pull * s.v[0] * ufl.dx
         s.pressure.value = 50.0
+        found.append(s.solved(F))
+    (u, k_n), (expected, stiffness) = found
+    assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)
+
+
+@pytest.mark.parametrize("kind", ["cells", "facets"])
+def test_rules_of_their_own_over_the_same_tags(kind):
+    """Two rules over a tag, one of them over several at once: both count.
+
+    DOLFINx 0.9 assembles one of them as one form, and is silent: of residual, tangent and E.
+    """
+    found = []
+    for tagged in (True, False):
+        s = Layers()
+        rule = {"quadrature_degree": 4}
+        bed = 100.0 * ufl.dot(s.u, s.v)
+        F = s.plain() if kind == "facets" or not tagged else -s.loads(s.dx(UPPER), s.ds(TOP))
+        if tagged and kind == "cells":
+            F += sum(s.work(E[tag]) * s.dx(tag, metadata=rule) for tag in (LOWER, UPPER))
+            F += bed * s.dx((LOWER, UPPER)) + s.v[0] * s.dx((LOWER, UPPER))
+        elif kind == "cells":
+            F += bed * ufl.dx + s.v[0] * ufl.dx
+        else:
+            both = [s.ds(t, metadata=rule if tagged else {}) for t in (LEFT, RIGHT)]
+            F += bed * both[0] + 2 * bed * both[1]
+            F += bed * s.ds((LEFT, RIGHT)) + s.v[0] * s.ds((LEFT, RIGHT))
         found.append(s.solved(F))
     (u, k_n), (expected, stiffness) = found
     assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)

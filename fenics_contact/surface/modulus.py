@@ -12,7 +12,7 @@ import ufl
 from dolfinx import fem
 
 from fenics_contact import compat
-from fenics_contact.compiling import compile_form
+from fenics_contact.compiling import compile_by_rule, compile_form
 from fenics_contact.parallel import global_max, global_min
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_cells
@@ -70,7 +70,8 @@ def cell_modulus(
         return modulus
     # A form of its own: one with data of subdomains, as the user's may be, takes no other measures.
     volume = assembled(compile_form(weight * ufl.TestFunction(modulus.function_space) * ufl.dx))
-    shear, stretch = assembled(compile_form(both)).reshape(-1, 2).T / volume
+    energies = np.sum([assembled(part) for part in compile_by_rule(both)], axis=0)
+    shear, stretch = energies.reshape(-1, 2).T / volume
     isotropic = stretch > 1.2 * shear  # λ > -0.8 G: else no isotropic solid, and E is the stretch's
     if displacement.mixed:
         modulus.x.array[:] = 3 * shear

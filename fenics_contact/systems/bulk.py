@@ -19,7 +19,7 @@ from petsc4py import PETSc
 from ufl.algorithms import extract_coefficients
 from ufl.corealg.traversal import unique_pre_traversal
 
-from fenics_contact.compiling import compile_form
+from fenics_contact.compiling import compile_by_rule, compile_form
 from fenics_contact.parallel import all_finite, collective_errors, global_max, global_min
 from fenics_contact.surface.dependence import Dependence
 from fenics_contact.surface.displacement import Displacement
@@ -114,8 +114,13 @@ class Bulk:
         kinds = dict.fromkeys(integral.integral_type() for integral in form.integrals())
         parts = (_Part(form, kind, u) for kind in kinds)
         self._parts = [part for part in parts if not part.empty]
-        self._compiled_tangent = compile_form(self.tangent_form)
-        self.stiffness: PETSc.Mat = fem.petsc.create_matrix(self._compiled_tangent)
+        self._compiled_tangent = compile_by_rule(self.tangent_form)
+        self._pattern = (
+            self._compiled_tangent[0]
+            if len(self._compiled_tangent) == 1
+            else compile_form(self.tangent_form)
+        )
+        self.stiffness: PETSc.Mat = fem.petsc.create_matrix(self._pattern)
         self.symmetric = True
         self.scale = 0.0
         self._load = fem.Function(u.function_space)  # F(0)
@@ -159,8 +164,7 @@ class Bulk:
             return False
         self._dependence.forget()  # until the matrix is complete
         self.stiffness.zeroEntries()
-        fem.petsc.assemble_matrix(self.stiffness, self._compiled_tangent)
-        self.stiffness.assemble()
+        self._assemble_tangent(self.stiffness)
         diagonal = self.stiffness.getDiagonal()
         if self.linear or not self.scale:
             of_displacement = self.displacement.within(np.ones(self.displacement.n_owned))
@@ -182,13 +186,19 @@ class Bulk:
         if self.is_current():
             yield self.stiffness
             return
-        matrix = fem.petsc.assemble_matrix(self._compiled_tangent)
-        matrix.assemble()
+        matrix = fem.petsc.create_matrix(self._pattern)
+        self._assemble_tangent(matrix)
         self._in_units(matrix)
         try:
             yield matrix
         finally:
             matrix.destroy()
+
+    def _assemble_tangent(self, matrix: PETSc.Mat) -> None:
+        """Add the tangent at the present ``u`` to a matrix of its pattern. Collective."""
+        for part in self._compiled_tangent:
+            fem.petsc.assemble_matrix(matrix, part)
+        matrix.assemble()
 
     def own_stiffness(self) -> PETSc.Mat:
         """The tangent of this rank's cells alone, ghosts behind its own dofs. Collective.
@@ -198,7 +208,10 @@ class Bulk:
         if self.space.mesh.comm.size == 1:
             return self.stiffness
         # Entries of rows of ghosts are still here, not where their owners would add them up.
-        rows = fem.assemble_matrix(self._compiled_tangent).to_scipy(ghosted=True).tocsr()
+        matrix = fem.create_matrix(self._pattern)
+        for part in self._compiled_tangent:
+            fem.assemble_matrix(matrix, part)
+        rows = matrix.to_scipy(ghosted=True).tocsr()
         rows.sort_indices()
         csr = (rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType), rows.data)
         return PETSc.Mat().createAIJ(rows.shape, csr=csr, comm=PETSc.COMM_SELF)
@@ -365,7 +378,7 @@ def _branches_by(form: ufl.Form, u: fem.Function) -> bool:
 class _Part:
     """The integrals of F of one kind: over cells, over exterior facets ...
 
-    Taken apart no further, so that every integral keeps the quadrature rule it has in F.
+    Taken apart no further but by rules, so that every integral keeps the one that it has in F.
     """
 
     def __init__(self, form: ufl.Form, kind: str, u: fem.Function) -> None:
@@ -374,7 +387,7 @@ class _Part:
         self.empty = ufl.algorithms.expand_derivatives(mine).empty()  # a load that is 0 in UFL
         still = ufl.replace(mine, {u: ufl.zero(u.ufl_shape)})
         self._vanishes = ufl.algorithms.expand_derivatives(still).empty()
-        self._compiled = compile_form(mine)
+        self._compiled = compile_by_rule(mine)
         self._u = u
         others = [c for c in mine.coefficients() if c is not u]
         self._dependence = Dependence(mine.constants(), others)
@@ -382,7 +395,8 @@ class _Part:
 
     def assemble(self, target: Array) -> None:
         """Add to ``target``, ghosts not collected."""
-        fem.assemble_vector(target, self._compiled)
+        for part in self._compiled:
+            fem.assemble_vector(target, part)
 
     def at_rest(self) -> Array:
         """Values at u = 0, ghosts not collected; assembled if they may have changed."""
