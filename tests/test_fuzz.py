@@ -118,6 +118,23 @@ def test_scenes_that_were_wrong(entry):
     assert outcome.outcome in entry.get("allowed", FINE), outcome
 
 
+@pytest.mark.mpi
+@pytest.mark.whole
+@pytest.mark.parametrize("form", fuzz_scenes.FORMS[1:])
+def test_forms_are_written_in_many_ways(form):
+    """Bodies of two materials, linear and of rubber, each form of them: as the one with E by cell.
+
+    Cells are tagged by body and half, facets by their sides.
+    """
+    if COMM.size > 1 and form not in ("pairs", "beside"):
+        pytest.skip("takes longer on several ranks")
+    linear = next(s for s in SCENES["scenes"] if s["seed"] == 600052) | {"weight": 0.1}
+    rubber = next(s for s in SCENES["bodies"] if s["seed"] == 2419)
+    for scene in (linear, rubber):
+        outcome = played(scene | {"form": form})
+        assert outcome.outcome == "right", f"{outcome}\n{json.dumps(scene)}"
+
+
 # ---- that the comparison sees --------------------------------------------------------------------
 
 ONE = {
@@ -426,6 +443,8 @@ def test_seeds_reproduce_and_features_can_be_left_out():
     for scenes in (finite_scenes, present_scenes):
         drawn = [scenes.draw(s) for s in range(30)]
         assert drawn == [json.loads(json.dumps(scenes.draw(s))) for s in range(30)]
+        assert {s.pop("form", "plain") for s in drawn} == set(fuzz_scenes.FORMS)
+        assert drawn == [scenes.draw(s, without=("form",)) for s in range(30)]
     plain = [fuzz_scenes.draw(s, without=("units", "restart")) for s in range(30)]
     assert all(s["units"] == [1.0, 1.0] and "restart" not in s for s in plain)
 

@@ -19,7 +19,7 @@ from fenics_contact.elasticity import NeoHookean
 from fenics_contact.types import Array
 from scenes.surfaces import ball, box, ring
 from verification.fuzz_made import Made
-from verification.fuzz_scenes import TOP, Scene, dice, element, frictions
+from verification.fuzz_scenes import Scene, dice, draw_form, element, frictions
 
 __all__ = ["DEGREE", "KINDS", "FiniteMade", "draw", "pieces", "place_of"]
 
@@ -41,7 +41,7 @@ def draw(
     Args:
         seed: The same gives the same.
         without: Features to leave out: "space", "rubber", "turn", "motion", "multipliers",
-            "units", "restart", "corner", "method", "accuracy", "changes", "ration".
+            "units", "restart", "corner", "method", "accuracy", "changes", "ration", "form".
         ranks: Kept in the scene.
         family: See `fuzz_scenes.draw`.
     """
@@ -214,7 +214,7 @@ def draw(
         scene["thickness"] = log(-2, 2)
     if chance(0.05, "ration", of=rng):
         scene["ration"] = int(rng.integers(4, 12))
-    return scene
+    return scene | draw_form(seed, family, without)
 
 
 # ---- supports ------------------------------------------------------------------------------------
@@ -313,20 +313,24 @@ class FiniteMade(Made):
             bulk: Function of u, v, E and ν: density of the virtual work of rubber (UFL); by default
                 that of the package.
         """
+        self._rubber = scene["bulk"] == "rubber"
+        self._density = bulk
         super().__init__(scene, comm)
-        d = self.d
         self.angle = _constant(self.mesh, 0.0)
-        if scene["bulk"] == "rubber":
-            v = ufl.TestFunction(self.V)
-            ds = ufl.ds(self.mesh, subdomain_data=self.tags)
-            dx = ufl.Measure("dx", self.mesh, metadata={"quadrature_degree": DEGREE})
-            nu = _constant(self.mesh, scene["nu"])
-            if bulk is None:
-                kind = "plane strain" if d == 2 else "3D"
-                work = NeoHookean(self.u, self.E, nu, kind).residual(v, dx)
-            else:
-                work = bulk(self.u, v, self.E, nu) * dx
-            self.F = self.thickness * work - self.thickness * ufl.dot(self.traction, v) * ds(TOP)
+
+    def bulk(self, E: Any, dx: ufl.Measure) -> ufl.Form:
+        """Work of the stresses with a modulus over a measure; of rubber with a rule of its own."""
+        if not self._rubber:
+            return super().bulk(E, dx)
+        dx = dx(metadata={"quadrature_degree": DEGREE})
+        if self._density is not None:
+            return self.thickness * self._density(self.u, self.v, E, self.nu) * dx
+        kind = "plane strain" if self.d == 2 else "3D"
+        return self.thickness * NeoHookean(self.u, E, self.nu, kind).residual(self.v, dx)
+
+    def bulk_of_energy(self, E: Any, dx: ufl.Measure) -> ufl.Form:
+        """See `Made`; rubber's is the derivative of its energy anyway."""
+        return self.bulk(E, dx) if self._rubber else super().bulk_of_energy(E, dx)
 
     def drives(self, stage: int, t: float) -> dict[str, float]:
         """Normal, side, across and turn at a value of the load parameter within a stage."""

@@ -243,7 +243,7 @@ def _ahead(scene: Scene, records: list[dict[str, Any]]) -> tuple[int, float] | N
 def features(scene: Scene) -> list[str]:
     """What a scene has, for tables."""
     found = [scene["layout"], scene["cell"], f"degree {scene['degree']}", f"drive {scene['drive']}"]
-    found += [f"bulk {scene['bulk']}"] if "bulk" in scene else []
+    found += [f"{n} {scene[n]}" for n in ("bulk", "form") if n in scene]
     for contact in scene["contacts"]:
         support = contact["support"]
         found += [f"law {contact['law']['kind']}", f"support {support['kind']}"]
@@ -466,6 +466,7 @@ def _simpler(scene: Scene) -> Iterator[Scene]:
         "condensation",
         "weight",
         "thickness",
+        "form",
         "bend",
         "cuts",
     ):

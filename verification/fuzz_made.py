@@ -17,6 +17,7 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact import compat
 from fenics_contact.types import Array
+from verification import fuzz_forms
 from verification.fuzz_scenes import TOP, Scene, frictions
 
 __all__ = ["Made", "geometry", "history", "tag_of"]
@@ -94,6 +95,8 @@ class Made:
     """A scene as mesh, forms and constants, on any number of ranks.
 
     Attributes:
+        F: The residual with coefficients by cell and plain measures; the package gets it as the
+            scene says that it is written (`fuzz_forms.written`).
         set_down: Displacements from which slip is counted anew in this increment, by the names of
             contacts; see `_displacement`.
     """
@@ -119,7 +122,7 @@ class Made:
         self.stress = self.force / self.length ** (d - 1)
         self.V = fem.functionspace(self.mesh, ("Lagrange", scene["degree"], (d,)))
         self.u = fem.Function(self.V, name="u")
-        v = ufl.TestFunction(self.V)
+        self.v = ufl.TestFunction(self.V)
         piecewise = fem.functionspace(self.mesh, ("DG", 0))
         vectors = fem.functionspace(self.mesh, ("DG", 0, (d,)))
         self.E = fem.Function(piecewise)
@@ -129,15 +132,10 @@ class Made:
         self.E.x.array[piecewise.dofmap.list[:n_cells, 0]] = moduli[self.box]
         self.traction, self.weight = fem.Function(vectors), fem.Function(vectors)
         self._cells = vectors.dofmap.list[:n_cells, 0]
-        nu = fem.Constant(self.mesh, scene["nu"])
-        strain = ufl.sym(ufl.grad(self.u))
-        lame = self.E * nu / ((1 + nu) * (1 - 2 * nu))
-        stress = self.E / (1 + nu) * strain + lame * ufl.tr(strain) * ufl.Identity(d)
-        ds = ufl.ds(self.mesh, subdomain_data=self.tags)
+        self.nu = fem.Constant(self.mesh, scene["nu"])
         self.thickness = fem.Constant(self.mesh, float(scene.get("thickness", 1.0)))
-        self.F = self.thickness * ufl.inner(stress, ufl.sym(ufl.grad(v))) * ufl.dx(self.mesh)
-        self.F -= self.thickness * ufl.dot(self.traction, v) * ds(TOP)
-        self.F -= self.thickness * ufl.dot(self.weight, v) * ufl.dx(self.mesh)
+        dx, ds = ufl.dx(self.mesh), ufl.ds(self.mesh, subdomain_data=self.tags)
+        self.F = self.bulk(self.E, dx) - self.loads(dx, ds)
         self.bcs: list[fem.DirichletBC] = []
         self.moved: list[fem.Constant] = []
         for body, side, components, how in scene["holds"]:
@@ -153,6 +151,29 @@ class Made:
         self.shift = fem.Constant(self.mesh, np.zeros(d))
         self.push = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
         self.pull = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
+
+    def energy(self, E: Any, dx: ufl.Measure) -> ufl.Form:
+        """Elastic energy of a linear body."""
+        strain, nu = ufl.sym(ufl.grad(self.u)), self.nu
+        lame = E * nu / ((1 + nu) * (1 - 2 * nu))
+        density = E / (1 + nu) * ufl.inner(strain, strain) + lame * ufl.tr(strain) ** 2
+        return self.thickness / 2 * density * dx
+
+    def bulk_of_energy(self, E: Any, dx: ufl.Measure) -> ufl.Form:
+        """`bulk` as the derivative of `energy`."""
+        return ufl.derivative(self.energy(E, dx), self.u, self.v)
+
+    def bulk(self, E: Any, dx: ufl.Measure) -> ufl.Form:
+        """Work of the stresses with a modulus over a measure."""
+        strain, nu = ufl.sym(ufl.grad(self.u)), self.nu
+        lame = E * nu / ((1 + nu) * (1 - 2 * nu))
+        stress = E / (1 + nu) * strain + lame * ufl.tr(strain) * ufl.Identity(self.d)
+        return self.thickness * ufl.inner(stress, ufl.sym(ufl.grad(self.v))) * dx
+
+    def loads(self, dx: ufl.Measure, ds: ufl.Measure) -> ufl.Form:
+        """Work of the loads, by measures of all cells and of all tagged facets."""
+        on_top = self.thickness * ufl.dot(self.traction, self.v) * ds(TOP)
+        return on_top + self.thickness * ufl.dot(self.weight, self.v) * dx
 
     def outside(self) -> fem.Form:
         """Forces of the loads: what of -F is left without displacements."""
@@ -349,7 +370,7 @@ class Made:
         if "ration" in scene:
             options["snes_max_it"] = scene["ration"]
         return fc.ContactProblem(
-            self.F,
+            fuzz_forms.written(self),
             self.u,
             bcs=self.bcs,
             contacts=contacts,

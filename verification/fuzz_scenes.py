@@ -15,12 +15,14 @@ from typing import Any
 import numpy as np
 
 __all__ = [
+    "FORMS",
     "LAWS",
     "SUPPORTS",
     "TOP",
     "Scene",
     "dice",
     "draw",
+    "draw_form",
     "element",
     "frictions",
     "path",
@@ -40,6 +42,16 @@ LAWS = (
     "ellipse",
 )
 SUPPORTS = ("halfspace", "ball", "cylinder", "obstacle", "ball inside", "cylinder inside")
+# How a bulk form is written; see `fuzz_forms`.
+FORMS = (
+    "plain",
+    "tags",  # a material for each tag of one measure, loads over several tags at once
+    "pairs",  # the same, its tags as a list of (number, cells)
+    "measures",  # a measure for each material, with one object of tags
+    "energy",  # the derivative of energies over tags
+    "loads",  # coefficients by cell and a measure with tags, which the loads are over
+    "beside",  # a plain measure beside that of the loads
+)
 TOP = 1
 NU_MAX = 0.45
 
@@ -100,7 +112,7 @@ def draw(
         seed: The same gives the same.
         without: Features to leave out: "levels", "apart", "increment" (pairs anew), "units",
             "restart", "bend", "both", "narrow", "changes", "multipliers", "motion", "gap",
-            "ration", "space", "method", "accuracy".
+            "ration", "space", "method", "accuracy", "form".
         ranks: Kept in the scene.
         family: Scenes of one family differ in their numbers, loads, methods and histories, and
             share what they are built of, so that few forms are compiled; by default a scene is its
@@ -358,7 +370,20 @@ def draw(
         scene["cuts"] = 4
     if chance(0.08, "ration", of=rng):
         scene["ration"] = int(rng.integers(3, 9))
-    return scene
+    return scene | draw_form(seed, family, without)
+
+
+def draw_form(seed: int, family: int | None, without: tuple[str, ...]) -> dict[str, str]:
+    """What a scene says of its form; by numbers of its own, so that nothing else is drawn anew.
+
+    Args:
+        seed: Of the scene.
+        family: Whose scenes have one form; see `fuzz_scenes.draw`.
+        without: With "form" it is written in the plain way.
+    """
+    rng = np.random.default_rng([seed if family is None else family, 23])
+    way = FORMS[int(rng.integers(len(FORMS)))]
+    return {} if way == "plain" or "form" in without else {"form": way}
 
 
 def path(scene: Scene) -> list[tuple[int, float]]:

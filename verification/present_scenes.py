@@ -16,7 +16,7 @@ from mpi4py import MPI
 
 from verification.finite_scenes import FiniteMade
 from verification.fuzz_made import Made
-from verification.fuzz_scenes import Scene, dice, element
+from verification.fuzz_scenes import Scene, dice, draw_form, element
 
 __all__ = ["PresentMade", "draw", "turn"]
 
@@ -36,7 +36,7 @@ def draw(
     Args:
         seed: The same gives the same.
         without: Features to leave out: "space", "rubber", "bend", "spin", "rock", "multipliers",
-            "units", "restart", "method", "ration", "edge", "stiff", "fine".
+            "units", "restart", "method", "ration", "edge", "stiff", "fine", "form".
         ranks: Kept in the scene.
         family: See `fuzz_scenes.draw`.
         extreme: The same scene, its bodies as unlike as `_unlike` makes them.
@@ -170,7 +170,7 @@ def draw(
         scene["ration"] = int(rng.integers(4, 12))
     if extreme:
         _unlike(scene, np.random.default_rng([seed, 42]))
-    return scene
+    return scene | draw_form(seed, family, without)
 
 
 def _unlike(scene: Scene, rng: np.random.Generator) -> None:
