@@ -58,9 +58,9 @@ class Asperities(fc.FrictionLaw):
         closing = kinematics.normal_displacement - kinematics.gap
         penetration = positive_part(closing)
         pressure = parameters["p0"] * (ufl.exp(penetration / parameters["h"]) - 1)
-        limit = parameters["friction"] * pressure
-        traction, slip = self.slide(kinematics, limit, parameters)
-        return fc.Response(-pressure, positive_part(-closing), penetration, traction, limit, slip)
+        bound = self.friction_bound(kinematics, pressure, parameters)
+        traction, slip = self.slide(kinematics, bound, parameters)
+        return fc.Response(-pressure, positive_part(-closing), penetration, traction, bound, slip)
 
     def normal_potential(self, kinematics, parameters):
         """∫ p dδ."""
@@ -78,17 +78,17 @@ class Saturating(fc.FrictionLaw):
     k_n: Any
     k_t: Any
 
-    def limit(self, pressure, parameters):
+    def friction_bound(self, kinematics, pressure, parameters):
         """The bound."""
         s = parameters["strength"]
         return s * (1 - ufl.exp(-parameters["friction"] * pressure / s))
 
     def response(self, kinematics, parameters):
-        """Unilateral contact, and friction up to the limit."""
+        """Unilateral contact, and friction up to the bound."""
         penetration = positive_part(kinematics.normal_displacement - kinematics.gap)
         opening = positive_part(kinematics.gap - kinematics.normal_displacement)
         pressure = parameters["k_n"] * penetration
-        limit = self.limit(pressure, parameters)
-        traction, slip = self.slide(kinematics, limit, parameters)
+        bound = self.friction_bound(kinematics, pressure, parameters)
+        traction, slip = self.slide(kinematics, bound, parameters)
         slip = tuple(ufl.conditional(ufl.gt(pressure, 0), mode, 0) for mode in slip)
-        return fc.Response(-pressure, opening, penetration, traction, limit, slip)
+        return fc.Response(-pressure, opening, penetration, traction, bound, slip)

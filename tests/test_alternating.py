@@ -95,7 +95,7 @@ def test_a_driven_support():
 @pytest.mark.parametrize("condensation", [False, None])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_the_residual_is_the_gradient_of_the_energy(cell, condensation):
-    """With the limit of friction frozen: central differences, 1e-6.
+    """With the friction bound given: central differences, 1e-6.
 
     On all unknowns, and on those of contact alone where that is the choice.
     """
@@ -103,7 +103,7 @@ def test_the_residual_is_the_gradient_of_the_energy(cell, condensation):
     scene, problem, contact = pressed(cell, law, "newton", side=0.03, condensation=condensation)
     problem.solve()
     problem.commit()
-    contact.acting.freeze(contact.pressure)
+    contact.acting.fix_friction_bound(contact.values.friction_bound)
     space = problem.solver.system
     equations = problem.solver.equations
     x = equations.solution.copy()
@@ -121,7 +121,7 @@ def test_the_residual_is_the_gradient_of_the_energy(cell, condensation):
         energies.append(equations.energy(z))
     assert slope != 0.0
     assert close((energies[0] - energies[1]) / (2 * step), slope, 1e-6)
-    contact.acting.thaw()
+    contact.acting.release_friction_bound()
 
 
 @pytest.mark.parametrize(("factor", "friction"), [(1e6, 0.0), (1e8, 0.0), (1e4, 0.3)])
@@ -144,10 +144,10 @@ def test_stiff_contact_from_a_cold_start(factor, friction):
 
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
 def test_each_cycle_gains_a_constant_factor_in_proportion_to_friction(cell, monkeypatch):
-    """The limit of friction is a multiple of the pressure, which what changes in it changes back.
+    """The friction bound is a multiple of the pressure, which what changes in it changes back.
 
     The same points stick and slip with all of the coefficients. From cycle to cycle the change of
-    the pressure falls by one factor, to a twentieth of it: minimum problems are solved to a
+    the bound falls by one factor, to a twentieth of it: minimum problems are solved to a
     hundredth of the whole law's residual. Twice the coefficient has twice the factor, to a tenth:
     the pressure itself is a little different.
     """
@@ -156,17 +156,17 @@ def test_each_cycle_gains_a_constant_factor_in_proportion_to_friction(cell, monk
         law = fc.Coulomb(friction, k_n=2e4, k_t=1e4)
         n = 6 if cell == "triangle" else 3
         _, problem, contact = pressed(cell, law, "alternating", n=n, side=0.0)
-        freeze, limits = contact.acting.freeze, []
+        fix, bounds = contact.acting.fix_friction_bound, []
 
-        def note(pressure, freeze=freeze, limits=limits):
-            limits.append(pressure.copy())
-            freeze(pressure)
+        def note(bound, fix=fix, bounds=bounds):
+            bounds.append(bound.copy())
+            fix(bound)
 
-        monkeypatch.setattr(contact.acting, "freeze", note)
+        monkeypatch.setattr(contact.acting, "fix_friction_bound", note)
         r = problem.solve().contacts["contact"]
         zones.append((r.stick, r.slip))
-        limits.append(contact.pressure.copy())
-        squares = [contact.measure @ np.diff(pair, axis=0)[0] ** 2 for pair in pairwise(limits)]
+        bounds.append(contact.values.friction_bound.copy())
+        squares = [contact.measure @ np.diff(pair, axis=0)[0] ** 2 for pair in pairwise(bounds)]
         changes = np.sqrt([COMM.allreduce(float(square)) for square in squares])
         falls = changes[1:] / changes[:-1]
         assert falls[-2] == pytest.approx(falls[-1], rel=0.05)

@@ -91,12 +91,15 @@ class Point:
         self.modes = 0
         if law.has_tangential:
             stiffness = law.tangential_stiffness(kinematics, parameters)
-            expressions |= {"tau": response.traction, "grip": law.grip(parameters)}
+            expressions |= {"tau": response.traction}
             expressions |= {f"K {i}": stiffness[i, :] for i in range(d)}
         if law.has_friction:
             traction = ufl.variable(response.traction)
-            functions = law.yield_functions(kinematics, traction, response.limit, parameters)
-            expressions |= {"limit": response.limit, "slip": ufl.as_vector(response.slip)}
+            functions = law.yield_functions(
+                kinematics, traction, response.friction_bound, parameters
+            )
+            expressions["circumradius"] = law.circumradius(parameters)
+            expressions |= {"limit": response.friction_bound, "slip": ufl.as_vector(response.slip)}
             expressions["functions"] = ufl.as_vector(functions)
             expressions["dissipated"] = law.dissipated(kinematics, response, parameters)
             self.modes = len(functions)
@@ -328,6 +331,7 @@ def test_cone_and_flow(name, d, data):
     adherence = gauge(name, a, trial(a))
     rounding = exact * size(a) * (limit / adherence if adherence > limit else 1.0)
     assert abs(g.max() + limit - gauge(name, a, tau)) <= exact * limit + rounding
+    assert np.linalg.norm(corners(name, a), axis=1).max() <= (1 + exact) * r["circumradius"]
     assert abs(tau @ a["n"]) <= rounding
     along = np.outer(a["n"], a["n"])
     difference = r["K"] + a["k_t"] * along - stiffness(a)

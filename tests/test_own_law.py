@@ -212,7 +212,7 @@ def test_a_potential_of_another_law():
 
 
 def test_a_limit_of_another_law():
-    """A response whose limit is none that `Law.limit` tells is found by the verdict."""
+    """A response with another friction bound than `Law.friction_bound` is found by the verdict."""
 
     class Wrong(Saturating):
         """It slides at the limit of another strength than the one that it tells."""
@@ -223,10 +223,10 @@ def test_a_limit_of_another_law():
             return super().response(kinematics, more)
 
     _, problem, _ = dragged(Wrong(0.5, 4.0, fc.Scaled(), fc.Scaled()))
-    with pytest.raises(fc.NotConverged, match="limit violated by") as caught:
+    with pytest.raises(fc.NotConverged, match="friction bound violated by") as caught:
         problem.solve()
     # Smaller increments would not mend it.
-    assert "response, limit and normal_potential" in str(caught.value)
+    assert "response, friction_bound and normal_potential" in str(caught.value)
     assert "smaller increments" not in str(caught.value)
 
 

@@ -31,8 +31,8 @@ class Changed(fc.Coulomb):
         parts = {name: getattr(r, name) for name in r.__dataclass_fields__}
         if self.what == "cone":
             parts["traction"] = 1.01 * r.traction
-        elif self.what == "limit":
-            parts["limit"] = 0.99 * r.limit
+        elif self.what == "friction bound":
+            parts["friction_bound"] = 0.99 * r.friction_bound
         elif self.what == "stiffness":
             parts["normal_traction"] = 1.01 * r.normal_traction
         elif self.what == "adhesion":
@@ -55,7 +55,7 @@ def test_the_changed_law_is_sound_when_nothing_is_changed():
 
 
 @pytest.mark.parametrize(
-    "what", ["cone", "limit", "stiffness", "adhesion", "penetration", "slip", "direction"]
+    "what", ["cone", "friction bound", "stiffness", "adhesion", "penetration", "slip", "direction"]
 )
 def test_a_law_that_lies_is_caught(what):
     """Reactions that break the cone, complementarity or the flow rule do not pass as a solution."""

@@ -54,10 +54,10 @@ class LinearSprings:
         stretch = np.zeros_like(normal)
         borne = _borne_by_springs(contact)
         if law.has_normal_stiffness:
-            # A slipping point's friction follows the pressure as its limit does.
-            follows = (status == Status.SLIP) & (pressure > 0) & (values.limit > 0)
-            slope = np.where(follows, values.limit_slope, 0.0)
-            ratio = slope / np.where(follows, values.limit, 1.0)
+            # A slipping point's friction follows the pressure as its bound does.
+            follows = (status == Status.SLIP) & (pressure > 0) & (values.friction_bound > 0)
+            slope = np.where(follows, values.friction_bound_slope, 0.0)
+            ratio = slope / np.where(follows, values.friction_bound, 1.0)
             direction = normal - ratio[:, None] * tangential
             k_n = np.where(closed, contact.normal_stiffness, 0.0)
             stiffness += k_n[:, None, None] * np.einsum("qi,qj->qij", direction, normal)

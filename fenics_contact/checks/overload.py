@@ -17,7 +17,6 @@ import scipy.optimize
 from mpi4py import MPI
 
 from fenics_contact.checks.rigid_motions import RigidMotions
-from fenics_contact.contact.values import PointValues
 from fenics_contact.parallel import agreed, global_max, global_sum
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.types import Array
@@ -63,16 +62,6 @@ class Overload:
         )
 
 
-def _bound(values: PointValues) -> Array:
-    """What no tangential traction exceeds in any direction, (n_points,) (stress).
-
-    Of a polygon or an ellipse the limit is that of one direction alone.
-    """
-    friction = values.parameters["friction"]
-    ratio = np.divide(values.grip, friction, out=np.ones_like(friction), where=friction > 0)
-    return values.limit * np.maximum(ratio, 1.0)
-
-
 def find_overload(motions: RigidMotions, operators: Sequence[ContactOperator]) -> Overload | None:
     """The worst motion by which the load outdoes friction at its present limits. Collective.
 
@@ -84,19 +73,25 @@ def find_overload(motions: RigidMotions, operators: Sequence[ContactOperator]) -
 
     Returns:
         None where friction can bear the load, or nothing can be told: supports that turn, places
-        that follow the bodies, tangential forces without limit.
+        that follow the bodies, tangential forces without limit, friction bounds that depend on
+        the motion itself.
     """
     comm, wanted = motions.comm, motions.resultant
     contacts = [operator.contact for operator in operators]
     rubbing = [c for c in contacts if c.law.has_friction]
     unlimited = any(c.law.has_tangential and not c.law.has_friction for c in contacts)
+    unlimited |= any(c.acting.own.bound_depends_on_motion for c in rubbing)
     if unlimited or not rubbing or any(c.finite or c.law.has_tension for c in contacts):
         return None
     size = np.abs(wanted).max(initial=0.0)
     if motions.turning or not size > 0:
         return None
-    finite = all(np.isfinite(c.values.limit).all() for c in rubbing)
-    if not comm.allreduce(finite, op=MPI.LAND):  # of a state that has gone astray
+    finite = all(
+        np.isfinite(v).all()
+        for c in rubbing
+        for v in (c.values.bound_of_law, c.values.circumradius)
+    )
+    if not comm.allreduce(finite, op=MPI.LAND):  # unknown, or of a state that has gone astray
         return None
     sliding, approaching = [], []
     for operator, contact in zip(operators, contacts, strict=True):
@@ -107,7 +102,9 @@ def find_overload(motions: RigidMotions, operators: Sequence[ContactOperator]) -
             approaching.append(along[:, contact.paired])
         if contact.law.has_friction:
             across = modes - along[:, :, None] * normal
-            sliding.append((across, contact.measure * _bound(contact.values)))
+            # An open point may close: it counts with the bound that the law has without pressure.
+            bound = contact.values.bound_of_law * contact.values.circumradius
+            sliding.append((across, contact.measure * bound))
     closing = np.concatenate(approaching or [np.zeros((len(wanted), 0))], axis=1)
 
     def taken(motion: Array) -> tuple[float, Array]:

@@ -304,7 +304,7 @@ class RigidMotions:
             closed = contact.status != Status.OPEN
             bearing.append(closed)
             if contact.law.has_tangential:
-                bearing.append(closed & (contact.values.grip > 0))
+                bearing.append(closed & (contact.values.friction_bound_ratio > 0))
         # What holds a body still does with more of Γc closed: no need to look again.
         same = bool(self._holding) and all(operator in self._holders for operator in operators)
         same = same and not self._turning.any()
@@ -456,7 +456,8 @@ class RigidMotions:
         # A history often has one direction of load and one support: what balanced it does again.
         data = [resultant / np.abs(resultant).max()]
         for contact in contacts:
-            data += [contact.values.normal, _bearing_normals(contact), contact.values.grip]
+            data += [contact.values.normal, _bearing_normals(contact)]
+            data += [contact.values.friction_bound_ratio]
             data += [np.array([contact.pairs.number])]
         known = len(data) == len(self._balanced) and all(map(_alike, data, self._balanced))
         if self.comm.allreduce(not known) == 0:
@@ -506,12 +507,13 @@ class RigidMotions:
                 around.append(-around[0])
             else:
                 around = _around(normal)
-            friction = values.grip[:, None]
-            if law.has_friction and not law.has_potential:
-                enlarge = 1.0 if d == 2 else 1 / np.cos(np.pi / _CONE_SIDES)
-                directions = [-normal + enlarge * friction * t for t in around]
-            else:  # Tresca, foundation: the tangential force does not need the normal one
-                directions = [np.where(friction > 0, t, 0.0) for t in around]
+            ratio = values.friction_bound_ratio[:, None]
+            ratio = ratio if d == 2 else ratio / np.cos(np.pi / _CONE_SIDES)
+            bounded = np.isfinite(ratio)  # by the normal force
+            pushes = -_bearing_normals(contact) * law.has_normal_stiffness
+            directions = [
+                np.where(bounded, pushes + np.where(bounded, ratio, 0.0) * t, t) for t in around
+            ]
         if law.has_normal_stiffness:
             pushes = -_bearing_normals(contact)
             directions += [pushes, -pushes] if law.has_tension else [pushes]
@@ -609,17 +611,21 @@ def _around(normal: Array) -> list[Array]:
 
 
 def _slip(contact: Contact) -> Array:
-    """Along the friction of the points that slip against it, of length 1 or 0, (n_points, gdim)."""
+    """Along the friction of the points that slip against it, of length 1 or 0, (n_points, gdim).
+
+    The traction there is constant along it, but where the friction bound depends on the motion.
+    """
     traction = contact.values.traction
     size = np.linalg.norm(traction, axis=1)
     slips = (contact.status == Status.SLIP) & (size > 0) & contact.law.has_friction
+    slips &= not contact.acting.own.bound_depends_on_motion
     return np.asarray(traction * (slips / np.where(slips, size, 1.0))[:, None], dtype=np.float64)
 
 
 def rubbing(contact: Contact, modes: Array, weights: Array) -> Array:
-    """Products along Γc, where it grips, of n motions by their jumps there, (n, n_points, gdim)."""
+    """Products along Γc, where it resists, of n motions by their jumps, (n, n_points, gdim)."""
     if not contact.law.has_tangential:
         return np.zeros((len(modes), len(modes)))
-    normal, grip = contact.values.normal, weights * (contact.values.grip > 0)
+    normal, resists = contact.values.normal, weights * (contact.values.friction_bound_ratio > 0)
     across = modes - np.einsum("mqd,qd->mq", modes, normal)[:, :, None] * normal
-    return np.asarray(np.einsum("mqd,q,nqd->mn", across, grip, across), dtype=np.float64)
+    return np.asarray(np.einsum("mqd,q,nqd->mn", across, resists, across), dtype=np.float64)

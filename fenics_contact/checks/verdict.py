@@ -253,12 +253,12 @@ def check_laws(contact: Contact) -> dict[str, float]:
         (eq. 6-11: r_n ≤ 0, δ± ≥ 0, δ₊δ₋ = 0, r_n δ₊ = 0, s - u_n = δ₊ - δ₋, r_n = -k_n δ₋;
         with multipliers r_n = -k_n (u_n - s) - λ_n where that is < 0; of a law with its own
         `normal_potential` r_n is minus the derivative of it by u_n instead), or
-        where the law bears tension "stiffness" (r_n = -k_n (u_n - s)). With friction "limit" (it is
-        what the law tells of the pressure) and, by the law's yield functions g_j, "cone" (g_j ≤ 0),
-        "slip" (eq. 44: Δβ ≥ 0, the change of the traction is that of adherence and associated slip,
-        Δτ = -K_t (Δu_t + Σ Δβ_j ∂g_j/∂τ)) and "dissipation" (Δβ_j g_j = 0, slip against τ). With
-        tangential tractions but no friction
-        "stiffness" holds τ = -K_t u_t too, or τ = 0 where open. NaN where something is not finite.
+        where the law bears tension "stiffness" (r_n = -k_n (u_n - s)). With friction "friction
+        bound" (it is `Law.friction_bound` at the pressure) and, by the law's yield functions g_j,
+        "cone" (g_j ≤ 0), "slip" (eq. 44: Δβ ≥ 0, the change of the traction is that of adherence
+        and associated slip, Δτ = -K_t (Δu_t + Σ Δβ_j ∂g_j/∂τ)) and "dissipation" (Δβ_j g_j = 0,
+        slip against τ). With tangential tractions but no friction "stiffness" holds τ = -K_t u_t
+        too, or τ = 0 where open. NaN where something is not finite.
     """
     comm = contact.surface.mesh.comm
     # Points without an opposite bear nothing, whatever they do.
@@ -318,12 +318,12 @@ def check_laws(contact: Contact) -> dict[str, float]:
         found["stiffness"] = max(found.get("stiffness", 0.0), violation)
         return found
 
-    limit, beta = v.limit, v.slip_increment
+    bound, beta = v.friction_bound, v.slip_increment
     functions, gradients = (rows[paired] for rows in contact.evaluate_yield())
     missing = contact.slip_vector()[paired]  # = -Σ Δβ_j ∂g_j/∂τ (44)
     change = missing - v.increment
     # An open point keeps no traction and counts no slip, whatever it moves.
-    bears = limit > 0
+    bears = bound > 0
     slipped = -np.einsum("qm,qmd->qd", beta, gradients)
     # Round-off in the increments is that of the displacements they are differences of, and of the
     # traction, which the springs turn into one: with multipliers that is larger than either.
@@ -331,12 +331,14 @@ def check_laws(contact: Contact) -> dict[str, float]:
     borne = np.linalg.norm(tau, axis=1)
     yields = np.divide(borne, size, out=np.zeros_like(borne), where=size > 0)
     travel = (v.jump, v.increment, change, _ROUND_OFF * yields)
-    found["cone"] = relative(worst(np.maximum(functions, 0)), limit)
-    found["limit"] = relative(worst(limit - v.limit_told), limit)
+    found["cone"] = relative(worst(np.maximum(functions, 0)), bound)
+    # Where nothing presses a law may bound friction by zero, whatever its bound without pressure.
+    apart = np.where((r_n < 0) | (bound != 0.0), bound - v.bound_of_law, 0.0)
+    found["friction bound"] = relative(worst(apart), bound)
     found["slip"] = relative(worst(np.minimum(beta, 0), (missing - slipped)[bears]), *travel)
     found["dissipation"] = relative(
         worst((beta * functions)[bears], np.maximum(np.sum(tau * missing, axis=1) * bears, 0)),
-        np.array([worst(limit) * worst(*travel)]),
+        np.array([worst(bound) * worst(*travel)]),
     )
     return found
 
@@ -410,7 +412,7 @@ class NotConverged(RuntimeError):
 _OVERLOAD = "overload:"
 _OF_A_LAW = (
     "The law itself does not hold where the equations do: of a law of your own look whether its "
-    "response, limit and normal_potential belong together"
+    "response, friction_bound and normal_potential belong together"
 )
 _OF_OVERLOAD = "Try less load, more friction, or a condition that holds the body along this motion"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ufl
 from dolfinx import fem
 
 from fenics_contact.contact.opposite import Opposite
@@ -37,15 +36,15 @@ class ActingLaw:
         self.in_form, self.own = opposite.laws(self._within)
         self.own.prepare()
         self._acting = self.own
-        self._frozen: tuple[PointLaw, fem.Function] | None = None  # and the pressure in it
+        self._fixed: tuple[PointLaw, fem.Function] | None = None  # and the friction bound in it
         # Tangent planes that turn with u leave friction without a potential.
         self._turns = opposite.follows or (opposite.is_finite and law.has_tangential)
         self.has_potential = law.has_potential and not self._turns
 
     @property
-    def freezes(self) -> bool:
-        """Whether there is a potential, at least under a given pressure."""
-        return not self._turns and self._law.at_pressure(ufl.as_ufl(0.0)).has_potential
+    def can_fix_friction_bound(self) -> bool:
+        """Whether there is a potential, at least under a given friction bound."""
+        return not self._turns and self._law.with_given_friction_bound().has_potential
 
     def traction(self) -> Array:
         """r_n n + τ at the present ``u``, (n_points, gdim) (stress). Collective."""
@@ -66,24 +65,24 @@ class ActingLaw:
         self._opposite.update()
         return self._acting.evaluate_potential()
 
-    def freeze(self, pressure: Array) -> None:
-        """Let `Law.at_pressure` act. Collective.
+    def fix_friction_bound(self, bound: Array) -> None:
+        """Let the law act with a given friction bound, if it has no potential. Collective.
 
         Args:
-            pressure: ≥ 0, shape (n_points,) (stress).
+            bound: ≥ 0, shape (n_points,) (stress).
         """
         if self.has_potential:
             return
-        if self._frozen is None:
-            given = fem.Function(self._quadrature.space(), name="pressure")
-            parameters = {**self.own.seen.parameters, "pressure": given}
-            law = self._law.at_pressure(given)
-            self._frozen = self.own.with_law(law, parameters), given
-        self._acting, given = self._frozen
-        given.x.array[: self._quadrature.n_points] = pressure
+        if self._fixed is None:
+            given = fem.Function(self._quadrature.space(), name="friction_bound")
+            parameters = {**self.own.seen.parameters, "friction_bound": given}
+            law = self._law.with_given_friction_bound()
+            self._fixed = self.own.with_law(law, parameters), given
+        self._acting, given = self._fixed
+        given.x.array[: self._quadrature.n_points] = bound
         given.x.scatter_forward()
 
-    def thaw(self) -> None:
+    def release_friction_bound(self) -> None:
         """Let the law itself act again."""
         self._acting = self.own
 

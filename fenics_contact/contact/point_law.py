@@ -10,6 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import ufl
 from dolfinx import fem
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.apply_derivatives import apply_derivatives
 from ufl.corealg.traversal import traverse_unique_terminals
 from ufl.domain import extract_unique_domain
 
@@ -118,7 +120,9 @@ class PointLaw:
             opening=there(response.opening),
             penetration=there(response.penetration),
             traction=None if response.traction is None else there(response.traction),
-            limit=None if response.limit is None else there(response.limit),
+            friction_bound=None
+            if response.friction_bound is None
+            else there(response.friction_bound),
             slip=tuple(there(mode) for mode in response.slip),
         )
 
@@ -196,7 +200,7 @@ class PointLaw:
         """The law's yield functions and their gradients. Collective.
 
         Returns:
-            g_j(τ, limit) (stress), (n_points, n_modes), and ∂g_j/∂τ, (n_points, n_modes, gdim).
+            g_j(τ, bound) (stress), (n_points, n_modes), and ∂g_j/∂τ, (n_points, n_modes, gdim).
         """
         found = self._yield()
         gradients = [found[name] for name in found if name != "functions"]
@@ -207,7 +211,7 @@ class PointLaw:
         felt = self._felt()
         response, parameters = self._response(felt), self.seen.parameters
         traction = ufl.variable(response.traction)
-        functions = self.law.yield_functions(felt, traction, response.limit, parameters)
+        functions = self.law.yield_functions(felt, traction, response.friction_bound, parameters)
         rows = {f"gradient {j}": ufl.diff(g, traction) for j, g in enumerate(functions)}
         return self._evaluator({"functions": ufl.as_vector(functions)} | rows)
 
@@ -217,7 +221,48 @@ class PointLaw:
 
     def evaluate(self) -> dict[str, Array]:
         """All that a law tells, by name; see `PointValues`. Collective."""
-        return self._all()
+        found = self._all()
+        if self.law.has_friction:
+            found["friction_bound_ratio"] = self._ratio(found)
+        elif self.law.has_tangential:
+            resists = [
+                np.any(found[f"tangential_stiffness {i}"], axis=1) for i in range(self._gdim)
+            ]
+            found["friction_bound_ratio"] = np.where(np.any(resists, axis=0), np.inf, 0.0)
+        return found
+
+    def _ratio(self, found: dict[str, Array]) -> Array:
+        """`PointValues.friction_bound_ratio`; what it was made of is taken out."""
+        found.setdefault("circumradius", np.full(len(found["friction_bound"]), np.inf))
+        if not self._bound_is_linear:
+            return np.full(len(found["friction_bound"]), np.inf)
+        slope, cohesion = found.pop("slope of the bound"), found.pop("cohesion")
+        radius = np.where(slope > 0, found["circumradius"], 0.0)
+        return np.where(cohesion > 0, np.inf, slope * radius)
+
+    @property
+    def bound_depends_on_motion(self) -> bool:
+        """Whether the friction bound is a function of the motion itself, beside the pressure."""
+        return self._bound[0]
+
+    @property
+    def _bound_is_linear(self) -> bool:
+        """Whether the friction bound is m p + c, with m and c from the data alone."""
+        return self._bound[1]
+
+    @cached_property
+    def _bound(self) -> tuple[bool, bool]:
+        """What the expression of the friction bound says of itself; see the properties."""
+        felt = self._felt()
+        names = ["gap", "normal_displacement", "tangential_displacement"]
+        names += ["tangential_increment", "multiplier"]
+        given = {name: getattr(felt, name) for name in names}
+        motion = {n: ufl.variable(v) for n, v in given.items() if v is not None}
+        pressure = ufl.variable(self.seen.gap)  # any scalar
+        bound = self.law.friction_bound(replace(felt, **motion), pressure, self.seen.parameters)
+        if any(_depends(bound, variable) for variable in motion.values()):
+            return True, False
+        return False, not _depends(ufl.diff(bound, pressure), pressure)
 
     @cached_property
     def _all(self) -> PointEvaluator:
@@ -235,20 +280,28 @@ class PointLaw:
             told |= self._own_normal(felt, response)
         if law.has_tangential:
             stiffness = law.tangential_stiffness(felt, parameters)
-            told |= {"traction": response.traction, "grip": law.grip(parameters)}
+            told |= {"traction": response.traction}
             told |= {f"tangential_stiffness {i}": stiffness[i, :] for i in range(self._gdim)}
         if law.has_friction:
             pressure = ufl.variable(-response.normal_traction)
-            limit = law.limit(pressure, parameters)
+            bound = law.friction_bound(felt, pressure, parameters)
             told |= {
-                "limit_told": self._there(limit),
-                "limit_slope": self._there(ufl.diff(limit, pressure)),
+                "bound_of_law": self._there(bound),
+                "friction_bound_slope": self._there(ufl.diff(bound, pressure)),
                 "increment": felt.tangential_increment,
                 "old_traction": felt.traction,
-                "limit": response.limit,
+                "friction_bound": response.friction_bound,
                 "dissipated": self._there(law.dissipated(felt, response, parameters)),
                 "slip_increment": ufl.as_vector(response.slip),
             }
+            circumradius = law.circumradius(parameters)
+            if circumradius is not None:
+                told["circumradius"] = circumradius
+            if self._bound_is_linear:
+                told |= {
+                    "slope of the bound": ufl.diff(bound, pressure),
+                    "cohesion": law.friction_bound(felt, ufl.as_ufl(0.0), parameters),
+                }
         if felt.multiplier is not None:
             told |= {"multiplier": felt.multiplier}
             if law.has_friction:
@@ -311,3 +364,9 @@ class PointLaw:
                     "law knows of a point what its kinematics and parameters tell it: give it as a "
                     'parameter, a field of the class, and take it from parameters["..."]'
                 )
+
+
+def _depends(expression: Any, variable: Any) -> bool:
+    """Whether an expression is a function of a `ufl.variable`, its derivatives evaluated."""
+    plain = apply_derivatives(apply_algebra_lowering(ufl.as_ufl(expression)))
+    return variable.label() in set(traverse_unique_terminals(plain))

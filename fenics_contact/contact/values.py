@@ -113,13 +113,16 @@ class PointValues:
         normal_stiffness: -∂r_n/∂u_n where closed (stress/length).
         normal_reaction: r_n by the law's own potential, where it has one (stress).
         traction: τ on the body (stress).
-        grip: Bound of |τ|/p; not zero where motion along Γc is resisted.
+        friction_bound_ratio: Bound of |τ|/p over all directions; infinite where tangential forces
+            are not bounded by normal ones, 0 where nothing resists motion along Γc.
+        circumradius: Largest |τ| on the yield surface, by its friction bound; infinite where it is
+            not known.
         stored: Energy in the springs per area.
         increment: Δu_t since the last commit (length).
         old_traction: τ that the increment started from (stress).
-        limit: Of |τ| (stress).
-        limit_told: The same by `Law.limit` at the contact pressure (stress).
-        limit_slope: Its derivative by the pressure.
+        friction_bound: Size of the yield surface (stress).
+        bound_of_law: The same by `Law.friction_bound` at the contact pressure (stress).
+        friction_bound_slope: Its derivative by the pressure.
         dissipated: Work of friction per area.
         slip_increment: Δβ of every mode, (n_points, n_modes) (length).
         multiplier: λ_n (stress).
@@ -150,13 +153,14 @@ class PointValues:
     normal_stiffness: Array
     normal_reaction: Array
     traction: Array
-    grip: Array
+    friction_bound_ratio: Array
+    circumradius: Array
     stored: Array
     increment: Array
     old_traction: Array
-    limit: Array
-    limit_told: Array
-    limit_slope: Array
+    friction_bound: Array
+    bound_of_law: Array
+    friction_bound_slope: Array
     dissipated: Array
     slip_increment: Array
     multiplier: Array
@@ -182,8 +186,8 @@ class PointValues:
 
         by_penalty = parameters.get("k_n", _everywhere(0.0, (n,)))
         scalars = (
-            *("normal_reaction", "grip", "limit", "limit_told", "limit_slope", "dissipated"),
-            *("multiplier", "depth"),
+            *("normal_reaction", "friction_bound_ratio", "circumradius", "friction_bound"),
+            *("bound_of_law", "friction_bound_slope", "dissipated", "multiplier", "depth"),
         )
         vectors = ("slide", "traction", "increment", "old_traction", "elastic_slip")
         always = (

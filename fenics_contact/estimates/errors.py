@@ -304,7 +304,7 @@ def _differences(
         pressure, side = contact.pressure - along, change - along[:, None] * normal
         friction = np.linalg.norm(contact.tangential_traction + side, axis=1)
         if contact.law.has_friction:
-            friction = np.minimum(friction, _limit(contact, pressure))
+            friction = np.minimum(friction, _friction_bound(contact, pressure))
         sums = global_sum(comm, [measure @ pressure, measure @ friction])
         peak = global_max(comm, pressure)
         after |= _named(problem, contact, float(sums[0]), float(sums[1]), peak)
@@ -312,11 +312,12 @@ def _differences(
     return {name: values[name] - after[name] for name in values}
 
 
-def _limit(contact: Contact, pressure: Array) -> Array:
-    """Largest friction at the points under another pressure (stress)."""
+def _friction_bound(contact: Contact, pressure: Array) -> Array:
+    """Friction bound at the points under another pressure (stress)."""
     values = contact.values
-    changed = values.limit + values.limit_slope * (pressure - contact.pressure)
-    return np.where(contact.status == Status.OPEN, values.limit, np.maximum(changed, 0.0))
+    bound = values.friction_bound
+    changed = bound + values.friction_bound_slope * (pressure - contact.pressure)
+    return np.where(contact.status == Status.OPEN, bound, np.maximum(changed, 0.0))
 
 
 # ---- discretisation ------------------------------------------------------------------------------

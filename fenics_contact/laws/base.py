@@ -60,7 +60,8 @@ class Response:
         opening: δ₊ ≥ 0 (length), eq. (6).
         penetration: δ₋ ≥ 0 (length), eq. (6).
         traction: τ (stress), shape (gdim,); None if the law gives none.
-        limit: μ p, the size of the yield surface (stress); None without friction.
+        friction_bound: Size of the yield surface, μ p of Coulomb's law (stress); None without
+            friction.
         slip: Δβ ≥ 0 of each slip mode (length), eq. (44).
     """
 
@@ -68,7 +69,7 @@ class Response:
     opening: Expr
     penetration: Expr
     traction: Expr | None = None
-    limit: Expr | None = None
+    friction_bound: Expr | None = None
     slip: tuple[Expr, ...] = ()
 
 
@@ -177,11 +178,10 @@ class Law:
             "there; the energies of an increment are in step.energy"
         )
 
-    def at_pressure(self, pressure: Expr) -> Law:
-        """A law with a potential that is this one where ``pressure`` is the contact pressure.
+    def with_given_friction_bound(self) -> Law:
+        """This law with its friction bound given by a parameter "friction_bound" ≥ 0 (stress).
 
-        Args:
-            pressure: Taken for given where this law has no potential, ≥ 0 (stress).
+        Tractions of such a law have a potential. A law that has one is returned as it is.
         """
         return self
 
@@ -189,16 +189,28 @@ class Law:
         """Number of slip modes."""
         return 0
 
-    def grip(self, parameters: Mapping[str, Expr]) -> Expr:
-        """Bound of |τ|/p over all directions; not zero wherever motion along Γc is resisted."""
-        return ufl.as_ufl(0.0)
+    def friction_bound(
+        self, kinematics: Kinematics, pressure: Expr, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """Size of the yield surface under a contact pressure (stress), ≥ 0.
 
-    def limit(self, pressure: Expr, parameters: Mapping[str, Expr]) -> Expr:
-        """Limit of friction under a contact pressure (stress): the `Response.limit` there.
+        It is all that is known of the strength of friction: the `response` and the checks call it.
+        It may depend on the kinematics, as on the slip distance of the increment. What is μ p, with
+        μ from the parameters alone, bounds tangential forces by normal ones; no other bound does.
 
-        Its derivative by the pressure is what friction follows the pressure by.
+        Args:
+            kinematics: Of the point.
+            pressure: -r_n ≥ 0 (stress).
+            parameters: Of the law, as UFL.
         """
         return ufl.as_ufl(0.0)
+
+    def circumradius(self, parameters: Mapping[str, Expr]) -> Expr | None:
+        """Largest |τ| on the yield surface of friction bound 1; None where it is not known.
+
+        Where it is not known no load is refused because of friction.
+        """
+        return None
 
     def tangential_stiffness(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
         """K_t of a sticking point (stress/length), shape (gdim, gdim), with K_t n = 0."""
@@ -212,9 +224,9 @@ class Law:
         return traction / parameters["k_t"]
 
     def yield_functions(
-        self, kinematics: Kinematics, traction: Expr, limit: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: Kinematics, traction: Expr, bound: Expr, parameters: Mapping[str, Expr]
     ) -> tuple[Expr, ...]:
-        """g_j(τ, limit) ≤ 0 of each slip mode (stress), eq. (29), apart from the return map.
+        """g_j(τ, bound) ≤ 0 of each slip mode (stress), eq. (29), apart from the return map.
 
         Slip is associated with them: K_t⁻¹ Δτ = -(Δu_t + Σ Δβ_j ∂g_j/∂τ), eq. (44).
         """

@@ -26,7 +26,9 @@ __all__ = ["Coulomb", "FrictionLaw", "Tresca", "perpendicular"]
 class FrictionLaw(Law):
     """What laws with friction share: the yield surface in the tangent plane, and slip.
 
-    In the plane it is ±limit. In space it is the cone |τ| ≤ limit; with ``modes`` the regular
+    Its size is the `friction_bound`, which a subclass may replace; its shape is this:
+
+    In the plane it is ±bound. In space it is the cone |τ| ≤ bound; with ``modes`` the regular
     polygon around that circle; with ``transverse_friction`` the cone (or polygon) is stretched
     across the direction by r = μ₂/μ₁. In σ = B⁻¹τ, B = diag(1, r), it is the unstretched one, and
     with K_t = k_t B² the closest point in the metric of K_t is the closest point in σ.
@@ -85,9 +87,9 @@ class FrictionLaw(Law):
         given.pop("modes", None)
         return given
 
-    def at_pressure(self, pressure: Expr) -> Law:
-        """See `Law.at_pressure`: the pressure sets the limit of friction, and nothing else."""
-        return self if self.has_potential else _AtPressure(self)
+    def with_given_friction_bound(self) -> Law:
+        """See `Law.with_given_friction_bound`."""
+        return self if self.has_potential else _GivenBound(self)
 
     def check_dimension(self, gdim: int) -> None:
         """See `Law.check_dimension`."""
@@ -103,16 +105,24 @@ class FrictionLaw(Law):
         """Slip modes: ± in the plane (eq. 29), in space the one cone or the polygon's sides."""
         return 2 if gdim == 2 else self.modes or 1
 
-    def grip(self, parameters: Mapping[str, Expr]) -> Expr:
-        """See `Law.grip`: the vertices of the polygon, the larger of the two frictions."""
-        bound = parameters["friction"]
-        if self.transverse_friction is not None:
-            bound = ufl.max_value(bound, parameters["transverse_friction"])
-        return bound if self.modes is None else bound / math.cos(math.pi / self.modes)
-
-    def limit(self, pressure: Expr, parameters: Mapping[str, Expr]) -> Expr:
-        """See `Law.limit`: μ p."""
+    def friction_bound(
+        self, kinematics: Kinematics, pressure: Expr, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """See `Law.friction_bound`: μ p."""
         return parameters["friction"] * pressure
+
+    def circumradius(self, parameters: Mapping[str, Expr]) -> Expr | None:
+        """See `Law.circumradius`: of the polygon's vertices, and along the larger half-axis.
+
+        A subclass with yield functions of its own has another surface.
+        """
+        if type(self).yield_functions is not FrictionLaw.yield_functions:
+            return None
+        radius = ufl.as_ufl(1.0 if self.modes is None else 1 / math.cos(math.pi / self.modes))
+        if self.transverse_friction is None:
+            return radius
+        ratio = parameters["transverse_friction"] / parameters["friction"]
+        return radius * ufl.max_value(1.0, ratio)
 
     def _frame(self, normal: Expr, parameters: Mapping[str, Expr]) -> tuple[Expr, Expr]:
         """Orthonormal vectors of the tangent plane, the first along the direction.
@@ -166,53 +176,53 @@ class FrictionLaw(Law):
         return self._stretched(traction, -2, kinematics.normal, parameters) / parameters["k_t"]
 
     def yield_functions(
-        self, kinematics: Kinematics, traction: Expr, limit: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: Kinematics, traction: Expr, bound: Expr, parameters: Mapping[str, Expr]
     ) -> tuple[Expr, ...]:
-        """See `Law.yield_functions`: eq. (29) in the plane, |σ| - limit or σ·a_j - limit."""
+        """See `Law.yield_functions`: eq. (29) in the plane, |σ| - bound or σ·a_j - bound."""
         n = kinematics.normal
         if len(n) == 2:
             along = ufl.dot(traction, perpendicular(n))
-            return along - limit, -along - limit
+            return along - bound, -along - bound
         sigma = self._stretched(traction, -1, n, parameters)
         if self.modes is None:
-            return (norm(sigma) - limit,)
-        return tuple(ufl.dot(sigma, a) - limit for a, _ in self._sides(n, parameters))
+            return (norm(sigma) - bound,)
+        return tuple(ufl.dot(sigma, a) - bound for a, _ in self._sides(n, parameters))
 
     def _return(
-        self, kinematics: Kinematics, limit: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: Kinematics, bound: Expr, parameters: Mapping[str, Expr]
     ) -> tuple[Expr, Expr, tuple[Expr, ...]]:
         """Return map of the increment in σ, eq. (41-45): σ*, σ and Δβ of each mode."""
         n, k_t = kinematics.normal, parameters["k_t"]
         trial = self._stretched(kinematics.traction, -1, n, parameters)
         trial = trial - k_t * self._stretched(kinematics.tangential_increment, 1, n, parameters)
         if len(n) == 2:
-            sigma, excess = return_to_segment(trial, limit, perpendicular(n))
+            sigma, excess = return_to_segment(trial, bound, perpendicular(n))
         elif self.modes is None:
-            sigma, excess = return_to_cone(trial, limit)
+            sigma, excess = return_to_cone(trial, bound)
         else:
-            sigma, excess = return_to_polygon(trial, limit, self._sides(n, parameters))
+            sigma, excess = return_to_polygon(trial, bound, self._sides(n, parameters))
         return trial, sigma, tuple(e / k_t for e in excess)
 
     def slide(
-        self, kinematics: Kinematics, limit: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: Kinematics, bound: Expr, parameters: Mapping[str, Expr]
     ) -> tuple[Expr, tuple[Expr, ...]]:
         """τ at the end of the increment, shape (gdim,), and Δβ of each mode, eq. (41-45)."""
-        _, sigma, slip = self._return(kinematics, limit, parameters)
+        _, sigma, slip = self._return(kinematics, bound, parameters)
         return self._stretched(sigma, 1, kinematics.normal, parameters), slip
 
     def sliding_potential(
-        self, kinematics: Kinematics, limit: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: Kinematics, bound: Expr, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """Minus its derivative by Δu_t is τ for a given limit: ½|σ*|²/k_t, linear beyond it.
+        """Minus its derivative by Δu_t is τ for a given bound: ½|σ*|²/k_t, linear beyond it.
 
         That is (|σ*|² - |σ* - σ|²)/(2 k_t), whose gradient by σ* is the closest point σ over k_t.
         """
-        trial, sigma, _ = self._return(kinematics, limit, parameters)
+        trial, sigma, _ = self._return(kinematics, bound, parameters)
         return ufl.dot(sigma, trial - sigma / 2) / parameters["k_t"]
 
 
-class _AtPressure(FrictionLaw):
-    """Another law, but for the limit of its friction, which is that under a given "pressure"."""
+class _GivenBound(FrictionLaw):
+    """Another law with its friction bound given by the parameter "friction_bound"."""
 
     def __init__(self, law: FrictionLaw) -> None:
         self._law, self.friction, self.k_t = law, law.friction, law.k_t
@@ -226,16 +236,16 @@ class _AtPressure(FrictionLaw):
 
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """See `Law.response`."""
-        limit = self._law.limit(parameters["pressure"], parameters)
-        traction, slip = self.slide(kinematics, limit, parameters)
+        bound = parameters["friction_bound"]
+        traction, slip = self._law.slide(kinematics, bound, parameters)
         found = self._law.response(kinematics, parameters)
-        return replace(found, traction=traction, limit=limit, slip=slip)
+        return replace(found, traction=traction, friction_bound=bound, slip=slip)
 
     def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
         """See `Law.potential`."""
-        limit = self._law.limit(parameters["pressure"], parameters)
         normal = self._law.normal_potential(kinematics, parameters)
-        return normal + self.sliding_potential(kinematics, limit, parameters)
+        bound = parameters["friction_bound"]
+        return normal + self._law.sliding_potential(kinematics, bound, parameters)
 
 
 def perpendicular(normal: Expr) -> Expr:
@@ -271,11 +281,11 @@ class Coulomb(FrictionLaw):
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """See `Law.response`. Where the gap is open τ = 0, and moving is not slipping."""
         r_n, opening, penetration = signorini(kinematics, parameters["k_n"])
-        limit = self.limit(-r_n, parameters)
-        traction, slip = self.slide(kinematics, limit, parameters)
         closed = ufl.lt(r_n, 0)
+        bound = ufl.conditional(closed, self.friction_bound(kinematics, -r_n, parameters), 0)
+        traction, slip = self.slide(kinematics, bound, parameters)
         slip = tuple(ufl.conditional(closed, mode, 0) for mode in slip)
-        return Response(r_n, opening, penetration, traction, limit, slip)
+        return Response(r_n, opening, penetration, traction, bound, slip)
 
 
 @dataclass(frozen=True)
@@ -318,24 +328,26 @@ class Tresca(FrictionLaw):
         without = {"unilateral"} if self.unilateral else {"unilateral", "k_n"}
         return {n: v for n, v in super().parameters().items() if n not in without}
 
-    def limit(self, pressure: Expr, parameters: Mapping[str, Expr]) -> Expr:
-        """See `Law.limit`: μ times the pressure that is prescribed, whatever the other is."""
+    def friction_bound(
+        self, kinematics: Kinematics, pressure: Expr, parameters: Mapping[str, Expr]
+    ) -> Expr:
+        """See `Law.friction_bound`: μ times the prescribed pressure, whatever the other is."""
         return parameters["friction"] * parameters["pressure"]
 
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """See `Law.response`."""
-        limit = self.limit(parameters["pressure"], parameters)
-        traction, slip = self.slide(kinematics, limit, parameters)
+        bound = self.friction_bound(kinematics, parameters["pressure"], parameters)
+        traction, slip = self.slide(kinematics, bound, parameters)
         k_n = parameters["k_n"] if self.unilateral else ufl.as_ufl(0)
         r_n, opening, penetration = signorini(kinematics, k_n)
         if not self.unilateral:
             r_n = -parameters["pressure"]
-        return Response(r_n, opening, penetration, traction, limit, slip)
+        return Response(r_n, opening, penetration, traction, bound, slip)
 
     def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
         """Eq. (19) and (43)."""
-        limit = self.limit(parameters["pressure"], parameters)
-        tangential = self.sliding_potential(kinematics, limit, parameters)
+        bound = self.friction_bound(kinematics, parameters["pressure"], parameters)
+        tangential = self.sliding_potential(kinematics, bound, parameters)
         if not self.unilateral:
             return tangential + parameters["pressure"] * kinematics.normal_displacement
         return tangential + signorini_potential(kinematics, parameters["k_n"])

@@ -82,10 +82,6 @@ class Foundation(Law):
         """See `Law.parameters`."""
         return {"k_n": self.k_n} | ({"k_t": self.k_t} if self.has_tangential else {})
 
-    def grip(self, parameters: Mapping[str, Expr]) -> Expr:
-        """See `Law.grip`: there is no limit, so that this tells only where k_t is."""
-        return parameters["k_t"]
-
     def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
         """See `Law.response`."""
         r_n, opening, penetration = signorini(kinematics, parameters["k_n"])

@@ -1,14 +1,14 @@
 """Minimum problems one after another: contact with friction of given limit, then a new limit.
 
-Coulomb's law has no potential. Given the pressure that sets the limit of friction, unilateral
-contact with friction has one (Signorini with Tresca or Duvaut-Lions, section 3): Newton's method
-with a line search on the energy solves it however stiff it is. The pressure that comes out sets the
-next limit, until the whole law holds. Each cycle gains a factor, which is constant once no point
-changes its status, and the less the larger the friction is.
+Coulomb's law has no potential. With a given friction bound, unilateral contact with friction has
+one (Signorini with Tresca or Duvaut-Lions, section 3): Newton's method with a line search on the
+energy solves it however stiff it is. The pressure that comes out sets the next bound, until the
+whole law holds. Each cycle gains a factor, which is constant once no point changes its status, and
+the less the larger the friction is.
 
 The paper's conclusion takes the normal and the tangential reaction apart, one given while the other
 is sought. A body that contact alone holds is loose in either of these problems, and each has to
-wait for the other where both change; here only the limit of friction waits.
+wait for the other where both change; here only the friction bound waits.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class Alternation(OwnMethod):
         relaxation = 1.0
         try:
             residual = self._residual()
-            pressure: Array = self._pressure()
+            bound: Array = self._friction_bound()
             for cycle in range(_MAX_CYCLES):
                 needed = equations.friction_needed()
                 overloads = overloads + 1 if 1.0 < needed < np.inf else 0
@@ -122,10 +122,10 @@ class Alternation(OwnMethod):
                     logger.debug("%d cycles, %d Newton iterations: overload", cycle, iterations)
                     return iterations, OVERLOADED
                 if overloads:
-                    pressure = _MORE * needed * pressure
+                    bound = _MORE * needed * bound
                 ends = np.cumsum([c.quadrature.n_points for c in equations.contacts])[:-1]
-                for contact, part in zip(equations.contacts, np.split(pressure, ends), strict=True):
-                    contact.acting.freeze(part)
+                for contact, part in zip(equations.contacts, np.split(bound, ends), strict=True):
+                    contact.acting.fix_friction_bound(part)
                 share = 0.0 if equations.has_potential else _INNER
                 self._goal = share * residual
                 iterations += self._minimise()
@@ -141,12 +141,12 @@ class Alternation(OwnMethod):
                     return iterations, int(reasons.DIVERGED_MAX_IT)
                 if stalls and stalls % _PATIENCE == 0:
                     relaxation = max(relaxation / 2, _LEAST)
-                pressure = pressure + relaxation * (self._pressure() - pressure)
+                bound = bound + relaxation * (self._friction_bound() - bound)
             return iterations, int(reasons.DIVERGED_MAX_IT)
         finally:
             equations.forget_h0()
             for contact in equations.contacts:
-                contact.acting.thaw()
+                contact.acting.release_friction_bound()
 
     def check(self) -> None:
         """See `OwnMethod.check`: minimum problems, all of which have energies to be lowered."""
@@ -158,7 +158,7 @@ class Alternation(OwnMethod):
         none = self._without_potential()
         if none:
             laws = ", ".join(type(c.law).__name__ for c in none)
-            why = "not even under a given pressure"
+            why = "not even under a given friction bound"
             if all(c.finite for c in none):
                 why = "where displacements are finite, whose tangent planes turn"
             raise ValueError(
@@ -173,20 +173,20 @@ class Alternation(OwnMethod):
         return bool(self._equations.contacts) and not mixed and not self._without_potential()
 
     def _without_potential(self) -> list[Contact]:
-        return [c for c in self._equations.contacts if not c.acting.freezes]
+        return [c for c in self._equations.contacts if not c.acting.can_fix_friction_bound]
 
-    def _pressure(self) -> Array:
-        """Of all contacts at this rank's points."""
+    def _friction_bound(self) -> Array:
+        """Friction bound of all contacts at this rank's points (stress)."""
         contacts = self._equations.contacts
         for contact in contacts:
             contact.evaluate()
-        return np.concatenate([contact.pressure for contact in contacts])
+        return np.concatenate([contact.values.friction_bound for contact in contacts])
 
     def _residual(self) -> float:
         """That of the whole law."""
         equations = self._equations
         for contact in equations.contacts:
-            contact.acting.thaw()
+            contact.acting.release_friction_bound()
         return float(equations.residual(equations.solution, equations.function).total)
 
     def _minimise(self) -> int:

@@ -30,7 +30,7 @@ def acting(contact: Contact) -> Mask:
     """
     values = contact.values
     # What is not a number tells nothing.
-    acts = np.any(np.abs(values.total_traction) > 0.0, axis=1) | (values.limit > 0.0)
+    acts = np.any(np.abs(values.total_traction) > 0.0, axis=1) | (values.friction_bound > 0.0)
     return np.asarray((contact.status != Status.OPEN) | (acts & contact.paired))
 
 

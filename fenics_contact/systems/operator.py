@@ -274,7 +274,8 @@ class ContactOperator:
         if self._turn is None or not contact.law.has_friction:
             return 0.0
         arms = values.tangential(self._arms())
-        weight = contact.measure * np.maximum(contact.pressure, 0.0) * (values.grip > 0)
+        resists = values.friction_bound_ratio > 0
+        weight = contact.measure * np.maximum(contact.pressure, 0.0) * resists
         found = [weight @ np.sum(arms * v, axis=1) for v in (values.increment, arms)]
         slip, size = (float(v) for v in global_sum(self.unknowns.comm, found))
         return slip / size if size > 0 else 0.0
