@@ -278,7 +278,8 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "warning": {
         "displacements are taken as small": (
-            "What small displacements leave out is more than 1 % of force or pressure.",
+            "What small displacements leave out is more than 1 % of force or pressure. It is said "
+            "again where it has doubled; the summary of each step has it.",
             'Accept it, or take `kinematics="finite"`. From 20 % on the increment fails.',
         ),
         "points into the body": (

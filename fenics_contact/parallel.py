@@ -24,6 +24,7 @@ __all__ = [
     "global_max",
     "global_min",
     "global_sum",
+    "longest",
     "warn",
 ]
 
@@ -136,6 +137,18 @@ def global_max(comm: MPI.Comm, values: Array, empty: float = 0.0) -> float:
 def global_min(comm: MPI.Comm, values: Array, empty: float = 0.0) -> float:
     """Smallest entry over the ranks; ``empty`` where no rank has one; NaN wins. Collective."""
     return -global_max(comm, -np.asarray(values), -empty)
+
+
+def longest(comm: MPI.Comm, vectors: Array) -> float:
+    """Length of the longest row over the ranks, in any frame; 0 without rows; NaN wins. Collective.
+
+    Args:
+        comm: The ranks.
+        vectors: (n, gdim); numbers, (n,), count by their size.
+    """
+    with np.errstate(over="ignore"):  # of a diverged state
+        lengths = np.abs(vectors) if vectors.ndim == 1 else np.linalg.norm(vectors, axis=1)
+    return global_max(comm, lengths)
 
 
 def all_finite(comm: MPI.Comm, values: Array) -> bool:

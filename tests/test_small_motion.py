@@ -5,16 +5,18 @@ gap and normals are those of where it is; to drag the body as far the other way 
 """
 
 import warnings
+from itertools import pairwise
 
 import numpy as np
 import pytest
+import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.blocks import TOP, block
+from scenes.blocks import BOTTOM, TOP, Block, block, block_mesh
 from scenes.comparing import at_points, close
-from scenes.elasticity import stress
+from scenes.elasticity import displacement_space, stress
 
 COMM = MPI.COMM_WORLD
 RADIUS, DEPTH = 4.0, 0.05
@@ -113,15 +115,122 @@ def test_a_stiffness_in_other_units_fails(condensation):
     assert pushed(1e6, top=50.0).verdict.displacement < 2
 
 
-def test_motion_that_is_hardly_small_is_warned_of_once():
+def test_motion_that_is_hardly_small_is_warned_of_as_it_grows():
+    """Once for each doubling; every summary has it."""
     problem, _ = pressed(body=-0.2, kinematics=0.5)
     with pytest.warns(UserWarning, match="taken as small") as caught:
-        problem.solve()
+        step = problem.solve()
     problem.commit()
     assert len(caught) == 1
+    told = str(caught[0].message).split("moved to, ")[1]
+    assert told in step.summary() and told in step._repr_html_()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         problem.solve()
+    first = step.verdict.kinematics["contact"].worst
+    moved, said, shares = fem.Constant(problem.u.function_space.mesh, 0.0), [], []
+    problem, _ = pressed(body=moved, kinematics=np.inf)
+    for way in np.linspace(0.0, -0.4, 9):
+        moved.value = way
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            step = problem.solve()
+        problem.commit()
+        said.append(any("taken as small" in str(w.message) for w in caught))
+        shares.append(step.verdict.kinematics["contact"].worst)
+        assert ("taken as small" in step.summary()) == (shares[-1] > 0.01)
+    warned = [share for share, told in zip(shares, said, strict=True) if told]
+    assert len(warned) > 2 and warned[-1] > first
+    assert all(b > 2 * a for a, b in pairwise(warned))
+    assert max(shares) <= 2 * warned[-1]
+
+
+# ---- in any frame --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", [30.0, 45.0])
+def test_the_verdict_is_that_of_the_turned_scene(angle):
+    """All of a scene turned: the shares are the same, to 1e-5 of themselves, as is the budget.
+
+    By the largest component the share in the force would be smaller by up to the root of 2.
+    """
+    found = []
+    for turn in (0.0, np.deg2rad(angle)):
+        c, s = np.cos(turn), np.sin(turn)
+        q = np.array([[c, -s], [s, c]])
+        mesh, tags = block_mesh("triangle", n=6)
+        mesh.geometry.x[:, :2] = mesh.geometry.x[:, :2] @ q.T
+        zero = np.zeros(2)
+        scene = Block(
+            mesh=mesh,
+            tags=tags,
+            u=fem.Function(displacement_space(mesh, 1), name="u"),
+            E=fem.Constant(mesh, 1000.0),
+            nu=fem.Constant(mesh, 0.3),
+            traction=fem.Constant(mesh, zero),
+            body_force=fem.Constant(mesh, zero),
+            surface=fc.ContactSurface(mesh, tags, BOTTOM),
+        )
+        ball = fc.Ball(q @ [0.5, -2.0], 2.0)
+        top = fem.Function(scene.u.function_space)
+        top.x.array[:] = np.tile(q @ [-0.05, -0.02], top.x.array.size // 2)
+        nodes = fem.locate_dofs_topological(scene.u.function_space, 1, tags.find(TOP))
+        problem, _ = scene.problem(
+            fc.Coulomb(0.2), [fem.dirichletbc(top, nodes)], contact={"support": ball}
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            step = problem.solve()
+        told = step.verdict.kinematics["contact"]
+        budget = fc.estimate_errors(problem, stress(scene.u, scene.E, scene.nu))
+        found.append([told.force, told.pressure])
+        found[-1] += [budget.values["displacement"], budget.parts["kinematics"]["displacement"]]
+    assert min(found[0][:2]) > 0.01
+    assert found[1] == pytest.approx(found[0], rel=1e-5)
+
+
+# ---- a support whose displacement varies along Γc ------------------------------------------------
+
+
+def tilted(angle, how):
+    """A block held by its top, into which a floor is tilted by a given displacement."""
+    scene = block("quadrilateral", n=8)
+    x = ufl.SpatialCoordinate(scene.mesh)
+    floor = fc.HalfSpace((0.5, 0.02), (-np.sin(angle), np.cos(angle)))
+    if how != "plane":
+        space = scene.u.function_space
+        if how == "function on Γc":
+            space = fem.functionspace(scene.surface.submesh, ("Lagrange", 1, (2,)))
+        motion = fem.Function(space)
+        motion.interpolate(lambda x: np.stack([-angle * x[1], 0.02 + angle * (x[0] - 0.5)]))
+        if how == "expression":
+            motion = ufl.as_vector([-angle * x[1], 0.02 + angle * (x[0] - 0.5)])
+        floor = fc.HalfSpace((0.5, 0.0), (0.0, 1.0), displacement=motion)
+        if how == "profile":
+            line = np.linspace(-2.0, 3.0, 21)
+            points = np.stack([line, np.zeros_like(line)], axis=1)
+            floor = fc.RigidProfile(points[::-1], displacement=motion)
+    bcs = [scene.hold(TOP, 0), scene.hold(TOP, 1)]
+    problem, contact = scene.problem(
+        fc.Frictionless(), bcs, contact={"support": floor}, kinematics=np.inf
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        step = problem.solve()
+    return step.verdict.kinematics["contact"], contact.resultants().force
+
+
+@pytest.mark.parametrize("how", ["expression", "function", "function on Γc", "profile"])
+def test_a_plane_tilted_by_its_displacement_is_no_plane(how):
+    """The estimate is the difference to the tilted plane itself, to a tenth; none if shifted."""
+    for angle in (0.03, 0.1):
+        told, force = tilted(angle, how)
+        exact, reference = tilted(angle, "plane")
+        assert exact.worst == 0.0
+        missing = np.linalg.norm(force - reference) / np.linalg.norm(force)
+        assert told.force == pytest.approx(missing, rel=0.1)
+    told, _ = tilted(0.0, how)
+    assert told.worst <= 1e-3
 
 
 def test_small_motion_is_no_matter():

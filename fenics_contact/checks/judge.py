@@ -15,7 +15,7 @@ from fenics_contact.checks.second_route import SecondRoute
 from fenics_contact.checks.strays import strays
 from fenics_contact.checks.tunnelling import TunnellingCheck
 from fenics_contact.checks.verdict import Balance, Verdict, check_laws
-from fenics_contact.parallel import global_max, global_sum, warn
+from fenics_contact.parallel import global_sum, longest, warn
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.system import System
@@ -27,8 +27,8 @@ __all__ = ["Judge", "Respond"]
 # tractions added on the body.
 Respond = Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]]
 
-# Share by which small displacements may change forces or pressures before it is said.
-_NOTABLE = 0.01
+# Growth of what small displacements leave out from which on it is said again.
+_AGAIN = 2.0
 # Displacements beyond this many sizes of the mesh excuse no round-off: a body that nothing loads
 # may go anywhere, and then anything would pass.
 _FARTHEST = 10.0
@@ -58,7 +58,7 @@ class Judge:
         self._contacts, self._comm = full.contacts, full.unknowns.comm
         self._imposed = motions.size
         self._tunnelling = TunnellingCheck(full.contacts)
-        self._told: set[str] = set()
+        self._warned: dict[str, float] = {}
         self._few: set[tuple[str, str]] = set()
         space = full.displacement.u.function_space
         gdim = space.mesh.geometry.dim
@@ -75,7 +75,7 @@ class Judge:
         for contact in self._contacts:
             data = contact.opposite.data.values
             imposed += [data["shift"], data["initial_gap"]]
-        largest = (global_max(self._comm, np.abs(v)) for v in imposed)
+        largest = (longest(self._comm, v) for v in imposed)
         self._imposed = max(self._motions.size, *largest)
         return _FARTHEST * self._imposed
 
@@ -117,7 +117,10 @@ class Judge:
         allowed = np.sqrt(sizes[0]) * 2 * tolerance[: len(imbalance)] + 1e-12 * sizes[1]
         augmented = [c for c in self._contacts if c.multipliers is not None and laws]
         equations = zip(names, norms.residual, norms.force, tolerance, strict=True)
-        sums = zip(names, np.abs(imbalance).max(axis=1), sizes[1], allowed, strict=False)
+        # Neither forces nor moments are judged by the axes.
+        parts = np.split(imbalance, [self._full.gdim], axis=1)
+        unbalanced = np.max([np.linalg.norm(part, axis=1) for part in parts], axis=0)
+        sums = zip(names, unbalanced, sizes[1], allowed, strict=False)
         verdict = Verdict(
             equations={name: Balance(*map(float, row)) for name, *row in equations},
             sums={name: Balance(*map(float, row)) for name, *row in sums},
@@ -129,8 +132,7 @@ class Judge:
             tunnelling=self._tunnelling.evaluate(before) if system is self._full else {},
             kinematics=self._linearisation(respond) if respond else {},
             kinematics_allowed=self.kinematics,
-            displacement=global_max(self._comm, np.abs(self._full.displacement.u.x.array))
-            / self._imposed,
+            displacement=self._largest_displacement() / self._imposed,
             strays=strays(self._full, self._motions, contacts, began)
             if laws and system is self._full
             else {},
@@ -140,15 +142,14 @@ class Judge:
         return verdict, system.forces(bulk, reaction)
 
     def warn_of_large_motion(self, verdict: Verdict) -> None:
-        """Say once of every contact that displacements are not small. Collective."""
+        """Say that displacements are not small, and again where twice as much. Collective."""
         for name, found in verdict.kinematics.items():
-            if found.worst > _NOTABLE and name not in self._told:
-                self._told.add(name)
+            if found.is_notable and found.worst > _AGAIN * self._warned.get(name, 0.0):
+                self._warned[name] = found.worst
                 warn(
                     self._comm,
                     f"{name}: displacements are taken as small, with gap and normals of the "
-                    "undeformed body; where it has moved to, the contact force would differ by "
-                    f"{100 * found.force:.2g} % and the pressure by {100 * found.pressure:.2g} %",
+                    f"undeformed body; where it has moved to, {found.in_words()}",
                 )
 
     def warn_of_few_points(self) -> None:
@@ -158,6 +159,11 @@ class Judge:
                 told = contact.name, say.__name__
                 if told not in self._few and say(contact):
                     self._few.add(told)
+
+    def _largest_displacement(self) -> float:
+        """Of the body, of all of its nodes (length). Collective."""
+        u = self._full.displacement.u
+        return longest(self._comm, u.x.array.reshape(-1, u.function_space.dofmap.bs))
 
     def _linearisation(self, respond: Respond) -> dict[str, Linearisation]:
         """What taking displacements as small changes at this state, by contact. Collective."""

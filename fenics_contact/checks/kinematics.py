@@ -14,7 +14,7 @@ import numpy as np
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import global_max, global_min, global_sum
+from fenics_contact.parallel import global_min, global_sum, longest
 from fenics_contact.types import Array, Mask
 
 __all__ = ["Deviation", "LinearSprings", "Linearisation", "linearisation"]
@@ -27,6 +27,8 @@ _NEGLIGIBLE = 1e-3
 _SLID, _TURNED = 1e-2, 1e-3
 # Round-off of a gap, relative to the coordinates that it is the difference of.
 _ROUND_OFF = 1e-12
+# Share by which small displacements may change forces or pressures before it is said.
+_NOTABLE = 0.01
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ class Linearisation:
     """What the linearised kinematics change in a contact, relative, equal on every rank.
 
     Attributes:
-        force: In the contact force, by its largest change along any direction.
+        force: In the contact force, by the length of its change.
         pressure: In the pressure, in the mean square over Γc: single points at an edge tell
             nothing.
         rough: Whether the pressure is told roughly: between two meshes, whose facets meet at
@@ -100,6 +102,18 @@ class Linearisation:
         """The larger of the two; infinite where one is not finite."""
         worst = max(self.force, self.pressure)
         return worst if np.isfinite(self.force) and np.isfinite(self.pressure) else np.inf
+
+    @property
+    def is_notable(self) -> bool:
+        """Whether it is more than 1 % of force or pressure."""
+        return self.worst > _NOTABLE
+
+    def in_words(self) -> str:
+        """By how much, in words."""
+        return (
+            f"the contact force would differ by {100 * self.force:.2g} % and the pressure by "
+            f"{100 * self.pressure:.2g} %"
+        )
 
     @property
     def judged(self) -> float:
@@ -132,8 +146,8 @@ class Deviation:
         values, closed = contact.values, contact.status != Status.OPEN
         zero, nothing = np.zeros(len(closed)), np.zeros(len(closed), dtype=np.bool_)
         none = cls(zero, np.zeros_like(values.normal), values.normal, nothing, nothing)
-        flat = contact.finite or contact.support.is_flat
-        if flat or not (contact.rigid or _moves(contact)):
+        exact = contact.finite or contact.opposite.is_flat
+        if exact or not (contact.rigid or _moves(contact)):
             return none
         change, normal = contact.opposite.deviation(values)
         if not contact.rigid:
@@ -200,13 +214,10 @@ def _moves(contact: Contact) -> bool:
     smallest = global_min(comm, contact.quadrature.facet_sizes, empty=np.inf)
     x, u = values.x, contact.own_displacement()
     # A point without an opposite may find one wherever it goes.
-    slide = np.where(contact.paired[:, None], values.slide, u)
-    slid = global_max(comm, np.linalg.norm(slide, axis=1))
-    spread = np.zeros((2, d))
-    for i in range(d):
-        for row, field in zip(spread, (x[:, i], u[:, i]), strict=True):
-            row[i] = global_max(comm, field, empty=-np.inf) - global_min(comm, field, empty=np.inf)
-    turned = np.abs(spread[1]).max() / max(spread[0].max(), 1e-300)
+    slid = longest(comm, np.where(contact.paired[:, None], values.slide, u))
+    sums = global_sum(comm, np.stack([x.sum(axis=0), u.sum(axis=0), np.full(d, len(x))]))
+    middle, mean = sums[:2] / np.maximum(sums[2], 1.0)
+    turned = longest(comm, u - mean) / max(longest(comm, x - middle), 1e-300)
     return not (slid <= _SLID * smallest and turned <= _TURNED)
 
 
@@ -230,10 +241,10 @@ def linearisation(
         d = contact.points.shape[1]
         sums = global_sum(comm, [measure @ (contact.pressure > 0), measure.sum()])
         size = float(sums[0] or sums[1]) ** (1 / (d - 1)) or 1.0
-        largest = global_max(comm, np.linalg.norm(contact.traction, axis=1))
-        turn = largest * global_max(comm, np.linalg.norm(deviation.turn, axis=1))
-        push = modulus / size * global_max(comm, np.abs(deviation.gap))
-        lost = global_max(comm, np.linalg.norm(contact.traction[deviation.lost], axis=1))
+        largest = longest(comm, contact.traction)
+        turn = largest * longest(comm, deviation.turn)
+        push = modulus / size * longest(comm, deviation.gap)
+        lost = longest(comm, contact.traction[deviation.lost])
         matters |= not max(turn, push, lost) <= _NEGLIGIBLE * largest
     if not matters:
         return {c.name: Linearisation() for c in contacts}
@@ -249,14 +260,14 @@ def linearisation(
 
 def _relative(contact: Contact, change: Array) -> Linearisation:
     comm, measure = contact.surface.mesh.comm, contact.measure
-    sums = global_sum(comm, np.stack([measure @ contact.traction, measure @ change]))
+    force_change = global_sum(comm, measure @ change)
     size = float(global_sum(comm, measure @ np.linalg.norm(contact.traction, axis=1)))
-    largest = global_max(comm, np.abs(contact.pressure)) or 1.0  # squares must not overflow
+    largest = longest(comm, contact.pressure) or 1.0  # squares must not overflow
     along = np.sum(change * contact.values.normal, axis=1) / largest
     squares = [measure @ along**2, measure @ (contact.pressure / largest) ** 2]
     changed, whole = np.sqrt(global_sum(comm, squares))
     # Where the contact bears nothing all of what it ought to bear is missing.
     size = size or float(global_sum(comm, measure @ np.linalg.norm(change, axis=1)))
-    force = float(np.abs(sums[1]).max()) / size if size else 0.0
+    force = float(np.linalg.norm(force_change)) / size if size else 0.0
     pressure = float(changed / whole) if whole else 0.0
     return Linearisation(force, pressure, not contact.rigid)

@@ -11,7 +11,7 @@ import ufl
 from fenics_contact.checks.verdict import Balance
 from fenics_contact.compiling import compile_form
 from fenics_contact.contact.contact import Contact
-from fenics_contact.parallel import global_max, global_sum
+from fenics_contact.parallel import global_sum, longest
 from fenics_contact.surface.mass import assembled
 from fenics_contact.types import Array
 
@@ -39,11 +39,12 @@ class SecondRoute:
         for contact in self._contacts:
             comm, values = contact.surface.mesh.comm, contact.values
             mine, other = self._forces(contact)
-            across = np.abs(values.tangential_stiffness).max(axis=(1, 2))
+            across = np.linalg.norm(values.tangential_stiffness, axis=(1, 2))
             stiffness = values.normal_stiffness + across
             terms = contact.moved() + np.abs(values.initial_gap)
             blur = float(global_sum(comm, contact.measure @ (stiffness * terms)))
-            sizes = (global_max(comm, np.abs(f)) for f in (mine - other, mine))
+            d = values.x.shape[1]
+            sizes = (longest(comm, f.reshape(-1, d)) for f in (mine - other, mine))
             residual, force = (float(size) for size in sizes)
             allowed = 1e-10 * force + _ROUND_OFF * blur
             found[contact.name] = Balance(residual, force, allowed)

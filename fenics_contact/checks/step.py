@@ -15,7 +15,7 @@ from fenics_contact.types import Array
 __all__ = ["Step"]
 
 
-# Of a vector's largest component, what of another is the solver's tolerance.
+# Of a vector's length, what of a component is the solver's tolerance.
 _NOTHING = 1e-9
 
 
@@ -61,7 +61,8 @@ class Step:
         """One line for people.
 
         Of every contact "force" is ∫ -r_n, "friction ∫|τ|" the sum of the sizes over the points,
-        and "resultant" the force on the body, in which tractions of opposite ways cancel.
+        and "resultant" the force on the body, in which tractions of opposite ways cancel. What
+        small displacements leave out is in it from 1 % of force or pressure on.
         """
         parts = [f"increment {self.increment}"]
         if self.load is not None:
@@ -75,7 +76,16 @@ class Step:
                 f"{r.tangential_force:.6g}, resultant {_components(r.force)}, "
                 f"area {r.area:.4g}, {r.stick} stick {r.slip} slip {r.open} open"
             )
-        return "; ".join(parts)
+        return "; ".join(parts + self._left_out())
+
+    def _left_out(self) -> list[str]:
+        """What taking displacements as small leaves out of every contact, where it is notable."""
+        found = self.verdict.kinematics.items()
+        return [
+            f"{name}: displacements are taken as small, else {left_out.in_words()}"
+            for name, left_out in found
+            if left_out.is_notable
+        ]
 
     def _made(self) -> str:
         """By which method, and in how many iterations."""
@@ -101,10 +111,11 @@ class Step:
             for name, r in self.contacts.items()
         ]
         remarks = [f"{self._made()}; residual {self.verdict.relative_residual:.1e} of the forces"]
+        remarks += self._left_out()
         return shown(title, (*header, "stick", "slip", "open"), rows, remarks)
 
 
 def _components(vector: Array) -> str:
-    """In words; what is next to nothing beside the largest is 0."""
-    size = np.abs(vector).max(initial=0.0)
+    """In words; what is next to nothing beside the length is 0."""
+    size = np.linalg.norm(vector)
     return "(" + ", ".join(f"{v if abs(v) > _NOTHING * size else 0:.6g}" for v in vector) + ")"

@@ -12,7 +12,7 @@ from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.tunnelling import Tunnelling
 from fenics_contact.contact.contact import Contact
 from fenics_contact.markup import shown
-from fenics_contact.parallel import global_max
+from fenics_contact.parallel import longest
 from fenics_contact.types import Array
 
 __all__ = ["Attempt", "Balance", "NotConverged", "Verdict", "check_laws"]
@@ -267,7 +267,7 @@ def check_laws(contact: Contact) -> dict[str, float]:
         v = v.at(paired)
 
     def worst(*violations: Array) -> float:
-        return max(global_max(comm, np.abs(x)) for x in violations)
+        return max(longest(comm, x) for x in violations)
 
     def relative(value: float, *scales: Array) -> float:
         scale = worst(*scales)
@@ -313,7 +313,7 @@ def check_laws(contact: Contact) -> dict[str, float]:
         if not law.has_tension:
             elastic[penetration <= 0] = 0.0
         # Round-off in u_t is that of the displacement it is a part of.
-        whole = np.abs(stiffness).max(axis=(1, 2))[:, None] * v.jump
+        whole = np.linalg.norm(stiffness, axis=(1, 2))[:, None] * v.jump
         violation = relative(worst(tau + elastic), tau, whole)
         found["stiffness"] = max(found.get("stiffness", 0.0), violation)
         return found
@@ -327,7 +327,7 @@ def check_laws(contact: Contact) -> dict[str, float]:
     slipped = -np.einsum("qm,qmd->qd", beta, gradients)
     # Round-off in the increments is that of the displacements they are differences of, and of the
     # traction, which the springs turn into one: with multipliers that is larger than either.
-    size = np.abs(stiffness).max(axis=(1, 2), initial=0.0)
+    size = np.linalg.norm(stiffness, axis=(1, 2))
     borne = np.linalg.norm(tau, axis=1)
     yields = np.divide(borne, size, out=np.zeros_like(borne), where=size > 0)
     travel = (v.jump, v.increment, change, _ROUND_OFF * yields)

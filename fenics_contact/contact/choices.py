@@ -44,8 +44,9 @@ def is_finite(name: str, kinematics: str, support: Support, law: Law, gap: Any) 
     if kinematics == "small":
         if support.rotation is not None:
             raise ValueError(
-                f'{name}: a support that turns needs Contact(kinematics="finite"); for small '
-                "turns give its displacement as a UFL vector"
+                f'{name}: a support that turns needs Contact(kinematics="finite"); for turns '
+                "below 0.01 give its displacement as a UFL vector: forces are off by about as much "
+                "as the angle"
             )
         return False
     if gap is not None:

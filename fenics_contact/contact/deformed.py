@@ -7,14 +7,17 @@ import ufl
 from dolfinx import fem
 
 from fenics_contact.supports.base import Placement
+from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
 from fenics_contact.types import Array
 
-__all__ = ["DeformedPlaces"]
+__all__ = ["DeformedPlaces", "VaryingMotion"]
 
 
 # Deviation of a gap's slope along the normal from -1 with which it is no distance.
 _NO_DISTANCE = 0.5
+# Extent of a facet along one direction, by its largest, that is round-off.
+_FLAT = 1e-6
 
 
 class DeformedPlaces:
@@ -28,7 +31,7 @@ class DeformedPlaces:
         Args:
             quadrature: The points.
             displacement: u at the points.
-            placement: Of the support, seen from X.
+            placement: Of the support, seen from X, but displaced as it is where X has moved to.
         """
         self._quadrature, self._displacement, self._placement = quadrature, displacement, placement
         self._evaluate: PointEvaluator | None = None
@@ -50,3 +53,48 @@ class DeformedPlaces:
         # A distance falls along the normal as fast as one moves.
         told = np.abs(found["slope"] + 1) < _NO_DISTANCE
         return np.where(told, found["gap"], np.inf), found["normal"]
+
+
+class VaryingMotion:
+    """A prescribed displacement w of a support that varies along Γc.
+
+    It turns and stretches the surface of the support: a tangent t becomes t + ∇w t, so that the
+    normal is along n - ∇wᵀ n, to first order, with the derivatives of w along the surface.
+
+    Attributes:
+        moved: w where the points have moved to, w + ∇w u (UFL), as of the last `update`.
+    """
+
+    def __init__(self, quadrature: SurfaceQuadrature) -> None:
+        """Take the points. Collective."""
+        self._rows = quadrature.point_rows()
+        d = quadrature.surface.mesh.geometry.dim
+        self._fields = PointFields(quadrature, {"moved": d})
+        self.moved = self._fields.ufl("moved")
+        self._slope: Array = np.zeros((quadrature.n_points, d, d))
+
+    def update(self, x: Array, shift: Array, normal: Array, displacement: Array) -> None:
+        """Take w at the points, and u. Collective.
+
+        The derivatives are of the linear function of the place that is nearest to w at the points
+        of each facet; one point alone tells none.
+
+        Args:
+            x: Places of the points, (n_points, gdim) (length).
+            shift: w there, likewise.
+            normal: Of the support before it is displaced, (n_points, gdim).
+            displacement: u there, (n_points, gdim) (length).
+        """
+        away, change = (v[self._rows] - v[self._rows].mean(axis=1)[:, None] for v in (x, shift))
+        mean = normal[self._rows].mean(axis=1)
+        away -= np.einsum("fqi,fi,fj->fqj", away, mean, mean)
+        by_facet = (np.linalg.pinv(away, rcond=_FLAT) @ change).swapaxes(1, 2)
+        self._slope[self._rows] = by_facet[:, None]
+        moved = shift + np.einsum("qij,qj->qi", self._slope, displacement)
+        self._fields.commit({"moved": moved})
+
+    def turn(self, gap: Array, normal: Array) -> tuple[Array, Array]:
+        """Distance and normal of the support displaced by w, of those before it is turned by it."""
+        turned = normal - np.einsum("qij,qi->qj", self._slope, normal)
+        length = np.linalg.norm(turned, axis=1)
+        return gap / length, turned / length[:, None]

@@ -300,6 +300,11 @@ class Opposite(ABC):
         return np.where(np.isinf(gap), 0.0, gap - values.gap), normal
 
     @property
+    def is_flat(self) -> bool:
+        """Whether s - u_n is the true gap wherever the body moves, and the normal constant."""
+        return False
+
+    @property
     def turns(self) -> bool:
         """Whether the support turns."""
         return self._parts.inputs.rotation is not None

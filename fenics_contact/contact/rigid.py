@@ -10,7 +10,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from fenics_contact.contact.deformed import DeformedPlaces
+from fenics_contact.contact.deformed import DeformedPlaces, VaryingMotion
 from fenics_contact.contact.finite import (
     ExactView,
     FiniteKinematics,
@@ -20,6 +20,7 @@ from fenics_contact.contact.finite import (
     check_rigid,
     is_known_everywhere,
 )
+from fenics_contact.contact.inputs import varies
 from fenics_contact.contact.obstacle_sampler import ObstacleSampler
 from fenics_contact.contact.opposite import Opposite, Parts
 from fenics_contact.contact.point_law import PointLaw, PointTangent
@@ -41,23 +42,41 @@ class RigidOpposite(Opposite):
             ValueError: Data of a `SampledSupport` do not fit.
         """
         x, jump = ufl.SpatialCoordinate(parts.quadrature.surface.mesh), parts.new_jump()
-        frame = Frame(parts.inputs.shift, None)
-        at_rest, self._moved = _sampled_places(parts, frame, jump)
+        shift = parts.inputs.shift
+        frame = moved = Frame(shift, None)
+        self._varying: VaryingMotion | None = None
+        if varies(shift):
+            self._varying = VaryingMotion(parts.quadrature)
+            moved = Frame(self._varying.moved, None)
+        at_rest, self._moved = _sampled_places(parts, jump, frame, moved)
         if at_rest is None:
             placement = _placed(parts, x, frame.shift)
         else:
             placement = at_rest.at(frame.into(x))
         super().__init__(parts, parts.new_pairs(), jump, placement, at_rest)
+        if self._varying is not None and at_rest is None:
+            placement = _placed(parts, x, moved.shift)
         self._deformed = DeformedPlaces(parts.quadrature, jump, placement)
         self.sampler = _sampler(parts)
+
+    @property
+    def is_flat(self) -> bool:
+        """See `Opposite`."""
+        return self._parts.support.is_flat and self._varying is None
 
     def true_placement(self, values: PointValues) -> tuple[Array, Array]:
         """See `Opposite`."""
         self.update()
+        if self._varying is not None:
+            data = self.data.values
+            jump = self.present_jump()
+            self._varying.update(data["x"], data["support"], data["normal"], jump)
         if self._moved is not None:
             self._moved.update()
-            return self._moved.values("distance"), self._moved.values("normal")
-        return self._deformed()
+            found = self._moved.values("distance"), self._moved.values("normal")
+        else:
+            found = self._deformed()
+        return found if self._varying is None else self._varying.turn(*found)
 
 
 class MovingOpposite(Opposite):
@@ -75,7 +94,7 @@ class MovingOpposite(Opposite):
         inputs, quadrature = parts.inputs, parts.quadrature
         mesh = quadrature.surface.mesh
         frame, jump = Frame(inputs.shift, inputs.rotation), parts.new_jump()
-        at_rest, self._moved = _sampled_places(parts, frame, jump)
+        at_rest, self._moved = _sampled_places(parts, jump, frame, frame)
         check_rigid(parts.name, inputs.shift, inputs.rotation)
 
         def place(z: Any) -> Placement:
@@ -186,9 +205,9 @@ def _sampler(parts: Parts) -> ObstacleSampler | None:
 
 
 def _sampled_places(
-    parts: Parts, frame: Frame, jump: fem.Function
+    parts: Parts, jump: fem.Function, frame: Frame, moved: Frame
 ) -> tuple[SampledPlaces | None, SampledPlaces | None]:
-    """A support known in numbers, from X, and from X + u, in its frame; else none. Collective.
+    """A support known in numbers, from X and from X + u in its frames; else none. Collective.
 
     Raises:
         ValueError: Its data are of another dimension, or not the same on every rank.
@@ -209,6 +228,6 @@ def _sampled_places(
             "the same (read the file on all of them, or broadcast its arrays)"
         )
     x = ufl.SpatialCoordinate(mesh)
-    places = (frame.into(x), frame.into(x + jump))
-    rest, moved = (SampledPlaces(parts.quadrature, support, place) for place in places)
-    return rest, moved
+    places = (frame.into(x), moved.into(x + jump))
+    rest, deformed = (SampledPlaces(parts.quadrature, support, place) for place in places)
+    return rest, deformed

@@ -22,7 +22,7 @@ from fenics_contact.compiling import compile_form
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.markup import shown
-from fenics_contact.parallel import global_max, global_sum
+from fenics_contact.parallel import global_max, global_sum, longest
 from fenics_contact.problem import ContactProblem
 from fenics_contact.surface.mass import assembled, mass_solver
 from fenics_contact.surface.surface import PointEvaluator
@@ -37,7 +37,7 @@ _REMEDIES = {
     "enforcement": "a higher k_n and k_t",
     "discretisation": "a finer mesh at the contact, or a higher degree",
     "increments": "more increments",
-    "kinematics": "a motion of the support instead of the body, or pairs found anew,",
+    "kinematics": 'kinematics="finite", or a motion of the support instead of the body,',
     "solver": "a smaller snes_rtol",
 }
 
@@ -251,10 +251,13 @@ def _named(
 def _displacement(problem: ContactProblem, state: Array) -> float:
     """Displacement of the loads along themselves; without loads the largest one."""
     comm, load = problem.u.function_space.mesh.comm, problem.load
-    size, work = global_sum(comm, [np.abs(load).sum(), load @ state])
+    of_nodes = np.linalg.norm(problem.displacement.vectors(load), axis=1)
+    others = load.copy()  # forces on free supports
+    others[: problem.unknowns.n_dofs] = 0.0
+    size, work = global_sum(comm, [of_nodes.sum() + np.abs(others).sum(), load @ state])
     if size > 0:
         return float(work / size)
-    return global_max(comm, np.abs(state[: problem.unknowns.n_dofs]))
+    return longest(comm, problem.displacement.vectors(state))
 
 
 # ---- enforcement and solver ----------------------------------------------------------------------

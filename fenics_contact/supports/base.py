@@ -177,8 +177,10 @@ class Support:
     """A rigid support: subclasses say where it is.
 
     Args to all of them: ``displacement``, the prescribed rigid translation (gdim numbers, a
-    ``fem.Constant`` to be changed between increments, or a UFL vector), or a `Motion` where the
-    force on the support is given; none means fixed. ``rotation``, a `Rotation`: with finite
+    ``fem.Constant`` to be changed between increments, or a UFL vector, which may vary along Γc), or
+    a `Motion` where the force on the support is given; none means fixed. One that varies along Γc
+    turns the support without its normals: forces are off by about the angle, of which the verdict
+    tells. ``rotation``, a `Rotation`: with finite
     kinematics alone.
 
     A support that moves is moved by these alone. Where its place or gap is changed instead (a
@@ -214,7 +216,7 @@ class Support:
 
     @property
     def is_flat(self) -> bool:
-        """Whether s - u_n is the true gap wherever the body moves, and the normal constant."""
+        """Whether it is a plane: of one normal, with a gap that is linear in the place."""
         return False
 
     def place(

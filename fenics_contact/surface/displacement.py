@@ -122,6 +122,11 @@ class Displacement:
         found[self.dofs[: values.size]] = values
         return found
 
+    def vectors(self, values: Array) -> Array:
+        """Of values at the owned dofs of ``whole`` those of ``u``, node by node, (n, gdim)."""
+        owned = np.arange(self.n_owned) if self.dofs is None else self.dofs[: self.n_owned]
+        return np.asarray(values[owned]).reshape(-1, self.u.function_space.dofmap.bs)
+
     def lifted(self, matrix: PETSc.Mat) -> PETSc.Mat:
         """A matrix over the dofs of ``u`` as one over those of ``whole``. Collective.
 
