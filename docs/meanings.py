@@ -224,8 +224,8 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "Smaller increments, finer cells there.",
         ),
         "penetrates between the quadrature points": (
-            "A place of either surface lies deeper in what is opposite than the points of Γc around "
-            "it resist: an edge, a corner or an obstacle narrower than the points are apart.",
+            "A place of either surface lies deeper in what is opposite than the points of Γc "
+            "around it resist: an edge, a corner or an obstacle narrower than the points are apart.",
             "Let the finer surface be Γc, refine it there, give a larger `quadrature_degree`, or "
             "add a second contact with the surfaces swapped.",
         ),
@@ -240,8 +240,8 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "has crossed what lies opposite": (
             "In one increment a place of Γc entered the obstacle or the other body on one side and "
             "left it, or is about to, on another; or it came in where no point of Γc resists.",
-            "Smaller increments (`increments` cuts by itself); all sides that may touch in Γc and in "
-            "the opposite surface.",
+            "Smaller increments (`increments` cuts by itself); all sides that may touch in Γc and "
+            "in the opposite surface.",
         ),
         "rad in one increment": (
             "The support turns by more than a right angle in one increment, with friction.",
