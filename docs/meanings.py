@@ -225,7 +225,7 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         ),
         "penetrates between the quadrature points": (
             "A place of either surface lies deeper in what is opposite than the points of Γc "
-            "around it resist: an edge, a corner or an obstacle narrower than the points are apart.",
+            "around it resist: an edge, a corner or an obstacle narrower than points are apart.",
             "Let the finer surface be Γc, refine it there, give a larger `quadrature_degree`, or "
             "add a second contact with the surfaces swapped.",
         ),

@@ -24,6 +24,7 @@ from fenics_contact.contact.values import Status
 from fenics_contact.markup import shown
 from fenics_contact.parallel import global_max, global_sum, longest
 from fenics_contact.problem import ContactProblem
+from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.mass import assembled, mass_solver
 from fenics_contact.surface.surface import PointEvaluator
 from fenics_contact.types import Array
@@ -37,7 +38,7 @@ _REMEDIES = {
     "enforcement": "a higher k_n and k_t",
     "discretisation": "a finer mesh at the contact, or a higher degree",
     "increments": "more increments",
-    "kinematics": 'kinematics="finite", or a motion of the support instead of the body,',
+    "kinematics": 'Contact(kinematics="finite"), or a motion of the support instead of the body,',
     "solver": "a smaller snes_rtol",
 }
 
@@ -185,8 +186,12 @@ def estimate_errors(
 
     Args:
         problem: A problem that has been solved; it stays as it is.
-        stress: σ(u) of the bulk (UFL), shape (d, d) or (3, 3).
-        strain: ε(u), of the shape of the stress; by default the symmetric gradient.
+        stress: σ(u) of the bulk (UFL), shape (d, d), or (3, 3) as ``elasticity.LinearElastic`` and
+            `NeoHookean` have it.
+        strain: ε(u), of the shape of the stress. By default the symmetric gradient; of a stress
+            (3, 3) in the plane with a strain across: u_r/r where the stress has the
+            displacement itself, not its gradient alone, as that of an axisymmetric body has; else
+            zero (in plane stress, where the strain across is not zero, the stress is).
         increment_error: Errors by the size of the increments, ``Step.increment_error``.
 
     Raises:
@@ -196,11 +201,11 @@ def estimate_errors(
     problem.complete()
     displacement = problem.displacement
     stress = ufl.as_ufl(stress)
-    strain = ufl.sym(ufl.grad(displacement.expression)) if strain is None else ufl.as_ufl(strain)
+    strain = _conjugate_strain(displacement, stress) if strain is None else ufl.as_ufl(strain)
     if stress.ufl_shape != strain.ufl_shape or len(stress.ufl_shape) != 2:
         raise ValueError(
-            f"stress has shape {stress.ufl_shape}, strain {strain.ufl_shape}; both must be (d, d), "
-            "or (3, 3) with a strain given"
+            f"stress has shape {stress.ufl_shape}, strain {strain.ufl_shape}; both must be (d, d) "
+            "or (3, 3)"
         )
     values = quantities(problem)
     parts = _linear_parts(problem, values)
@@ -219,6 +224,18 @@ def estimate_errors(
         energy=float(np.sqrt(smooth.share)),
         cells=smooth.squares,
     )
+
+
+def _conjugate_strain(displacement: Displacement, stress: Any) -> Any:
+    """The small strain that the stress does work on, of its shape (UFL)."""
+    u = displacement.expression
+    strain = ufl.sym(ufl.grad(u))
+    if stress.ufl_shape != (3, 3) or strain.ufl_shape == (3, 3):
+        return strain
+    hoop = u[0] / ufl.SpatialCoordinate(displacement.u.function_space.mesh)[0]
+    across = hoop if displacement.is_undifferentiated_in(stress) else 0
+    (xx, xy), (_, yy) = ([strain[i, j] for j in range(2)] for i in range(2))
+    return ufl.as_tensor([[xx, xy, 0], [xy, yy, 0], [0, 0, across]])
 
 
 def _bearing_facets(problem: ContactProblem) -> tuple[float, float]:

@@ -15,6 +15,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from petsc4py import PETSc
+from ufl.algorithms import expand_derivatives
 
 from fenics_contact.arguments import check_instance
 from fenics_contact.compat import collapsed
@@ -108,6 +109,22 @@ class Displacement:
     def same_part(self, other: Displacement) -> bool:
         """Whether another one is the same part of the same function."""
         return self.whole is other.whole and self._part == other._part
+
+    def is_undifferentiated_in(self, expression: Any) -> bool:
+        """Whether UFL has the displacement itself, and not its gradient alone."""
+        own: list[Any] = [self.whole]
+        if self._part is not None:
+            own = [ufl.split(self.whole)[self._part]]
+            own += own[0].ufl_operands  # components, as they are indexed
+        rest, seen = [expand_derivatives(ufl.as_ufl(expression))], set()
+        while rest:
+            item = rest.pop()
+            if item in own:
+                return True
+            if item not in seen and not isinstance(item, ufl.classes.Grad):
+                rest += item.ufl_operands
+            seen.add(item)
+        return False
 
     def follow(self) -> None:
         """Take the present values of ``whole`` over into ``u``."""
