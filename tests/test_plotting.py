@@ -126,8 +126,8 @@ def test_fields_and_stress(cell, tmp_path, drawn):
             grey = field != "gap" and bool(np.any(means == 0.0))
             assert entries(figure) == ([f"no {field}"] if grey else [])
         if d == 2:
-            upper, lower = drawn[4].axes
-            curves = {line.get_label(): line.get_data() for line in (*upper.lines, *lower.lines)}
+            lines = [line for axes in drawn[4].axes for line in axes.lines]
+            curves = {line.get_label(): line.get_data() for line in lines}
             names = {"pressure": "pressure", "|tangential traction|": "friction", "gap": "gap"}
             for label, name in (names | {"accumulated slip": "slip"}).items():
                 x, y = curves[label]

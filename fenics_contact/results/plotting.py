@@ -14,6 +14,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import collective_errors
 from fenics_contact.results import drawing
+from fenics_contact.results.along import along
 from fenics_contact.results.writer import facet_status
 from fenics_contact.types import Array, Mask
 
@@ -266,8 +267,10 @@ def plot_along(
 ) -> None:
     """Draw tractions, gap and slip at the points of Γc in the plane. Collective.
 
-    Over the coordinate along which the contact reaches farthest, on the undeformed Γc; each side of
-    a Γc that turns back, a hole's for instance, has a curve of its own.
+    Over the coordinate along which the contact reaches farthest where Γc does not turn back about
+    the contact, else over the angle about its middle where Γc is round, such as a hole or a ring,
+    else over the arc length; on the undeformed Γc, and somewhat beyond the contact. Each connected
+    curve of Γc has a line of its own.
 
     Args:
         path: PNG or PDF to write.
@@ -284,40 +287,37 @@ def plot_along(
         raise ValueError(
             f"{contact.name}: curves along Γc are drawn in the plane; in space use plot_field"
         )
-    points, comm = contact.gather(), contact.surface.mesh.comm
-    with collective_errors(comm):
-        if comm.rank != 0:
+    found = along(contact, length)
+    with collective_errors(contact.surface.mesh.comm):
+        if found is None:
             return
-        status = points["status"]
-        closed = status != Status.OPEN
-        if not closed.any():
-            closed = np.ones_like(closed)
-        axis = int(np.argmax(np.ptp(points["x"][closed], axis=0)))
-        x, normal = points["x"][:, axis], points["normal"][:, 1 - axis]
-        # Somewhat beyond the contact.
-        low, high = x[closed].min(), x[closed].max()
-        margin = 0.25 * (high - low) or 1.0
-        near = (x >= low - margin) & (x <= high + margin)
-        sides = [near & side for side in (normal < 0, normal >= 0) if np.any(near & side)]
-        plt = drawing.pyplot()
-        figure, (upper, lower) = plt.subplots(
-            2, 1, sharex=True, figsize=(7.6, 6.0), layout="constrained"
+        plt, x, values = drawing.pyplot(), found.abscissa, found.values
+        lower = {"gap": ("gap", "pressure")}
+        if np.any(values["slip"]):
+            lower["slip"] = ("accumulated slip", "tangential")
+        figure, rows = plt.subplots(
+            1 + len(lower),
+            sharex=True,
+            figsize=(7.6, 3.6 + 2.2 * len(lower)),
+            height_ratios=[3.0, *(2.0 for _ in lower)],
+            layout="constrained",
         )
-        size = np.linalg.norm(points["tangential_traction"], axis=1)
-        _draw_tractions(upper, x, points["pressure"], size, status, sides)
-        for name, colour in (("gap", "pressure"), ("slip", "tangential")):
-            for i, side in enumerate(sides):
-                label = {"gap": "gap", "slip": "accumulated slip"}[name] if i == 0 else None
-                values = points[name]
-                if name == "gap" or np.any(values):
-                    style = {"color": drawing.COLOURS[colour], "label": label}
-                    lower.plot(x[side], values[side], ".-", **style)
-        upper.set(ylabel=f"traction [{stress}]", title=title)
-        lower.set(xlabel=f"{'xy'[axis]} [{length}]", ylabel=f"gap, slip [{length}]")
-        for axes in (upper, lower):
+        _draw_tractions(
+            rows[0], x, values["pressure"], values["friction"], values["status"], found.curves
+        )
+        rows[0].set(ylabel=f"traction [{stress}]", title=title)
+        for axes, (name, (label, colour)) in zip(rows[1:], lower.items(), strict=True):
+            for curve in found.curves:
+                style = {"color": drawing.COLOURS[colour], "label": label}
+                axes.plot(x[curve], values[name][curve], ".-", **style)
+            axes.set(ylabel=f"{label} [{length}]")
+        rows[-1].set(xlabel=found.label)
+        if found.is_angle:
+            rows[-1].locator_params(axis="x", steps=[1, 1.5, 3, 4.5, 9, 10])
+        rows[0].legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
+        for axes in rows:
             axes.axhline(0.0, color="#555555", linewidth=0.6)  # lest round-off fill the picture
             axes.grid(alpha=0.25)
-            axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
         drawing.save(figure, path)
 
 
