@@ -141,6 +141,7 @@ GROUPS: list[tuple[str, list[str], str]] = [
     (
         "Results",
         [
+            "contact.results",
             "results.files",
             "results.output",
             "results.vtu",

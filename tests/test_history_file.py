@@ -8,11 +8,15 @@ import os
 
 import numpy as np
 import pytest
+import ufl
+from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.results import files
+from scenes.blocks import TOP, block
 from scenes.comparing import close, raised_everywhere, shared_folder
+from scenes.elasticity import strain, stress
 from scenes.histories import Press
 from scenes.rubber import Tool
 from scenes.rubbing import Rub
@@ -48,19 +52,20 @@ def test_a_row_is_a_step(cell, tmp_path):
             moments.append({c.name: c.moment([0.0] * made.scene.dim) for c in contacts})
             assert len(table(path)) == len(steps)
     rows = table(path)
+    per = "" if made.scene.dim == 3 else " per thickness"
     assert [int(row["increment"]) for row in rows] == [step.increment for step in steps]
     assert numbers(rows, "load") == [step.load for step in steps]
     for name in ("floor", "wall"):
         for i, axis in enumerate("xyz"[: made.scene.dim]):
             forces = [step.contacts[name].force[i] for step in steps]
-            assert numbers(rows, f"{name}: force {axis} (force)") == forces
+            assert numbers(rows, f"{name}: force {axis} (force{per})") == forces
         for i, axis in enumerate("xyz" if made.scene.dim == 3 else "z"):
-            column = numbers(rows, f"{name}: moment {axis} about the origin (force length)")
+            column = numbers(rows, f"{name}: moment {axis} about the origin (force length{per})")
             assert close(column, [moment[name][i] for moment in moments], 1e-12)
         for column, attribute in (
-            ("normal force (force)", "normal_force"),
-            ("friction as the sum of sizes (force)", "tangential_force"),
-            ("area in contact (area)", "area"),
+            (f"normal force (force{per})", "normal_force"),
+            (f"friction as the sum of sizes (force{per})", "tangential_force"),
+            (f"area in contact (area{per})", "area"),
             ("largest pressure (stress)", "max_pressure"),
             ("largest penetration (length)", "max_penetration"),
             ("open (points)", "open"),
@@ -71,7 +76,9 @@ def test_a_row_is_a_step(cell, tmp_path):
             assert numbers(rows, f"{name}: {column}") == expected
         for state in ("contact", "stick", "slip"):
             extents = [step.contacts[name].extents[state] for step in steps]
-            assert numbers(rows, f"{name}: area in {state} (area)") == [e.area for e in extents]
+            assert numbers(rows, f"{name}: area in {state} (area{per})") == [
+                e.area for e in extents
+            ]
             for i, axis in enumerate("xyz"[: made.scene.dim]):
                 for word, ends in (
                     ("from", [e.low for e in extents]),
@@ -82,7 +89,7 @@ def test_a_row_is_a_step(cell, tmp_path):
                     assert found == told
     for name in ("work", "elastic", "springs", "dissipation", "remainder"):
         expected = [getattr(step.energy, name) for step in steps]
-        assert numbers(rows, f"{name} (force length)") == expected
+        assert numbers(rows, f"{name} (force length{per})") == expected
     assert [row["method"] for row in rows] == [step.method for step in steps]
     assert numbers(rows, "iterations") == [step.iterations for step in steps]
     assert numbers(rows, "cuts") == [0.0] * len(steps)
@@ -108,7 +115,11 @@ def test_a_resumed_history(tmp_path):
             assert table(folder / "parts.csv")[:4] == before[:4]
     rows, expected = table(folder / "parts.csv"), table(folder / "whole.csv")
     assert [row["increment"] for row in rows] == [row["increment"] for row in expected]
-    for column in ("load", "floor: normal force (force)", "floor: force x (force)"):
+    for column in (
+        "load",
+        "floor: normal force (force per thickness)",
+        "floor: force x (force per thickness)",
+    ):
         assert close(numbers(rows, column), numbers(expected, column), whole.tolerance)
     # What is done is not done again, and leaves the table alone.
     done = Press()
@@ -248,7 +259,7 @@ def test_finite_kinematics(tmp_path):
     made = Tool(law=fc.Frictionless(1e4))
     (step,) = made.increments(1.0, steps=1, history=path)
     (row,) = table(path)
-    moment = float(row["contact: moment z about the origin (force length)"])
+    moment = float(row["contact: moment z about the origin (force length per thickness)"])
     assert close([moment], made.contact.moment((0.0, 0.0)), 1e-12)
     points = sum(int(row[f"contact: {s} (points)"]) for s in ("open", "stick", "slip"))
     assert points == COMM.allreduce(len(made.contact.points))
@@ -258,3 +269,38 @@ def test_finite_kinematics(tmp_path):
     lever = COMM.allreduce(np.sum(x[:, 0] * force[:, 1] - x[:, 1] * force[:, 0]))
     size = abs(step.contacts["contact"].normal_force)
     assert abs(moment - lever) <= 1e-9 * size
+
+
+def test_units_with_a_thickness(tmp_path):
+    """A weight makes forces and areas those of the whole body; without one they are per thickness.
+
+    Reference: the same block, thickness 2.5: all integrals are so many times as large (1e-8 for
+    two solutions of the same equations), and the columns of the integrals alone are named anew.
+    """
+    folder, thickness = shared_folder(tmp_path), 2.5
+    found = []
+    for weight in (None, thickness):
+        scene = block("quadrilateral", up=-3.0)
+        v = ufl.TestFunction(scene.u.function_space)
+        t = fem.Constant(scene.mesh, weight or 1.0)
+        F = t * ufl.inner(stress(scene.u, scene.E, scene.nu), strain(v)) * ufl.dx(scene.mesh)
+        F += t * 3.0 * v[1] * ufl.ds(scene.mesh, subdomain_data=scene.tags)(TOP)
+        contact = scene.contact(fc.Frictionless(1e4), weight=weight and t)
+        problem = fc.ContactProblem(F, scene.u, bcs=scene.rollers(), contacts=[contact])
+        path = folder / f"{weight}.csv"
+        (step,) = fc.increments(problem, lambda load: None, 0, 1, history=path)
+        found.append((step, table(path)[0]))
+        told = "forces and areas per unit thickness"
+        assert (told in step.summary()) == (weight is None)
+        assert (told in step._repr_html_().lower().replace("are ", "")) == (weight is None)
+        assert step.contacts["contact"].per_thickness == (weight is None)
+    (plain, row), (thick, whole) = found
+    one, all_of_it = plain.contacts["contact"], thick.contacts["contact"]
+    assert close([all_of_it.area, *all_of_it.force], thickness * np.r_[one.area, one.force], 1e-8)
+    assert len(row) == len(whole)
+    for before, after in zip(row, whole, strict=True):
+        assert before.replace(" per thickness)", ")") == after
+        integral = any(f"({unit}" in before for unit in ("force)", "force ", "area"))
+        assert (before == after) == (not integral), before
+    area = "contact: area in contact (area)"
+    assert close(float(whole[area]), thickness * float(row[area[:-1] + " per thickness)"]), 1e-8)

@@ -1,6 +1,7 @@
 """The page of a history: well formed, whole without other files, and of the right numbers."""
 
 import base64
+import csv
 from html.parser import HTMLParser
 
 import numpy as np
@@ -9,6 +10,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.results import drawing
+from scenes.blocks import block
 from scenes.comparing import close, raised_everywhere, shared_folder
 from scenes.elasticity import stress
 from scenes.histories import Press, Ramp
@@ -162,20 +164,21 @@ def test_a_resumed_history(tmp_path, curves):
     page = Page(path)
     page.check(made.problem, steps)
     assert "<b>one & two</b>" in page.text and "Increments 1 to 6" in page.text
+    assert "per m of thickness" in page.text
     assert page.tables["Error budget"][0][1:] == list(budget.values)
     assert "augmented" in dict(page.tables["Contact: floor"])["enforcement"]
     assert dict(page.tables["Contact: wall"])["enforcement"] == "penalty"
     loads = [step.load for step in steps]
     for n, name in enumerate(("floor", "wall")):
         for i, axis in enumerate("xy"):
-            x, y = drawn(curves, ("force on the body [kN]", f"force {axis}"), n)
+            x, y = drawn(curves, ("force on the body [kN/m]", f"force {axis}"), n)
             assert close(x, loads, 1e-14)
             assert close(y, [step.contacts[name].force[i] for step in steps], 1e-14)
-        x, y = drawn(curves, ("moment about the origin [kN m]", "moment z"), n)
+        x, y = drawn(curves, ("moment about the origin [kN m/m]", "moment z"), n)
         assert close(y, [step.contacts[name].moment[0] for step in steps], 1e-14)
-        x, y = drawn(curves, ("area [m]", "stick"), n)
+        x, y = drawn(curves, ("area [m²/m]", "stick"), n)
         assert close(y, [step.contacts[name].extents["stick"].area for step in steps], 1e-14)
-    x, y = drawn(curves, ("sum so far [kN m]", "dissipation"))
+    x, y = drawn(curves, ("sum so far [kN m/m]", "dissipation by friction"))
     assert close(y, np.cumsum([step.energy.dissipation for step in steps]), 1e-14)
     # At the points: what `gather` has, of those near the contact.
     points = made.problem.contacts[0].gather()
@@ -219,11 +222,43 @@ def test_all_kinds(scene, tmp_path, curves):
     path = fc.report(problem, steps, shared_folder(tmp_path), stress=sigma)
     steps = [steps] if isinstance(steps, fc.Step) else steps
     Page(path).check(problem, steps)
-    force = drawn(curves, ("force on the body [N]", "force y"))
+    per = "/mm" if problem.contacts[0].points.shape[1] == 2 else ""
+    force = drawn(curves, (f"force on the body [N{per}]", "force y"))
     name = problem.contacts[0].name
     assert close(force[1], [step.contacts[name].force[1] for step in steps], 1e-14)
     loads = [step.increment if step.load is None else step.load for step in steps]
     assert close(force[0], loads, 1e-14)
+
+
+def test_an_unloaded_body(tmp_path):
+    """Pressed and let go: there are no forces, which a residual of round-off is no share of.
+
+    By the line, the table of a step, the page and the file alike; what is round-off beside the
+    residual that passes is 0. A displacement of round-off is not drawn 1e20 times as large.
+    """
+    folder = shared_folder(tmp_path)
+    scene = block("quadrilateral", degree=2, n=4)
+    problem, _ = scene.problem(fc.Coulomb(0.3), scene.rollers())
+    steps = []
+    for start, end in ((0.0, -3.0), (-3.0, 0.0)):
+        load = fc.increments(
+            problem, lambda p: scene.load(up=p), start, end, steps=2, history=folder / "h.csv"
+        )
+        steps += list(load)
+    for step in steps:
+        loaded = step is not steps[-1]
+        assert ("; no forces; " in step.summary()) != loaded
+        assert ("; no forces</p>" in step._repr_html_()) != loaded
+        assert step.verdict.is_loaded == loaded
+    assert steps[-1].contacts["contact"].normal_force != 0.0  # round-off, else this tests nothing
+    assert "contact: force 0, friction ∫|τ| 0, resultant (0, 0)" in steps[-1].summary()
+    assert steps[-1].verdict.relative_residual == 0.0
+    page = Page(fc.report(problem, steps, folder, history=folder / "h.csv"))
+    assert "There are no forces." in page.text and "of the forces." not in page.text
+    assert "It bears no force" in page.text and "e+" not in " ".join(page.pictures)
+    rows = (folder / "h.csv").read_text().splitlines()
+    residuals = [row["residual (share of the forces)"] for row in csv.DictReader(rows)]
+    assert residuals[-1] == "" and all(0 <= float(r) < 1e-9 for r in residuals[:-1])
 
 
 def test_bad_input(tmp_path):

@@ -12,7 +12,7 @@ import ufl
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact.results.writer import facet_values
+from fenics_contact.surface.facet_values import facet_values
 from scenes import vtu
 from scenes.blocks import CELLS, GRID, dimension, polynomial
 from scenes.comparing import close, raised_everywhere, shared_folder

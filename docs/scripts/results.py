@@ -4,7 +4,7 @@ import logging
 
 import numpy as np
 import ufl
-from dolfinx import fem, mesh
+from dolfinx import fem, io, mesh
 from mpi4py import MPI
 
 import fenics_contact as fc
@@ -38,7 +38,17 @@ for step in fc.increments(problem, push, 0, 1e-4, steps=5, history="output/histo
     writer.write(step)
     film.add(step)
 film.save()
-fc.report(problem, step, "output", history="output/history.csv", stress=steel.stress)
+budget = fc.estimate_errors(problem, steel.stress)
+print(budget)
+fc.report(problem, step, "output", history="output/history.csv", stress=steel.stress, budget=budget)
 fc.plotting.plot_pressure("output/pressure.png", contact)
 fc.plotting.plot_status("output/status.png", contact)
 fc.plotting.plot_deformation("output/deformation.png", u, magnification=1000)
+
+# begin function
+pressure = contact.function("pressure")
+form = fem.form(pressure * ds(BOTTOM), entity_maps=contact.entity_maps)
+force = msh.comm.allreduce(fem.assemble_scalar(form))
+assert np.isclose(force, contact.resultants().normal_force)
+with io.VTKFile(msh.comm, "output/pressure.pvd", "w") as file:
+    file.write_function(pressure)

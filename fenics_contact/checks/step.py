@@ -61,22 +61,24 @@ class Step:
         """One line for people.
 
         Of every contact "force" is ∫ -r_n, "friction ∫|τ|" the sum of the sizes over the points,
-        and "resultant" the force on the body, in which tractions of opposite ways cancel. What
-        small displacements leave out is in it from 1 % of force or pressure on.
+        and "resultant" the force on the body, in which tractions of opposite ways cancel. What the
+        verdict cannot tell from zero is 0 (`Balance.is_loaded`). What small displacements leave out
+        is said from 1 % of force or pressure on. Where forces and areas are per unit thickness
+        (`Resultants.per_thickness`) the line ends with these words.
         """
         parts = [f"increment {self.increment}"]
         if self.load is not None:
             parts.append(f"load {self.load:.6g}")
         parts.append(self._made())
-        residual, force = self.verdict.relative_residual, self.verdict.force
-        parts.append(f"residual {residual:.1e} of the forces" if force > 0 else "no forces")
+        parts.append(self._residual())
         for name, r in self.contacts.items():
+            normal, friction, resultant = self._forces(name)
             parts.append(
-                f"{name}: force {r.normal_force:.6g}, friction ∫|τ| "
-                f"{r.tangential_force:.6g}, resultant {_components(r.force)}, "
+                f"{name}: force {normal}, friction ∫|τ| {friction}, resultant {resultant}, "
                 f"area {r.area:.4g}, {r.stick} stick {r.slip} slip {r.open} open"
             )
-        return "; ".join(parts + self._left_out())
+        per_thickness = ["forces and areas per unit thickness"] * self._per_thickness
+        return "; ".join([*parts, *self._left_out(), *per_thickness])
 
     def _left_out(self) -> list[str]:
         """What taking displacements as small leaves out of every contact, where it is notable."""
@@ -86,6 +88,22 @@ class Step:
             for name, left_out in found
             if left_out.is_notable
         ]
+
+    @property
+    def _per_thickness(self) -> bool:
+        return any(r.per_thickness for r in self.contacts.values())
+
+    def _residual(self) -> str:
+        if not self.verdict.is_loaded:
+            return "no forces"
+        return f"residual {self.verdict.relative_residual:.1e} of the forces"
+
+    def _forces(self, contact: str) -> tuple[str, str, str]:
+        """Normal force, friction and resultant of a contact; 0 where it is not loaded."""
+        r = self.contacts[contact]
+        loaded = float(self.verdict.equations[contact].is_loaded)
+        normal, friction = (f"{loaded * f:.6g}" for f in (r.normal_force, r.tangential_force))
+        return normal, friction, _components(loaded * r.force)
 
     def _made(self) -> str:
         """By which method, and in how many iterations."""
@@ -102,16 +120,14 @@ class Step:
         rows = [
             (
                 name,
-                f"{r.normal_force:.6g}",
-                f"{r.tangential_force:.6g}",
-                _components(r.force),
+                *self._forces(name),
                 f"{r.area:.4g}",
                 *(str(number) for number in (r.stick, r.slip, r.open)),
             )
             for name, r in self.contacts.items()
         ]
-        remarks = [f"{self._made()}; residual {self.verdict.relative_residual:.1e} of the forces"]
-        remarks += self._left_out()
+        remarks = [f"{self._made()}; {self._residual()}", *self._left_out()]
+        remarks += ["Forces and areas are per unit thickness."] * self._per_thickness
         return shown(title, (*header, "stick", "slip", "open"), rows, remarks)
 
 

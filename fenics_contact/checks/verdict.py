@@ -43,6 +43,11 @@ class Balance:
     force: float
     tolerance: float
 
+    @property
+    def is_loaded(self) -> bool:
+        """Whether there are forces: more than the residual that passes, which none is told from."""
+        return self.force > self.tolerance
+
     def holds(self, times: float = 1.0) -> bool:
         """Whether the residual passes, and all is finite."""
         finite = np.isfinite([self.residual, self.force, self.tolerance]).all()
@@ -129,10 +134,15 @@ class Verdict:
         return self._worst(self.sums).tolerance
 
     @property
+    def is_loaded(self) -> bool:
+        """Whether forces act on a body, a free support or a contact; see `Balance.is_loaded`."""
+        return any(balance.is_loaded for balance in self.equations.values())
+
+    @property
     def relative_residual(self) -> float:
-        """The residual by the forces it is judged by; 0 where there are none."""
-        worst = self._worst(self.equations)
-        return worst.residual / worst.force if worst.force else 0.0
+        """The largest residual relative to the forces it is judged by; 0 where there are none."""
+        loaded = (balance for balance in self.equations.values() if balance.is_loaded)
+        return max((balance.residual / balance.force for balance in loaded), default=0.0)
 
     @staticmethod
     def _worst(balances: dict[str, Balance]) -> Balance:

@@ -163,6 +163,12 @@ class Inputs:
 
     # ---- as UFL ----------------------------------------------------------------------------------
 
+    @property
+    def per_thickness(self) -> bool:
+        """Whether integrals are per unit thickness: in the plane, where the weight is 1."""
+        weight = self.weight
+        return self._gdim == 2 and isinstance(weight, fem.Constant) and float(weight.value) == 1.0
+
     def scalar(self, name: str, value: Any) -> ufl.core.expr.Expr:
         """A number, constant or UFL scalar as UFL."""
         expression = self.to_ufl(name, value)

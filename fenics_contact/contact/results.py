@@ -6,15 +6,20 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cached_property
 
+import basix.ufl
 import numpy as np
 import numpy.typing as npt
 import ufl
+from dolfinx import fem
 
+from fenics_contact.arguments import check_instance
+from fenics_contact.contact.inputs import Inputs
 from fenics_contact.contact.values import Extent, PointValues, Resultants, Status
 from fenics_contact.laws.base import Law
 from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_sum
 from fenics_contact.supports.base import as_vector
 from fenics_contact.surface.displacement import Displacement
+from fenics_contact.surface.facet_values import facet_values
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import ContactSurface, PointEvaluator, SurfaceQuadrature
 from fenics_contact.types import Array
@@ -24,6 +29,8 @@ __all__ = ["PointResults"]
 
 # Of coordinates that are compared, by the largest.
 _DIGITS = 9
+# Results that are functions on Γc.
+_FUNCTIONS = ("pressure", "traction", "tangential_traction", "gap", "slip", "normal")
 
 
 class PointResults(ABC):
@@ -39,6 +46,7 @@ class PointResults(ABC):
         displacement: What u is in the function that is solved for.
         quadrature: The points of Γc.
         history: The committed state.
+        inputs: All that was given, as UFL.
     """
 
     name: str
@@ -47,6 +55,7 @@ class PointResults(ABC):
     law: Law
     quadrature: SurfaceQuadrature
     history: PointFields
+    inputs: Inputs
 
     @property
     @abstractmethod
@@ -130,7 +139,10 @@ class PointResults(ABC):
 
     @property
     def measure(self) -> Array:
-        """Area that each point stands for, the contact's weight included, shape (n_points,)."""
+        """Area that each point stands for, the contact's weight included, shape (n_points,).
+
+        In the plane with a weight of 1, the default, it is per unit thickness, a length.
+        """
         return self.quadrature.weights * self.values.weight
 
     @abstractmethod
@@ -178,6 +190,52 @@ class PointResults(ABC):
         area = ufl.sqrt(ufl.dot(normal, normal))
         return PointEvaluator(self.quadrature, {"area": area})
 
+    def function(self, name: str, into: fem.Function | None = None) -> fem.Function:
+        """A result as a function on Γc, for UFL, files and pictures. Collective.
+
+        On every facet it is the linear function that fits the values at its quadrature points best
+        without leaving their range, as in the files of `Writer`; it jumps between facets. The
+        integral over a flat facet is that of the points. It lives on ``surface.submesh``: compile
+        forms of it over the body's mesh with ``entity_maps=contact.entity_maps``.
+
+        Args:
+            name: "pressure" (stress), "traction" (r_n n + τ on the body) and "tangential_traction"
+                (stress), "gap" (length, NaN on facets none of whose points has an opposite), "slip"
+                (accumulated and committed, the sum of the modes, in length) or "normal".
+            into: What an earlier call has returned for a result of this shape: it gets the present
+                values, so that forms of it need not be compiled anew. By default a new function.
+
+        Raises:
+            ValueError: There is no such result, or ``into`` is no such function.
+        """
+        if name not in _FUNCTIONS:
+            raise ValueError(
+                f"{self.name}: there is no result {name!r} as a function; use one of "
+                f"{list(_FUNCTIONS)}"
+            )
+        values = self.values.normal if name == "normal" else getattr(self, name)
+        values = values.sum(axis=1) if name == "slip" else values
+        submesh, d = self.surface.submesh, self.points.shape[1]
+        cell, shape = submesh.topology.cell_name(), values.shape[1:]
+        element = basix.ufl.element("DG", cell, 1, shape=shape)
+        if into is None:
+            into = fem.Function(fem.functionspace(submesh, element), name=name)
+        check_instance(f"{self.name}: into", into, fem.Function)
+        space = into.function_space
+        if space.mesh != submesh or space.ufl_element() != element:
+            raise ValueError(
+                f"{self.name}: into is in {space.ufl_element()}; it must be a function that "
+                f"function({name!r}) of this contact has returned"
+            )
+        n_cells = submesh.topology.index_map(submesh.topology.dim).size_local
+        rows = self.quadrature.space().dofmap.list[:n_cells]
+        dofs = space.dofmap.list[:n_cells]
+        nodes = space.tabulate_dof_coordinates()[dofs][:, :, :d]
+        fitted = facet_values(self.points[rows], self.quadrature.weights[rows], values[rows], nodes)
+        into.x.array.reshape(-1, *shape)[dofs] = fitted
+        into.x.scatter_forward()
+        return into
+
     def resultants(self) -> Resultants:
         """Forces, moment, counts and extents. Collective."""
         comm = self.surface.mesh.comm
@@ -193,6 +251,7 @@ class PointResults(ABC):
             ],
         )
         return Resultants(
+            per_thickness=self.inputs.per_thickness,
             force=force,
             normal_force=float(sums[0]),
             tangential_force=float(sums[1]),

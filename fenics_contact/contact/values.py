@@ -31,7 +31,8 @@ class Extent:
     length are known to within the distance of two points, which is less than a facet.
 
     Attributes:
-        area: That they stand for, the contact's weight included (in the plane a length).
+        area: That they stand for, the contact's weight included; in the plane with a weight of 1,
+            the default, per unit thickness.
         low, high: Their least and largest coordinates on the undeformed Γc, (gdim,) (length); NaN
             where there are no such points.
     """
@@ -54,7 +55,9 @@ class Resultants:
     """Integrals over Γc, counts and extents of its points, the same on every rank.
 
     Attributes:
-        force: Contact force on the body, ∫ (r_n n + τ), shape (gdim,) (2D: per thickness).
+        per_thickness: Whether forces, moment and areas are per unit thickness: in the plane, where
+            the contact's weight is 1, the default.
+        force: Contact force on the body, ∫ (r_n n + τ), shape (gdim,).
         normal_force: ∫ -r_n, tension counted negative.
         tangential_force: ∫ |τ|.
         moment: Of the force about the origin, as `Contact.moment` gives it, (1,) or (3,).
@@ -65,6 +68,7 @@ class Resultants:
         max_penetration: Largest δ₋ (length).
     """
 
+    per_thickness: bool
     force: Array
     normal_force: float
     tangential_force: float
@@ -78,7 +82,7 @@ class Resultants:
 
     @property
     def area(self) -> float:
-        """Measure of the closed part."""
+        """Area of the closed part, the contact's weight included; see `per_thickness`."""
         return self.extents["contact"].area
 
 

@@ -30,8 +30,23 @@ from fenics_contact.types import Array
 
 __all__ = ["report"]
 
-# Of the mesh's size, how far displacements are drawn at least.
-_VISIBLE = 0.05
+# Of the mesh's size, how far displacements are drawn at least; where they are less than the
+# round-off of coordinates there is nothing to be seen.
+_VISIBLE, _ROUND_OFF = 0.05, float(np.finfo(float).eps)
+# What legends call the energies.
+_ENERGIES = {
+    "work": "work of loads and motions",
+    "elastic": "elastic energy",
+    "springs": "contact springs (k_n, k_t)",
+    "dissipation": "dissipation by friction",
+    "remainder": "remainder",
+}
+_REMAINDER = (
+    "The work of an increment is that of the mean of the forces at its two ends. The remainder is "
+    "the part of it that is in none of the other sums: contact that changes within an increment, "
+    "and springs that are let go where contact opens. Smaller increments make it smaller; where it "
+    "is large beside the work, the increments are too large for the energies."
+)
 _STYLE = """
 body { font: 15px/1.5 sans-serif; color: #1a1a1a; max-width: 72rem; margin: 2rem auto;
   padding: 0 1rem; }
@@ -90,7 +105,8 @@ def report(
         budget: What `estimate_errors` found of this state.
         title: Heading.
         units: Of length, force and stress, for what is shown; moments and energies are in force
-            times length. In the plane forces are per thickness unless the contacts' weight has it.
+            times length. In the plane forces, moments, areas and energies are per unit thickness,
+            and the page says so, unless the contacts' weight has it.
         magnification: Factor by which displacements are drawn; by default 1 with finite kinematics,
             and else so that they can be seen.
         view: In space where to look from: elevation and azimuth in degrees.
@@ -121,7 +137,7 @@ def report(
                 rows = _rows(problem, steps, history)
         problem.complete()
         problem.displacement.follow()
-        page = _Page(scratch, units, view)
+        page = _Page(scratch, units, view, per_thickness=table.is_per_thickness(problem))
         if magnification is None:
             magnification = _visible(problem)
         _state(page, problem, steps[-1], shape, magnification)
@@ -204,13 +220,19 @@ class _Page:
     Attributes:
         length, force, stress: Units.
         view: Where to look from in space.
+        per_thickness: Whether there are integrals per unit thickness.
     """
 
     def __init__(
-        self, scratch: Path, units: tuple[str, str, str], view: tuple[float, float] | None
+        self,
+        scratch: Path,
+        units: tuple[str, str, str],
+        view: tuple[float, float] | None,
+        *,
+        per_thickness: bool,
     ) -> None:
         self.length, self.force, self.stress = units
-        self.view = view
+        self.view, self.per_thickness = view, per_thickness
         self._scratch, self._parts = scratch, [""]
         self._pictures = 0
 
@@ -221,6 +243,10 @@ class _Page:
     def heading(self, text: str, level: int = 2) -> None:
         """A heading, escaped."""
         self.add(f"<h{level}>{escape(text)}</h{level}>")
+
+    def per(self, per_thickness: bool) -> str:
+        """What the unit of an integral ends with."""
+        return f"/{self.length}" if per_thickness else ""
 
     def words(self, title: str, header: Sequence[str], rows: Iterable[tuple[str, ...]]) -> None:
         """A table of words."""
@@ -255,6 +281,8 @@ class _Page:
         )
         now = datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
         units = f"Lengths in {self.length}, forces in {self.force}, stresses in {self.stress}."
+        if self.per_thickness:
+            units += f" Forces, moments, areas and energies are per {self.length} of thickness."
         foot = f"<p>{escape(units)} Written {now}.</p></body></html>"
         return "\n".join([head, *self._parts, foot, ""])
 
@@ -281,9 +309,10 @@ def _visible(problem: ContactProblem) -> float:
     """A magnification, 1, 2 or 5 by a power of ten, with which displacements show. Collective."""
     u, comm = problem.displacement.u, problem.u.function_space.mesh.comm
     largest = global_max(comm, np.abs(u.x.array))
-    if any(contact.finite for contact in problem.contacts) or not largest > 0:
+    size = problem.motions.size
+    if any(contact.finite for contact in problem.contacts) or not largest > _ROUND_OFF * size:
         return 1.0
-    wanted = _VISIBLE * problem.motions.size / largest
+    wanted = _VISIBLE * size / largest
     power = 10.0 ** np.floor(np.log10(wanted))
     return float(max(1.0, power * max(n for n in (1, 2, 5) if n * power <= wanted)))
 
@@ -306,10 +335,12 @@ def _state(
         small = [c.name for c in problem.contacts if not c.finite]
         known = step.verdict.kinematics
         checked += ["that displacements are small"] if any(n in known for n in small) else []
+        residual = f"The residual is {step.verdict.relative_residual:.1e} of the forces."
+        if not step.verdict.is_loaded:
+            residual = "There are no forces."
         page.add(
             f'<p class="holds">{escape(where)}: the state holds. Checked apart from the solver: '
-            f"{', '.join(checked)}. The residual is {step.verdict.relative_residual:.1e} of the "
-            "forces.</p>"
+            f"{', '.join(checked)}. {residual}</p>"
         )
     page.add(step._repr_html_())
     page.heading("Deformed body")
@@ -327,6 +358,8 @@ def _state(
 def _contact(page: _Page, contact: Contact, step: Step, magnification: float) -> None:
     """Tractions, gap, slip, status and extents. Collective."""
     page.heading(f"Contact: {contact.name}")
+    if not step.verdict.equations[contact.name].is_loaded:
+        page.add("<p>It bears no force; tractions other than zero are round-off.</p>")
     units = {"length": page.length, "stress": page.stress}
     drawn = []
     if contact.points.shape[1] == 2:
@@ -360,7 +393,9 @@ def _contact(page: _Page, contact: Contact, step: Step, magnification: float) ->
         )
         for state in table.STATES
     ]
-    page.add(shown("Extents on the undeformed surface", ("state", "area", "from", "to"), rows))
+    area = f"area [{page.length}²{page.per(contact.inputs.per_thickness)}]"
+    header = ("state", area, f"from [{page.length}]", f"to [{page.length}]")
+    page.add(shown("Extents on the undeformed surface", header, rows))
 
 
 def _place(x: Array) -> str:
@@ -382,19 +417,20 @@ def _history(page: _Page, problem: ContactProblem, rows: list[dict[str, str]]) -
         path, d = page.path(), contact.surface.mesh.geometry.dim
         with plotting.figure(path, columns=3, size=(4.6, 3.6)) as (forces, moments, areas):
             for axis in table.AXES[:d]:
-                values = _column(rows, f"{contact.name}: force {axis} (force)")
+                values = _column(rows, table.column(contact, f"force {axis}", "force"))
                 forces.plot(over, values, ".-", label=f"force {axis}")
-            friction = _column(rows, f"{contact.name}: friction as the sum of sizes (force)")
-            forces.plot(over, friction, "k:", label="friction ∫|τ|")
+            name = table.column(contact, "friction as the sum of sizes", "force")
+            forces.plot(over, _column(rows, name), "k:", label="friction ∫|τ|")
             for axis in table.AXES if d == 3 else "z":
-                name = f"{contact.name}: moment {axis} about the origin (force length)"
+                name = table.column(contact, f"moment {axis} about the origin", "force length")
                 moments.plot(over, _column(rows, name), ".-", label=f"moment {axis}")
             for state in table.STATES:
-                values = _column(rows, f"{contact.name}: area in {state} (area)")
+                values = _column(rows, table.column(contact, f"area in {state}", "area"))
                 areas.plot(over, values, ".-", label=state)
-            forces.set(ylabel=f"force on the body [{page.force}]")
-            moments.set(ylabel=f"moment about the origin [{page.force} {page.length}]")
-            areas.set(ylabel=f"area [{page.length}{'²' if d == 3 else ''}]")
+            per = page.per(contact.inputs.per_thickness)
+            forces.set(ylabel=f"force on the body [{page.force}{per}]")
+            moments.set(ylabel=f"moment about the origin [{page.force} {page.length}{per}]")
+            areas.set(ylabel=f"area [{page.length}²{per}]")
             for axes in (forces, moments, areas):
                 axes.set(xlabel=abscissa)
                 axes.locator_params(axis="x", nbins=6)
@@ -411,14 +447,16 @@ def _history(page: _Page, problem: ContactProblem, rows: list[dict[str, str]]) -
             solver.annotate(f"cut {times:.0f}×", (number, 0.0), rotation=90, ha="center")
         solver.set(xlabel="increment", ylabel="iterations")
         for name in table.ENERGIES:
-            sums = np.cumsum(_column(rows, f"{name} (force length)"))
-            energy.plot(increments, sums, ".-", label=name)
-        energy.set(xlabel="increment", ylabel=f"sum so far [{page.force} {page.length}]")
+            sums = np.cumsum(_column(rows, table.energy_column(problem, name)))
+            energy.plot(increments, sums, ".-", label=_ENERGIES[name])
+        per = page.per(page.per_thickness)
+        energy.set(xlabel="increment", ylabel=f"sum so far [{page.force} {page.length}{per}]")
         energy.legend(fontsize="small")
         for axes in (solver, energy):
             axes.grid(alpha=0.25)
             axes.locator_params(axis="x", integer=True)
     page.add(page.picture(path, "Iterations of the increments; work, and what became of it"))
+    page.add(f"<p>{escape(_REMAINDER)}</p>")
 
 
 def _column(rows: list[dict[str, str]], name: str) -> Array:
@@ -434,7 +472,7 @@ def _errors(page: _Page, budget: ErrorBudget | None) -> None:
     """The budget, where there is one."""
     page.heading("Errors")
     if budget is None:
-        page.add("<p>Not estimated: report(budget=estimate_errors(...)) has them.</p>")
+        page.add("<p>Not estimated: give report(..., budget=estimate_errors(problem, stress)).</p>")
     else:
         page.add(budget._repr_html_())
 

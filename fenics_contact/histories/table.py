@@ -17,7 +17,18 @@ from fenics_contact.parallel import collective_errors
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import files
 
-__all__ = ["AXES", "ENERGIES", "STATES", "Table", "columns", "read", "values"]
+__all__ = [
+    "AXES",
+    "ENERGIES",
+    "STATES",
+    "Table",
+    "column",
+    "columns",
+    "energy_column",
+    "is_per_thickness",
+    "read",
+    "values",
+]
 
 AXES = "xyz"
 STATES = ("contact", "stick", "slip")
@@ -25,13 +36,14 @@ ENERGIES = ("work", "elastic", "springs", "dissipation", "remainder")
 # How every table begins: a file that begins otherwise is not overwritten.
 _FIRST = ("increment", "load")
 _BEGINS = ",".join(_FIRST)
+_PER_THICKNESS = " per thickness"
 
 
 class Table:
     """A file of comma-separated values (CSV), written by the first rank.
 
-    A row is there as soon as its increment is committed. In the plane forces, moments and energies
-    are per thickness, unless the contacts' weight has it.
+    A row is there as soon as its increment is committed. In the plane forces, moments, areas and
+    energies are per unit thickness, and the header says so, unless the contacts' weight has it.
     """
 
     def __init__(self, path: Path, problem: ContactProblem, errors: Sequence[str] = ()) -> None:
@@ -140,18 +152,41 @@ def columns(problem: ContactProblem) -> list[str]:
     """Names and units of what a row has of every step."""
     names = [*_FIRST]
     for contact in problem.contacts:
-        names += [f"{contact.name}: {column}" for column in _columns(contact)]
-    names += [f"{name} (force length)" for name in ENERGIES]
+        names += [column(contact, *each) for each in _columns(contact)]
+    names += [energy_column(problem, name) for name in ENERGIES]
     return [*names, "residual (share of the forces)", "method", "iterations", "cuts"]
 
 
+def is_per_thickness(problem: ContactProblem) -> bool:
+    """Whether energies are per unit thickness, see `Inputs.per_thickness`."""
+    return any(contact.inputs.per_thickness for contact in problem.contacts)
+
+
+def energy_column(problem: ContactProblem, name: str) -> str:
+    """Name and unit of the column of one of `ENERGIES`."""
+    return f"{name} (force length{_PER_THICKNESS if is_per_thickness(problem) else ''})"
+
+
+def column(contact: Contact, name: str, unit: str) -> str:
+    """Name and unit of a column of a contact.
+
+    Args:
+        contact: The contact.
+        name: Of the quantity.
+        unit: "force", "force length" or "area", which may be per unit thickness; or another one.
+    """
+    integral = unit in ("force", "force length", "area") and contact.inputs.per_thickness
+    return f"{contact.name}: {name} ({unit}{_PER_THICKNESS if integral else ''})"
+
+
 def values(problem: ContactProblem, step: Step) -> list[object]:
-    """The same in numbers; empty where there is none."""
+    """What a row has of a step; empty where there is no number."""
     row: list[object] = [step.increment, "" if step.load is None else step.load]
     for contact in problem.contacts:
         row += _values(step.contacts[contact.name])
     row += [getattr(step.energy, name) for name in ENERGIES]
-    row += [step.verdict.relative_residual, step.method, step.iterations]
+    row.append(step.verdict.relative_residual if step.verdict.is_loaded else "")
+    row += [step.method, step.iterations]
     return [*row, sum(attempt.method == "cut" for attempt in step.attempts)]
 
 
@@ -179,25 +214,25 @@ def read(path: Path, problem: ContactProblem) -> list[dict[str, str]]:
     return rows
 
 
-def _columns(contact: Contact) -> list[str]:
+def _columns(contact: Contact) -> list[tuple[str, str]]:
     """Names and units of what a contact has in a row."""
     d = contact.surface.mesh.geometry.dim
     turns = AXES if d == 3 else "z"
     return [
-        *(f"force {axis} (force)" for axis in AXES[:d]),
-        "normal force (force)",
-        "friction as the sum of sizes (force)",
-        *(f"moment {axis} about the origin (force length)" for axis in turns),
-        *(f"area in {state} (area)" for state in STATES),
+        *((f"force {axis}", "force") for axis in AXES[:d]),
+        ("normal force", "force"),
+        ("friction as the sum of sizes", "force"),
+        *((f"moment {axis} about the origin", "force length") for axis in turns),
+        *((f"area in {state}", "area") for state in STATES),
         *(
-            f"{state} {end} {axis} (length)"
+            (f"{state} {end} {axis}", "length")
             for state in STATES
             for end in ("from", "to")
             for axis in AXES[:d]
         ),
-        "largest pressure (stress)",
-        "largest penetration (length)",
-        *(f"{state} (points)" for state in ("open", "stick", "slip")),
+        ("largest pressure", "stress"),
+        ("largest penetration", "length"),
+        *((state, "points") for state in ("open", "stick", "slip")),
     ]
 
 

@@ -1,0 +1,102 @@
+"""Results as functions on Γc, for forms of the user's own and for files.
+
+References: integrals over the points themselves, which linear functions on flat facets keep to
+round-off (1e-12 of the largest), and the range of the values there.
+"""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem, io
+from mpi4py import MPI
+
+import fenics_contact as fc
+from scenes.blocks import BOTTOM, CELLS, block
+from scenes.comparing import (
+    assemble_number,
+    close,
+    compiled,
+    gathered,
+    raised_everywhere,
+    shared_folder,
+)
+from scenes.rubbing import Rub
+
+COMM = MPI.COMM_WORLD
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_integrals_are_those_of_the_points(cell):
+    """In forms over the body's mesh, on facets of all orientations; nothing leaves its range."""
+    made = Rub(cell=cell, degree=2, mesh={"n": 4, "shuffled": True})
+    made.problem.kinematics = np.inf
+    list(fc.increments(made.problem, made.load, 0, 2, steps=2))
+    contact, d = made.contact, made.scene.dim
+    ds = ufl.ds(made.scene.mesh, subdomain_data=made.scene.tags)(BOTTOM)
+    for name, values in (
+        ("pressure", contact.pressure),
+        ("traction", contact.traction),
+        ("tangential_traction", contact.tangential_traction),
+        ("gap", contact.gap),
+        ("slip", contact.slip.sum(axis=1)),
+        ("normal", contact.values.normal),
+    ):
+        found = contact.function(name)
+        n = 1 if values.ndim == 1 else d
+        rows = values.reshape(-1, n)
+        parts = [found] if values.ndim == 1 else [found[i] for i in range(d)]
+        sums = [assemble_number(compiled(part * ds, contact), COMM) for part in parts]
+        expected = COMM.allreduce(contact.measure @ rows)
+        size = COMM.allreduce(contact.measure @ np.abs(rows))
+        assert close(sums, expected, 1e-12, scale=size.max()), name
+        everywhere = gathered(COMM, rows)
+        low, high = everywhere.min(axis=0), everywhere.max(axis=0)
+        nodal = found.x.array.reshape(-1, n)
+        assert COMM.allreduce(int(np.any((nodal < low) | (nodal > high)))) == 0, name
+    force = contact.resultants().normal_force
+    pressure = contact.function("pressure")
+    assert close(assemble_number(compiled(pressure * ds, contact), COMM), force, 1e-12)
+
+
+def test_a_form_that_is_compiled_once():
+    """The same function takes the values of the next state."""
+    made = Rub(mesh={"n": 4})
+    made.problem.kinematics = np.inf
+    contact = made.contact
+    ds = ufl.ds(made.scene.mesh, subdomain_data=made.scene.tags)(BOTTOM)
+    pressure, slip = contact.function("pressure"), contact.function("slip")
+    form = compiled(pressure * ds, contact)
+    assert assemble_number(form, COMM) == 0.0
+    for _ in fc.increments(made.problem, made.load, 0, 2, steps=4):
+        assert contact.function("pressure", pressure) is pressure
+        contact.function("slip", into=slip)
+        assert close(assemble_number(form, COMM), contact.resultants().normal_force, 1e-12)
+    assert COMM.allreduce(np.max(slip.x.array, initial=0.0), op=MPI.MAX) > 0
+
+
+def test_files(tmp_path):
+    """A gap that is the same everywhere, at every node; and DOLFINx writes such functions."""
+    scene = block("tetrahedron", n=3)
+    support = fc.Obstacle(0.1, scene.vector(up=-1.0))
+    gap = scene.contact(fc.Frictionless(1e3), support=support).function("gap")
+    off = COMM.allreduce(np.abs(gap.x.array - 0.1).max(initial=0.0), op=MPI.MAX)
+    assert off <= 1e-12
+    path = shared_folder(tmp_path) / "gap.pvd"
+    with io.VTKFile(COMM, path, "w") as file:
+        file.write_function(gap)
+    COMM.barrier()
+    assert path.exists()
+
+
+def test_bad_input():
+    """Named, on all ranks."""
+    scene = block("triangle")
+    contact = scene.contact(fc.Frictionless(1e3))
+    raised_everywhere(lambda: contact.function("heat"), ValueError, "'heat'", "'pressure'")
+    raised_everywhere(lambda: contact.function("gap", into=3), ValueError, "into is a int")
+    vector = contact.function("normal")
+    raised_everywhere(lambda: contact.function("gap", into=vector), ValueError, "function('gap')")
+    other = fem.Function(fem.functionspace(scene.mesh, ("DG", 1)))
+    raised_everywhere(lambda: contact.function("gap", into=other), ValueError, "function('gap')")
