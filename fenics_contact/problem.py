@@ -30,6 +30,7 @@ from fenics_contact.checks.verdict import Attempt, NotConverged, Verdict
 from fenics_contact.contact.contact import Contact, Found
 from fenics_contact.methods.approach import Approach
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
+from fenics_contact.methods.first_touch import FirstTouch
 from fenics_contact.methods.solver import Settings, Solver
 from fenics_contact.parallel import fail_together, global_max, warn
 from fenics_contact.systems import linear
@@ -233,6 +234,7 @@ class ContactProblem:
         # goes with them, and how far the last increment moved them.
         self._committed = self.full.state()
         self._approach = Approach(self.full, self.motions)
+        self._first_touch = FirstTouch(self.full)
         for contact in self.contacts:
             contact.evaluate()
         self._commits = [contact.commits for contact in self.contacts]
@@ -447,13 +449,17 @@ class ContactProblem:
         if stiffness_changed and self.bulk.linear:
             self._modulus.measure()
         cold = self._approach.lead(load, first=self.increment == 0)
-        solver.starts.carried = self._approach.carried
         if solver.chooses():
             return None
         solver.update_system(stiffness_changed)
         self.full.farthest = solver.system.farthest = self._judge.begin()
         solver.system.begin(load)
         solver.equations.began = self._committed if cold else None
+        led = np.where(self.constrained, before, self.full.state())
+        self._first_touch.count_slip(led, solver.end_without)
+        solver.starts.carried = self._approach.carried
+        if self._first_touch.end is not None:
+            solver.starts.carried = self._first_touch.end
         with solver.system.acting():
             reason, attempts, rounds = solver.solve(
                 ahead=ahead,

@@ -353,7 +353,7 @@ def _wider(u):
 def test_a_body_set_down_elsewhere_is_found(spoil, check):
     def spoiled(record):
         if record["contacts"][0]["set_down"] is not None:
-            spoil(record["contacts"][0]["set_down"])
+            spoil(record["contacts"][0]["set_down"]["u"])
 
     outcome = played(LOOSE, spoiled=spoiled)
     assert outcome.outcome == "wrong"

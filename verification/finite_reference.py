@@ -50,9 +50,6 @@ _DIFFERENCE = 1e-8
 _PARTS = (4, 32)
 _SOFTER = 10.0 ** np.arange(-5, 0.1, 0.5)
 _ROUNDS = 400
-# How well bodies are set down, by their size, and how rigidly, by their way; and contact forces, by
-# the load, that are round-off of a body that was let go.
-_DOWN, _LEFT, _ROUND_OFF = 1e-6, 1e-7, 1e-13
 
 
 # ---- shapes --------------------------------------------------------------------------------------
@@ -283,8 +280,12 @@ class FiniteContact(reference.ContactModel):
         found |= {"framed": tau @ pose.turn, "inward": inward, "foot": pose.into(foot)}
         return found | {"turn": pose.turn}
 
+    def at_rest(self) -> Pose:
+        """See `reference.ContactModel`."""
+        return self.pose(np.zeros(self.d), 0.0)
+
     def counted_from(self, found: dict[str, Array], old: Any, idle: Array) -> FiniteState:
-        """History with slip of some points, (n,), counted from a state that is not committed."""
+        """See `reference.ContactModel`."""
         jump = np.where(idle[:, None], found["foot"], old.jump)
         return replace(old, jump=jump, normal=np.where(idle[:, None], found["inward"], old.normal))
 
@@ -664,68 +665,11 @@ class FiniteJudge(fuzz_judge.Judge):
     def take(self, record: dict[str, Any]) -> None:
         """Judge one committed increment."""
         load = self._load(record["stage"], record["load"])
-        self._take_set_down(record, load)
         super().take(record)
         self.problem.before = self._apart.before = load
         whole = self.problem.bulk(self._u)[2]
         name = f"stage {record['stage']} at {record['load']:.4g}"
         self._check(name, "inside out", 0.0 if whole else 2.0, 1.0)
-
-    def _take_set_down(self, record: dict[str, Any], load: Any) -> None:
-        """Count slip from where bodies were set down, at points that bore nothing before.
-
-        The package tells where that is. Asked of it is what the reference knows of it: bodies went
-        there as rigid ones, are no deeper inside of anything than before, and touch something.
-        """
-        name, problem = f"stage {record['stage']} at {record['load']:.4g}", self.problem
-        size = np.ptp(problem.body.places, axis=0).max()
-        before, old = self._u.copy(), list(self._old)
-        before[load.fixed] = load.values
-        borne = None if self._before is None else [c["size"] for c in self._before["contacts"]]
-        for i, told in enumerate(c["set_down"] for c in record["contacts"]):
-            if told is None:
-                continue
-            u = self._numbered(told)
-            then, now = (problem.respond(v, self._motion, load, old) for v in (before, u))
-            deep, deeper = (
-                max(f["closing"][c.paired].max() for c, f in zip(problem.contacts, at, strict=True))
-                for at in (then, now)
-            )
-            strain, way = self._strain(u - before, before, load), np.abs(u - before).max()
-            self._check(name, "set down rigid", strain, _DOWN * way + _ROUND_OFF * size)
-            self._check(name, "set down inside", deeper - max(deep, 0.0), _DOWN * size)
-            self._check(name, "set down aloft", -deeper, _DOWN * size)
-            idle = np.ones(len(now[i]["r_n"]), dtype=bool)
-            if borne is not None and sum(borne) > _LEFT * np.linalg.norm(load.force):
-                idle = self._before["found"][i]["r_n"] == 0.0
-            self._old[i] = problem.contacts[i].counted_from(now[i], old[i], idle)
-            apart = self._apart.respond(u, self._own_motion, load, self._own_old)[i]
-            self._own_old[i] = self._apart.contacts[i].counted_from(apart, self._own_old[i], idle)
-
-    def _strain(self, way: Array, before: Array, load: Any) -> float:
-        """What of a motion from a state on is not rigid (length).
-
-        Nodes where displacements are prescribed are left out.
-        """
-        body, d = self.problem.body, self.problem.body.d
-        free = np.ones(way.size, dtype=bool)
-        free[load.fixed] = False
-        free = free.reshape(-1, d).all(axis=1)
-        off = [0.0]
-        for b in range(body.parts.max() + 1):
-            own = free & (body.parts == b)
-            if not own.any():
-                continue
-            x, w = (body.places + before.reshape(-1, d))[own], way.reshape(-1, d)[own]
-            if self.scene["bulk"] == "linear":  # small rotations alone are rigid
-                x = body.places[own]
-                i, j = np.triu_indices(len(x), 1)
-                stretch = np.sum((x[i] - x[j]) * (w[i] - w[j]), axis=1) / np.ptp(x, axis=0).max()
-            else:
-                start, end = (scipy.spatial.distance.pdist(y) for y in (x, x + w))
-                stretch = end - start
-            off.append(np.abs(stretch).max(initial=0.0))
-        return float(max(off))
 
     def _with_multipliers(self, contact: Any, old: Any, record: dict[str, Any]) -> Any:
         if contact.project is None:

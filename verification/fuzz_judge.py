@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import scipy.spatial
+import scipy.spatial.distance
 
 from verification import fuzz_models, fuzz_scenes
 from verification import reference_solver as reference
@@ -35,6 +36,9 @@ _CURVED = 5.0
 _SMOOTHED, _K = 1e-7, ("k_n", "k_t")
 # Penetration that multipliers may leave, by the size of Γc.
 _INSIDE = 1e-2
+# How well bodies are set down, by their size, and how rigidly, by their way; and contact forces, by
+# the load, that are round-off of a body that was let go.
+_DOWN, _LEFT, _ROUND_OFF = 1e-6, 1e-7, 1e-13
 # Forces of the nearest exact solution, and of one found apart.
 _NEAREST, _APART = 1e-5, 1e-4
 # The latter where multipliers of friction are not determined at the edge of Γc.
@@ -96,6 +100,7 @@ class Judge:
             if friction is not None:
                 for history in (problem, self._apart):
                     history.contacts[i].law.friction = friction
+        self._take_set_down(name, record, load)
         u = self._numbered(record["u"])
         motion = np.array([record["contacts"][c]["motion"][i] for c, i in problem.motions()])
         old = [
@@ -160,6 +165,84 @@ class Judge:
         ).query(mine)
         assert distance.max() < 1e-9 * size
         return rows[row, d + 1 :].ravel().copy()
+
+    def _take_set_down(self, name: str, record: dict[str, Any], load: Any) -> None:
+        """Count slip from set-down or first touch, at points that bore nothing before.
+
+        The package tells where that is. Asked of it is what the reference knows of it: contact just
+        touches; and bodies that were set down went there as rigid ones, no deeper into anything.
+        """
+        problem, old = self.problem, list(self._old)
+        size = np.ptp(problem.body.places, axis=0).max()
+        before = self._u.copy()
+        before[load.fixed] = load.values
+        borne = None if self._before is None else [c["size"] for c in self._before["contacts"]]
+        for i, record_of in enumerate(record["contacts"]):
+            told, model = record_of["set_down"], problem.contacts[i]
+            if told is None:
+                continue
+            u = self._numbered(told["u"])
+            if told["rigid"]:
+                then, now = (problem.respond(v, self._motion, load, old) for v in (before, u))
+                deep, deeper = (
+                    max(
+                        f["closing"][c.paired].max()
+                        for c, f in zip(problem.contacts, at, strict=True)
+                    )
+                    for at in (then, now)
+                )
+                found = now[i]
+                strain, way = self._strain(u - before, before, load), np.abs(u - before).max()
+                self._check(name, "set down rigid", strain, _DOWN * way + _ROUND_OFF * size)
+                self._check(name, "set down inside", deeper - max(deep, 0.0), _DOWN * size)
+                self._check(name, "set down aloft", -deeper, _DOWN * size)
+            else:
+                found = self._touching(model, record_of, u, old[i])
+                miss = abs(found["closing"][model.paired].max())
+                self._check(name, "first touch", miss, _DOWN * size)
+            idle = np.ones(len(found["r_n"]), dtype=bool)
+            if borne is not None and sum(borne) > _LEFT * np.linalg.norm(load.force):
+                idle = self._before["found"][i]["r_n"] == 0.0
+            self._old[i] = model.counted_from(found, old[i], idle)
+            own, own_old = self._apart.contacts[i], self._own_old[i]
+            if told["rigid"]:
+                self._own_u = u  # to start from
+                apart = self._apart.respond(u, self._own_motion, load, self._own_old)[i]
+            else:
+                apart = self._touching(own, record_of, u, own_old)
+            self._own_old[i] = own.counted_from(apart, own_old, idle)
+
+    def _touching(self, model: Any, record: dict[str, Any], u: Array, old: Any) -> dict[str, Any]:
+        """What follows from the state of first touch, in which a support is on its way."""
+        if hasattr(model, "respond_at"):
+            return model.respond_at(u, old)
+        jump = record["set_down"]["jump"][self._rows(model, record)]
+        return model.respond(jump, model.at_rest(), old)
+
+    def _strain(self, way: Array, before: Array, load: Any) -> float:
+        """What of a motion from a state on is not rigid (length).
+
+        Nodes where displacements are prescribed are left out.
+        """
+        body, d = self.problem.body, self.problem.body.d
+        free = np.ones(way.size, dtype=bool)
+        free[load.fixed] = False
+        free = free.reshape(-1, d).all(axis=1)
+        off = [0.0]
+        for b in range(body.parts.max() + 1):
+            own = free & (body.parts == b)
+            if not own.any():
+                continue
+            x, w = (body.places + before.reshape(-1, d))[own], way.reshape(-1, d)[own]
+            if self.scene.get("bulk", "linear") == "linear":  # small rotations alone are rigid
+                x = body.places[own]
+                i, j = np.triu_indices(len(x), 1)
+                stretch = np.sum((x[i] - x[j]) * (w[i] - w[j]), axis=1) / np.ptp(x, axis=0).max()
+            else:
+                start, end = (scipy.spatial.distance.pdist(y) for y in (x, x + w))
+                stretch = end - start
+            off.append(np.abs(stretch).max(initial=0.0))
+        return float(max(off))
 
     def _with_multipliers(self, contact: Any, old: Any, record: dict[str, Any]) -> Any:
         if contact.project is None:

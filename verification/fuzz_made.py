@@ -97,14 +97,15 @@ class Made:
     Attributes:
         F: The residual with coefficients by cell and plain measures; the package gets it as the
             scene says that it is written (`fuzz_forms.written`).
-        set_down: Displacements from which slip is counted anew in this increment, by the names of
-            contacts; see `_displacement`.
+        set_down: Where slip is counted from anew in this increment, by the names of contacts:
+            "rigid", whether bodies were set down, "u" (see `_displacement`), and "jump", the
+            displacement relative to the support at the points, (n_points, d).
     """
 
     def __init__(self, scene: Scene, comm: MPI.Comm) -> None:
         """Make mesh, bulk form and conditions. Collective."""
         self.scene, self.comm = scene, comm
-        self.set_down: dict[str, np.ndarray] = {}
+        self.set_down: dict[str, dict[str, Any]] = {}
         self.length, self.force = scene["units"]
         x, cells, boxes = _arrays(scene)
         self.d = d = x.shape[1]
@@ -446,14 +447,24 @@ def _displacement(made: Made) -> np.ndarray:
 
 
 def _note_set_down(made: Made, contact: fc.Contact) -> None:
-    """Let a scene know where bodies are from which slip at a contact is counted anew."""
-    set_down = contact.set_down
+    """Let a scene know where slip at a contact is counted from anew, and why."""
 
-    def noted(*given: Any, **options: Any) -> None:
-        made.set_down[contact.name] = _displacement(made)
-        set_down(*given, **options)
+    def noting(method: Any, *, rigid: bool) -> Any:
+        def noted(*given: Any, **options: Any) -> None:
+            jump = gathered(made.comm, np.column_stack([contact.points, contact.values.jump]))
+            made.set_down[contact.name] = {
+                "rigid": rigid,
+                "u": _displacement(made),
+                "jump": jump[:, made.d :],
+            }
+            method(*given, **options)
 
-    contact.set_down = noted  # type: ignore[method-assign]
+        return noted
+
+    contact.set_down = noting(contact.set_down, rigid=True)  # type: ignore[method-assign]
+    contact.count_slip_from_here = noting(  # type: ignore[method-assign]
+        contact.count_slip_from_here, rigid=False
+    )
 
 
 def _record(

@@ -9,7 +9,7 @@ differences, node by node. Shared are DOLFINx's assembly of the bulk, and the nu
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -189,10 +189,6 @@ class PresentContact(reference.ContactModel):
             np.add.at(across, (rows, nodes), share)
         stiff = np.maximum(self.k_n, self.k_t) / self.weights
         return np.kron(across.T @ (stiff[:, None] * across), np.eye(self.d))
-
-    def counted_from(self, found: dict[str, Array], old: Any, idle: Array) -> PresentState:
-        """See `FiniteContact`: ways in the committed bodies."""
-        return replace(old, jump=np.where(idle[:, None], found["relative"], old.jump))
 
     def augment(self, found: dict[str, Array], old: Any) -> PresentState:
         """One round: the multipliers that the tractions found make."""

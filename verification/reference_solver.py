@@ -149,6 +149,14 @@ class ContactModel:
             by_shift[:, :, k] = found.imag / _STEP
         return by_jump, by_shift
 
+    def at_rest(self) -> Any:
+        """Where the support began, as `respond` takes it."""
+        return np.zeros(self.d)
+
+    def counted_from(self, found: dict[str, Array], old: Any, idle: Array) -> Any:
+        """History with slip of some points, (n,), counted from a state that is not committed."""
+        return replace(old, jump=np.where(idle[:, None], found["relative"], old.jump))
+
     def augment(self, found: dict[str, Array], old: State) -> State:
         """One round: the multipliers that the tractions found make."""
         assert self.project is not None

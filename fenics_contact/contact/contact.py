@@ -637,14 +637,25 @@ class Contact(PointResults):
             felt: Which points feel what was set down.
             released: Whether nothing was borne by then: what some points bore is round-off.
         """
+        bore = self.history.values("normal_traction") != 0.0
+        self._count_from_here(felt if released else felt & ~bore)
+
+    def count_slip_from_here(self) -> None:
+        """Let slip be counted from the state evaluated last, at which surfaces first touch.
+
+        `restore` takes it back. Collective.
+        """
+        self._count_from_here(np.ones(self.quadrature.n_points, dtype=np.bool_))
+
+    def _count_from_here(self, points: Mask) -> None:
+        """Let slip at some points be counted from the state evaluated last. Collective."""
         if not self.law.has_friction:
             return
         if self._aloft is None:
             self._aloft = self.history.rows()
         kept = {name: self.history.values(name) for name in self.history.names}
-        anew = felt if released else felt & (kept["normal_traction"] == 0.0)
         feet = self.opposite.feet(self.values)
-        counted = {n: np.where(anew[:, None], v, kept[n]) for n, v in feet.items()}
+        counted = {n: np.where(points[:, None], v, kept[n]) for n, v in feet.items()}
         self.history.commit(kept | counted)
         self.forget()
 

@@ -169,14 +169,11 @@ class Approach:
     def _set_down(self, load: Array, which: Index, *, released: bool) -> None:
         """Move bodies that touch nothing to where they rest, or to first touch. Collective.
 
-        With finite kinematics slip is counted from there: points come down on other places of a
-        curved support than are closest from above. With small displacements it is counted from the
-        last commit as ever, and draws a body back by all that it went along Γc.
+        Slip is counted from there, for until then nothing is touched.
         """
         full = self._full
         aloft = full.state()
-        finite = all(contact.finite for contact in full.contacts)
-        for along in (_ALONG, np.inf) if finite else (_ALONG,):
+        for along in (_ALONG, np.inf):
             if self._lands(load, which, along):
                 break
             self._go(aloft)
@@ -192,8 +189,7 @@ class Approach:
         if not self._motions.of_any_body()[which].any():
             return
         for contact, jumps in zip(full.contacts, self._felt(which)[1], strict=True):
-            if contact.finite:
-                contact.set_down(_feeling(jumps), released=released)
+            contact.set_down(_feeling(jumps), released=released)
 
     def _follow_stiffness(self) -> None:
         """Take that of a nonlinear bulk which has turned. Collective."""

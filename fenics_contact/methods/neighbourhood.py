@@ -24,7 +24,7 @@ _ROUGHLY = 1e-2
 
 @contextmanager
 def linearised(
-    equations: Equations, springs: Sequence[Array]
+    equations: Equations, springs: Sequence[Array], *, prescribed: Array | None = None
 ) -> Iterator[Callable[[Sequence[Array] | None], Array]]:
     """Solve with the bulk's tangent and given springs on Γc, about the present state.
 
@@ -34,9 +34,11 @@ def linearised(
         equations: At a complete state.
         springs: Stiffness at the points of every contact, (n_points, gdim, gdim) each
             (stress/length).
+        prescribed: By how much prescribed values are still to change, 0 elsewhere, over all
+            unknowns, on which the system has to be (length); None: they have their new values.
 
     Yields:
-        See `ContactProblem.linearised`.
+        See `ContactProblem.linearised`; changes are without ``prescribed``.
     """
     system = equations.system
     right, left = system.vector(), system.vector()
@@ -46,6 +48,10 @@ def linearised(
         right.set(0.0)
         if tractions is None:
             right.array[:] = system.bulk_force() + system.contact_force()
+            if prescribed is not None:
+                assert equations.full.stiffness is not None
+                left.array[:] = prescribed
+                equations.full.stiffness.multAdd(left, right, right)
         else:
             for operator, traction in zip(system.operators, tractions, strict=True):
                 operator.add_force(right, traction)

@@ -17,6 +17,8 @@ from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.verdict import Attempt
 from fenics_contact.contact.accuracy import Accuracy
+from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.values import Status
 from fenics_contact.methods.alternating import Alternation
 from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
@@ -582,6 +584,44 @@ class Solver:
         self.starts.forget()  # the matrix that is about to be used is another one
         self.system.begin(load)
         return linearised(self.equations, springs)
+
+    def end_without(self, contacts: Sequence[Contact], start: Array) -> Array | None:
+        """Where the increment would end, to first order, if contacts did not act. Collective.
+
+        All other points that are closed in ``start`` stick.
+
+        Args:
+            contacts: These.
+            start: The state in which it starts, prescribed values as they were.
+
+        Returns:
+            The state; None where the other contacts do not hold the bodies.
+        """
+        full, present = self._full, self._full.state()
+        moved = None
+        with self.system.acting():
+            try:
+                for contact in contacts:
+                    contact.confine(np.zeros(contact.quadrature.n_points, dtype=np.bool_))
+                if not full.bulk.linear:  # a bulk that conditions have moved into may be inverted
+                    moved = present - start
+                    full.set_state(start)
+                    full.update_stiffness()
+                for contact in full.contacts:
+                    contact.evaluate()
+                if not self.equations.held():
+                    return None
+                closed = [contact.status != Status.OPEN for contact in full.contacts]
+                springs = [c.springs(s, s) for c, s in zip(full.contacts, closed, strict=True)]
+                self.starts.forget()  # the matrix that is about to be used is another one
+                with linearised(self.equations, springs, prescribed=moved) as solve:
+                    return present + solve(None)
+            finally:
+                for contact in contacts:
+                    contact.confine()
+                full.set_state(present)
+                if not full.bulk.linear:
+                    full.update_stiffness()
 
     def respond(self, springs: Sequence[Array], tractions: Sequence[Array]) -> list[Array]:
         """`neighbourhood.respond`, by the matrix factored last. Collective."""

@@ -1,0 +1,222 @@
+"""Slip is counted from first touch, where surfaces begin an increment apart.
+
+The references are the same scenes that begin where the surfaces just touch: what they move along
+each other before that is no slip.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import ufl
+
+import fenics_contact as fc
+from fenics_contact.elasticity import NeoHookean
+from scenes.bodies import Bodies, boxes
+from scenes.comparing import close, gathered
+from scenes.tags import between, near
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+BORE, SURFACE, AXIS = 1, 2, 3
+RADIUS, CLEARANCE = 10.0, 0.05
+LAW = fc.Coulomb(friction=0.3)
+
+
+class Pin:
+    """Half of a hollow pin of steel in a rigid hole, lengths in mm, stresses in MPa.
+
+    Attributes:
+        load: What drives it: a traction in the bore, or a displacement of bore or hole, downwards.
+    """
+
+    def __init__(self, driven, bulk="linear", *, apart=True, **options):
+        """Make it in the middle of the hole, or where it touches below."""
+        axes = [[np.linspace(4.0, RADIUS, 5), np.linspace(0.0, 1.0, 33)]]
+
+        def ends(x, cell):
+            return np.isclose(x[:, 1], 0.0) | np.isclose(x[:, 1], 1.0)
+
+        def bend(x):
+            angle = np.pi * (x[:, 1] - 0.5)
+            return x[:, :1] * np.column_stack([np.cos(angle), np.sin(angle)])
+
+        sides = {BORE: near(0, 4.0), SURFACE: near(0, RADIUS), AXIS: ends}
+        self.bodies = bodies = Bodies(boxes(axes, sides, bend=bend), 210e3, 0.3)
+        if bulk == "rubber":
+            bodies.F = NeoHookean(bodies.u, 210e3, 0.3, "plane strain").residual(bodies.v)
+        self.load, hole = bodies.constant(), bodies.constant((0.0, 0.0))
+        bodies.hold(AXIS, 0)
+        if driven == "load":
+            bodies.F += self.load * bodies.v[1] * bodies.ds(BORE)
+        elif driven == "bore":
+            bodies.hold(BORE, 1, value=self.load)
+        else:
+            bodies.hold(BORE, 1)
+            hole = ufl.as_vector([0.0, self.load])
+        middle = (0.0, 0.0 if apart else CLEARANCE)
+        around = fc.Cylinder(middle, RADIUS + CLEARANCE, inside=True, displacement=hole)
+        self.contact = bodies.contact(SURFACE, around, LAW, **options)
+        self.problem = bodies.problem(self.contact)
+
+    def results(self, start, end, steps):
+        """Normal and tangential force, largest pressure, and what friction took on the way."""
+        took = 0.0
+        for step in fc.increments(self.problem, self.load, start, end, steps=steps, max_cuts=0):
+            took += step.energy.dissipation
+        r = self.contact.resultants()
+        return np.array([r.normal_force, r.tangential_force, r.max_pressure, took])
+
+
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+@pytest.mark.parametrize("driven", ["load", "bore", "hole"])
+def test_a_clearance_is_not_felt(driven, kinematics, enforcement):
+    """Of a pin that is pressed or led into contact, or met by its hole; at once, or bit by bit.
+
+    Reference: it touches below from the start. With finite kinematics that is the same, to what
+    iterations leave; small ones keep the normals of the middle of the hole, which are turned by up
+    to clearance over radius, 0.005: 2 to 5 % of the work, and half of that with half of it. Slip
+    counted from before gave 1.2 to 2.8 times the friction, and took 3 to 16 times the work at once.
+    """
+    tolerance = 1e-5 if kinematics == "finite" else 0.06
+    options = {"kinematics": kinematics, "enforcement": enforcement}
+    down = {"load": 1000.0, "bore": -0.05, "hole": 0.05}[driven]
+    flight = 0.0 if driven == "load" else down
+    for steps in (1, 4):
+        apart = Pin(driven, **options).results(0.0, flight + down, steps * (1 + (flight != 0)))
+        touching = Pin(driven, apart=False, **options).results(0.0, down, steps)
+        assert np.all(np.abs(apart - touching) <= tolerance * np.abs(touching))
+        if flight:  # flight and contact in one increment
+            at_once = Pin(driven, **options).results(0.0, flight + down, 1)
+            if steps == 1:
+                assert np.all(np.abs(at_once - touching) <= tolerance * np.abs(touching))
+
+
+@pytest.mark.parametrize("driven", ["bore", "hole"])
+def test_a_pin_of_rubber_is_led_into_contact(driven):
+    """In one increment, its tangent as it is at the start.
+
+    Reference: as above, to 1 %: what is not linear in the way.
+    """
+    down = {"bore": -0.05, "hole": 0.05}[driven]
+    options = {"bulk": "rubber", "kinematics": "finite"}
+    apart = Pin(driven, **options).results(0.0, 2 * down, 1)
+    touching = Pin(driven, apart=False, **options).results(0.0, down, 1)
+    assert np.all(np.abs(apart - touching) <= 0.01 * np.abs(touching))
+
+
+class Blocks:
+    """A block of the size 1 held above, over another one that is held below, or over a floor."""
+
+    def __init__(self, gap, opposite, *, along=True, **options):
+        """Make them."""
+        lines = np.linspace(0.0, 1.0, 5)
+        under = [np.linspace(-0.5, 1.5, 9), np.linspace(-1.0 - gap, -gap, 5)]
+        sides = {
+            1: between(1, -gap / 2, above=True),
+            2: near(1, 1.0),
+            3: between(1, -gap / 2, above=False),
+            4: near(1, -1.0 - gap),
+        }
+        # What bounds the boxes at the sides has no tag.
+        for tag, height in ((1, 0.0), (3, -gap)):
+            sides[tag] = near(1, height)
+        parts = [[lines, lines], under] if opposite == "body" else [[lines, lines]]
+        if opposite != "body":
+            sides = {tag: sides[tag] for tag in (1, 2)}
+        self.bodies = bodies = Bodies(boxes(parts, sides), 1000.0, 0.3)
+        self.way = [bodies.constant(), bodies.constant()]
+        floor = None
+        if opposite == "body":
+            bodies.hold(4, 0, 1)
+        if opposite == "moved":
+            bodies.hold(2, 0, 1)
+            floor = ufl.as_vector([-self.way[0], -self.way[1]])
+        else:
+            for i, value in enumerate(self.way):
+                bodies.hold(2, i, value=value)
+        support = 3 if opposite == "body" else fc.HalfSpace((0, -gap), (0, 1), displacement=floor)
+        self.contact = bodies.contact(1, support, fc.Coulomb(friction=0.3), **options)
+        self.problem = bodies.problem(self.contact)
+
+    def go(self, along, up):
+        """Lead the upper one to a place, solve and commit: the energy, and the forces."""
+        for constant, value in zip(self.way, (along, up), strict=True):
+            constant.value = value
+        step = self.problem.solve()
+        self.problem.commit()
+        r = self.contact.resultants()
+        return np.array([step.energy.dissipation, *r.force, r.tangential_force])
+
+
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+@pytest.mark.parametrize("opposite", ["body", "floor", "moved"])
+def test_a_way_along_in_the_air_is_no_slip(opposite, kinematics):
+    """Led down and along at once, by a body or its floor; what is slip is a tenth of the way.
+
+    Reference: the way in two increments, of which the first ends at first touch; to 1e-5. All of
+    the way was slip, and friction at its limit.
+    """
+    gap, down, along = 0.09, 0.1, 0.003
+    touch = gap / down
+    found = []
+    for ways in ([(along, -down)], [(touch * along, -gap), (along, -down)]):
+        scene = Blocks(gap, opposite, kinematics=kinematics)
+        found.append([scene.go(*way) for way in ways][-1])
+    assert close(found[0], found[1], 1e-5)
+    assert found[0][3] < 0.25 * found[0][2]  # friction is not at its limit
+
+
+def test_what_is_not_committed_leaves_no_trace():
+    """Reference: the history before, to the bit; and the same forces again."""
+    scene = Blocks(0.09, "floor")
+    before = scene.contact.history.rows()
+    forces = []
+    for _ in range(2):
+        for constant, value in zip(scene.way, (0.003, -0.1), strict=True):
+            constant.value = value
+        scene.problem.solve()
+        forces.append(scene.contact.resultants().force)
+        assert np.array_equal(scene.contact.committed().history, before)
+        scene.problem.restore()
+        assert np.array_equal(scene.contact.history.rows(), before)
+    assert close(forces[1], forces[0], 1e-9)
+
+
+def test_an_unrelated_contact_counts_by_itself():
+    """Of two blocks led down at once one touches at a third of the way, and one at nine tenths.
+
+    Reference: each block alone, its slip vector to 1e-9 of the way.
+    """
+
+    def slips(gaps):
+        lines = np.linspace(0.0, 1.0, 3)
+        sides, parts = {}, []
+        for n, gap in enumerate(gaps):
+            parts.append([3.0 * gap * 10 + lines, lines + gap])
+
+            def low(x, cell, n=n, gap=gap):
+                return np.isclose(x[:, 1], gap) & (np.abs(x[:, 0] - 30.0 * gap - 0.5) < 0.6)
+
+            def high(x, cell, n=n, gap=gap):
+                return np.isclose(x[:, 1], gap + 1.0) & (np.abs(x[:, 0] - 30.0 * gap - 0.5) < 0.6)
+
+            sides |= {1 + 2 * n: low, 2 + 2 * n: high}
+        bodies = Bodies(boxes(parts, sides), 1000.0, 0.3)
+        way, contacts = [bodies.constant(0.01), bodies.constant(-0.1)], []
+        for n in range(len(gaps)):
+            for i, value in enumerate(way):
+                bodies.hold(2 + 2 * n, i, value=value)
+            floor = fc.HalfSpace((0, 0), (0, 1))
+            contacts.append(bodies.contact(1 + 2 * n, floor, LAW, name=f"contact {n}"))
+        bodies.problem(*contacts).solve()
+        comm = bodies.mesh.comm
+        return [
+            np.sort(gathered(comm, np.column_stack([c.values.increment[:, 0]])).ravel())
+            for c in contacts
+        ]
+
+    both = slips([0.03, 0.09])
+    for n, gap in enumerate((0.03, 0.09)):
+        assert np.abs(both[n] - slips([gap])[0]).max() < 1e-9 * 0.01
+        assert both[n].max() < 0.011 * (1 - gap / 0.1)
