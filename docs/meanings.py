@@ -211,8 +211,8 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "between "
             'bodies `update="increment"`.',
         ),
-        "times as large as the mesh": (
-            "A displacement is that of a body which nothing holds.",
+        "times its size: nothing holds": (
+            "A body is deformed as none that has stiffness is.",
             "Dirichlet conditions; units of stiffness and loads.",
         ),
         "is thrown out: it has gone": (

@@ -219,12 +219,13 @@ class ContactProblem:
         self.motions = RigidMotions(
             self.displacement,
             self.unknowns,
+            self.full.scales,
             [f"{m.kind} {m.way} of the support of {name}" for name, m in supports],
             turning=[motion.turns for _, motion in supports],
         )
-        self.initial_penetration = check_start(self.contacts, self.motions.size)
-        self.motions.find_free(self.full.stiffness, self.constrained)
-        self.motions.check_held(self.operators)
+        self.initial_penetration = check_start(self.contacts, self.full.scales.mesh_size)
+        self._find_free_motions()
+        self.full.scales.begin(self.operators)
         self._judge = Judge(
             self.full, self.motions, kinematics=kinematics, second_route=second_route
         )
@@ -244,9 +245,22 @@ class ContactProblem:
         self._fresh = True  # nothing was solved yet
         self._told = False  # of an increment that was not committed
 
+    def _find_free_motions(self) -> None:
+        """Find the rigid motions that are free with the present data of F. Collective.
+
+        Raises:
+            ValueError: Nothing will ever hold one of them.
+        """
+        with self.full.stiffness_at_rest() as stiffness:
+            self.full.scales.measure_stiffness(stiffness)
+            self.motions.find_free(stiffness, self.constrained)
+        self.motions.check_held(self.operators)
+        self.bulk.note_data()
+
     def _unloaded(self) -> _Balance:
         """That of a body at rest."""
-        forces: dict[object, Forces] = {self.full.mark: Forces.none(self._committed)}
+        nothing = Forces.none(self._committed, self.full.label)
+        forces: dict[object, Forces] = {self.full.mark: nothing}
         load: Array = np.zeros(self.unknowns.n_local)
         return _Balance(load, EnergyState.unloaded(forces, self.contacts))
 
@@ -452,9 +466,9 @@ class ContactProblem:
         if solver.chooses():
             return None
         solver.update_system(stiffness_changed)
-        self.full.farthest = solver.system.farthest = self._judge.begin()
+        self.full.scales.begin(self.operators)
         solver.system.begin(load)
-        solver.equations.began = self._committed if cold else None
+        solver.equations.began = self._committed
         led = np.where(self.constrained, before, self.full.state())
         self._first_touch.count_slip(led, solver.end_without)
         solver.starts.carried = self._approach.carried
@@ -489,7 +503,7 @@ class ContactProblem:
         self._now = _Balance(load, energies, pending)
         if reason <= 0 or verdict.failures:
             raise self._not_converged(reason, verdict, tried)
-        energy = energies.since(self._then.energy, self.contacts, self._comm)
+        energy = energies.since(self._then.energy, self.contacts, self.full.scales)
         verdict = replace(verdict, created=energy.created)
         if verdict.failures:
             raise self._not_converged(reason, verdict, tried)
@@ -536,7 +550,7 @@ class ContactProblem:
 
     def _begin_energy_kept(self) -> None:
         """Have the committed forces in the coordinates of the unknowns kept; at rest are none."""
-        nothing = Forces.none(np.zeros(1))
+        nothing = Forces.none(np.zeros(1), np.zeros(1, dtype=np.intp))
         self._then.energy.forces.setdefault(self.solver.system.mark, nothing)
 
     def complete(self) -> Verdict | None:
@@ -610,6 +624,8 @@ class ContactProblem:
                 "infinite at ν = 0.5)"
             )
         check_values(self._bcs, self.u)
+        if self.bulk.has_new_data():
+            self._find_free_motions()
         if self.bulk.linear:
             self.motions.check_balance(load, self.operators)
         return load
@@ -793,7 +809,7 @@ class ContactProblem:
             self.contacts, points, taken.pairs_anew, strict=True
         ):
             contact.take_up(history, values, anew=anew)
-        found = Forces(taken.state, taken.internal, taken.external)
+        found = Forces(taken.state, taken.internal, taken.external, self.full.label)
         forces: dict[object, Forces] = {self.full.mark: found}
         energy = EnergyState.at(forces, self.contacts)
         energy = energy.between([c.opposite.committed_jump for c in self.contacts])

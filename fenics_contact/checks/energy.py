@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 
 from fenics_contact.contact.contact import Contact
-from fenics_contact.parallel import global_sum
 from fenics_contact.systems.forces import Forces
-from fenics_contact.types import Array
+from fenics_contact.systems.reference_scales import ReferenceScales
+from fenics_contact.types import Array, Index
 
 __all__ = ["Energy", "EnergyState"]
 
@@ -46,6 +45,9 @@ class Energy:
             at both ends, up to the solver's tolerance. Not between bodies with finite kinematics,
             whose points have other partners at both ends: what they felt of the one before is not
             what the force on it does. It gets less with smaller increments.
+        created: Share of the energy exchanged that friction has given instead of taken, the largest
+            of the groups of bodies between which forces pass; 0 if none. Where a sliding body is
+            turned round in one increment works cancel: then by what friction takes each way.
     """
 
     work: float
@@ -56,17 +58,7 @@ class Energy:
     friction: float
     sliding: float
     imbalance: float
-
-    @property
-    def created(self) -> float:
-        """Share of the energy exchanged that friction has given instead of taken, 0 if none.
-
-        Where a sliding body is turned round in one increment works cancel: then by what friction
-        takes each way.
-        """
-        exchanged = abs(self.work) + abs(self.elastic) + abs(self.springs)
-        scale = max(exchanged, self.sliding)
-        return self.friction / scale if self.friction > 0 and scale > 0 else 0.0
+    created: float
 
 
 @dataclass(frozen=True)
@@ -80,22 +72,23 @@ class EnergyState:
             the support turns, the displacement relative to it in its frame, that of the body less
             the free motion of the support, and the axes of the frame: (3 + gdim, n_points, gdim).
             Where a moment turns it two more: `Contact.turning_rate`, and the angle.
-        springs: Energy in the contact's springs on this rank.
+        springs: Of each contact the energy in the springs at the points, (n_points,).
     """
 
     forces: dict[Any, Forces]
     contacts: list[Array]
-    springs: float
+    springs: list[Array]
 
     @classmethod
     def unloaded(cls, forces: dict[Any, Forces], contacts: Sequence[Contact]) -> EnergyState:
         """No forces on Γc."""
-        return cls(forces, [_ways(c, 0 * c.points) for c in contacts], 0.0)
+        springs: list[Array] = [np.zeros(len(c.points)) for c in contacts]
+        return cls(forces, [_ways(c, 0 * c.points) for c in contacts], springs)
 
     @classmethod
     def at(cls, forces: dict[Any, Forces], contacts: Sequence[Contact]) -> EnergyState:
         """The state that ``contacts`` have evaluated."""
-        springs = sum(float(c.measure @ c.values.stored) for c in contacts)
+        springs = [np.asarray(c.measure * c.values.stored) for c in contacts]
         return cls(forces, [_ways(c, c.traction) for c in contacts], springs)
 
     def between(self, jumps: Sequence[Array]) -> EnergyState:
@@ -105,18 +98,31 @@ class EnergyState:
         ]
         return dataclasses.replace(self, contacts=ways)
 
-    def since(self, before: EnergyState, contacts: Sequence[Contact], comm: MPI.Comm) -> Energy:
+    def since(
+        self, before: EnergyState, contacts: Sequence[Contact], scales: ReferenceScales
+    ) -> Energy:
         """Energies on the way from ``before`` to here, in coordinates both have. Collective."""
         mark = next(mark for mark in self.forces if mark in before.forces)
         old, new = before.forces[mark], self.forces[mark]
         way = new.unknowns - old.unknowns
-        # Work, elastic, springs, dissipation, work of the tractions, that of friction, its size.
-        sums = np.zeros(8)
-        sums[7] = np.abs(new.internal * new.unknowns).sum() + self.springs
-        sums[0] = 0.5 * (old.external + new.external) @ way
-        sums[1] = 0.5 * (old.internal + new.internal) @ way
-        sums[2] = self.springs - before.springs
-        for contact, there, here in zip(contacts, before.contacts, self.contacts, strict=True):
+        groups = scales.group[new.label]
+        # Work, elastic, springs, dissipation, work of the tractions, that of friction, its size,
+        # and the level of all: by group.
+        sums: Array = np.zeros((8, scales.n_groups))
+
+        def add(row: int, values: Array, groups: Index) -> None:
+            sums[row] += np.bincount(groups, values, minlength=scales.n_groups)
+
+        add(7, np.abs(new.internal * new.unknowns), groups)
+        add(0, 0.5 * (old.external + new.external) * way, groups)
+        add(1, 0.5 * (old.internal + new.internal) * way, groups)
+        states = zip(
+            contacts, before.contacts, self.contacts, before.springs, self.springs, strict=True
+        )
+        for number, (contact, there, here, had, has) in enumerate(states):
+            groups = scales.group_of_points(number)
+            add(7, has, groups)
+            add(2, has - had, groups)
             mean = contact.measure[:, None] * 0.5 * (there[0] + here[0])
             relative, carried = here[1] - there[1], here[2] - there[2]
             if contact.opposite.turns:
@@ -129,26 +135,38 @@ class EnergyState:
                     # The work of the moment is that of the loads, too.
                     turned = here[-1] - there[-1]
                     moments = 0.5 * (there[0] * there[-2] + here[0] * here[-2])
-                    sums[0] -= np.sum(contact.measure[:, None] * moments * turned)
-            sums[0] += np.sum(mean * carried)
-            sums[4] -= np.sum(mean * relative)
+                    add(0, -contact.measure * np.sum(moments * turned, axis=1), groups)
+            add(0, _dot(mean, carried), groups)
+            add(4, -_dot(mean, relative), groups)
             if contact.law.has_friction:
-                sums[3] += contact.measure @ contact.values.dissipated
+                add(3, contact.measure * contact.values.dissipated, groups)
                 # Tractions before are those of the commit, not multipliers in their place.
                 slip, normal = contact.slip_vector(), contact.values.normal
                 weight, length = 0.5 * contact.measure, np.sqrt(_dot(slip, slip))
                 first = contact.values.carried_traction if contact.finite else there[0]
                 for traction in (first, here[0]):
                     side = traction - _dot(traction, normal)[:, None] * normal
-                    sums[5] += weight @ _dot(side, slip)
-                    sums[6] += weight @ (np.sqrt(_dot(side, side)) * length)
-        total = (float(v) for v in global_sum(comm, sums))
-        work, elastic, springs, dissipation, tractions, friction, sliding, level = total
-        if abs(friction) <= _NOTHING * level:  # nothing has slipped but what the solver leaves
-            friction = 0.0
-        remainder = work - elastic - springs - dissipation
-        imbalance = work - elastic - tractions
-        return Energy(work, elastic, springs, dissipation, remainder, friction, sliding, imbalance)
+                    add(5, weight * _dot(side, slip), groups)
+                    add(6, weight * (np.sqrt(_dot(side, side)) * length), groups)
+        sums = scales.global_sum(sums)
+        # Nothing has slipped but what the solver leaves.
+        sums[5, np.abs(sums[5]) <= _NOTHING * sums[7]] = 0.0
+        work, elastic, springs, dissipation, tractions, friction, sliding, _ = map(
+            float, sums.sum(axis=1)
+        )
+        exchanged = np.maximum(np.abs(sums[:3]).sum(axis=0), sums[6])
+        gives = (sums[5] > 0) & (exchanged > 0)
+        return Energy(
+            work=work,
+            elastic=elastic,
+            springs=springs,
+            dissipation=dissipation,
+            remainder=work - elastic - springs - dissipation,
+            friction=friction,
+            sliding=sliding,
+            imbalance=work - elastic - tractions,
+            created=float((sums[5, gives] / exchanged[gives]).max(initial=0.0)),
+        )
 
 
 def _ways(contact: Contact, traction: Array) -> Array:

@@ -15,7 +15,7 @@ from fenics_contact.checks.second_route import SecondRoute
 from fenics_contact.checks.strays import strays
 from fenics_contact.checks.tunnelling import TunnellingCheck
 from fenics_contact.checks.verdict import Balance, Verdict, check_laws
-from fenics_contact.parallel import global_sum, longest, warn
+from fenics_contact.parallel import global_sum, warn
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.system import System
@@ -29,9 +29,6 @@ Respond = Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]]
 
 # Growth of what small displacements leave out from which on it is said again.
 _AGAIN = 2.0
-# Displacements beyond this many sizes of the mesh excuse no round-off: a body that nothing loads
-# may go anywhere, and then anything would pass.
-_FARTHEST = 10.0
 
 
 class Judge:
@@ -56,28 +53,16 @@ class Judge:
         self._full, self._motions = full, motions
         self._second_route = SecondRoute(full.contacts) if second_route else None
         self._contacts, self._comm = full.contacts, full.unknowns.comm
-        self._imposed = motions.size
         self._tunnelling = TunnellingCheck(full.contacts)
         self._warned: dict[str, float] = {}
         self._few: set[tuple[str, str]] = set()
         space = full.displacement.u.function_space
         gdim = space.mesh.geometry.dim
         n_nodes = space.dofmap.index_map.size_global
-        self._cell_size = motions.size / n_nodes ** (1 / gdim)
-
-    def begin(self) -> float:
-        """Take the motions and gaps that are imposed in this increment. Collective.
-
-        Returns:
-            Largest displacement whose round-off counts (length).
-        """
-        imposed = [self._full.state()[self._full.constrained]]
-        for contact in self._contacts:
-            data = contact.opposite.data.values
-            imposed += [data["shift"], data["initial_gap"]]
-        largest = (longest(self._comm, v) for v in imposed)
-        self._imposed = max(self._motions.size, *largest)
-        return _FARTHEST * self._imposed
+        products = np.einsum("bmi,bni->bmn", motions.of_bodies, motions.of_bodies)
+        # A body of one node has no rotations.
+        self._inverse = np.linalg.pinv(global_sum(self._comm, products), hermitian=True)
+        self._cell_size = full.scales.mesh_size / n_nodes ** (1 / gdim)
 
     def judge(
         self,
@@ -85,7 +70,7 @@ class Judge:
         bulk: Array,
         *,
         start: Array,
-        began: Array | None,
+        began: Array,
         rtol: float,
         laws: bool = True,
         respond: Respond | None = None,
@@ -97,7 +82,7 @@ class Judge:
             system: The unknowns on which the residual is looked at.
             bulk: Residual of the bulk on these.
             start: Norms of `System.terms` where the increment began, (n_bodies,).
-            began: The state in which the increment began; None: something was borne in it.
+            began: The state in which the increment began.
             rtol: Residual that passes, as a share of the forces.
             laws: Whether to check the laws, too. If not, tractions are those evaluated last,
                 whatever has become of the laws' data since.
@@ -132,7 +117,7 @@ class Judge:
             tunnelling=self._tunnelling.evaluate(before) if system is self._full else {},
             kinematics=self._linearisation(respond) if respond else {},
             kinematics_allowed=self.kinematics,
-            displacement=self._largest_displacement() / self._imposed,
+            deformation=self._deformation(),
             strays=strays(self._full, self._motions, contacts, began)
             if laws and system is self._full
             else {},
@@ -160,17 +145,29 @@ class Judge:
                 if told not in self._few and say(contact):
                     self._few.add(told)
 
-    def _largest_displacement(self) -> float:
-        """Of the body, of all of its nodes (length). Collective."""
-        u = self._full.displacement.u
-        return longest(self._comm, u.x.array.reshape(-1, u.function_space.dofmap.bs))
-
     def _linearisation(self, respond: Respond) -> dict[str, Linearisation]:
         """What taking displacements as small changes at this state, by contact. Collective."""
         if not self._contacts:
             return {}
-        modulus = self._full.bulk.scale * self._cell_size ** (2 - self._full.gdim)
-        return linearisation(self._contacts, modulus, respond)
+        moduli = [self._full.scales.modulus(i) for i in range(len(self._contacts))]
+        return linearisation(self._contacts, moduli, respond)
+
+    def _deformation(self) -> dict[str, float]:
+        """Largest displacement of every body but for its rigid motion, by its size. Collective.
+
+        By what is prescribed, where Dirichlet values of the body differ by more than its size.
+        """
+        full, scales, motions = self._full, self._full.scales, self._motions.of_bodies
+        state = full.state()
+        rigid = np.einsum("bmn,bn->bm", self._inverse, global_sum(self._comm, motions @ state))
+        moves = np.any(motions != 0.0, axis=(0, 1))
+        rest = scales.largest(np.where(moves, state - np.einsum("bm,bmi->i", rigid, motions), 0.0))
+        spread: Array = np.zeros(len(motions))
+        for along in np.swapaxes(motions[:, : full.gdim], 0, 1):
+            held = np.any(along != 0.0, axis=0) & full.constrained
+            spread = np.maximum(spread, scales.spread(state, held))
+        found = rest / np.maximum(scales.size, spread)
+        return dict(zip(full.parts.names, found.tolist(), strict=False))
 
     def _force_sums(
         self, system: System, internal: Array, forces: Sequence[Array]

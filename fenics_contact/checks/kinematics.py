@@ -223,20 +223,21 @@ def _moves(contact: Contact) -> bool:
 
 def linearisation(
     contacts: Sequence[Contact],
-    modulus: float,
+    moduli: Sequence[float],
     respond: Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]],
 ) -> dict[str, Linearisation]:
     """What the linearised kinematics change in every contact, by name. Collective.
 
     Args:
         contacts: Evaluated contacts, at a solution.
-        modulus: Of the bulk, about (stress): to see whether there is anything to solve for.
+        moduli: Of every contact that of its bodies, about (stress): to see whether there is
+            anything to solve for.
         respond: The change of the relative displacements at the points of every contact, with
             springs there, by tractions that are added on the bodies.
     """
     deviations = [Deviation.of(c) for c in contacts]
     matters = False
-    for contact, deviation in zip(contacts, deviations, strict=True):
+    for contact, deviation, modulus in zip(contacts, deviations, moduli, strict=True):
         comm, measure = contact.surface.mesh.comm, contact.measure
         d = contact.points.shape[1]
         sums = global_sum(comm, [measure @ (contact.pressure > 0), measure.sum()])

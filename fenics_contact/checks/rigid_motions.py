@@ -12,7 +12,6 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.linalg
 import scipy.optimize
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact import compat
@@ -24,6 +23,7 @@ from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_cells
 from fenics_contact.systems.modes import rigid_motions
 from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array, Index, Mask
 
@@ -50,7 +50,6 @@ class RigidMotions:
 
     Attributes:
         comm: The ranks.
-        size: Diagonal of the mesh's bounding box (length).
         names: Name of every motion, those of the bodies first.
         turns: Which of these turn a body, and the size of it by which the angle has to be
             multiplied to be one of order one (length); 0 for the others.
@@ -64,6 +63,7 @@ class RigidMotions:
         self,
         displacement: Displacement,
         unknowns: Unknowns,
+        scales: ReferenceScales,
         supports: Sequence[str] = (),
         *,
         turning: Sequence[bool] = (),
@@ -73,7 +73,8 @@ class RigidMotions:
         Args:
             displacement: What moves.
             unknowns: The dofs and the free motions of supports, each a rigid motion of its own.
-            supports: Names of the latter.
+            scales: Reference scales of the bodies.
+            supports: Names of the free motions of supports.
             turning: Which of them are rotations, whose arms change with the state.
         """
         space = displacement.u.function_space
@@ -82,16 +83,8 @@ class RigidMotions:
         n_owned = space.dofmap.index_map.size_local
         x = space.tabulate_dof_coordinates()[:n_owned, :gdim]
         n_bodies, self._body = connected_bodies(space)
-        body = self._body[:n_owned]
-        low, high = np.full((n_bodies, gdim), np.inf), np.full((n_bodies, gdim), -np.inf)
-        for b in np.unique(body):
-            mine = x[body == b] if n_bodies > 1 else x
-            low[b], high[b] = mine.min(axis=0), mine.max(axis=0)
-        self.comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-        self.comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
-        self.size = float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
-        self._space, self._centres = space, (low + high) / 2
-        self._sizes = np.linalg.norm(high - low, axis=1)
+        self._space, self._scales = space, scales
+        self._centres, self._sizes = scales.centre, scales.size
         self._displacement, self._unknowns, self._x = displacement, unknowns, x
         self.names: list[str] = []
         turns: list[float] = []
@@ -140,19 +133,22 @@ class RigidMotions:
     def find_free(self, stiffness: PETSc.Mat, constrained: Mask) -> None:
         """Find the motions with no bulk energy that no Dirichlet condition holds. Collective.
 
+        The energy of each is relative to the stiffness of the body that it moves.
+
         Args:
             stiffness: Bulk tangent without conditions.
             constrained: Mask over this rank's unknowns.
         """
-        diagonal = stiffness.getDiagonal()
-        top = diagonal.norm(PETSc.NormType.NORM_INFINITY)
+        # Motions of supports have no bulk energy.
+        stiffest = np.append(self._scales.stiffness, np.ones(len(self._of_supports)))
+        stiffest = stiffest[self._scales.label]
         gram = np.zeros((2, len(self._modes), len(self._modes)))
         work, image = stiffness.createVecs()
         for j, mode in enumerate(self._modes):
             work.array[:] = mode
             stiffness.mult(work, image)
             held = np.where(constrained, mode, 0.0)
-            gram[0, :, j] = self._modes @ (image.array / top + held)
+            gram[0, :, j] = self._modes @ (image.array / stiffest + held)
             gram[1, :, j] = self._modes @ mode
         energy, mass = global_sum(self.comm, gram)
         scale = 1 / np.sqrt(np.diag(mass))
@@ -164,7 +160,7 @@ class RigidMotions:
         self._free_sizes = np.abs(self._free_fields)
         self._balanced = []
         self._holding = []
-        for vector in (diagonal, work, image):
+        for vector in (work, image):
             vector.destroy()
 
     def at_points(self, operator: ContactOperator) -> Array:
@@ -376,6 +372,8 @@ class RigidMotions:
     ) -> Array:
         """What no contact feels of some free motions, (n_loose, n_rows). Collective.
 
+        Their jumps are squared and relative to the area of Γc that belongs to the bodies they move.
+
         Args:
             operators: Of evaluated contacts, over all unknowns.
             rows: Numbers of the free motions to look at.
@@ -383,7 +381,9 @@ class RigidMotions:
             slips: Whether those that slip feel no motion along their friction.
         """
         n_free = len(rows)
-        gram, area = np.zeros((n_free, n_free)), 0.0
+        gram: Array = np.zeros((n_free, n_free))
+        area: Array = np.zeros(n_free)
+        together = self.together()[np.ix_(rows, rows)].astype(np.float64)
         for operator in operators:
             contact, values = operator.contact, operator.contact.values
             modes = self.at_points(operator)[rows]
@@ -391,16 +391,18 @@ class RigidMotions:
             weights = contact.quadrature.weights
             if closed_only:
                 weights = weights * (contact.status != Status.OPEN)
-            area += contact.quadrature.weights.sum()
+            felt = np.abs(modes).max(axis=2, initial=0.0) > _FELT
+            area += ((together @ felt) > 0) @ contact.quadrature.weights
             if contact.law.has_normal_stiffness:
                 gram += (along * weights) @ along.T
             if slips:
                 way = _slip(contact)
                 modes = modes - np.einsum("mqd,qd->mq", modes, way)[:, :, None] * way
             gram += rubbing(contact, modes, weights)
-        mean = global_sum(self.comm, gram) / max(float(global_sum(self.comm, area)), 1e-300)
-        sizes, vectors = np.linalg.eigh(mean)
-        return agreed(self.comm, vectors[:, sizes < _FELT].T)
+        gram, area = global_sum(self.comm, gram), global_sum(self.comm, area)
+        scale = 1 / np.sqrt(np.where(area > 0, area, 1.0))
+        sizes, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
+        return agreed(self.comm, (vectors * scale[:, None])[:, sizes < _FELT].T)
 
     def _straight(self) -> Index:
         """Numbers of the free motions but for those by which supports turn."""

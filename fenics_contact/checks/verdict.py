@@ -25,8 +25,9 @@ _ROUND_OFF = 16 * np.finfo(float).eps / _LAW_TOLERANCE
 # ends it does so where slip turns round within a long increment (6 % where a load aside is
 # reversed at once); in a state that smaller increments do not lead to it is half or more.
 _CREATED = 0.25
-# A displacement by the size of the mesh that is none of a body that anything holds.
-_FARTHEST = 10.0
+# A displacement by the size of the body, rigid motion apart, that no body with stiffness has: half
+# of what its ends move apart.
+_MOST_DEFORMED = 5.0
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,10 @@ class Verdict:
         tunnelling: Penetration that the points of a contact do not resist, and places that have
             crossed what lies opposite, by contact; see `Tunnelling`.
         kinematics: What taking displacements as small changes, relative, by contact.
-        kinematics_allowed: What passes; where it is finite no displacement passes that is more than
-            ten times as large as the mesh, and as the motions and gaps that are imposed.
-        displacement: The largest one, relative to these.
+        kinematics_allowed: What passes; where it is finite no body passes that is deformed by more
+            than five times its size.
+        deformation: Of every body its largest displacement, rigid motion apart, by its size, or by
+            how far its Dirichlet values differ, if that is more.
         strays: Bodies that nothing touches any more, how far they have gone, and how far anything
             else has (length), by their names; see `strays`.
         created: Share of the energy exchanged that friction has given; see `Energy.created`.
@@ -102,7 +104,7 @@ class Verdict:
     tunnelling: dict[str, Tunnelling] = field(default_factory=dict)
     kinematics: dict[str, Linearisation] = field(default_factory=dict)
     kinematics_allowed: float = np.inf
-    displacement: float = 0.0
+    deformation: dict[str, float] = field(default_factory=dict)
     strays: dict[str, tuple[float, float]] = field(default_factory=dict)
     created: float = 0.0
     inverted: bool = False
@@ -228,11 +230,13 @@ class Verdict:
                     "load in smaller steps, describe the motion as one of the support, find pairs "
                     'anew (update="increment"), or accept it: ContactProblem(kinematics=inf)'
                 )
-        if not (self.displacement <= _FARTHEST or self.kinematics_allowed == np.inf):
+        for name, deformation in self.deformation.items():
+            if self.kinematics_allowed == np.inf or deformation <= _MOST_DEFORMED:
+                continue
             found.append(
-                f"a displacement is {self.displacement:.2g} times as large as the mesh: nothing "
-                "holds a body there, or stiffness and loads are in other units than lengths; or "
-                "accept it: ContactProblem(kinematics=inf)"
+                f"{name} is deformed by {deformation:.2g} times its size: nothing holds a part of "
+                "it, or stiffness and loads are in other units than lengths; or accept it: "
+                "ContactProblem(kinematics=inf)"
             )
         for name, (way, others) in self.strays.items():
             found.append(

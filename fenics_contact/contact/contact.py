@@ -567,10 +567,11 @@ class Contact(PointResults):
         """What the springs bear at the last evaluated state, relative: 0 if exact. Collective.
 
         The largest |Π p - λ_n| and |Π τ - λ_t| over the points, by the largest pressure or
-        traction: what another round would change. k_n times the penetration is that, and k_t times
-        the elastic slip, as far as displacements of Γc can undo them. Infinite where nothing is
-        borne any more and multipliers are left. Where multipliers grow from round to round, and
-        springs bear what they did, it is relative to the tractions of the first round.
+        traction of the same connected part of Γc, and of all parts the largest: what another round
+        would change. k_n times the penetration is that, and k_t times the elastic slip, as far as
+        displacements of Γc can undo them. Infinite where nothing is borne any more and multipliers
+        are left. Where multipliers grow from round to round, and springs bear what they did, it is
+        relative to the tractions of the first round.
 
         Raises:
             ValueError: There are no multipliers.

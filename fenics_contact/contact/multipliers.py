@@ -19,18 +19,20 @@ falls with the mesh as the rest of the error does.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import numpy as np
 from dolfinx import fem
+from mpi4py import MPI
 
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law
 from fenics_contact.parallel import global_max, global_sum
+from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.mass import mass_solver
 from fenics_contact.surface.surface import SurfaceQuadrature
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Index
 
 __all__ = ["Multipliers", "TraceProjection"]
 
@@ -92,16 +94,15 @@ class TraceProjection:
 
 
 class _Acceleration:
-    """Anderson's, of a sequence in which each array is made from the one before.
+    """Anderson's, of a sequence in which each array is made from the one before, on a part of Γc.
 
     The next is the combination of those made, the coefficients adding up to 1, whose rests (what a
     round changes) combined that way are least in the mean square over Γc. A rest that is larger
     than the one before, as where points have changed their status, begins a new sequence.
     """
 
-    def __init__(self, quadrature: SurfaceQuadrature) -> None:
-        self._comm = quadrature.surface.mesh.comm
-        self._weights = quadrature.weights
+    def __init__(self, comm: MPI.Comm, weights: Array) -> None:
+        self._comm, self._weights = comm, weights
         self._last: tuple[Array, Array] | None = None
         self._size = np.inf
         self._steps: list[tuple[Array, Array]] = []
@@ -116,6 +117,9 @@ class _Acceleration:
         Args:
             given: What the round began with, (n_points, n).
             made: What came of it, the same shape.
+
+        Returns:
+            It, the same shape.
         """
         rest = made - given
         size = float(self._product(rest, rest))
@@ -167,8 +171,14 @@ class Multipliers:
         self.fields = PointFields(quadrature, {"pressure": 0} | dict.fromkeys(self._vectors, gdim))
         self.as_displacement = degree == 1
         self._project = TraceProjection(quadrature, degree)
-        self._accelerated = _Acceleration(quadrature)
-        self._first: tuple[float, float] | None = None  # change and tractions of the first round
+        # By connected part of Γc: one of them may bear a millionth of another.
+        self._patch, self._n_patches = _patches(quadrature)
+        self._accelerated = [
+            _Acceleration(self._comm, np.where(self._patch == i, quadrature.weights, 0.0))
+            for i in range(self._n_patches)
+        ]
+        # Of every part, change and tractions of the first round; NaN: there was none yet.
+        self._first: Array = np.full((2, self._n_patches), np.nan)
         self._left_out: Array | None = None  # of the next change of λ_t
 
     def _next(self, values: PointValues) -> dict[str, Array]:
@@ -210,29 +220,40 @@ class Multipliers:
         found = self._next(values)
         names = [n for n in ("normal_traction", "traction") if n in history]
 
-        def largest(of: Callable[[str], Array], names: Iterable[str]) -> float:
-            return max(global_max(self._comm, np.abs(of(n))) for n in names)
+        def largest(rows: Iterable[Array]) -> Array:
+            return np.max([self._largest(row) for row in rows], axis=0, initial=0.0)
 
-        change = largest(lambda n: found[n] - self.fields.values(n), found)
+        change = largest(found[n] - self.fields.values(n) for n in found)
         # By the tractions of this increment: those before it leave round-off and no more.
-        scale = largest(lambda n: values.arrays[n], names)
-        before = largest(history.values, names)
+        scale = largest(values.arrays[n] for n in names)
+        before = largest(history.values(n) for n in names)
         # Displacements have round-off however little is borne, and springs make a traction of it.
         springs = [values.parameters[n] for n in sorted({"k_n", "k_t"} & set(values.parameters))]
-        noise = max(
-            (float(_BLUR * global_max(self._comm, k * moved)) for k in springs), default=0.0
-        )
-        if scale > noise:
-            if change > 0:
-                self._first = self._first or (change, scale)
-            # What springs bear may be lost in the round-off of multipliers that have grown so far.
-            left = max(change, _LOST * scale)
-            first = self._first or (left, scale)
-            if scale > _GROWN * first[1] and left > _FALLEN * first[0]:
-                return left / first[1]
-        if change <= max(_ROUND_OFF * max(scale, before), noise):
-            return 0.0
-        return change / scale if scale > 0 else np.inf
+        noise = _BLUR * largest(k * moved for k in springs)
+        bears = scale > noise
+        begins = bears & (change > 0) & np.isnan(self._first[0])
+        self._first = np.where(begins, [change, scale], self._first)
+        # What springs bear may be lost in the round-off of multipliers that have grown so far.
+        left = np.maximum(change, _LOST * scale)
+        first = np.where(np.isnan(self._first), [left, scale], self._first)
+        grown = bears & (scale > _GROWN * first[1]) & (left > _FALLEN * first[0])
+        nothing = change <= np.maximum(_ROUND_OFF * np.maximum(scale, before), noise)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative = np.where(nothing, 0.0, change / scale)
+            error = np.where(grown, left / first[1], relative)
+        return float(error.max())
+
+    def _largest(self, values: Array) -> Array:
+        """Largest absolute value on every connected part of Γc, (n_patches,). Collective.
+
+        Args:
+            values: (n_points,) or (n_points, n).
+        """
+        sizes = np.abs(values) if values.ndim == 1 else np.abs(values).max(axis=1, initial=0.0)
+        found: Array = np.zeros(self._n_patches)
+        np.maximum.at(found, self._patch, sizes)
+        self._comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
+        return found
 
     def shrink(self, share: float) -> None:
         """Begin the rounds with a share of λ_n; λ_t, which friction has come to, stays."""
@@ -243,7 +264,9 @@ class Multipliers:
         """Make the tractions of an evaluated contact the multipliers, and go on. Collective."""
         found = self._next(values)
         given = np.column_stack([self.fields.values(name) for name in found])
-        rows = self._accelerated(given, np.column_stack(list(found.values())))
+        rows = made = np.column_stack(list(found.values()))
+        for i, accelerated in enumerate(self._accelerated):
+            rows = np.where((self._patch == i)[:, None], accelerated(given, made), rows)
         self.fields.commit(
             {"pressure": rows[:, 0], "traction": rows[:, 1:], "normal": values.framed_normal}
         )
@@ -268,7 +291,24 @@ class Multipliers:
 
     def restore(self, history: PointFields) -> None:
         """Take those of the last commit. Collective."""
-        self._accelerated.begin()
-        self._first = self._left_out = None
+        for accelerated in self._accelerated:
+            accelerated.begin()
+        self._first[:] = np.nan
+        self._left_out = None
         values = {"pressure": history.values("multiplier")}
         self.fields.commit(values | {name: history.values(name) for name in self._vectors})
+
+
+def _patches(quadrature: SurfaceQuadrature) -> tuple[Index, int]:
+    """The connected part of Γc that each of this rank's points is on, and their number. Collective.
+
+    Returns:
+        Numbers from 0, (n_points,), and how many there are.
+    """
+    space = fem.functionspace(quadrature.surface.submesh, ("Lagrange", 1))
+    n_patches, of_node = connected_bodies(space)
+    rows = quadrature.point_rows()
+    cells = np.argsort(quadrature.surface.parent_facets())
+    patch = np.zeros(quadrature.n_points, dtype=np.intp)
+    patch[rows.ravel()] = np.repeat(of_node[space.dofmap.list[cells, 0]], rows.shape[1])
+    return patch, n_patches

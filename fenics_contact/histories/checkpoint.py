@@ -230,7 +230,7 @@ def check_places(problem: ContactProblem) -> None:
     if problem in _told_apart:
         return
     comm = problem.u.function_space.mesh.comm
-    shared = n_shared(comm, node_places(parts_of(problem)[0].space), problem.motions.size)
+    shared = n_shared(comm, node_places(parts_of(problem)[0].space), problem.full.scales.mesh_size)
     if shared:
         raise ValueError(
             f"{shared} nodes of the mesh are where others are, in cells that cover one another, so "
@@ -282,7 +282,7 @@ def take_up(
     comm = problem.u.function_space.mesh.comm
     check_fields(problem, fields)
     refuse(stored, why_another_scene(stored, problem, fields))
-    size = problem.motions.size
+    size = problem.full.scales.mesh_size
     motions = stored.arrays["motions"]
     rows = np.zeros((len(motions), problem.unknowns.n_dofs))
     for part in parts_of(problem):

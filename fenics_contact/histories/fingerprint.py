@@ -57,7 +57,7 @@ def changed_data(
     differences += _compare_probes(problem, stored.arrays)
     differences += _compare_conditions(problem, committed)
     for contact, theirs in zip(problem.contacts, given, strict=True):
-        differences += _compare_points(contact, theirs, problem.motions.size)
+        differences += _compare_points(contact, theirs, problem.full.scales.mesh_size)
     return differences
 
 
@@ -140,7 +140,7 @@ def probe(problem: ContactProblem) -> dict[str, Array]:
             for dofs, bs, x in parts:
                 phases = 1.0 + k + 2.0 * np.arange(bs)
                 waves = np.cos(np.add.outer(np.arange(d), np.arange(bs)) * (1 + k)) * (2 + k)
-                values = np.sin((x - low) / problem.motions.size @ waves + phases)
+                values = np.sin((x - low) / problem.full.scales.mesh_size @ waves + phases)
                 field.x.array[dofs] = values.ravel()
             field.x.scatter_forward()
             stiffness.mult(field.x.petsc_vec, image.x.petsc_vec)
@@ -208,7 +208,7 @@ def _compare_shapes(
 def _compare_probes(problem: ContactProblem, theirs: dict[str, Array]) -> list[str]:
     """Stiffness and loads."""
     ours, differences = probe(problem), []
-    rigid = problem.bulk.scale * problem.motions.size * np.finfo(float).eps
+    rigid = problem.bulk.scale * problem.full.scales.mesh_size * np.finfo(float).eps
     for name, words in (
         ("stiffness", "stiffness of the bulk, by smooth fields v·Kw,"),
         ("loads", "loads of the bulk and on free supports, by smooth fields v·f,"),

@@ -309,7 +309,7 @@ def _visible(problem: ContactProblem) -> float:
     """A magnification, 1, 2 or 5 by a power of ten, with which displacements show. Collective."""
     u, comm = problem.displacement.u, problem.u.function_space.mesh.comm
     largest = global_max(comm, np.abs(u.x.array))
-    size = problem.motions.size
+    size = problem.full.scales.mesh_size
     if any(contact.finite for contact in problem.contacts) or not largest > _ROUND_OFF * size:
         return 1.0
     wanted = _VISIBLE * size / largest

@@ -35,7 +35,7 @@ _OPEN_SHARE = 1e-3
 # Share of the contact stiffness of all of Γc, once a body is let go: with a hundredth a pin that
 # comes out of its hub by itself flew on by 0.7 % of the way.
 _LET_GO = 0.1
-# An unknown with less than this share of the bulk's stiffness has none.
+# An unknown with less than this share of the stiffness of its body has none.
 _FELT = 1e-12
 
 
@@ -51,7 +51,7 @@ class Equations:
         watch: What becomes of the status of the points from iteration to iteration.
         norms: Norms where `residual` was computed last.
         start: Norms of `System.terms` where the increment began, (n_bodies,).
-        began: State of `full` there; None: something was borne.
+        began: State of `full` there.
         rtol: Residual that ends the whole solution, as a share of the forces.
         round_rtol: That of the present round of multipliers, if larger.
         solution: The state to start from and, after a method, the one found; dimensionless.
@@ -75,7 +75,7 @@ class Equations:
             phi: Share of the tangential stiffness of sticking points in H₀.
         """
         self.full, self.motions, self.contacts = full, motions, full.contacts
-        self.length = motions.size
+        self.length = full.scales.mesh_size
         self._bulk, self._comm = full.bulk, full.unknowns.comm
         self._alpha, self._phi = alpha, phi
         self.watch = StatusWatch(full.contacts)
@@ -92,7 +92,7 @@ class Equations:
         self._h0_is_made = False
         self._hardness: tuple[Any, float] | None = None  # of what, and how much
         self.system: System = full
-        self.began: Array | None = None
+        self.began = full.state()
         self.solution, self.function = full.vector(), full.vector()
 
     def take(self, system: System) -> None:
@@ -318,7 +318,8 @@ class Equations:
             part.destroy()
             diagonal.destroy()
         # The motion of a support has no stiffness.
-        felt = (bulk > _FELT * self._bulk.scale) & ~self.system.constrained
+        stiffness = np.append(self.full.scales.stiffness, np.full(self.system.n_bodies, np.inf))
+        felt = (bulk > _FELT * stiffness[self.system.label]) & ~self.system.constrained
         found = global_max(self._comm, added[felt] / bulk[felt])
         self._hardness = given, found
         return found

@@ -99,7 +99,7 @@ class FirstTouch:
         """
         comm, rows = self._full.unknowns.comm, contact.quadrature.point_rows()
         gap = _gap(contact, way)
-        acting = np.abs(contact.values.limit) + np.abs(contact.values.normal_traction)
+        acting = np.abs(contact.values.friction_bound) + np.abs(contact.values.normal_traction)
         least, most = gap[rows].min(axis=1), np.where(gap < np.inf, gap, -np.inf)[rows].max(axis=1)
         apart = global_min(comm, (2.0 * least - most)[least < np.inf], empty=0.0) > 0.0
         return apart and not global_max(comm, acting) > 0.0

@@ -159,7 +159,7 @@ class Solver:
         self._comm = full.unknowns.comm
         self._obstacle: str | None = None  # to condensation, as last said
         self._pairings = self._present_pairings()  # those of the system
-        self._kept = Kept(full, motions.size, all_that_pay=bool(settings.condensation))
+        self._kept = Kept(full, full.scales.mesh_size, all_that_pay=bool(settings.condensation))
         # What is chosen and made by `_configure`, for the increments that are expected.
         self.options = Defaults()
         self._named: list[str] = []  # options given that name a linear solver

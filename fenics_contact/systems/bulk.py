@@ -130,6 +130,9 @@ class Bulk:
         self._n_owned: int = dofmap.index_map.size_local * dofmap.index_map_bs
         tangent = self.tangent_form
         self._dependence = Dependence(tangent.constants(), tangent.coefficients())
+        # What the tangent at rest depends on.
+        data = [c for c in tangent.coefficients() if c is not u]
+        self._data = Dependence(tangent.constants(), data)
 
     def check_finite(self) -> None:
         """Refuse values that are not finite in any coefficient or constant. Collective.
@@ -199,6 +202,27 @@ class Bulk:
         for part in self._compiled_tangent:
             fem.petsc.assemble_matrix(matrix, part)
         matrix.assemble()
+
+    @contextmanager
+    def stiffness_at_rest(self) -> Iterator[PETSc.Mat]:
+        """The tangent at u = 0 with the present data; `stiffness` stays as it is. Collective."""
+        values = self._u.x.array
+        saved = values.copy()
+        values[:] = 0.0
+        try:
+            with self.present_stiffness() as matrix:
+                values[:] = saved
+                yield matrix
+        finally:
+            values[:] = saved
+
+    def has_new_data(self) -> bool:
+        """Whether data of the tangent have changed since `note_data` was called. Collective."""
+        return self.space.mesh.comm.allreduce(int(self._data.changed)) > 0
+
+    def note_data(self) -> None:
+        """Take the data of the tangent as they are now for known."""
+        self._data.note()
 
     def own_stiffness(self) -> PETSc.Mat:
         """The tangent of this rank's cells alone, ghosts behind its own dofs. Collective.

@@ -198,8 +198,9 @@ class CondensedSystem(System):
         internal = [own - response.by_values, response.forces, x]
         external = [response.load - response.by_values + reaction, response.forces, x]
         unknowns = [x, response.field, -response.by_values]
-        joined = (np.concatenate(part) for part in (unknowns, internal, external))
-        return Forces(*joined)
+        labels = np.concatenate([self.label, self._full.label, self.label])
+        u, inner, outer = (np.concatenate(part) for part in (unknowns, internal, external))
+        return Forces(u, inner, outer, labels)
 
     def forget(self) -> None:
         """Drop the solutions for earlier loads."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Index
 
 __all__ = ["Forces"]
 
@@ -18,13 +18,15 @@ class Forces:
     Attributes:
         unknowns: Displacements and free motions on this rank.
         internal, external: Forces of the bulk, and loads with reactions, at the unknowns.
+        label: Body or free support of every unknown.
     """
 
     unknowns: Array
     internal: Array
     external: Array
+    label: Index
 
     @classmethod
-    def none(cls, unknowns: Array) -> Forces:
+    def none(cls, unknowns: Array, label: Index) -> Forces:
         """No forces."""
-        return cls(unknowns, np.zeros_like(unknowns), np.zeros_like(unknowns))
+        return cls(unknowns, np.zeros_like(unknowns), np.zeros_like(unknowns), label)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
@@ -17,6 +18,7 @@ from fenics_contact.surface.displacement import Displacement
 from fenics_contact.systems import linear
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.forces import Forces
+from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array, Indices, Mask
@@ -29,6 +31,7 @@ class FullSystem(System):
 
     Attributes:
         displacement: What of it is one.
+        scales: Reference scales of the bodies.
         stiffness: The bulk's tangent over all unknowns, after `update_stiffness`.
     """
 
@@ -53,13 +56,12 @@ class FullSystem(System):
             label[u.function_space.dofmap.list] = body[space.dofmap.list[:, :1]]
             dofs = label[: unknowns.n_dofs]
         self.displacement = displacement
-        motions = n + np.arange(n_motions)
-        label = unknowns.joined(dofs.astype(np.float64), motions.astype(np.float64))
-        super().__init__(
-            u, unknowns, bulk, contacts, constrained, label.astype(np.intp), n + n_motions
-        )
+        motions = (n + np.arange(n_motions)).astype(np.float64)
+        label = unknowns.joined(dofs.astype(np.float64), motions).astype(np.intp)
+        super().__init__(u, unknowns, bulk, contacts, constrained, label, n + n_motions)
         moves = displacement.within(np.ones(displacement.n_owned))
         self._moves: Mask = unknowns.joined(moves, np.ones(n_motions)) > 0
+        self.scales = ReferenceScales(displacement, body, label, self._moves, n_motions, contacts)
         self.stiffness: PETSc.Mat | None = None
         self._near_nullspace: PETSc.NullSpace | None = None
         self._body = body
@@ -88,6 +90,12 @@ class FullSystem(System):
                 self.stiffness.destroy()
             self.stiffness = self.unknowns.widened(self.bulk.stiffness, rows=True)
         return changed
+
+    @contextmanager
+    def stiffness_at_rest(self) -> Iterator[PETSc.Mat]:
+        """The bulk's tangent at u = 0 over all unknowns, with the present data. Collective."""
+        with self.bulk.stiffness_at_rest() as stiffness:
+            yield self.unknowns.widened(stiffness, rows=True)
 
     def update(self) -> int:
         """Nothing to do: `fill` takes the stiffness as it is."""
@@ -135,7 +143,7 @@ class FullSystem(System):
             terms = terms + self.diagonal * self._cell_size
         if not self.displacement.mixed:
             return terms
-        moved = min(global_max(self.unknowns.comm, np.abs(state[self._moves])), self.farthest)
+        moved = global_max(self.unknowns.comm, np.abs(state[self._moves]))
         return np.where(self._moves, terms, self.bulk.scale * moved)
 
     def part(self, state: Array) -> Array:
@@ -161,7 +169,7 @@ class FullSystem(System):
 
     def forces(self, bulk: Array, reaction: Array) -> Forces:
         """Forces at all unknowns; see `System.forces`."""
-        return Forces(self.state(), bulk + self.load, self.load + reaction)
+        return Forces(self.state(), bulk + self.load, self.load + reaction, self.label)
 
     def forget(self) -> None:
         """Drop the diagonal, whose round-off is allowed for."""

@@ -46,7 +46,6 @@ class System(ABC):
         load: External forces at the unknowns (force).
         diagonal: Diagonal of the matrix assembled last (force/length).
         outside: Norms of load and of `terms` at unknowns outside of the system, (2, n_bodies).
-        farthest: Largest displacement whose round-off counts (length).
         label: Body or free support of every unknown of this rank, (n_local,).
         n_bodies: Their number.
         linear_kind: How linear systems are solved, one of `linear.KINDS`.
@@ -77,7 +76,6 @@ class System(ABC):
         self.load: Array = np.zeros(unknowns.n_local)
         self.diagonal: Array = np.zeros(unknowns.n_local)
         self.outside: Array = np.zeros((2, n_bodies))
-        self.farthest = np.inf
         self._motions = [motion for contact in contacts for motion in contact.motions]
         self._contact_vector = unknowns.vector()
         counts = [len(contact.motions) for contact in contacts]
@@ -196,8 +194,7 @@ class System(ABC):
 
         With finite kinematics contact sums up places in the place of displacements. Collective.
         """
-        moved = np.abs(np.clip(state, -self.farthest, self.farthest))
-        return np.asarray(self.diagonal * (moved + self._coordinates()))
+        return np.asarray(self.diagonal * (np.abs(state) + self._coordinates()))
 
     def _coordinates(self) -> Array:
         """Largest coordinate of a finite contact at what it touches, 0 elsewhere. Collective."""

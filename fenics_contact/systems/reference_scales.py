@@ -1,0 +1,210 @@
+"""Reference scales: what forces, displacements, energies and stiffness are compared with.
+
+A quantity is zero, small or large relative to another one of the same body or of the same contact.
+The largest one of a problem is no reference: what an unrelated body in the same mesh is, does or
+bears must not change what is found of this one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse.csgraph
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from fenics_contact.contact.contact import Contact
+from fenics_contact.parallel import global_sum
+from fenics_contact.surface.displacement import Displacement
+from fenics_contact.surface.facets import facet_cells
+from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.types import Array, Index, Mask
+
+__all__ = ["ReferenceScales"]
+
+# Relative displacement, by that of a body, below which a point does not belong to the body.
+_NO_SHARE = 1e-10
+# Contact forces, by stiffness times size of a body, that are round-off.
+_NO_FORCE = 1e-12
+
+
+class ReferenceScales:
+    """Reference quantities of every body and of every free support, the same on every rank.
+
+    Bodies come first, then the supports that move freely (together: the parts). Two of them are
+    coupled in an increment if a point of a contact belongs to both.
+
+    Attributes:
+        n_bodies: Number of bodies.
+        label: Part of every unknown of this rank, (n_local,).
+        centre: Middle of the bounding box of every body, (n_bodies, gdim) (length).
+        size: Diagonal of that box, (n_bodies,) (length).
+        cell_size: Mean size of its cells, (n_bodies,) (length).
+        mesh_size: Diagonal of the bounding box of all bodies (length).
+        stiffness: Largest entry of a body on the diagonal of the bulk's tangent, (n_bodies,)
+            (force/length).
+        group: Number of the group of coupled parts that a part belongs to, (n_parts,).
+        touching: Which bodies a contact touches, with the pairs at the start of the increment,
+            (n_contacts, n_bodies).
+        unloaded: Which bodies bore no contact force at the start of the increment, (n_bodies,).
+    """
+
+    def __init__(
+        self,
+        displacement: Displacement,
+        body: npt.NDArray[np.intp],
+        label: npt.NDArray[np.intp],
+        moves: Mask,
+        n_motions: int,
+        contacts: Sequence[Contact],
+    ) -> None:
+        """Measure the bodies. Collective.
+
+        Args:
+            displacement: In what is solved for.
+            body: Body of every node of this rank, ghosts last.
+            label: Part of every unknown of this rank, (n_local,).
+            moves: Which of these unknowns are displacements or motions, (n_local,).
+            n_motions: Number of free motions of supports, each of which is a part.
+            contacts: Of the problem.
+        """
+        space = displacement.u.function_space
+        self._comm, self.label, self._moves = space.mesh.comm, label, moves
+        n_bodies = self._comm.allreduce(int(body.max(initial=-1)), op=MPI.MAX) + 1
+        n_owned, d = space.dofmap.index_map.size_local, space.mesh.geometry.dim
+        x, mine = space.tabulate_dof_coordinates()[:n_owned, :d], body[:n_owned]
+        corners = np.full((2, n_bodies, d), np.inf)
+        for corner, sign in zip(corners, (1.0, -1.0), strict=True):
+            np.minimum.at(corner, mine, sign * x)
+        self._comm.Allreduce(MPI.IN_PLACE, corners, op=MPI.MIN)
+        low, high = corners[0], -corners[1]
+        self.n_bodies, self.centre = n_bodies, (low + high) / 2
+        self.size: Array = np.linalg.norm(high - low, axis=1)
+        self.mesh_size = float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
+        n_nodes = global_sum(self._comm, np.bincount(mine, minlength=n_bodies))
+        self.cell_size = np.asarray(self.size / n_nodes ** (1 / d), dtype=np.float64)
+        self.stiffness: Array = np.ones(n_bodies)
+        self.group: Index = np.arange(n_bodies + n_motions)
+        self.touching: Mask = np.zeros((len(contacts), n_bodies), dtype=np.bool_)
+        self.unloaded: Mask = np.ones(n_bodies, dtype=np.bool_)
+        self._own = [_body_of_points(contact, space, body) for contact in contacts]
+
+    @property
+    def force(self) -> Array:
+        """Stiffness times size, (n_bodies,) (force)."""
+        return self.stiffness * self.size
+
+    def measure_stiffness(self, stiffness: PETSc.Mat) -> None:
+        """Take the stiffness of the bodies from the bulk's tangent. Collective.
+
+        Args:
+            stiffness: Over all unknowns, without conditions.
+        """
+        diagonal = stiffness.getDiagonal()
+        largest = self.largest(np.where(self._moves, diagonal.array_r, 0.0))
+        diagonal.destroy()
+        self.stiffness = np.where(largest > 0, largest, 1.0)
+
+    def largest(self, values: Array) -> Array:
+        """Largest absolute value of every body, at its unknowns, (n_bodies,). Collective."""
+        found: Array = np.zeros(len(self.group))
+        np.maximum.at(found, self.label, np.abs(values))
+        self._comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
+        return found[: self.n_bodies]
+
+    def spread(self, values: Array, chosen: Mask) -> Array:
+        """Largest less smallest of some values of every body, (n_bodies,). Collective.
+
+        Args:
+            values: At this rank's unknowns.
+            chosen: Which of them count.
+        """
+        ends = np.full((2, len(self.group)), -np.inf)
+        for end, sign in zip(ends, (1.0, -1.0), strict=True):
+            np.maximum.at(end, self.label[chosen], sign * values[chosen])
+        self._comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
+        return np.maximum(ends.sum(axis=0), 0.0)[: self.n_bodies]
+
+    def sums(self, values: Array) -> Array:
+        """Sum of absolute values of every body, at its unknowns, (n_bodies,). Collective."""
+        found = np.bincount(self.label, np.abs(values), minlength=len(self.group))
+        return global_sum(self._comm, found)[: self.n_bodies]
+
+    def begin(self, operators: Sequence[ContactOperator]) -> None:
+        """Find which parts are coupled, and what each bore at the last commit. Collective.
+
+        Args:
+            operators: Of the contacts, over all unknowns, at the start of an increment.
+        """
+        n = len(self.group)
+        couplings: Array = np.eye(n)
+        borne: Array = np.zeros(n)
+        touching: Array = np.zeros((len(operators), n))
+        for number, operator in enumerate(operators):
+            belongs = self._belonging(operator, number)
+            couplings += belongs @ belongs.T
+            touching[number] = belongs.any(axis=1)
+            committed = operator.contact.committed().points
+            if committed is not None:
+                force = operator.contact.measure * np.abs(committed.total_traction).sum(axis=1)
+                borne += belongs @ force
+        couplings, touching, borne = (
+            global_sum(self._comm, found) for found in (couplings, touching, borne)
+        )
+        _, self.group = scipy.sparse.csgraph.connected_components(couplings > 0, directed=False)
+        self.touching = touching[:, : self.n_bodies] > 0
+        self.unloaded = self.is_unloaded(borne[: self.n_bodies])
+
+    def is_unloaded(self, force: Array) -> Mask:
+        """Which bodies bear no force but round-off, by the sum of sizes of the forces on each."""
+        return np.asarray(force <= _NO_FORCE * self.force)
+
+    @property
+    def n_groups(self) -> int:
+        """Number of groups of coupled parts."""
+        return int(self.group.max()) + 1
+
+    def global_sum(self, values: Array) -> Array:
+        """Sum over all ranks. Collective."""
+        return global_sum(self._comm, values)
+
+    def coupled_with(self, body: int) -> Mask:
+        """Which other bodies may exchange forces with a body in this increment, (n_bodies,)."""
+        others = self.group[: self.n_bodies] == self.group[body]
+        others[body] = False
+        return others
+
+    def group_of_points(self, number: int) -> Index:
+        """Groups of the bodies with this rank's points of a contact, by its number, (n_points,)."""
+        return np.asarray(self.group[self._own[number]])
+
+    def modulus(self, number: int) -> float:
+        """Stiffness of the bodies that a contact touches, by the size of their cells (stress)."""
+        d, mine = self.centre.shape[1], self.touching[number]
+        moduli = self.stiffness * self.cell_size ** (2 - d)
+        return float(moduli[mine].max(initial=0.0))
+
+    def _belonging(self, operator: ContactOperator, number: int) -> Array:
+        """Whether points belong to parts, one or zero, (n_parts, n_points). Collective."""
+        n, own = len(self.group), self._own[number]
+        belongs = np.zeros((n, len(own)))
+        if n > 1 and not (operator.contact.rigid and not operator.contact.motions):
+            for part, row in enumerate(belongs):
+                jump = operator.jump((self.label == part).astype(np.float64))
+                row[:] = np.abs(jump).max(axis=1, initial=0.0) > _NO_SHARE
+        belongs[own, np.arange(len(own))] = 1.0
+        return belongs
+
+
+def _body_of_points(
+    contact: Contact, space: fem.FunctionSpace, body: npt.NDArray[np.intp]
+) -> Index:
+    """The body behind each of this rank's points of Γc, (n_points,)."""
+    rows = contact.quadrature.point_rows()
+    cells = facet_cells(space.mesh, contact.surface.facets)
+    own = np.zeros(contact.quadrature.n_points, dtype=np.intp)
+    own[rows.ravel()] = np.repeat(body[space.dofmap.list[cells, 0]], rows.shape[1])
+    return own

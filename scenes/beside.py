@@ -1,0 +1,163 @@
+"""Scenes of boxes, and unrelated bodies that are busy in the same mesh meanwhile.
+
+Whatever such a body does, is and bears, the outcome of the scene beside it is the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import dolfinx
+import numpy as np
+from dolfinx import fem
+
+import fenics_contact as fc
+from fenics_contact.elasticity import NeoHookean
+from fenics_contact.types import Array
+from scenes.blocks import BOTTOM, RIGHT, TOP, block_mesh
+from scenes.bodies import Bodies
+
+# How far from the origin busy bodies stand.
+PLACE = 30.0
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box of quadrilaterals, and of what.
+
+    Attributes:
+        low, size: Its lowest corner and its sides (length).
+        n: Cells along both.
+        E: Young's modulus, by that of the scene.
+        bend: Moves its nodes, (n, 2).
+    """
+
+    low: tuple[float, float] = (0.0, 0.0)
+    size: tuple[float, float] = (1.0, 1.0)
+    n: tuple[int, int] = (3, 3)
+    E: float = 1.0
+    bend: Callable[[Array], Array] | None = None
+
+    def mesh(self) -> tuple[dolfinx.mesh.Mesh, None, dolfinx.mesh.MeshTags]:
+        """Its mesh, no tags of cells, and tags of its sides. Collective."""
+        mesh, tags = block_mesh("quadrilateral", n=self.n, size=self.size)
+        x = mesh.geometry.x[:, :2]
+        x[:] = (self.bend(x) if self.bend else x) + self.low
+        return mesh, None, tags
+
+
+@dataclass(frozen=True)
+class Busy:
+    """An unrelated block, its top moved, or loaded and its bottom on a floor of its own.
+
+    Attributes:
+        E: Young's modulus, by that of the scene.
+        place: Where it stands along x (length).
+        moved: By how much its top is moved aside and up (length); None: it is loaded instead.
+        load: Traction on its top aside and up, by E.
+        floor: Whether it stands on a floor; else its bottom is free.
+        wall: How far away a wall is that it may come to (length); None: there is none.
+    """
+
+    E: float = 1.0
+    place: float = PLACE
+    moved: tuple[float, float] | None = None
+    load: tuple[float, float] = (0.0, 0.0)
+    floor: bool = True
+    wall: float | None = None
+
+
+BUSY = {
+    "led aside": Busy(moved=(3.0, 0.0), floor=False),
+    "rubbed": Busy(moved=(3.0, -1e-2)),
+    "compressed": Busy(moved=(0.0, -0.1)),
+    "stiff": Busy(E=1e6, moved=(0.0, -1e-2)),
+    "soft": Busy(E=1e-6, load=(0.0, -1e-2)),
+    "light": Busy(load=(1e-8, -1e-7)),
+    "far away": Busy(place=1e4, load=(0.0, -1e-2), wall=1e3),
+}
+
+
+@dataclass
+class Beside:
+    """Boxes in one mesh with busy bodies: elastic, plane strain, ν = 0.3.
+
+    Attributes:
+        boxes: Of the scene, by name.
+        busy: The unrelated bodies.
+        rubber: Whether all are of rubber.
+        E: Young's modulus that those of all bodies are given by (stress).
+        bodies: Mesh, tags, displacement, residual and conditions.
+    """
+
+    boxes: Mapping[str, Box]
+    busy: Sequence[Busy] = ()
+    rubber: bool = False
+    E: float = 1.0
+    bodies: Bodies = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Make mesh and residual. Collective."""
+        more = {f"busy {i}": Box((b.place, 0.0), n=(2, 2), E=b.E) for i, b in enumerate(self.busy)}
+        self._all = {**self.boxes, **more}
+        self._joined = fc.join_meshes({name: box.mesh() for name, box in self._all.items()})
+        modulus = self._joined.by_body({name: box.E * self.E for name, box in self._all.items()})
+        self.bodies = Bodies((self._joined.mesh, self._joined.facets), modulus, 0.3)
+        if self.rubber:
+            elastic = NeoHookean(self.bodies.u, modulus, 0.3, "plane strain")
+            self.bodies.F = elastic.residual(self.bodies.v)
+        self._share = self.bodies.constant(0.0)  # of what busy bodies do
+        self._led: list[tuple[fem.Constant, Array]] = []
+        self._contacts: list[fc.Contact] = []
+
+    def tag(self, box: str, side: int) -> int:
+        """Of a side of a box, in the mesh of all."""
+        return self._joined.facet(box, side)
+
+    def hold(self, box: str, side: int, *components: int, value: Any = 0.0) -> None:
+        """Prescribe components of the displacement on a side. Collective."""
+        self.bodies.hold(self.tag(box, side), *components, value=value)
+
+    def load(self, box: str, side: int, component: int, value: Any) -> None:
+        """Apply a traction to a side."""
+        self.bodies.F -= value * self.bodies.v[component] * self.bodies.ds(self.tag(box, side))
+
+    def contact(self, box: str, side: int, support: Any, law: Any, **options: Any) -> fc.Contact:
+        """Contact of a side with a support, or with a side of another box. Collective."""
+        if isinstance(support, tuple):
+            support = fc.DeformableBody(self.bodies.tags, self.tag(*support))
+        return self.bodies.contact(self.tag(box, side), support, law, **options)
+
+    def problem(self, *contacts: fc.Contact, **options: Any) -> fc.ContactProblem:
+        """The problem, with the contacts of the busy bodies. Collective."""
+        return self.bodies.problem(*contacts, *self._keep_busy(contacts), **options)
+
+    def _keep_busy(self, contacts: Sequence[fc.Contact]) -> list[fc.Contact]:
+        """Conditions and loads of the busy bodies, and their contacts. Collective."""
+        made = []
+        finite = {"kinematics": "finite"} if any(c.finite for c in contacts) else {}
+        for i, busy in enumerate(self.busy):
+            name, floor = f"busy {i}", fc.HalfSpace((0, 0), (0, 1))
+            law = fc.Coulomb(0.3)
+            if busy.floor:
+                made.append(self.contact(name, BOTTOM, floor, law, name=f"{name}, floor", **finite))
+            if busy.wall is not None:
+                wall = fc.HalfSpace((busy.place + 1 + busy.wall, 0), (-1, 0))
+                made.append(self.contact(name, RIGHT, wall, law, name=f"{name}, wall", **finite))
+            for component in range(2):
+                if busy.moved is None:
+                    value = self._share * (busy.load[component] * busy.E * self.E)
+                    self.load(name, TOP, component, value)
+                else:
+                    constant = self.bodies.constant(0.0)
+                    self._led.append((constant, np.array(busy.moved[component])))
+                    self.hold(name, TOP, component, value=constant)
+        return made
+
+    def keep_busy(self, share: float) -> None:
+        """Let the busy bodies have done a share of what they do."""
+        self._share.value = share
+        for constant, whole in self._led:
+            constant.value = share * whole

@@ -1,0 +1,292 @@
+"""Unrelated bodies in the same mesh change no outcome: a scene that is refused is, and one holds.
+
+Reference of every case is the same scene alone, refused with the same words or right by its forces.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+import ufl
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.types import Array
+from scenes.beside import BUSY, Beside, Box
+from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP
+from scenes.comparing import assemble_number, close, compiled, raised_everywhere
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
+COMM = MPI.COMM_WORLD
+FLOOR = fc.HalfSpace((0, 0), (0, 1))
+
+
+class Play:
+    """A scene, the values that its increments set, and what is looked at."""
+
+    def __init__(
+        self,
+        scene: Beside,
+        increments: Sequence[Callable[[], None]],
+        *contacts: fc.Contact,
+        measured: Sequence[ufl.Form] = (),
+        **more: Any,
+    ) -> None:
+        """Make the problem. Collective."""
+        self.scene, self.increments, self.contacts = scene, increments, contacts
+        self.measured = [compiled(form) for form in measured]
+        self.problem = scene.problem(*contacts, **more)
+
+    def run(self) -> list[Array]:
+        """Solve all increments: resultants of the contacts of the scene, and what is measured."""
+        for number, setting in enumerate(self.increments, 1):
+            setting()
+            self.scene.keep_busy(number / len(self.increments))
+            step = self.problem.solve()
+            self.problem.commit()
+        forces = [step.contacts[contact.name].force for contact in self.contacts]
+        return forces + [np.array([assemble_number(form, COMM)]) for form in self.measured]
+
+
+def setting(constant, *values) -> list[Callable[[], None]]:
+    """Increments that set a constant to one value after another."""
+
+    def to(value):
+        constant.value = value
+
+    return [lambda value=value: to(value) for value in values]
+
+
+# ---- scenes that are refused ---------------------------------------------------------------------
+
+
+def pops_out(busy):
+    """A wedge between two walls, let go in one increment: out of them, with energy from nowhere."""
+
+    def lean(x):
+        return np.column_stack([x[:, 0] * (1 + 0.2 * x[:, 1]), x[:, 1]])
+
+    scene = Beside({"wedge": Box(n=(6, 6), bend=lean)}, busy, E=1e3)
+    press = scene.bodies.constant()
+    scene.load("wedge", TOP, 1, press)
+    walls = [
+        scene.contact("wedge", side, fc.HalfSpace(point, normal), fc.Coulomb(0.5), name=name)
+        for name, side, point, normal in (
+            ("upright", LEFT, (0, 0), (1, 0)),
+            ("leaning", RIGHT, (1, 0), (-1, 0.2)),
+        )
+    ]
+    increments = setting(press, -10.0, 0.0)
+    return Play(scene, increments, *walls, kinematics=np.inf, method="newton")
+
+
+def too_soft(busy):
+    """A block that its load presses to a fraction of nothing, and widens by many times its size."""
+    scene = Beside({"block": Box(n=(4, 4))}, busy, E=0.02)
+    press = scene.bodies.constant()
+    scene.load("block", TOP, 1, press)
+    scene.hold("block", TOP, 0)
+    floor = scene.contact("block", BOTTOM, FLOOR, fc.Frictionless(), name="floor")
+    return Play(scene, setting(press, -1.0), floor)
+
+
+def slides_far(busy):
+    """A block on a ball, moved aside by half of its size: gap and normals are others there."""
+    scene = Beside({"block": Box(n=(6, 4))}, busy)
+    aside = scene.bodies.constant()
+    scene.hold("block", TOP, 1, value=-0.02)
+    scene.hold("block", TOP, 0, value=aside)
+    ball = fc.Ball((0.5, -2.0), 2.0)
+    contact = scene.contact("block", BOTTOM, ball, fc.Frictionless(), name="ball")
+    return Play(scene, setting(aside, 0.5), contact)
+
+
+def held_inside(busy):
+    """Multipliers of a node that a condition holds inside of its support."""
+    scene = Beside({"block": Box()}, busy)
+    depth = scene.bodies.constant()
+    scene.hold("block", LEFT, 0, 1, value=depth)
+    contact = scene.contact(
+        "block", BOTTOM, FLOOR, fc.Frictionless(), name="floor", enforcement="augmented"
+    )
+    return Play(scene, setting(depth, -1e-3), contact)
+
+
+def not_held(busy):
+    """A block on a frictionless floor."""
+    scene = Beside({"block": Box()}, busy)
+    scene.load("block", TOP, 1, scene.bodies.constant(-1e-3))
+    contact = scene.contact("block", BOTTOM, FLOOR, fc.Frictionless(), name="floor")
+    return Play(scene, [], contact)
+
+
+def _pushed(busy, side, up):
+    scene = Beside({"block": Box()}, busy)
+    scene.load("block", TOP, 1, scene.bodies.constant(up))
+    scene.load("block", TOP, 0, scene.bodies.constant(side))
+    contact = scene.contact("block", BOTTOM, FLOOR, fc.Coulomb(0.3), name="floor")
+    return Play(scene, [lambda: None], contact)
+
+
+def pulled_off(busy):
+    """A block that its load lifts off its floor."""
+    return _pushed(busy, 0.0, 1e-3)
+
+
+def pushed_aside(busy):
+    """A block pushed along its floor by more than friction bears."""
+    return _pushed(busy, 4e-4, -1e-3)
+
+
+def without_number(busy):
+    """A load that is none."""
+    return _pushed(busy, 0.0, np.nan)
+
+
+def out_of_range(busy):
+    """Friction that is none."""
+    scene = Beside({"block": Box()}, busy)
+    scene.hold("block", TOP, 0, 1, value=-1e-3)
+    friction = scene.bodies.constant(-0.3)
+    contact = scene.contact("block", BOTTOM, FLOOR, fc.Coulomb(friction), name="floor")
+    return Play(scene, [lambda: None], contact)
+
+
+REFUSED = {
+    pops_out: "friction would drive the slip",
+    too_soft: "times its size",
+    slides_far: "too large to be taken as small",
+    held_inside: "penetration or elastic slip left",
+    not_held: "nothing will ever hold",
+    pulled_off: "no contact force can balance",
+    pushed_aside: "no contact force can balance",
+    without_number: "not finite",
+    out_of_range: "friction",
+}
+
+
+@pytest.mark.parametrize("busy", [None, *BUSY])
+@pytest.mark.parametrize("scene", REFUSED, ids=lambda scene: scene.__name__)
+def test_what_is_refused_alone_is_refused_beside_others(scene, busy):
+    """With the same words; they passed beside a body that was compressed, moved or far away."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        raised_everywhere(
+            lambda: scene([BUSY[busy]] if busy else []).run(),
+            (fc.NotConverged, ValueError),
+            REFUSED[scene],
+        )
+
+
+def test_a_wall_far_away_is_no_excuse():
+    """Of the same body: it is 1000 away, and the block is deformed by many times its size."""
+    scene = too_soft([]).scene
+    floor = scene.contact("block", BOTTOM, FLOOR, fc.Frictionless(), name="floor")
+    wall = fc.HalfSpace((1001.0, 0), (-1, 0))
+    wall = scene.contact("block", RIGHT, wall, fc.Frictionless(), name="wall")
+    scene.load("block", TOP, 1, scene.bodies.constant(-1.0))
+    play = Play(scene, [lambda: None], floor, wall)
+    raised_everywhere(play.run, fc.NotConverged, "times its size")
+
+
+# ---- scenes that hold ----------------------------------------------------------------------------
+
+
+def stacked(busy):
+    """Three blocks of rubber with gaps between them, the highest moved down."""
+    scene = Beside(
+        {
+            "lowest": Box((0, 0), (1, 0.3), (8, 2)),
+            "middle": Box((0.2, 0.31), (0.6, 0.2), (4, 2)),
+            "highest": Box((0.3, 0.52), (0.4, 0.2), (6, 2)),
+        },
+        busy,
+        rubber=True,
+        E=1e3,
+    )
+    down = scene.bodies.constant()
+    scene.hold("lowest", BOTTOM, 0, 1)
+    scene.hold("highest", TOP, 0)
+    scene.hold("highest", TOP, 1, value=down)
+    joints = [
+        scene.contact(box, BOTTOM, (below, TOP), fc.Coulomb(0.6), name=box, kinematics="finite")
+        for box, below in (("middle", "lowest"), ("highest", "middle"))
+    ]
+    return Play(scene, setting(down, -0.05), *joints)
+
+
+def _on_a_spring(stiffness):
+    """A block on a floor, held along it by a spring alone that its load stretches by 1e-2."""
+
+    def on_a_spring(busy):
+        scene = Beside({"block": Box(n=(4, 4))}, busy)
+        u, v, side = scene.bodies.u, scene.bodies.v, scene.bodies.ds(scene.tag("block", LEFT))
+        scene.bodies.F += stiffness * u[0] * v[0] * side
+        scene.load("block", TOP, 1, scene.bodies.constant(-1e-3))
+        scene.load("block", TOP, 0, scene.bodies.constant(1e-2 * stiffness))
+        contact = scene.contact("block", BOTTOM, FLOOR, fc.Frictionless(), name="floor")
+        return Play(scene, [lambda: None], contact, measured=[u[0] * side])
+
+    return on_a_spring
+
+
+def rubbed(busy):
+    """A block pressed and pushed along its floor, by less than friction bears."""
+    return _pushed(busy, 2e-4, -1e-3)
+
+
+HOLD = {
+    "stacked": stacked,
+    **{f"on a spring of {k:g} E": _on_a_spring(k) for k in (1e-4, 1e-6, 1e-8)},
+    "rubbed": rubbed,
+}
+_ALONE: dict[str, list[Array]] = {}
+
+
+@pytest.mark.parametrize("busy", BUSY)
+@pytest.mark.parametrize("scene", HOLD)
+def test_what_holds_alone_holds_beside_others(scene, busy):
+    """With the same forces, to 1e-6; stacked blocks were thrown out, and springs were not seen."""
+    if scene not in _ALONE:
+        _ALONE[scene] = HOLD[scene]([]).run()
+    for found, alone in zip(HOLD[scene]([BUSY[busy]]).run(), _ALONE[scene], strict=True):
+        assert close(found, alone, 1e-6)
+
+
+def _on_multipliers(names: Sequence[str]) -> Array:
+    """Blocks under one contact with multipliers on soft springs, loaded by 10 and 1e-5, E = 1000.
+
+    The first does not slide, the second is sheared by a fifth of its load.
+
+    Returns:
+        Largest pressure under the second, and the largest penetration there by what its load would
+        make of the springs.
+    """
+    boxes = {"heavy": Box(n=(4, 4)), "light": Box((3.0, 0.0), n=(8, 4))}
+    scene = Beside({name: boxes[name] for name in names}, E=1e3)
+    load, k = 1e-5, 1e3
+    scene.load("light", TOP, 1, scene.bodies.constant(-load))
+    scene.load("light", TOP, 0, scene.bodies.constant(0.2 * load))
+    if "heavy" in names:
+        scene.load("heavy", TOP, 1, scene.bodies.constant(-10.0))
+        scene.hold("heavy", TOP, 0)
+    tags = [scene.tag(name, BOTTOM) for name in names]
+    law, options = fc.Coulomb(0.5, k_n=k, k_t=k), {"enforcement": "augmented"}
+    contact = scene.bodies.contact(tags, FLOOR, law, name="floor", **options)
+    scene.problem(contact).solve()
+    mine = contact.points[:, 0] > 2.0
+    found = contact.pressure[mine], k * contact.values.penetration[mine]
+    largest = [np.abs(part).max(initial=0.0) / load for part in found]
+    return COMM.allreduce(np.array(largest), op=MPI.MAX)
+
+
+def test_multipliers_of_a_light_body_beside_a_heavy_one():
+    """One contact on both, loads a million times apart: as exact as alone, to 1e-6.
+
+    The largest pressure was 1.6 % off, because what the springs bore was small by the other's.
+    """
+    assert close(_on_multipliers(["heavy", "light"]), _on_multipliers(["light"]), 1e-6)
