@@ -11,7 +11,7 @@ import fenics_contact as fc
 from fenics_contact.checks.verdict import check_laws
 from scenes.blocks import BOTTOM, CELLS, LEFT, TOP, block, block_mesh, dimension
 from scenes.comparing import close, gathered, nodal, raised_everywhere
-from scenes.elasticity import displacement_space
+from scenes.elasticity import displacement_space, strain, stress
 from scenes.tags import sides
 from scenes.two_blocks import LOWER, UPPER, two_blocks
 
@@ -158,6 +158,39 @@ def test_springs_want_vertices():
         raised_everywhere(
             lambda value=value: fc.Springs(value), ValueError, repr(value), "greater than zero"
         )
+
+
+# ---- springs in the bulk form --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bulk", ["linear", "rubber"])
+def test_a_spring_that_comes_later_holds(bulk):
+    """A spring in F is raised from zero after the first increment, and let go after the second.
+
+    References: the load aside of 0.5, of which friction bears at most 0.3; the spring bears the
+    rest, and without it nothing does. A free motion was one for good: "no contact force can
+    balance".
+    """
+    scene = block("quadrilateral", E=1e3, up=-1.0)
+    u, v, k = scene.u, scene.F.arguments()[0], fem.Constant(scene.mesh, 0.0)
+    if bulk == "rubber":
+        linear = ufl.inner(stress(u, scene.E, scene.nu), strain(v)) * ufl.dx(scene.mesh)
+        rubber = fc.elasticity.NeoHookean(u, scene.E, scene.nu, "plane strain")
+        scene.F += rubber.residual(v) - linear
+    side = ufl.ds(scene.mesh, subdomain_data=scene.tags)(LEFT)
+    scene.F += k * u[0] * v[0] * side
+    problem, contact = scene.problem(fc.Coulomb(0.3), [])
+    problem.solve()
+    problem.commit()
+    k.value = 100.0
+    scene.load(up=-1.0, side=0.5)
+    problem.solve()
+    problem.commit()
+    stretched = COMM.allreduce(fem.assemble_scalar(fem.form(k * u[0] * side)))
+    assert close(contact.resultants().force[0] + 0.5, stretched, 1e-7)
+    assert stretched > 0.19
+    k.value = 0.0
+    raised_everywhere(problem.solve, (ValueError, fc.NotConverged))
 
 
 # ---- foundations ---------------------------------------------------------------------------------
