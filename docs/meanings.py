@@ -283,6 +283,12 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "again where it has doubled; the summary of each step has it.",
             'Accept it, or take `kinematics="finite"`. From 20 % on the increment fails.',
         ),
+        "round-off of its displacements leaves": (
+            "A stiff body is carried along so far that the round-off of its displacements, times "
+            "its stiffness, is more than 1e-5 of the forces on it.",
+            "Stresses and reactions of the softer bodies, and contact forces, are exact. Let the "
+            "support move in the place of the body, or take the stiff one for rigid.",
+        ),
         "points into the body": (
             "The support's normal is the wrong way round at every point of Γc.",
             "Turn it round. Where the body is deep inside, it is an error.",

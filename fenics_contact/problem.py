@@ -508,6 +508,7 @@ class ContactProblem:
         if verdict.failures:
             raise self._not_converged(reason, verdict, tried)
         self._judge.warn_of_large_motion(verdict)
+        self._judge.warn_of_round_off(verdict)
         self._judge.warn_of_few_points()
         self._solved = _Solved(self.full.state(), [c.found() for c in self.contacts])
         return Step(

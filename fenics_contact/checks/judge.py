@@ -55,6 +55,7 @@ class Judge:
         self._contacts, self._comm = full.contacts, full.unknowns.comm
         self._tunnelling = TunnellingCheck(full.contacts)
         self._warned: dict[str, float] = {}
+        self._inexact: set[str] = set()
         self._few: set[tuple[str, str]] = set()
         space = full.displacement.u.function_space
         gdim = space.mesh.geometry.dim
@@ -101,7 +102,8 @@ class Judge:
         imbalance, sizes = self._force_sums(system, bulk - reaction, [bulk, *contacts])
         allowed = np.sqrt(sizes[0]) * 2 * tolerance[: len(imbalance)] + 1e-12 * sizes[1]
         augmented = [c for c in self._contacts if c.multipliers is not None and laws]
-        equations = zip(names, norms.residual, norms.force, tolerance, strict=True)
+        rows = norms.residual, norms.force, tolerance, norms.round_off
+        equations = zip(names, *rows, strict=True)
         # Neither forces nor moments are judged by the axes.
         parts = np.split(imbalance, [self._full.gdim], axis=1)
         unbalanced = np.max([np.linalg.norm(part, axis=1) for part in parts], axis=0)
@@ -135,6 +137,18 @@ class Judge:
                     self._comm,
                     f"{name}: displacements are taken as small, with gap and normals of the "
                     f"undeformed body; where it has moved to, {found.in_words()}",
+                )
+
+    def warn_of_round_off(self, verdict: Verdict) -> None:
+        """Say once of every body whose forces are less exact than those of contact. Collective."""
+        for name, share in verdict.inexact.items():
+            if name not in self._inexact:
+                self._inexact.add(name)
+                warn(
+                    self._comm,
+                    f"{name}: round-off of its displacements leaves {100 * share:.2g} % of the "
+                    "forces on it, by which its stresses and reactions may be wrong; contact "
+                    "forces are as exact as on the softer bodies that it touches",
                 )
 
     def warn_of_few_points(self) -> None:

@@ -156,6 +156,7 @@ class RigidMotions:
         free = agreed(self.comm, (vectors * scale[:, None])[:, values < _FREE])
         self._jumps.clear()
         self.free = _plain(free.T)
+        self._scales.held = np.all(~np.hstack(self._moved()), axis=0)
         self._free_fields = self.free @ self._modes
         self._free_sizes = np.abs(self._free_fields)
         self._balanced = []

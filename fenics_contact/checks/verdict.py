@@ -13,6 +13,7 @@ from fenics_contact.checks.tunnelling import Tunnelling
 from fenics_contact.contact.contact import Contact
 from fenics_contact.markup import shown
 from fenics_contact.parallel import longest
+from fenics_contact.systems.balance import MOST_EXCUSED
 from fenics_contact.types import Array
 
 __all__ = ["Attempt", "Balance", "NotConverged", "Verdict", "check_laws"]
@@ -38,11 +39,13 @@ class Balance:
         residual: What is left (force).
         force: Size of the forces of the present increment (force).
         tolerance: Largest residual that passes (force).
+        round_off: Of what the stiffness sums up; 0 where no force acts, or it is not known (force).
     """
 
     residual: float
     force: float
     tolerance: float
+    round_off: float = 0.0
 
     @property
     def is_loaded(self) -> bool:
@@ -62,7 +65,13 @@ class Balance:
 
     def __str__(self) -> str:
         """What is left, and what would pass."""
-        return f"{self.residual:.3e} above {self.tolerance:.3e}, of forces of {self.force:.3e}"
+        found = f"{self.residual:.3e} above {self.tolerance:.3e}, of forces of {self.force:.3e}"
+        if self.round_off > self.tolerance:
+            found += (
+                f", where its displacements leave a round-off of {self.round_off:.3e}: its "
+                "stiffness, or how far it is carried, is too large beside the forces"
+            )
+        return found
 
 
 @dataclass(frozen=True)
@@ -109,6 +118,15 @@ class Verdict:
     created: float = 0.0
     inverted: bool = False
     routes: dict[str, Balance] = field(default_factory=dict)
+
+    @property
+    def inexact(self) -> dict[str, float]:
+        """Share of the forces on a body that is left by round-off, where it is more than 1e-5."""
+        return {
+            name: balance.residual / balance.force
+            for name, balance in self.equations.items()
+            if balance.residual > MOST_EXCUSED * balance.force and balance.round_off > 0
+        }
 
     @property
     def residual(self) -> float:

@@ -80,7 +80,7 @@ class Equations:
         self._alpha, self._phi = alpha, phi
         self.watch = StatusWatch(full.contacts)
         nothing: Array = np.zeros(full.n_bodies)
-        self.norms = Norms(nothing, nothing, nothing, nothing.size)
+        self.norms = Norms(nothing, nothing, nothing, nothing, nothing.size)
         self.start = nothing
         self.rtol = self.round_rtol = 0.0
         self.solvers: dict[bool, PETSc.KSP] = {}
@@ -123,7 +123,8 @@ class Equations:
         if thrown or self._bulk.is_inverted() or system.is_twisted() or system.is_degenerate():
             total[:] = np.nan  # a line search takes a shorter step
         self.norms = self.system.norms(total, contacts, self.start)
-        total[self.system.constrained] = 0.0
+        # No line search is to follow what is round-off beside what is not.
+        total[self.system.constrained | self.norms.is_round_off[self.system.label]] = 0.0
         f.array[:] = total / (self._bulk.scale * self.length)
         return self.norms
 

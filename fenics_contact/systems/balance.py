@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from fenics_contact.types import Array, Mask
+from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["Norms", "Parts", "by_body"]
+__all__ = ["MOST_EXCUSED", "Norms", "Parts", "by_body"]
 
 Labels = npt.NDArray[np.intp]
 
@@ -25,9 +25,9 @@ _SMALL = 1e-200
 # Round-off of a product K u by the size of its terms, summed up row by row. A body that is carried
 # along shows it: up to 14 eps on random tetrahedra of degree 2, 34 on a distorted mesh.
 _ROUND_OFF = 40 * np.finfo(float).eps
-# Round-off excuses a residual up to this share of the forces on a body that has a load, not more: a
-# displacement grown without bounds would excuse anything.
-_MOST = 1e-5
+# The largest share of forces that round-off excuses: of loads, of contact forces on a body that no
+# condition holds, and on one of both sides of every contact.
+MOST_EXCUSED = 1e-5
 # Forces below which numbers have lost digits: what is left of a load that has been taken away.
 _LEAST = np.finfo(float).tiny / np.finfo(float).eps
 
@@ -39,13 +39,16 @@ class Norms:
     Attributes:
         residual: Of the free unknowns, (n_parts,) (force).
         force: Of the forces that act now, the largest of load, reactions and contact, (n_parts,).
-        floor: Round-off, which no iteration can undercut, (n_parts,) (force).
+        floor: What round-off excuses, (n_parts,) (force).
+        round_off: That of the parts on which forces act, all of it, 0 for others, (n_parts,)
+            (force).
         n_bodies: Bodies and free supports, which share the unknowns between them.
     """
 
     residual: Array
     force: Array
     floor: Array
+    round_off: Array
     n_bodies: int
 
     def tolerance(self, rtol: float) -> Array:
@@ -65,9 +68,17 @@ class Norms:
         return bool(np.all(self.excess(rtol) <= 1.0))
 
     @property
+    def is_round_off(self) -> Mask:
+        """Whose residual is round-off and nothing else, (n_bodies,)."""
+        return np.asarray(self.residual <= self.floor)[: self.n_bodies]
+
+    @property
     def total(self) -> float:
-        """Residual of all unknowns (force): to see whether it falls, not whether it is small."""
-        return _root(self.residual[: self.n_bodies])
+        """Residual of all unknowns (force): to see whether it falls, not whether it is small.
+
+        Round-off of a stiff body would hide what is left on a soft one.
+        """
+        return _root(np.where(self.is_round_off, 0.0, self.residual[: self.n_bodies]))
 
 
 class Parts:
@@ -86,6 +97,8 @@ class Parts:
         bodies: Sequence[str],
         contacts: Sequence[str],
         touched: Sequence[npt.NDArray[np.int32]],
+        pairs: Sequence[Index],
+        held: Mask,
         motions: Sequence[int],
     ) -> None:
         """Collect. Collective.
@@ -96,18 +109,16 @@ class Parts:
             bodies: Names of bodies, then of free supports.
             contacts: Names of the contacts.
             touched: Unknowns of this rank that a contact feels or acts on, for every contact.
+            pairs: Bodies and supports that a contact presses on each other, for every contact,
+                (n_pairs, 2); a body on a rigid support is paired with itself.
+            held: Which bodies Dirichlet conditions hold against every rigid motion, (n_bodies,).
             motions: Of every free support the number of its contact.
         """
         self._comm, self.label, self._touched = comm, label, touched
         self.n_bodies = len(bodies)
         self._bodies: Labels | int = label if len(bodies) > 1 else 0
         self.names = [*bodies, *contacts]
-        self._motions = list(motions)
-        meets = np.zeros((len(contacts), self.n_bodies), dtype=np.bool_)
-        for row, unknowns in zip(meets, touched, strict=True):
-            row[label[unknowns]] = True
-        # Bodies that a contact touches, on any rank.
-        self._meets = np.any(comm.allgather(meets), axis=0)
+        self._motions, self._pairs, self._held = list(motions), pairs, held
 
     def norms(
         self,
@@ -134,27 +145,67 @@ class Parts:
         held = residual - free
         total = contacts[0] if len(contacts) == 1 else sum(contacts, np.zeros_like(residual))
         rows = [(v, self._bodies) for v in (free, held, total, load, product)]
-        for number, (force, touched) in enumerate(zip(contacts, self._touched, strict=True)):
-            rows += [(free[touched], n + number), (force[touched], n + number)]
-        found = _norms(self._comm, rows, n + len(contacts))
-        left, reaction, contact, loads, terms = found[:5, :n]
+        for force, touched in zip(contacts, self._touched, strict=True):
+            bodies = 0 if isinstance(self._bodies, int) else self._bodies[touched]
+            push = np.where(constrained, 0.0, force)[touched]
+            rows += [(free[touched], bodies), (push, bodies)]
+        found = _norms(self._comm, rows, n)
+        left, reaction, contact, loads, terms = found[:5]
         loads, terms = np.hypot(loads, outside[0]), np.hypot(terms, outside[1])
-        own = [found[5 + 2 * c, n + c] for c in range(len(contacts))]
-        push = [found[6 + 2 * c, n + c] for c in range(len(contacts))]
+        own, pushes = found[5::2], found[6::2]
         for body, number in zip(range(n - len(self._motions), n), self._motions, strict=True):
             # What acts on a free support may cancel; what it is the sum of does not.
-            contact[body] = push[number]
+            contact[body] = _root(pushes[number])
         force = np.max([loads, reaction, contact], axis=0)
-        floor = _ROUND_OFF * np.maximum(terms, start)
-        floor = np.where(loads > 0, np.minimum(floor, _MOST * force), floor)
+        round_off = np.maximum(_ROUND_OFF * np.maximum(terms, start), _LEAST)
+        # A contact force is as exact as the softer of both bodies has it.
+        exact = np.tile(round_off, (len(contacts), 1))
+        for row, pairs in zip(exact, self._pairs, strict=True):
+            for one, other in (pairs.T, pairs.T[::-1]):
+                np.minimum.at(row, one, round_off[other])
+        acts = pushes > exact
+        # A displacement that nothing holds may grow without bounds, and would excuse anything.
+        limited = (loads > 0) | (acts.any(axis=0) & ~self._held)
+        floor = np.where(limited, np.minimum(round_off, MOST_EXCUSED * force), round_off)
         floor = np.maximum(floor, _LEAST)
-        # A body has the round-off of what it touches, too, where the other has gone far.
-        floors = [floor[row].max(initial=0.0) for row in self._meets]
-        for row, shared in zip(self._meets, floors, strict=True):
-            floor = np.where(row, np.maximum(floor, shared), floor)
-        # An open contact has no measure of its own: what is left there is its body's.
-        own = [r if f > 0 else 0.0 for r, f in zip(own, push, strict=True)]
-        return Norms(np.append(left, own), np.append(force, push), np.append(floor, floors), n)
+        floors = np.where(acts, np.minimum(round_off, MOST_EXCUSED * pushes), round_off)
+        blurs = np.where(acts, round_off, 0.0)
+        sides = [
+            _governing(pairs, *rows)
+            for pairs, *rows in zip(self._pairs, own, pushes, floors, blurs, strict=True)
+        ]
+        of_contacts = np.reshape(sides, (len(contacts), 4)).T
+        acted_on = (loads > 0) | acts.any(axis=0)
+        of_bodies = np.array([left, force, floor, np.where(acted_on, round_off, 0.0)])
+        residual, force, floor, round_off = np.concatenate([of_bodies, of_contacts], axis=1)
+        return Norms(residual, force, floor, round_off, n)
+
+
+def _governing(
+    pairs: Index, left: Array, push: Array, floor: Array, round_off: Array
+) -> tuple[float, float, float, float]:
+    """What a contact is judged by: the four attributes of `Norms`.
+
+    What it does is known if one of both bodies is in balance, and not prescribed. So it is judged
+    by the pair whose better side is worst. An open contact has no measure of its own: what is left
+    is its body's.
+
+    Args:
+        pairs: Bodies that it presses on each other, (n_pairs, 2).
+        left: Residual where it touches each, (n_bodies,) (force).
+        push: Its force on what is free there, (n_bodies,) (force).
+        floor: What round-off excuses there, (n_bodies,) (force).
+        round_off: All of it, (n_bodies,) (force).
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = np.where(push > 0, left / push, np.inf)
+    one, other = pairs.T
+    better = np.where(relative[one] <= relative[other], one, other)
+    better = better[push[better] > 0]
+    if not better.size:
+        return 0.0, 0.0, _LEAST, 0.0
+    body = better[np.argmax(relative[better])]
+    return left[body], push[body], max(floor[body], _LEAST), round_off[body]
 
 
 def by_body(comm: MPI.Comm, vectors: Sequence[Array], label: Labels, n_bodies: int) -> Array:

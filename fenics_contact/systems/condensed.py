@@ -101,7 +101,7 @@ class CondensedSystem(System):
             unknowns.gathered(full.label[kept].astype(np.float64)).astype(np.intp),
             full.n_bodies,
         )
-        self.ready = False
+        self.ready, self.scales = False, full.scales
         self.mark = object()
         self._fixed: Array | None = None  # the constant part of the matrices
         self._places: Array | None = None

@@ -31,7 +31,6 @@ class FullSystem(System):
 
     Attributes:
         displacement: What of it is one.
-        scales: Reference scales of the bodies.
         stiffness: The bulk's tangent over all unknowns, after `update_stiffness`.
     """
 

@@ -7,6 +7,7 @@ bears must not change what is found of this one.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -25,8 +26,6 @@ from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["ReferenceScales"]
 
-# Relative displacement, by that of a body, below which a point does not belong to the body.
-_NO_SHARE = 1e-10
 # Contact forces, by stiffness times size of a body, that are round-off.
 _NO_FORCE = 1e-12
 
@@ -49,6 +48,8 @@ class ReferenceScales:
         group: Number of the group of coupled parts that a part belongs to, (n_parts,).
         touching: Which bodies a contact touches, with the pairs at the start of the increment,
             (n_contacts, n_bodies).
+        held: Which parts Dirichlet conditions, or springs of the bulk, hold against every rigid
+            motion, (n_parts,).
         unloaded: Which bodies bore no contact force at the start of the increment, (n_bodies,).
     """
 
@@ -90,6 +91,13 @@ class ReferenceScales:
         self.group: Index = np.arange(n_bodies + n_motions)
         self.touching: Mask = np.zeros((len(contacts), n_bodies), dtype=np.bool_)
         self.unloaded: Mask = np.ones(n_bodies, dtype=np.bool_)
+        counts = np.cumsum([0] + [len(contact.motions) for contact in contacts])
+        self._motions = [
+            n_bodies + np.arange(first, last) for first, last in itertools.pairwise(counts)
+        ]
+        turns = [motion.turns for contact in contacts for motion in contact.motions]
+        self._turning = n_bodies + np.flatnonzero(turns)
+        self.held: Mask = np.ones(n_bodies + n_motions, dtype=np.bool_)
         self._own = [_body_of_points(contact, space, body) for contact in contacts]
 
     @property
@@ -140,22 +148,24 @@ class ReferenceScales:
             operators: Of the contacts, over all unknowns, at the start of an increment.
         """
         n = len(self.group)
-        couplings: Array = np.eye(n)
         borne: Array = np.zeros(n)
-        touching: Array = np.zeros((len(operators), n))
+        self.touching = np.zeros((len(operators), self.n_bodies), dtype=np.bool_)
+        every = [np.zeros((0, 2), dtype=np.intp)]
         for number, operator in enumerate(operators):
-            belongs = self._belonging(operator, number)
-            couplings += belongs @ belongs.T
-            touching[number] = belongs.any(axis=1)
+            pairs = self.pairs(operator, number, self.label)
+            self.touching[number, pairs[pairs < self.n_bodies]] = True
+            every.append(pairs)
             committed = operator.contact.committed().points
             if committed is not None:
                 force = operator.contact.measure * np.abs(committed.total_traction).sum(axis=1)
-                borne += belongs @ force
-        couplings, touching, borne = (
-            global_sum(self._comm, found) for found in (couplings, touching, borne)
-        )
-        _, self.group = scipy.sparse.csgraph.connected_components(couplings > 0, directed=False)
-        self.touching = touching[:, : self.n_bodies] > 0
+                one, other = self._sides(operator, number, self.label)
+                np.add.at(borne, one, force)
+                for partner in other.T:
+                    np.add.at(borne, partner, np.where(partner == one, 0.0, force))
+        borne = global_sum(self._comm, borne)
+        links = np.concatenate(every)
+        graph = scipy.sparse.coo_matrix((np.ones(len(links)), links.T), (n, n))
+        _, self.group = scipy.sparse.csgraph.connected_components(graph, directed=False)
         self.unloaded = self.is_unloaded(borne[: self.n_bodies])
 
     def is_unloaded(self, force: Array) -> Mask:
@@ -187,16 +197,34 @@ class ReferenceScales:
         moduli = self.stiffness * self.cell_size ** (2 - d)
         return float(moduli[mine].max(initial=0.0))
 
-    def _belonging(self, operator: ContactOperator, number: int) -> Array:
-        """Whether points belong to parts, one or zero, (n_parts, n_points). Collective."""
-        n, own = len(self.group), self._own[number]
-        belongs = np.zeros((n, len(own)))
-        if n > 1 and not (operator.contact.rigid and not operator.contact.motions):
-            for part, row in enumerate(belongs):
-                jump = operator.jump((self.label == part).astype(np.float64))
-                row[:] = np.abs(jump).max(axis=1, initial=0.0) > _NO_SHARE
-        belongs[own, np.arange(len(own))] = 1.0
-        return belongs
+    def pairs(self, operator: ContactOperator, number: int, label: Index) -> Index:
+        """Parts that a contact presses on each other, (n_pairs, 2). Collective.
+
+        A body that it presses on a rigid support, or on nothing, is paired with itself.
+
+        Args:
+            operator: Of the contact, over some unknowns.
+            number: Of the contact.
+            label: Part of each of these unknowns.
+        """
+        own, opposite = self._sides(operator, number, label)
+        found = [np.column_stack([own, other]) for other in opposite.T]
+        found += [np.column_stack([own, np.full_like(own, m)]) for m in self._motions[number]]
+        mine = np.unique(np.concatenate(found), axis=0)
+        return np.unique(np.concatenate(self._comm.allgather(mine)), axis=0)
+
+    def _sides(self, operator: ContactOperator, number: int, label: Index) -> tuple[Index, Index]:
+        """The part on both sides of each of this rank's points. Collective.
+
+        Returns:
+            That with Γc, (n_points,), and by component what lies opposite, or the same where that
+            is rigid, (n_points, gdim).
+        """
+        own = self._own[number]
+        # Of the number of the part as a displacement a jump is the difference of both sides.
+        jump = operator.jump(np.where(np.isin(label, self._turning), 0.0, label + 1.0))
+        other = np.rint(own[:, None] + 1 - jump).astype(np.intp) - 1
+        return own, np.where(other < 0, own[:, None], other)
 
 
 def _body_of_points(

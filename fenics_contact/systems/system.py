@@ -23,6 +23,7 @@ from fenics_contact.systems.balance import Norms, Parts, by_body
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array, Mask
 
@@ -48,6 +49,7 @@ class System(ABC):
         outside: Norms of load and of `terms` at unknowns outside of the system, (2, n_bodies).
         label: Body or free support of every unknown of this rank, (n_local,).
         n_bodies: Their number.
+        scales: Reference scales of the bodies.
         linear_kind: How linear systems are solved, one of `linear.KINDS`.
         mark: Of the coordinates that `forces` are in.
         ready: Whether `fill` can be called; else `update` comes first.
@@ -56,6 +58,7 @@ class System(ABC):
     linear_kind = "direct"
     mark: object
     ready: bool
+    scales: ReferenceScales
 
     def __init__(
         self,
@@ -119,9 +122,16 @@ class System(ABC):
             bodies = [f"body {b + 1}" if n > 1 else "the body" for b in range(n)]
             bodies += [f"support of {self.contacts[c].name} {way}" for c, way in moving]
             touched = [operator.touched for operator in self.operators]
-            names = [c.name for c in self.contacts]
+            scales = self.scales
             parts = Parts(
-                self.unknowns.comm, self.label, bodies, names, touched, [c for c, _ in moving]
+                self.unknowns.comm,
+                self.label,
+                bodies,
+                [c.name for c in self.contacts],
+                touched,
+                [scales.pairs(o, i, self.label) for i, o in enumerate(self.operators)],
+                scales.held,
+                [c for c, _ in moving],
             )
             self._parts = pairings, parts
         return self._parts[1]

@@ -1,0 +1,89 @@
+"""Bodies that are carried far, much stiffer than what they touch: round-off excuses what it is.
+
+A displacement u of a body of the stiffness k has a round-off of its forces of about 1e-16 k u,
+which can be more than all forces of contact with a softer body.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+import fenics_contact as fc
+from fenics_contact.types import Array
+from scenes.beside import Beside, Box
+from scenes.blocks import BOTTOM, TOP
+from scenes.comparing import close, raised_everywhere
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
+WAYS = [
+    {},
+    {"method": "lbfgs", "condensation": False},
+    {"method": "newton", "condensation": False},
+]
+
+
+def pressed(stiffness: float, carried: float, **options) -> tuple[Array, fc.Step]:
+    """The force of a block, E = 1, on a slab so many times stiffer, both carried along."""
+    slab = Box((-0.5, -0.5), (2.0, 0.5), (6, 2), stiffness)
+    scene = Beside({"slab": slab, "block": Box(n=(4, 4))})
+    along = scene.bodies.constant(carried)
+    scene.hold("slab", BOTTOM, 0, value=along)
+    scene.hold("slab", BOTTOM, 1)
+    scene.hold("block", TOP, 0, value=along)
+    scene.hold("block", TOP, 1, value=-1e-2)
+    contact = scene.contact("block", BOTTOM, ("slab", TOP), fc.Coulomb(0.3), name="joint")
+    step = scene.problem(contact, **options).solve()
+    return step.contacts["joint"].force, step
+
+
+@pytest.mark.parametrize("options", WAYS, ids=["condensed", "lbfgs", "newton"])
+@pytest.mark.parametrize(
+    ("stiffness", "carried"), [(1e6, 10.0), (1e8, 10.0), (1e9, 10.0), (1e12, 0.3)]
+)
+def test_a_soft_block_on_a_stiff_slab(stiffness, carried, options):
+    """Its force is as where nothing is carried, to 1e-8; where the slab's is inexact it is said.
+
+    What passed was 1e-2 of the force at 1e9, and more than all of it at 1e12: it was off by 0.25 to
+    6 %. The tolerance is 1e-9 of the forces; displacements of 10 have a round-off of 1e-15, of
+    1e-2 by which the block is pressed.
+    """
+    expected, _ = pressed(stiffness, 0.0, **options)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found, step = pressed(stiffness, carried, **options)
+    assert close(found, expected, 1e-8)
+    inexact = step.verdict.inexact
+    assert set(inexact) <= {"body 1"}
+    said = [str(w.message) for w in caught if "round-off of its displacements" in str(w.message)]
+    assert len(said) == len(inexact)
+    assert bool(inexact) == (stiffness > 1e7)
+    assert step.iterations <= 20
+
+
+def test_a_stiff_slab_that_nothing_else_holds():
+    """Between two blocks, carried along: what presses on both of its sides cannot be told apart.
+
+    Refused, with the reason: its own equilibrium is round-off. Alike to the blocks it is right.
+    """
+
+    def between(stiffness):
+        slab = Box((-0.5, -0.2), (2.0, 0.2), (6, 2), stiffness)
+        scene = Beside({"low": Box((0.0, -1.2)), "slab": slab, "high": Box()})
+        along = scene.bodies.constant(0.3)
+        scene.hold("low", BOTTOM, 0, value=along)
+        scene.hold("low", BOTTOM, 1)
+        scene.hold("high", TOP, 0, value=along)
+        scene.hold("high", TOP, 1, value=-1e-2)
+        joints = [
+            scene.contact(box, side, ("slab", other), fc.Coulomb(0.3), name=box)
+            for box, side, other in (("high", BOTTOM, TOP), ("low", TOP, BOTTOM))
+        ]
+        step = scene.problem(*joints, fallback=False, method="newton").solve()
+        return [step.contacts[joint.name].force for joint in joints]
+
+    high, low = between(1.0)
+    assert close(high + low, 0 * high, 1e-8 * np.linalg.norm(high), scale=1.0)
+    raised_everywhere(lambda: between(1e12), fc.NotConverged, "leave a round-off of")
