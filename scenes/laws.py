@@ -1,7 +1,8 @@
-"""Laws of a user's own: an exponential overclosure, friction on it, and friction with a bound."""
+"""Laws of a user's own: exponential overclosure, friction on it or with a bound, an adhesive."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,6 +38,41 @@ class Overclosure(fc.Law):
         """∫ p dδ."""
         closing = kinematics.normal_displacement - kinematics.gap
         return parameters["h"] * self.pressure(closing, parameters)
+
+
+@dataclass(frozen=True)
+class Bond(fc.Law):
+    """An adhesive that pulls by k_n o exp(-o/h) at the opening o, and pushes by the same."""
+
+    k_n: Any
+    h: Any
+
+    @property
+    def has_tension(self):
+        """It pulls."""
+        return True
+
+    @property
+    def positive(self):
+        """Both."""
+        return frozenset({"k_n", "h"})
+
+    @property
+    def strength(self):
+        """The largest pull, at o = h."""
+        return self.k_n * self.h * math.exp(-1)
+
+    def response(self, kinematics, parameters):
+        """The pull, nothing along Γc."""
+        opening = kinematics.gap - kinematics.normal_displacement
+        pull = parameters["k_n"] * opening * ufl.exp(-opening / parameters["h"])
+        return fc.Response(pull, positive_part(opening), positive_part(-opening))
+
+    def normal_potential(self, kinematics, parameters):
+        """∫ pull do."""
+        k_n, h = parameters["k_n"], parameters["h"]
+        opening = kinematics.gap - kinematics.normal_displacement
+        return -k_n * h * (h + opening) * ufl.exp(-opening / h)
 
 
 @dataclass(frozen=True)

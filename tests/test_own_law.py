@@ -18,7 +18,7 @@ from fenics_contact.laws.return_maps import positive_part
 from scenes.blocks import TOP, block
 from scenes.comparing import close, gathered, raised_everywhere
 from scenes.elasticity import stress
-from scenes.laws import Asperities, Overclosure, Saturating
+from scenes.laws import Asperities, Bond, Overclosure, Saturating
 
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
@@ -59,6 +59,27 @@ def test_overclosure(cell, method, condensation):
 
 def _ones(contact):
     return np.ones(len(gathered(COMM, contact.pressure)))
+
+
+@pytest.mark.parametrize("condensation", [None, False])
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_a_bond_led_back_to_no_load(cell, condensation):
+    """An adhesive that softens, pulled to half of its strength and let go, twice over, and again.
+
+    What is left are displacements of round-off, in which the law's potential has no digit right.
+    The pull is k o exp(-o/h) = p at every point (1e-7 of the forces); without load nothing is left.
+    """
+    scene = block(cell, E=E, nu=NU)
+    bond = Bond(k_n=1e3, h=1e-2)
+    problem, contact = scene.problem(bond, scene.rollers(), condensation=condensation)
+    for pull in (1.0, 0.5 * bond.strength, 0.0, 0.0, 1.0, 0.0):
+        scene.load(up=pull)
+        step = problem.solve()
+        assert step.verdict.failures == []
+        problem.commit()
+        assert close(-gathered(COMM, contact.pressure), pull * _ones(contact), EXACT, scale=1.0)
+        opening = gathered(COMM, contact.gap)
+        assert close(1e3 * opening * np.exp(-opening / 1e-2), pull * _ones(contact), EXACT, scale=1)
 
 
 def test_any_units():

@@ -12,7 +12,7 @@ from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.tunnelling import Tunnelling
 from fenics_contact.contact.contact import Contact
 from fenics_contact.markup import shown
-from fenics_contact.parallel import longest
+from fenics_contact.parallel import global_max, global_min, longest
 from fenics_contact.systems.balance import MOST_EXCUSED
 from fenics_contact.types import Array
 
@@ -20,7 +20,7 @@ __all__ = ["Attempt", "Balance", "NotConverged", "Verdict", "check_laws"]
 
 # The laws hold point by point up to rounding of their few operations.
 _LAW_TOLERANCE = 1e-10
-# Round-off of a traction, as a share of it, in units of that tolerance.
+# Round-off as a share of a place or a traction, in units of that tolerance.
 _ROUND_OFF = 16 * np.finfo(float).eps / _LAW_TOLERANCE
 # Share of the energy exchanged that friction may seem to give: by the mean of the tractions at both
 # ends it does so where slip turns round within a long increment (6 % where a load aside is
@@ -281,7 +281,10 @@ def check_laws(contact: Contact) -> dict[str, float]:
         contact: An evaluated contact.
 
     Returns:
-        Largest violations, relative to the largest value concerned. "complementarity"
+        Largest violations, relative to the largest value concerned, or to the tolerance times
+        which it is the round-off of the places of points (16 eps times the size of the mesh), where
+        that is larger: displacements below it are none, and neither are tractions that they make,
+        such as what is left when a load has gone. "complementarity"
         (eq. 6-11: r_n ≤ 0, δ± ≥ 0, δ₊δ₋ = 0, r_n δ₊ = 0, s - u_n = δ₊ - δ₋, r_n = -k_n δ₋;
         with multipliers r_n = -k_n (u_n - s) - λ_n where that is < 0; of a law with its own
         `normal_potential` r_n is minus the derivative of it by u_n instead), or
@@ -305,8 +308,10 @@ def check_laws(contact: Contact) -> dict[str, float]:
         scale = worst(*scales)
         return value / scale if scale > 0 or not np.isfinite(scale) else value
 
+    x = contact.surface.mesh.geometry.x
+    nowhere = np.full(1, _ROUND_OFF * (global_max(comm, x) - global_min(comm, x)))
     opening, penetration, r_n = v.opening, v.penetration, v.normal_traction
-    length = (opening, penetration, v.initial_gap, v.normal_displacement)
+    length = (opening, penetration, v.initial_gap, v.normal_displacement, nowhere)
     violations = [
         relative(
             worst(
@@ -318,35 +323,32 @@ def check_laws(contact: Contact) -> dict[str, float]:
             *length,
         )
     ]
+    acting = np.where(r_n != 0, v.normal_stiffness, 0.0)  # where none acts it may be infinite
+    pressure = (r_n, nowhere * acting)
     if law.has_own_normal:
-        k = np.where(r_n != 0, v.normal_stiffness, 0.0)
-        parts = (k * v.normal_displacement, k * v.initial_gap)  # whose round-off is in r_n
         pull = np.maximum(r_n, 0) if not law.has_tension else np.zeros_like(r_n)
-        violations.append(relative(worst(pull, r_n - v.normal_reaction), r_n, *parts))
+        violations.append(relative(worst(pull, r_n - v.normal_reaction), *pressure))
     elif law.has_tension:
-        k_n = v.parameters["k_n"]
-        elastic = k_n * (v.normal_displacement - v.initial_gap)
-        parts = (k_n * v.normal_displacement, k_n * v.initial_gap)  # whose round-off is in r_n
-        violations.append(relative(worst(r_n + elastic), r_n, *parts))
+        elastic = v.parameters["k_n"] * (v.normal_displacement - v.initial_gap)
+        violations.append(relative(worst(r_n + elastic), *pressure))
     elif law.has_normal_stiffness and contact.multipliers is not None:
         slack = -r_n - v.multiplier - v.parameters["k_n"] * (penetration - opening)
-        violations.append(relative(worst(np.minimum(-r_n, slack)), r_n, v.multiplier))
+        violations.append(relative(worst(np.minimum(-r_n, slack)), v.multiplier, *pressure))
     elif law.has_normal_stiffness:
         elastic = v.parameters["k_n"] * penetration
-        violations.append(relative(worst(np.maximum(r_n, 0), r_n + elastic), r_n))
+        violations.append(relative(worst(np.maximum(r_n, 0), r_n + elastic), *pressure))
     violations.append(relative(worst(contact.traction[~paired]), contact.traction))
     found = {"stiffness" if law.has_tension else "complementarity": max(violations)}
     if not law.has_tangential:
         return found
 
     tau, stiffness = v.traction, contact.tangential_stiffness[paired]
+    stiffest = np.linalg.norm(stiffness, axis=(1, 2))
     if not law.has_friction:
         elastic = np.einsum("qij,qj->qi", stiffness, contact.tangential_displacement[paired])
         if not law.has_tension:
             elastic[penetration <= 0] = 0.0
-        # Round-off in u_t is that of the displacement it is a part of.
-        whole = np.linalg.norm(stiffness, axis=(1, 2))[:, None] * v.jump
-        violation = relative(worst(tau + elastic), tau, whole)
+        violation = relative(worst(tau + elastic), tau, nowhere * stiffest)
         found["stiffness"] = max(found.get("stiffness", 0.0), violation)
         return found
 
@@ -357,12 +359,11 @@ def check_laws(contact: Contact) -> dict[str, float]:
     # An open point keeps no traction and counts no slip, whatever it moves.
     bears = bound > 0
     slipped = -np.einsum("qm,qmd->qd", beta, gradients)
-    # Round-off in the increments is that of the displacements they are differences of, and of the
-    # traction, which the springs turn into one: with multipliers that is larger than either.
-    size = np.linalg.norm(stiffness, axis=(1, 2))
+    # Round-off of the traction is one of the slip by the springs, large where these are soft; that
+    # of the increments is by the displacements which they are differences of.
     borne = np.linalg.norm(tau, axis=1)
-    yields = np.divide(borne, size, out=np.zeros_like(borne), where=size > 0)
-    travel = (v.jump, v.increment, change, _ROUND_OFF * yields)
+    yields = np.divide(borne, stiffest, out=np.zeros_like(borne), where=stiffest > 0)
+    travel = (v.jump, v.increment, change, nowhere, _ROUND_OFF * yields)
     found["cone"] = relative(worst(np.maximum(functions, 0)), bound)
     # Where nothing presses a law may bound friction by zero, whatever its bound without pressure.
     apart = np.where((r_n < 0) | (bound != 0.0), bound - v.bound_of_law, 0.0)
