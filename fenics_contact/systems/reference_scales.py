@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -150,7 +151,7 @@ class ReferenceScales:
         n = len(self.group)
         borne: Array = np.zeros(n)
         self.touching = np.zeros((len(operators), self.n_bodies), dtype=np.bool_)
-        every = [np.zeros((0, 2), dtype=np.intp)]
+        every: list[Any] = [np.zeros((0, 2), dtype=np.intp)]
         for number, operator in enumerate(operators):
             pairs = self.pairs(operator, number, self.label)
             self.touching[number, pairs[pairs < self.n_bodies]] = True
