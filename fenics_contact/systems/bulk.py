@@ -102,7 +102,7 @@ class Bulk:
                     f"F has {other.name!r}, a part of u as w.sub(i) gives it, which its derivative "
                     "by u does not know; take the parts of ufl.split(w)"
                 )
-        check_measures(form, u.function_space.mesh.comm)
+        check_measures(form, u.function_space.mesh)
         form = share_subdomain_data(form)
         self._u, self.displacement = u, displacement
         self.units: Array | None = None

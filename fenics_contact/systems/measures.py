@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import dolfinx
 import ufl
-from mpi4py import MPI
 
+from fenics_contact import compat
 from fenics_contact.parallel import warn
 
 __all__ = ["check_measures", "share_subdomain_data"]
@@ -15,15 +16,21 @@ _MEASURES = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
 _EVERYWHERE = "everywhere"  # UFL's word for an integral over all cells, or all facets of a kind
 
 
-def check_measures(form: ufl.Form, comm: MPI.Comm) -> None:
-    """Refuse measures without the tags that they are over, or with two objects of tags. Collective.
+def check_measures(form: ufl.Form, mesh: dolfinx.mesh.Mesh) -> None:
+    """Refuse measures without the tags that they are over, or with tags of others. Collective.
 
     It warns of tags of nothing. An integral over a tag that is not known is zero without a word
     from DOLFINx: a load that is not there.
 
+    Args:
+        form: A residual.
+        mesh: That it is on.
+
     Raises:
-        ValueError: A measure has no tags, or two of one kind have different ones. On all ranks.
+        ValueError: A measure has no tags, two of one kind have different ones, or tags are of
+            other entities or of another mesh. On all ranks.
     """
+    comm, tdim = mesh.comm, mesh.topology.dim
     shared = _subdomain_data(form)
     for integral in form.integrals():
         kind, data = integral.integral_type(), integral.subdomain_data()
@@ -35,6 +42,13 @@ def check_measures(form: ufl.Form, comm: MPI.Comm) -> None:
                 "for each kind of measure: put the tags of both into one MeshTags (or list), and "
                 f'make all of them by {measure} = ufl.Measure("{measure}", domain=mesh, '
                 "subdomain_data=tags)"
+            )
+        dim, what = (tdim, "cells") if kind == "cell" else (tdim - 1, "facets")
+        if hasattr(data, "dim") and not (data.dim == dim and compat.entities_of(data, mesh)):
+            raise ValueError(
+                f"F has an integral over {measure}({tag}) whose tags are on entities of dimension "
+                f"{data.dim} of {'this' if compat.entities_of(data, mesh) else 'another'} mesh; "
+                f"give it tags of the {what} of the mesh of u"
             )
         if tag == _EVERYWHERE:
             continue
