@@ -16,6 +16,7 @@ from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
 from fenics_contact.histories.archive import Stored
 from fenics_contact.histories.places import parts_of, positions
+from fenics_contact.histories.signature import signature_of_law, signature_of_support
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.problem import ContactProblem
 from fenics_contact.supports.base import SampledSupport
@@ -100,12 +101,19 @@ def data_words(problem: ContactProblem) -> dict[str, str]:
         parameters = c.law.parameters()
         switches = {n: v for n, v in vars(c.law).items() if n not in parameters}
         words[f"law of {c.name}"] = _name(c.law, switches)
+        gdim, multipliers = problem.u.function_space.mesh.geometry.dim, c.multipliers is not None
+        code = signature_of_law(c.law, gdim, multipliers=multipliers)
+        words[f"code (UFL) of the law of {c.name}"] = code
         switches = {n: v for n, v in vars(c.support).items() if isinstance(v, bool | str)}
         if isinstance(c.support, DeformableBody):
             switches["search_distance"] = c.support.search_distance
         if isinstance(c.support, SampledSupport):
             switches["data"] = c.support.fingerprint
         words[f"support of {c.name}"] = _name(c.support, switches)
+        if c.finite and c.rigid and not isinstance(c.support, SampledSupport):
+            # With small displacements its values on Γc are all that counts.
+            code = signature_of_support(c.support, gdim)
+            words[f"code (UFL) of the support of {c.name}"] = code
         words[f"enforcement of {c.name}"] = (
             "penalty" if c.multipliers is None else f"augmented to {c.tolerance:g}"
         )

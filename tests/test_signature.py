@@ -1,0 +1,138 @@
+"""Signatures of laws and obstacles: other code is told apart, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.histories.signature import signature_of_law, signature_of_support
+from scenes.blocks import TOP, block
+from scenes.comparing import raised_everywhere, shared_folder
+from scenes.histories import Press
+
+COMM = MPI.COMM_WORLD
+pytestmark = pytest.mark.mpi
+
+
+def made(power=1.0, factor=1.0):
+    """A class of laws by the code of its friction bound; all have one name and parameters."""
+
+    @dataclass(frozen=True)
+    class Rubber(fc.Coulomb):
+        def friction_bound(self, kinematics, pressure, parameters):
+            return factor * parameters["friction"] * pressure**power
+
+    return Rubber
+
+
+@dataclass(frozen=True)
+class Fixed(fc.Law):
+    """Written here in full, so that its signature is that of no code of the package."""
+
+    k_n: float
+    k_t: float
+
+    @property
+    def has_tangential(self):
+        """It has, without friction."""
+        return True
+
+    def response(self, kinematics, parameters):
+        """Springs in both directions, the tangential ones where the gap is closed."""
+        n, u_t = kinematics.normal, kinematics.tangential_displacement
+        closing = kinematics.normal_displacement - kinematics.gap
+        across = ufl.Identity(len(n)) - ufl.outer(n, n)
+        traction = -parameters["k_t"] * ufl.dot(across, u_t) / (1 + ufl.dot(u_t, u_t))
+        traction = ufl.conditional(ufl.gt(closing, 0), traction, 0 * traction)
+        opening, penetration = ufl.max_value(-closing, 0), ufl.max_value(closing, 0)
+        return fc.Response(-parameters["k_n"] * penetration, opening, penetration, traction)
+
+    def stored(self, kinematics, response, parameters):
+        """Of no matter here."""
+        return response.penetration**2
+
+    def tangential_stiffness(self, kinematics, parameters):
+        """Of no matter here."""
+        return parameters["k_t"] * ufl.Identity(len(kinematics.normal))
+
+
+def test_it_is_the_same_in_every_process_and_release():
+    """Noted with DOLFINx 0.9 and 0.11: whatever was made before, on any rank."""
+    mesh = block("quadrilateral").mesh
+    noted = {2: "72c9dc8954bebf90", 3: "ae596acdcc4a05ba"}
+    for _ in range(1 + 7 * COMM.rank):
+        ufl.indices(3)
+        ufl.variable(fem.Constant(mesh, 1.0))
+        for gdim, word in noted.items():
+            assert signature_of_law(Fixed(1.0, 1.0), gdim, multipliers=False) == word
+
+
+def test_laws_are_told_apart_by_their_code():
+    """By bound, polygon, dimension and multipliers; not by the values of parameters."""
+    laws = [fc.Coulomb(0.3), fc.Coulomb(0.3, modes=4), fc.Coulomb(0.3, modes=5)]
+    laws += [made()(0.3), made(power=0.9)(0.3), made(factor=1.01)(0.3)]
+    laws += [fc.Tresca(0.3, 1.0), fc.Tresca(0.3, 1.0, unilateral=False)]
+    laws += [fc.Foundation(1.0, 1.0), fc.Foundation(1.0, 1.0, tension=False), fc.Frictionless()]
+    words = [signature_of_law(law, 3, multipliers=False) for law in laws]
+    # A factor and an exponent of one are none.
+    assert words[3] == words[0] and len(set(words)) == len(words) - 1
+    assert words == [signature_of_law(law, 3, multipliers=False) for law in laws]
+    assert signature_of_law(laws[0], 2, multipliers=False) != words[0]
+    assert signature_of_law(laws[0], 3, multipliers=True) != words[0]
+    assert signature_of_law(fc.Coulomb(0.7, 1e3, 1e2), 3, multipliers=False) == words[0]
+
+
+def test_a_long_chain():
+    """An obstacle of 3000 terms, one in the other, is no matter to Python's stack."""
+
+    def distance(x):
+        found = x[0]
+        for k in range(1, 3000):
+            found = ufl.min_value(found, x[1] + k)
+        return found
+
+    assert len(signature_of_support(fc.Obstacle(distance=distance), 2)) == 16
+
+
+@pytest.mark.parametrize("other", [made(power=0.99), made(factor=1.001)])
+def test_a_checkpoint_of_other_code_is_refused(other, tmp_path):
+    """The class has the same name and parameters; the same code made again goes on."""
+    path, options = shared_folder(tmp_path) / "state.npz", {"friction": 0.3, "k_n": 2e4, "k_t": 1e4}
+    first = Press(made()(**options))
+    for step in first.increments(checkpoint=path):
+        if step.increment == 2:
+            break
+    changed = Press(other(**options))
+    raised_everywhere(
+        lambda: next(changed.increments(checkpoint=path)), ValueError, "code (UFL) of the law of"
+    )
+    assert next(Press(made()(**options)).increments(checkpoint=path)).increment == 3
+    told = Press(other(**options))
+    assert next(told.increments(checkpoint=path, changed="continue")).increment == 4
+
+
+def test_a_checkpoint_of_an_obstacle_of_other_shape_elsewhere_is_refused(tmp_path):
+    """With finite kinematics bodies go to where two obstacles differ that are one at Γc."""
+    path = shared_folder(tmp_path) / "state.npz"
+
+    def history(height):
+        scene = block("quadrilateral", n=3)
+        push = fem.Constant(scene.mesh, 0.0)
+
+        def distance(x):
+            return x[1] - height * ufl.max_value(x[0] - 2.0, 0.0) ** 2
+
+        support = fc.Obstacle(distance=distance)
+        bcs = [scene.hold(TOP, 1, push), scene.hold(TOP, 0)]
+        contact = {"support": support, "kinematics": "finite"}
+        problem, _ = scene.problem(fc.Frictionless(), bcs, contact=contact)
+        return fc.increments(problem, push, 0.0, -0.02, steps=2, checkpoint=path)
+
+    next(history(0.0))
+    raised_everywhere(lambda: next(history(0.1)), ValueError, "code (UFL) of the support of")
+    assert next(history(0.0)).increment == 2
