@@ -136,7 +136,7 @@ class Judge:
                 warn(
                     self._comm,
                     f"{name}: displacements are taken as small, with gap and normals of the "
-                    f"undeformed body; where it has moved to, {found.in_words()}",
+                    f"undeformed body; where it has moved to, {found.describe()}",
                 )
 
     def warn_of_round_off(self, verdict: Verdict) -> None:

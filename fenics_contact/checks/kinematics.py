@@ -108,7 +108,7 @@ class Linearisation:
         """Whether it is more than 1 % of force or pressure."""
         return self.worst > _NOTABLE
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """By how much, in words."""
         return (
             f"the contact force would differ by {100 * self.force:.2g} % and the pressure by "

@@ -84,7 +84,7 @@ class Step:
         """What taking displacements as small leaves out of every contact, where it is notable."""
         found = self.verdict.kinematics.items()
         return [
-            f"{name}: displacements are taken as small, else {left_out.in_words()}"
+            f"{name}: displacements are taken as small, else {left_out.describe()}"
             for name, left_out in found
             if left_out.is_notable
         ]
