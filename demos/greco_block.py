@@ -172,7 +172,7 @@ def main() -> int:
         contact.u,
         title="GRECO block",
         magnification=100,
-        support=[[0.0, 0.0], [SIZE, 0.0]],
+        contacts=[contact],
     )
     points = contact.gather()
     if comm.rank == 0:

@@ -337,7 +337,7 @@ def write(folder: Path, scene: Scene, result: dict[str, Any]) -> None:
     fc.Writer(folder, scene.problem, stress=scene.stress).write(load)
     title = f"Half-cylinder on a rigid plane, μ = {friction:g}, q = {load:g} MPa"
     plotting.plot_deformation(
-        folder / "mesh.png", scene.u, title=title, support=[[0.0, 0.0], [0.7 * R, 0.0]]
+        folder / "mesh.png", scene.u, title=title, contacts=scene.problem.contacts
     )
     points = scene.contact.gather()
     if scene.u.function_space.mesh.comm.rank:

@@ -206,9 +206,9 @@ def main() -> int:
         references[name] = (sliding(friction), SLIDING)
     fc.Writer(folder, problem, stress=block.body.stress).write(arguments.push)
     title = "Pushed uphill, μ = 0.3"
-    line = [[0.0, 0.0], [LENGTH, WEDGE_SLOPE * LENGTH]]
+    contacts = problem.contacts
     plotting.plot_deformation(
-        folder / "mesh.png", block.u, title=title, magnification=200, support=line
+        folder / "mesh.png", block.u, title=title, magnification=200, contacts=contacts
     )
     result = {
         "references": output.compare(values, references),

@@ -247,7 +247,7 @@ def test_a_history_that_is_resumed(tmp_path):
     assert [row[0] for row in after] == [*range(1, 9)]
     assert close([row[2] for row in after], [row[2] for row in expected], whole.tolerance)
     kept = [n for n in before if n.endswith(".vtu") and int(n[-8:-4]) < 4]
-    assert len(kept) == 12
+    assert len(kept) == 16
     now = files(folder / "parts")
     assert all(now[name] == before[name] for name in kept)
 
@@ -256,7 +256,9 @@ def test_a_history_that_is_resumed(tmp_path):
     writer = fc.Writer(folder / "parts", fresh.problem)
     writer.write(next(iter(fresh.increments(4.0))))
     names = sorted(
-        f"{n}{end}" for n in ("body", "floor", "floor_points") for end in (".pvd", "_0000.vtu")
+        f"{n}{end}"
+        for n in ("body", "floor", "floor_points", "floor_obstacle")
+        for end in (".pvd", "_0000.vtu")
     )
     assert sorted(files(folder / "parts")) == names
 

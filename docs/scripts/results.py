@@ -43,7 +43,7 @@ print(budget)
 fc.report(problem, step, "output", history="output/history.csv", stress=steel.stress, budget=budget)
 fc.plotting.plot_pressure("output/pressure.png", contact)
 fc.plotting.plot_status("output/status.png", contact)
-fc.plotting.plot_deformation("output/deformation.png", u, magnification=1000)
+fc.plotting.plot_deformation("output/deformation.png", u, magnification=1000, contacts=[contact])
 
 # begin function
 pressure = contact.function("pressure")

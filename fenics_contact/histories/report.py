@@ -26,6 +26,7 @@ from fenics_contact.markup import shown
 from fenics_contact.parallel import collective_errors, global_max
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import drawing, files, plotting
+from fenics_contact.results.obstacles import shapes_of
 from fenics_contact.types import Array
 
 __all__ = ["report"]
@@ -349,7 +350,8 @@ def _state(
     with collective_errors(problem.u.function_space.mesh.comm):
         if drawn is not None:
             units = page.length, page.stress
-            figure = drawing.deformed(drawn, units, "", magnification, None, page.view)
+            obstacles = shapes_of(problem.contacts)
+            figure = drawing.deformed(drawn, units, "", magnification, obstacles, page.view)
             drawing.save(figure, path)
     told = "" if magnification == 1 else f", displacements × {magnification:g}"
     page.pictures(page.picture(path, f"Original and deformed mesh{told}"))

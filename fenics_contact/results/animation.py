@@ -17,6 +17,7 @@ from fenics_contact.checks.step import Step
 from fenics_contact.parallel import collective_errors
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import drawing, files
+from fenics_contact.results.obstacles import ObstacleShape, box_about, shapes_of
 from fenics_contact.results.writer import facet_status
 from fenics_contact.types import Array
 
@@ -30,11 +31,11 @@ class Animation:
     """A film of a problem's states, one frame a call of `add`, written by `save`.
 
     The body is drawn as it is deformed, coloured by its von Mises stress where one is given; in the
-    plane Γc, too: grey where it is open, blue where it sticks, red where it slips. A legend says
-    so, and how many times the displacement is drawn. All frames have the same axes and the same
-    colours, those of all states together. So they are drawn at the end; until then what is to be
-    drawn is in temporary files beside the film, and in memory nothing of it. While they are drawn a
-    frame takes one byte for each of its pixels.
+    plane Γc, too: grey where it is open, blue where it sticks, red where it slips. Rigid obstacles
+    are drawn where they are. A legend says so, and how many times the displacement is drawn. All
+    frames have the same axes and the same colours, those of all states together. So they are drawn
+    at the end; until then what is to be drawn is in temporary files beside the film, and in memory
+    nothing of it. While they are drawn a frame takes one byte for each of its pixels.
     """
 
     def __init__(
@@ -82,9 +83,11 @@ class Animation:
         self._shape = drawing.ShapeOf(problem.displacement.u, stress)
         self._n_frames = 0
         self._folder = Path()  # of what is to be drawn, on the first rank
+        self._obstacles: list[ObstacleShape] = []  # there
         with collective_errors(self._comm):
             if self._comm.rank == 0:
                 drawing.pyplot()  # whether it is there
+                self._obstacles = shapes_of(problem.contacts)
                 files.make_folder(self.path.parent)
                 # Where there is room for the film; /tmp may be memory.
                 folder, prefix = self.path.parent, f".{self.path.stem}."
@@ -127,6 +130,7 @@ class Animation:
                     frame["stress"] = shape.stress
                 if ends:
                     frame |= {"ends": np.concatenate(ends), "status": np.concatenate(status)}
+                frame |= {f"obstacle {i}": o.state() for i, o in enumerate(self._obstacles)}
                 np.savez(self._frame(self._n_frames), **frame)  # type: ignore[arg-type]
         self._n_frames += 1
 
@@ -174,12 +178,17 @@ class Animation:
             corners.append(np.array([flat.min(axis=0), flat.max(axis=0)]))
             largest = max(largest, frame.get("stress", np.zeros(0)).max(initial=0.0))
         unit, stress_unit, title = self._words
-        figure, axes = drawing.made_axes(np.array(corners), unit, title, self._view)
+        margin = drawing.MARGIN[bool(self._obstacles)]
+        places = np.array(corners)
+        figure, axes = drawing.made_axes(places, unit, title, self._view, margin)
+        box = box_about(places, margin)
         colours = drawing.scale_of(0.0, largest)
         body_of = drawing.magnified(self._magnification)
         handles = [Patch(fc=_BODY, ec=_EDGES, label=body_of)]
         handles += drawing.status_patches() if surfaces else []
-        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        if self._obstacles:
+            handles.append(drawing.obstacle_entry(box.shape[1]))
+        figure.legend(handles=handles, loc="outside lower center", ncols=3)
         try:
             for number, frame in enumerate(self._frames()):
                 faces: Any = _BODY
@@ -195,6 +204,10 @@ class Animation:
                     line = drawing.on_surface(frame["ends"], of_status)
                     line.set_linewidth(3.0)
                     drawn.append(axes.add_collection(line))
+                for i, shape in enumerate(self._obstacles):
+                    surface = shape(box, self._magnification, frame[f"obstacle {i}"])
+                    if len(surface):
+                        drawn.append(axes.add_collection(drawing.on_obstacle(surface)))
                 axes.set_title(f"{title}: {frame['words']}" if title else str(frame["words"]))
                 figure.canvas.draw()
                 image = Image.fromarray(np.array(figure.canvas.buffer_rgba())).convert("RGB")

@@ -20,20 +20,25 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_sum
 from fenics_contact.results import files
+from fenics_contact.results.obstacles import ObstacleShape, box_about, shapes_of
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.types import Array, Mask
 
 __all__ = [
     "COLOURS",
+    "MARGIN",
     "Shape",
     "ShapeOf",
     "Surface",
+    "add_obstacles",
     "check_near",
     "check_view",
     "deformed",
     "facets_of",
     "made_axes",
     "magnified",
+    "obstacle_entry",
+    "on_obstacle",
     "on_surface",
     "polygons",
     "pyplot",
@@ -46,10 +51,13 @@ __all__ = [
 ]
 
 
+# Of the size of what is drawn how much is shown beyond it, with and without obstacles.
+MARGIN = {True: 0.08, False: 0.03}
 COLOURS = {
     "pressure": "#1f5fa8",
     "tangential": "#c8502a",
     "mesh": "#9a9a9a",
+    "obstacle": "#111111",
     "open": "#d8d8d8",
 }
 # What legends call them, and their colours.
@@ -213,15 +221,29 @@ class Surface:
             bears=self.bears[kept],
         )
 
-    def axes(self, unit: str, title: str, view: tuple[float, float] | None) -> tuple[Any, Any]:
-        """A figure with the body in it, seen so that Γc is in front unless a view is given."""
+    def axes(
+        self,
+        unit: str,
+        title: str,
+        view: tuple[float, float] | None,
+        contact: Contact,
+        magnification: float,
+    ) -> tuple[Any, Any, list[Any]]:
+        """A figure with the body in it, seen so that Γc is in front unless a view is given.
+
+        In the plane with the contact's obstacle; in space it would hide Γc. The last are entries of
+        a legend.
+        """
         d = self.body.shape[2]
         if view is None and d == 3:
             view = _towards(self.outward)
         places = np.concatenate([self.body.reshape(-1, d), self.facets.reshape(-1, d)])
-        figure, axes = made_axes(places[None], unit, title, view)
+        shown = shapes_of([contact]) if d == 2 else []
+        margin = MARGIN[bool(shown)]
+        figure, axes = made_axes(places[None], unit, title, view, margin)
         axes.add_collection(polygons(self.body, "#9a9a9a10", "#9a9a9a60", 0.4))
-        return figure, axes
+        handles = add_obstacles(axes, shown, box_about(places, margin), magnification)
+        return figure, axes, handles
 
 
 def surface_of(contact: Contact, values: npt.NDArray[Any], magnification: float) -> Surface | None:
@@ -278,13 +300,14 @@ def deformed(
     units: tuple[str, str],
     title: str,
     magnification: float,
-    support: Sequence[Sequence[float]] | None,
+    obstacles: Sequence[ObstacleShape],
     view: tuple[float, float] | None,
 ) -> Any:
     """The figure of `plotting.plot_deformation`; units are those of length and stress."""
     original, moved = shape.original, shape.deformed(magnification)
     places = np.concatenate([original, moved])
-    figure, axes = made_axes(places, units[0], title, view)
+    margin = MARGIN[bool(obstacles)]
+    figure, axes = made_axes(places, units[0], title, view, margin)
     plane = original.shape[2] == 2  # in space what is behind is hidden
     if plane:
         axes.add_collection(polygons(original, "#ffffff00", COLOURS["mesh"], 0.4))
@@ -294,27 +317,56 @@ def deformed(
         lines = Line3DCollection(list(_ridges(original)), colors=COLOURS["mesh"], linewidths=0.8)
         axes.add_collection(lines)
     edges, width = COLOURS["pressure"], 0.5 if plane else 0.3
-    faces: Any = "#1f5fa818" if plane else "#e3ebf5e8"
+    body = faces = "#1f5fa818" if plane else "#e3ebf5e8"
     if shape.stress is not None:
         colours = scale_of(0.0, shape.stress.max(initial=0.0))
         faces, edges, width = colours.to_rgba(shape.stress), "#11111180", 0.2
+        body = colours.to_rgba(shape.stress.max(initial=0.0) / 2)
         figure.colorbar(colours, ax=axes, label=f"von Mises stress [{units[1]}]", shrink=0.8)
     axes.add_collection(polygons(moved, faces, edges, width))
     from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
 
     handles = [
         Line2D([], [], color=COLOURS["mesh"], label="original"),
-        Line2D([], [], color=edges[:7], label=magnified(magnification)),
+        Patch(fc=body, ec=edges, label=magnified(magnification)),
     ]
-    if support is not None:
-        ends = np.asarray(support)
-        handles += axes.plot(
-            ends[:, 0], ends[:, 1], color="black", linewidth=2, label="rigid support"
-        )
-        axes.autoscale()
-        axes.margins(0.03)
+    handles += add_obstacles(axes, obstacles, box_about(places, margin), magnification)
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
+
+
+def add_obstacles(
+    axes: Any, obstacles: Sequence[ObstacleShape], box: Array, magnification: float
+) -> list[Any]:
+    """Draw rigid obstacles where they are within a box; entries of a legend for them."""
+    surfaces = [shape(box, magnification) for shape in obstacles]
+    drawn = [on_obstacle(corners) for corners in surfaces if len(corners)]
+    for each in drawn:
+        axes.add_collection(each)
+    return [obstacle_entry(box.shape[1])] if drawn else []
+
+
+def obstacle_entry(d: int) -> Any:
+    """Entry of a legend for rigid obstacles in d dimensions."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    colour, label = COLOURS["obstacle"], "rigid obstacle"
+    if d == 3:
+        return Patch(fc=f"{colour}18", ec="none", label=label)
+    return Line2D([], [], color=colour, linewidth=2.2, label=label)
+
+
+def on_obstacle(corners: Array) -> Any:
+    """Segments of an obstacle, or triangles through which the body can be seen, (n, d, d)."""
+    from matplotlib.collections import LineCollection
+
+    if corners.shape[2] == 3:
+        return polygons(corners, COLOURS["obstacle"] + "18", "none", 0.0)
+    lines = LineCollection(list(corners), colors=COLOURS["obstacle"], linewidths=2.2, zorder=1.5)
+    lines.set_capstyle("round")  # the zorder: below Γc
+    return lines
 
 
 def magnified(magnification: float) -> str:
@@ -345,14 +397,15 @@ def _ridges(facets: Array) -> Array:
 
 
 def made_axes(
-    places: Array, unit: str, title: str, view: tuple[float, float] | None
+    places: Array,
+    unit: str,
+    title: str,
+    view: tuple[float, float] | None,
+    margin: float = MARGIN[False],
 ) -> tuple[Any, Any]:
-    """A figure and axes of equal scale that hold all places, (n, m, d)."""
+    """A figure and axes of equal scale that hold all places, (n, m, d), and a margin."""
     plt, d = pyplot(), places.shape[2]
-    places = places.reshape(-1, d)
-    low, high = places.min(axis=0), places.max(axis=0)
-    margin = 0.03 * (high - low).max()
-    low, high = low - margin, high + margin
+    low, high = box_about(places, margin)
     labels = dict(
         zip(("xlabel", "ylabel", "zlabel"), (f"{a} [{unit}]" for a in "xyz"), strict=True)
     )

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from dolfinx import fem
 
+from fenics_contact.arguments import listed
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import collective_errors
 from fenics_contact.results import drawing
 from fenics_contact.results.along import along
+from fenics_contact.results.obstacles import shapes_of
 from fenics_contact.results.writer import facet_status
 from fenics_contact.types import Array, Mask
 
@@ -46,7 +48,7 @@ def plot_deformation(
     stress_unit: str = "MPa",
     title: str = "",
     magnification: float = 1.0,
-    support: Sequence[Sequence[float]] | None = None,
+    contacts: Sequence[Contact] = (),
     view: tuple[float, float] | None = None,
 ) -> None:
     """Draw the original and the deformed mesh over each other. Collective.
@@ -62,7 +64,8 @@ def plot_deformation(
         stress_unit: Unit of stress, for the colours.
         title: Title.
         magnification: Factor by which the displacement is drawn.
-        support: End points of a line to draw as the rigid support, shape (2, gdim).
+        contacts: Whose rigid obstacles are drawn, where they are now; their displacements are
+            magnified as that of the body.
         view: In space where to look from: elevation and azimuth in degrees.
 
     Raises:
@@ -70,11 +73,11 @@ def plot_deformation(
         OSError: The file cannot be written; it is as before. On all ranks.
     """
     shape = drawing.ShapeOf(u, stress)()
+    contacts = listed("contacts", contacts, Contact)
     with collective_errors(u.function_space.mesh.comm):
         if shape is not None:
-            figure = drawing.deformed(
-                shape, (unit, stress_unit), title, magnification, support, view
-            )
+            obstacles, units = shapes_of(contacts), (unit, stress_unit)
+            figure = drawing.deformed(shape, units, title, magnification, obstacles, view)
             drawing.save(figure, path)
 
 
@@ -128,7 +131,7 @@ def plot_field(
         if drawn is None:
             return
         drawn = drawn.around(near)
-        figure, axes = drawn.axes(length, title, view)
+        figure, axes, handles = drawn.axes(length, title, view, contact, magnification)
         from matplotlib.colors import to_rgba
         from matplotlib.patches import Patch
 
@@ -145,8 +148,9 @@ def plot_field(
         figure.colorbar(colours, ax=axes, label=f"{name} [{unit}]", shrink=0.8)
         if none.any():
             label = "gap not known" if field == "gap" else f"no {field}"
-            entry = Patch(fc=grey, ec="#555555", label=label)
-            figure.legend(handles=[entry], loc="outside lower center")
+            handles.append(Patch(fc=grey, ec="#555555", label=label))
+        if handles:
+            figure.legend(handles=handles, loc="outside lower center", ncols=2)
         drawing.save(figure, path)
 
 
@@ -202,10 +206,11 @@ def plot_status(
         if drawn is None:
             return
         drawn = drawn.around(near)
-        figure, axes = drawn.axes(length, title, view)
+        figure, axes, handles = drawn.axes(length, title, view, contact, magnification)
         colours = drawing.status_colours(drawn.values)
         axes.add_collection(drawing.on_surface(drawn.facets, colours))
-        figure.legend(handles=drawing.status_patches(), loc="outside lower center", ncols=3)
+        handles = [*drawing.status_patches(), *handles]
+        figure.legend(handles=handles, loc="outside lower center", ncols=4)
         drawing.save(figure, path)
 
 

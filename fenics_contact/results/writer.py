@@ -26,11 +26,15 @@ from fenics_contact.parallel import collective_errors
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import files, vtu
 from fenics_contact.results.drawing import von_mises
+from fenics_contact.results.obstacles import ObstacleShape, box_about
 from fenics_contact.surface.facet_values import facet_values
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.types import Array
 
 __all__ = ["Writer", "facet_status"]
+
+# Of the size of the body, how far beyond it obstacles are written.
+_ABOUT = 0.1
 
 
 class Writer:
@@ -41,14 +45,16 @@ class Writer:
     - ``body.pvd``: displacement and, if given, stress and von_mises;
     - ``CONTACT.pvd`` for every contact, by its name: Γc, whose facets have what `facet_values`
       makes of the values at their points; the status is that of most of them;
-    - ``CONTACT_points.pvd``: the quadrature points of Γc, with the values themselves.
+    - ``CONTACT_points.pvd``: the quadrature points of Γc, with the values themselves;
+    - ``CONTACT_obstacle.pvd``, where it is rigid and has a place of its own: its surface about the
+      body, where it is at that time.
 
-    Both of a contact have displacement, pressure, tangential_traction (on the body), gap, slip
-    (accumulated and committed, the sum of the modes), status (`Status`), normal (from body to
+    The first two of a contact have displacement, pressure, tangential_traction (on the body), gap,
+    slip (accumulated and committed, the sum of the modes), status (`Status`), normal (from body to
     support); with finite kinematics true_pressure, per deformed area, the others being nominal; and
     if the support is deformable paired, the share of points with an opposite. Where nothing is
-    opposite the gap is NaN. All are on the undeformed body: "Warp By Vector" with the displacement
-    moves body, Γc and points alike.
+    opposite the gap is NaN. Body, Γc and points are on the undeformed body: "Warp By Vector" with
+    the displacement moves them alike; obstacles are where they have moved to.
 
     Every file is complete or as before, whenever writing ends, and nothing has to be closed.
     """
@@ -77,6 +83,8 @@ class Writer:
         self._body = _Body(problem, stress)
         self._surfaces = [_Surface(contact) for contact in problem.contacts]
         names = [series for s in self._surfaces for series in s.series]
+        known = [c for c in problem.contacts if ObstacleShape.is_known(c)]
+        names += [f"{contact.name}_obstacle" for contact in known]
         for name in names:
             if not re.fullmatch(r"[\w. +-]+", name) or [*names, "body"].count(name) > 1:
                 raise ValueError(
@@ -84,8 +92,10 @@ class Writer:
                     "another series has; give the contact another name, Contact(name=...)"
                 )
         self._series: dict[str, list[tuple[float, str]]] = {}
+        self._obstacles: dict[str, ObstacleShape] = {}  # on the first rank
         with collective_errors(self._comm):
             if self._comm.rank == 0:
+                self._obstacles = {f"{c.name}_obstacle": ObstacleShape(c) for c in known}
                 files.make_folder(self.folder)
                 for name in ("body", *names):
                     self._series[name] = vtu.read_series(self._path(name))
@@ -131,8 +141,16 @@ class Writer:
         whole = {name: _gathered(self._comm, grid) for name, grid in grids.items()}
         with collective_errors(self._comm):
             if self._comm.rank == 0:
+                whole |= self._obstacle_grids(whole["body"])
                 self._put(time, {name: replace(g, numbers=numbers) for name, g in whole.items()})
         self._last = time
+
+    def _obstacle_grids(self, body: vtu.Grid) -> dict[str, vtu.Grid]:
+        """Surfaces of the rigid obstacles about the body, deformed or not. On the first rank."""
+        x = body.points
+        box = box_about(np.stack([x, x + body.at_nodes["displacement"]]), _ABOUT)
+        kind = vtu.CELLS["interval" if x.shape[2] == 2 else "triangle"].number[0]
+        return {name: vtu.Grid(kind, shape(box)) for name, shape in self._obstacles.items()}
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{name}.pvd"

@@ -1,0 +1,184 @@
+"""Where rigid obstacles are drawn: on the surface that they are given by, moved as they are.
+
+References: the surfaces' equations. Linear functions on a grid of 1/160 of the box miss a circle by
+h²/8R, less than 1e-4 of the box here; planes they have to round-off.
+"""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from fenics_contact.results import drawing
+from fenics_contact.results.obstacles import ObstacleShape, zero_level
+from scenes import vtu
+from scenes.blocks import block, bulge
+from scenes.comparing import close, on_first, shared_folder
+from scenes.rubber import Tool
+from scenes.rubbing import Rub
+
+COMM = MPI.COMM_WORLD
+FINE = 1e-4
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+
+
+def circle(centre, radius):
+    return lambda x: np.linalg.norm(x - centre, axis=1) - radius
+
+
+def supports(mesh):
+    """By name an obstacle, and the equation of its surface where it has moved to."""
+    way, angle = fem.Constant(mesh, (0.1, 0.2)), fem.Constant(mesh, 0.0)
+    points = np.array([[0.2, 0.2], [0.8, 0.2], [0.5, 0.7]])
+    corners = np.array([[0, 1], [1, 2], [2, 0]])
+
+    def triangle(x):
+        ends = points[corners]
+        edges = ends[:, 1] - ends[:, 0]
+        along = np.einsum("pfi,fi->pf", x[:, None] - ends[:, 0], edges)
+        share = np.clip(along / np.sum(edges**2, axis=1), 0, 1)
+        off = x[:, None] - ends[:, 0] - share[:, :, None] * edges
+        return np.linalg.norm(off, axis=2).min(axis=1)
+
+    t = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    round_ = 0.5 + 0.3 * np.column_stack([np.cos(t), np.sin(t)])
+    return {
+        "plane": (fc.HalfSpace((0, 0.3), (1, 2)), lambda x: (x - [0, 0.3]) @ [1, 2] / 5**0.5),
+        "moved": (fc.Ball((0.4, 0.3), 0.3, displacement=way), circle((0.5, 0.5), 0.3)),
+        "hole": (fc.Cylinder((0.5, 0.5), 0.3, inside=True), circle((0.5, 0.5), 0.3)),
+        "distance": (
+            fc.Obstacle(distance=lambda x: ufl.sqrt(ufl.dot(x, x)) - way[1] * 3),
+            circle((0, 0), 0.6),
+        ),
+        "spline": (fc.RigidProfile(round_, closed=True), circle((0.5, 0.5), 0.3)),
+        "polyline": (fc.RigidSurface(points, corners), triangle),
+        "turned": (
+            fc.HalfSpace((0, 0.5), (0, 1), rotation=fc.Rotation(angle, (0.5, 0.5))),
+            lambda x: (x - 0.5) @ [1, 0],
+        ),
+        "_angle": (angle, None),
+    }
+
+
+@pytest.mark.parametrize(
+    "name", ["plane", "moved", "hole", "distance", "spline", "polyline", "turned"]
+)
+def test_the_surface_in_the_plane(name):
+    """All that is drawn is on the surface, whose length in the box is known from a finer grid."""
+    scene = block("triangle")
+    given = supports(scene.mesh)
+    support, equation = given[name]
+    kinematics = "finite" if name == "turned" else "small"
+    contact = scene.contact(fc.Frictionless(1e3), support=support, kinematics=kinematics)
+    if name == "turned":
+        given["_angle"][0].value = -np.pi / 2
+
+    def check():
+        assert ObstacleShape.is_known(contact)
+        found = ObstacleShape(contact)(np.array([[0.0, 0.0], [1.0, 1.0]]))
+        assert len(found) > 20 and found.shape[1:] == (2, 2)
+        # The corners of a polyline are cut off by up to a cell of the grid.
+        allowed = 1 / 160 if name == "polyline" else FINE
+        assert np.abs(equation(found.reshape(-1, 2))).max() < allowed
+        axis = np.linspace(0, 1, 401)
+        grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+        if name != "polyline":  # whose equation here has no sign
+            values = equation(grid.reshape(-1, 2)).reshape(grid.shape[:2])
+            lengths = [
+                np.linalg.norm(s[:, 1] - s[:, 0], axis=1).sum()
+                for s in (found, zero_level(grid, values))
+            ]
+            assert close(lengths[0], lengths[1], 1e-2)
+
+    on_first(check)
+
+
+@pytest.mark.parametrize("cell", ["tetrahedron", "hexahedron"])
+def test_the_surface_in_space(cell):
+    """A ball: its part in the box, with its area 2π R h of a cap of the height h, to 1 %."""
+    made = Rub(cell=cell)
+
+    def check():
+        box = np.array([[-2.5, -2.5, -1.0], [3.5, 3.5, 5.0]])
+        found = ObstacleShape(made.contact)(box)
+        middle = np.array([0.5, 0.5, -2.0])
+        assert np.abs(np.linalg.norm(found.reshape(-1, 3) - middle, axis=1) - 2.0).max() < 1e-2
+        edges = found[:, 1:] - found[:, :1]
+        area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum() / 2
+        assert close(area, 2 * np.pi * 2.0 * 1.0, 1e-2)
+
+    on_first(check)
+
+
+def test_what_has_no_place_is_not_drawn():
+    """A gap that is given on Γc, with and without a function of it."""
+    scene = block("triangle")
+    for options in (
+        {"support": bulge(scene)},
+        {"support": fc.Obstacle(0.1, (0.0, -1.0))},
+        {"gap": 0.1},
+    ):
+        assert not ObstacleShape.is_known(scene.contact(fc.Frictionless(1e3), **options))
+
+
+def test_magnified_motion_and_former_states():
+    """Displacements of obstacles are drawn so many times as large; frames have their own."""
+    scene = block("triangle")
+    way = fem.Constant(scene.mesh, (0.0, -0.01))
+    contact = scene.contact(fc.Frictionless(1e3), displacement=way)
+
+    def check():
+        shape, box = ObstacleShape(contact), np.array([[0.0, -1.0], [1.0, 1.0]])
+        before = shape.state()
+        way.value[1] = -0.02
+        for state, depth in ((None, -0.4), (before, -0.2)):
+            found = shape(box, 20.0, state)[..., 1]
+            assert len(found) and np.abs(found - depth).max() < 1e-12
+
+    on_first(check)
+
+
+def test_pictures_films_and_files(tmp_path, monkeypatch):
+    """A tool goes down on rubber: all of them have it where it is at the time."""
+    folder = shared_folder(tmp_path)
+    made = Tool(law=fc.Frictionless(1e4))
+    figures, save = [], drawing.save
+    monkeypatch.setattr(drawing, "save", lambda f, path: (figures.append(f), save(f, path)))
+    writer = fc.Writer(folder / "files", made.problem)
+    film = fc.Animation(folder / "film.gif", made.problem)
+    for step in made.increments(1.0, steps=2):
+        writer.write(step)
+        film.add(step)
+    film.save()
+    fc.plotting.plot_deformation(folder / "u.png", made.contact.u, contacts=[made.contact])
+    fc.plotting.plot_status(folder / "status.png", made.contact)
+    COMM.barrier()
+
+    def check():
+        for figure in figures:
+            words = [t.get_text() for legend in figure.legends for t in legend.get_texts()]
+            assert "rigid obstacle" in words
+        colour = drawing.COLOURS["obstacle"]
+        drawn = [c for f in figures for c in f.axes[0].collections if is_of(c, colour)]
+        assert len(drawn) == 2
+        series = vtu.series(folder / "files" / "contact_obstacle.pvd")
+        assert len(series) == 2
+        grids = [vtu.read(folder / "files" / name) for _, name in series]
+        assert all(grid.kind == 3 and len(grid.x) > 20 for grid in grids)
+        # It went down.
+        assert grids[1].x[..., 1].min() < grids[0].x[..., 1].min() - 1e-3
+
+    on_first(check)
+
+
+def is_of(collection, colour):
+    """Whether lines of a collection have a colour."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import to_rgba
+
+    if not isinstance(collection, LineCollection):
+        return False
+    return bool(np.allclose(collection.get_color(), to_rgba(colour)))
