@@ -255,7 +255,7 @@ def test_an_unloaded_body(tmp_path):
     assert steps[-1].verdict.relative_residual == 0.0
     page = Page(fc.report(problem, steps, folder, history=folder / "h.csv"))
     assert "There are no forces." in page.text and "of the forces." not in page.text
-    assert "It bears no force" in page.text and "e+" not in " ".join(page.pictures)
+    assert "There is no contact force" in page.text and "e+" not in " ".join(page.pictures)
     rows = (folder / "h.csv").read_text().splitlines()
     residuals = [row["residual (share of the forces)"] for row in csv.DictReader(rows)]
     assert residuals[-1] == "" and all(0 <= float(r) < 1e-9 for r in residuals[:-1])

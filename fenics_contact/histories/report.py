@@ -329,9 +329,9 @@ def _state(
     if failures:
         page.add(f'<p class="fails">{escape(where)}: the state does not hold.</p>')
     else:
-        checked = ["the equations", "the balance of forces and moments"]
-        checked += ["the laws at every point"] if step.verdict.laws else []
-        checked += ["what the multipliers leave"] if step.verdict.enforcement else []
+        checked = ["equilibrium", "the balance of forces and moments"]
+        checked += ["the contact laws at every point"] if step.verdict.laws else []
+        checked += ["the penetration left by multipliers"] if step.verdict.enforcement else []
         checked += ["the rigid supports"] if step.verdict.obstacles else []
         small = [c.name for c in problem.contacts if not c.finite]
         known = step.verdict.kinematics
@@ -340,8 +340,8 @@ def _state(
         if not step.verdict.is_loaded:
             residual = "There are no forces."
         page.add(
-            f'<p class="holds">{escape(where)}: the state holds. Checked apart from the solver: '
-            f"{', '.join(checked)}. {residual}</p>"
+            f'<p class="holds">{escape(where)}: the state holds. Verified independently of the '
+            f"solver: {', '.join(checked)}. {residual}</p>"
         )
     page.add(step._repr_html_())
     page.heading("Deformed body")
@@ -361,7 +361,7 @@ def _contact(page: _Page, contact: Contact, step: Step, magnification: float) ->
     """Tractions, gap, slip, status and extents. Collective."""
     page.heading(f"Contact: {contact.name}")
     if not step.verdict.equations[contact.name].is_loaded:
-        page.add("<p>It bears no force; tractions other than zero are round-off.</p>")
+        page.add("<p>There is no contact force; tractions other than zero are round-off.</p>")
     units = {"length": page.length, "stress": page.stress}
     drawn = []
     if contact.points.shape[1] == 2:
@@ -492,11 +492,16 @@ def _choices(page: _Page, problem: ContactProblem, step: Step) -> None:
         ("unknowns", str(space.dofmap.index_map.size_global * space.dofmap.index_map_bs)),
         ("ranks", str(mesh.comm.size)),
         ("method of the last increment", step.method),
-        ("tried in it", "; ".join(map(str, step.attempts))),
-        ("accuracy", "none said" if problem.accuracy is None else str(problem.accuracy)),
+        ("attempts in it", "; ".join(map(str, step.attempts))),
+        ("accuracy", "not given" if problem.accuracy is None else str(problem.accuracy)),
     ]
     if not all(contact.finite for contact in problem.contacts):
-        rows.append(("share that small displacements may change", f"{problem.kinematics:g}"))
+        rows.append(
+            (
+                "largest change of force or pressure by small displacements",
+                f"{problem.kinematics:g}",
+            )
+        )
     page.words("Problem", ("what", "choice"), rows)
     for contact in problem.contacts:
         count = contact.surface.submesh.topology
