@@ -307,6 +307,13 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "Let the finer surface be Γc; or the `quadrature_degree` that is told, which takes "
             "time by its square. A body 100 times as stiff opposite loses less than 1 %.",
         ),
+        "times as long as the radius": (
+            "A point of Γc sees the support where it is, and no more: where few of a facet touch, "
+            "the force goes up and down as they come and go. The radius of a `Ball`, a `Cylinder` "
+            "or a `RigidProfile` is known, and sets the number of points by default; that of "
+            "an `Obstacle` is measured where it bears.",
+            "Smaller facets where the support may come, or the `quadrature_degree` that is told.",
+        ),
         "times as short": (
             "Γc has slid to where the body opposite is meshed more finely than where Γc began, by "
             "which its points were counted. From here on the finer facets pass between them: a "

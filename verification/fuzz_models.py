@@ -166,10 +166,14 @@ def contact_of(
     if wanted and "enforcement" not in contact and not physical:
         augmented = fc.Accuracy.of(wanted).enforcement == "augmented"
     scheme, rule = contact.get("scheme"), contact.get("quadrature")
-    if scheme is None and rule is None and augmented and rigid and degree == 1:
+    per_node = 1
+    if rule is None and rigid:  # 4 along a round support, by its radius
+        around = made.support(contact).smallest_radius
+        per_node = int(np.ceil(4 * float(np.median(here.lengths())) / around - 1e-9))
+    if scheme is None and rule is None and augmented and rigid and degree == 1 and per_node <= 1:
         scheme = "vertex" if scene["cell"] != "hexahedron" else None
     if rule is None:
-        rule = 2 * degree
+        rule = max(2 * degree, min(2 * (per_node * degree - 1), {2: 78, 3: 6}[d]))
         if there is not None:  # p + 1 points for every facet that is opposite, but for many
             ratio = float(np.median(here.lengths()) / np.median(there.lengths()))
             graded = _most_under_one(here, there)

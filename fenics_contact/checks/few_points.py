@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_max, global_sum, warn
-from fenics_contact.surface.surface import FINEST_RULE
+from fenics_contact.surface.surface import FINEST_RULE, POINTS_PER_RADIUS
 
 __all__ = ["warn_of_divided_facets", "warn_of_few_points"]
 
@@ -22,7 +22,7 @@ def warn_of_few_points(contact: Contact) -> bool:
     """Say that points of Γc are too few where they are now, and whether it was. Collective.
 
     `ContactSurface` counts them by the undeformed bodies, and `ContactProblem` warns of these: here
-    it is of what slides onto finer facets.
+    it is of what slides onto finer facets, and of rigid supports whose radius was not known.
 
     Args:
         contact: At an evaluated state.
@@ -39,14 +39,26 @@ def warn_of_few_points(contact: Contact) -> bool:
     borne, whole = global_sum(comm, [force @ few, force.sum()])
     if not borne > _SHARE * whole:
         return False
-    most = round(global_max(comm, times[few & (contact.pressure > 0)]))
-    wanted = most * (quadrature.default_degree(degree) + 2) - 2
+    most = global_max(comm, times[few & (contact.pressure > 0)])
+    wanted = round(most) * (quadrature.default_degree(degree) + 2) - 2
+    facets = (
+        f"{contact.name}: facets of Γc that bear {100 * borne / whole:.2g} % of the normal force"
+    )
+    if contact.rigid:
+        warn(
+            comm,
+            f"{facets} are {most / POINTS_PER_RADIUS:.2g} times as long as the radius of the "
+            "support there, whose shape passes between their points: the force is wrong. Take "
+            f"smaller facets, or give ContactSurface(quadrature_degree={wanted}), as many points "
+            "as see it",
+        )
+        return True
     warn(
         comm,
-        f"{contact.name}: facets of Γc that bear {100 * borne / whole:.2g} % of the normal force "
-        f"have come to lie on facets opposite {most} times as short, which pass between their "
-        "points: the force is too small. Swap the surfaces, so that the finer one is Γc, or give "
-        f"ContactSurface(quadrature_degree={wanted}), as many points as the opposite facets take",
+        f"{facets} have come to lie on facets opposite {round(most)} times as short, which pass "
+        "between their points: the force is too small. Swap the surfaces, so that the finer one "
+        f"is Γc, or give ContactSurface(quadrature_degree={wanted}), as many points as the "
+        "opposite facets take",
     )
     return True
 

@@ -194,7 +194,11 @@ class Contact(PointResults):
         if isinstance(support, DeformableBody):
             opposite = tagged_facets(surface.mesh, support.facet_tags, support.tags)
         self.quadrature = surface.quadrature(
-            degree, nodal=nodal, opposite=opposite, pieces=not self.finite
+            degree,
+            nodal=nodal,
+            opposite=opposite,
+            pieces=not self.finite,
+            radius=support.smallest_radius,
         )
         moving = self.finite and not isinstance(support, DeformableBody)
         self.multipliers: Multipliers | None = None

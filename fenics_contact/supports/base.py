@@ -219,6 +219,14 @@ class Support:
         """Whether it is a plane: of one normal, with a gap that is linear in the place."""
         return False
 
+    @property
+    def smallest_radius(self) -> float:
+        """Smallest radius of curvature where the support is convex (length).
+
+        Infinite where it is nowhere convex, or where the radius is not known as a number.
+        """
+        return np.inf
+
     def place(
         self, x: ufl.core.expr.Expr, shift: ufl.core.expr.Expr | None, to_ufl: ToUFL
     ) -> Placement:

@@ -73,6 +73,13 @@ class Curve:
         second = curvature[:, None, None] * np.einsum("ni,nj->nij", along, along)
         return Sample(distance, -outward, second)
 
+    @property
+    def smallest_radius(self) -> float:
+        """Smallest radius of curvature where the support is convex, infinite if nowhere."""
+        (x, y), (bend_x, bend_y) = self._slope(self._starts).T, self._bend(self._starts).T
+        sharpest = float(np.max((x * bend_y - y * bend_x) / np.hypot(x, y) ** 3))
+        return 1.0 / sharpest if sharpest > 0.0 else np.inf
+
     def _closest(self, x: Array) -> Array:
         """Of every point the parameter of the closest place, (n,)."""
         found = np.asarray(self._tree.query(x, k=range(1, _STARTS + 1))[1], dtype=np.intp)

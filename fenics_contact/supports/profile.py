@@ -105,6 +105,11 @@ class RigidProfile(SampledSupport):
         """See `SampledSupport.fingerprint`."""
         return self._fingerprint
 
+    @property
+    def smallest_radius(self) -> float:
+        """See `Support.smallest_radius`: that of the profile."""
+        return self.curve.smallest_radius
+
     def sample(self, x: Array) -> Sample:
         """See `SampledSupport.sample`."""
         if self._section is None:

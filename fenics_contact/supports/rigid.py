@@ -6,8 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import ufl
+from dolfinx import fem
 
+from fenics_contact.arguments import is_number
 from fenics_contact.supports.base import (
     Placement,
     Rotation,
@@ -61,6 +64,11 @@ class Ball(Support):
     displacement: Any = None
     rotation: Rotation | None = None
 
+    @property
+    def smallest_radius(self) -> float:
+        """See `Support.smallest_radius`."""
+        return _convex_radius(self.radius, self.inside)
+
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
         """Gap |x - center - shift| - radius (negated inside); see `Support.place`."""
         gdim = x.ufl_shape[0]
@@ -84,6 +92,11 @@ class Cylinder(Support):
     displacement: Any = None
     rotation: Rotation | None = None
 
+    @property
+    def smallest_radius(self) -> float:
+        """See `Support.smallest_radius`."""
+        return _convex_radius(self.radius, self.inside)
+
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
         """Gap: distance from the axis minus radius (negated inside); see `Support.place`."""
         gdim = x.ufl_shape[0]
@@ -101,6 +114,13 @@ class Cylinder(Support):
         return _round(
             arm, shift, to_ufl(as_positive("radius of the Cylinder", self.radius)), self.inside
         )
+
+
+def _convex_radius(radius: Any, inside: bool) -> float:
+    """A radius where it is a number and the surface is convex, else infinity."""
+    if isinstance(radius, fem.Constant) and not radius.ufl_shape:
+        radius = float(radius.value)
+    return float(radius) if is_number(radius) and radius > 0.0 and not inside else np.inf
 
 
 def _round(arm: Any, shift: Any, radius: Any, inside: bool) -> Placement:

@@ -1,0 +1,115 @@
+"""Facets as long as a rigid support is round have points enough to see its shape."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+import ufl
+
+import fenics_contact as fc
+from scenes.bodies import Bodies, boxes
+from scenes.comparing import close
+from scenes.tags import near
+
+pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+RADIUS = 1.0
+
+
+def profile(middle):
+    """A circle as a spline, the support on the left of its way."""
+    angle = np.linspace(0.0, 2 * np.pi, 40, endpoint=False)
+    return fc.RigidProfile(
+        middle + RADIUS * np.column_stack([np.cos(angle), np.sin(angle)]), closed=True
+    )
+
+
+def distance(middle):
+    """The same as a distance, whose radius nobody knows."""
+
+    def to(x):
+        return ufl.sqrt((x[0] - middle[0]) ** 2 + (x[1] - middle[1]) ** 2) - RADIUS
+
+    return fc.Obstacle(distance=to)
+
+
+SHAPES = {
+    "cylinder": lambda middle: fc.Cylinder(middle, RADIUS),
+    "ball": lambda middle: fc.Ball(middle, RADIUS),
+    "profile": profile,
+    "distance": distance,
+}
+
+
+def forces(shape, length, *, quadrature=None, degree=1, **options):
+    """Normal forces of a tool 0.3 deep in a block, over two places of a facet of some length."""
+    found = []
+    for share in (0.0, 0.35):
+        up = np.linspace(-5.0, 0.0, 4)
+        sides = {1: near(1, -5.0), 2: near(1, 0.0)}
+        across = length * np.arange(-4.0, 5.0)
+        block = Bodies(boxes([[across, up]], sides), 1000.0, 0.3, degree=degree)
+        block.hold(1, 0, 1)
+        tool = SHAPES[shape](np.array([share * length, RADIUS - 0.3]))
+        options = {"kinematics": "finite"} | options
+        contact = block.contact(2, tool, fc.Coulomb(0.3), quadrature=quadrature, **options)
+        block.problem(contact).solve()
+        found.append(contact.resultants().normal_force)
+    return np.array(found), contact
+
+
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+@pytest.mark.parametrize("length", [1.0, 2.0])
+@pytest.mark.parametrize("shape", ["cylinder", "ball", "profile"])
+def test_facets_see_a_round_tool(shape, length, enforcement):
+    """As long as its radius, or twice that.
+
+    Reference: 40 points on a facet, to 4 %: with 4 or 8 of them one more or less touches. With two
+    points, or those of the nodes, it was up to 26 % by penalty, and by multipliers nothing at all
+    was touched in the middle of the longer ones.
+    """
+    found, contact = forces(shape, length, enforcement=enforcement)
+    fine, _ = forces(shape, length, enforcement=enforcement, quadrature=78)
+    assert contact.quadrature.degree // 2 + 1 >= 4 * length / RADIUS
+    assert np.all(np.abs(found / fine - 1) < 0.04)
+
+
+def test_points_stay_as_they_are_on_shorter_facets():
+    """Of a quarter of the radius, in a bore, on a plane; those asked for; and at nodes.
+
+    References: p + 1 points on a facet, or its nodes with multipliers.
+    """
+
+    def points(support, length=0.25, **options):
+        axes = [length * np.arange(5.0), np.linspace(-1.0, 0.0, 2)]
+        block = Bodies(boxes([axes], {2: near(1, 0.0)}), 1.0, 0.3, degree=options.pop("degree", 1))
+        return block.contact(2, support, fc.Frictionless(), **options).quadrature
+
+    tool = fc.Cylinder((0.0, RADIUS), RADIUS)
+    assert points(tool).degree == 2 and points(tool, degree=2).degree == 4
+    assert points(tool, enforcement="augmented").at_vertices
+    assert points(tool, 1.0, quadrature=2).degree == 2
+    for support in (fc.Ball((0.0, -5.0), 6.0, inside=True), fc.HalfSpace((0, 0), (0, -1))):
+        assert points(support, 1.0).degree == 2
+        assert points(support, 1.0, enforcement="augmented").at_vertices
+    assert points(tool, 100.0).degree == 78
+
+
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+def test_few_points_are_told_of(enforcement):
+    """Where the radius was not known, by what to give; and nothing where there are enough.
+
+    Reference: with the degree that is told the force is that of 40 points, to 4 %.
+    """
+    with pytest.warns(UserWarning, match="as long as the radius of the support") as told:
+        forces("distance", 2.0, enforcement=enforcement)
+    degree = int(str(told[0].message).split("quadrature_degree=")[1].split(")")[0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found, _ = forces("distance", 2.0, enforcement=enforcement, quadrature=degree)
+        forces("cylinder", 2.0, enforcement=enforcement)
+        if enforcement == "penalty":
+            forces("distance", 0.5)
+    fine, _ = forces("distance", 2.0, enforcement=enforcement, quadrature=78)
+    assert close(found, fine, 0.04)
