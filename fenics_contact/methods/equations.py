@@ -192,6 +192,10 @@ class Equations:
         """Whether H₀ or the consistent tangent holds anything."""
         return consistent in self._filled
 
+    def forget_tangent(self) -> None:
+        """Let the matrix of the consistent tangent hold nothing: it was that of another state."""
+        self._filled.discard(True)
+
     @property
     def h0_is_made(self) -> bool:
         """Whether the matrix of H₀ is that of `make_h0`, or of the status since."""

@@ -617,6 +617,7 @@ class Solver:
                 with linearised(self.equations, springs, prescribed=moved) as solve:
                     return present + solve(None)
             finally:
+                self.equations.forget_tangent()
                 for contact in contacts:
                     contact.confine()
                 full.set_state(present)
