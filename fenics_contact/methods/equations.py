@@ -52,6 +52,8 @@ class Equations:
         norms: Norms where `residual` was computed last.
         start: Norms of `System.terms` where the increment began, (n_bodies,).
         began: State of `full` there.
+        has_round_off: Whether a matrix was assembled in this increment, which tells the round-off
+            of its residuals.
         rtol: Residual that ends the whole solution, as a share of the forces.
         round_rtol: That of the present round of multipliers, if larger.
         solution: The state to start from and, after a method, the one found; dimensionless.
@@ -93,6 +95,7 @@ class Equations:
         self._hardness: tuple[Any, float] | None = None  # of what, and how much
         self.system: System = full
         self.began = full.state()
+        self.has_round_off = False
         self.solution, self.function = full.vector(), full.vector()
 
     def take(self, system: System) -> None:
@@ -123,8 +126,11 @@ class Equations:
         if thrown or self._bulk.is_inverted() or system.is_twisted() or system.is_degenerate():
             total[:] = np.nan  # a line search takes a shorter step
         self.norms = self.system.norms(total, contacts, self.start)
-        # No line search is to follow what is round-off beside what is not.
-        total[self.system.constrained | self.norms.is_round_off[self.system.label]] = 0.0
+        # No line search is to follow the round-off of a stiff body beside what is left on others.
+        # It is known once a matrix was assembled: before, a run taken up again has none.
+        left_out = self.norms.is_round_off & self.has_round_off
+        self.norms = self.norms.without(left_out)
+        total[self.system.constrained | left_out[self.system.label]] = 0.0
         f.array[:] = total / (self._bulk.scale * self.length)
         return self.norms
 
@@ -218,6 +224,7 @@ class Equations:
             contacts: Contact's part, used up.
         """
         self.factorisations += self.system.fill(matrix, contacts)
+        self.has_round_off = True
         if self.system.pattern_changes:
             # A factorisation of another pattern is no start, whatever the matrix says, and levels
             # do not follow: there may be other unknowns in contact, too.

@@ -454,6 +454,7 @@ class Solver:
             Reason of the last solution, what was tried, and how many solutions there were.
         """
         self.equations.start = np.zeros_like(self.equations.start)
+        self.equations.has_round_off = False
 
         def iterate(
             ahead: float, stiffness_changed: bool, overloaded: bool

@@ -8,7 +8,7 @@ left to itself.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -72,13 +72,16 @@ class Norms:
         """Whose residual is round-off and nothing else, (n_bodies,)."""
         return np.asarray(self.residual <= self.floor)[: self.n_bodies]
 
+    def without(self, bodies: Mask) -> Norms:
+        """The same without the residuals of some bodies, by a mask, (n_bodies,)."""
+        residual = self.residual.copy()
+        residual[: self.n_bodies][bodies] = 0.0
+        return replace(self, residual=residual)
+
     @property
     def total(self) -> float:
-        """Residual of all unknowns (force): to see whether it falls, not whether it is small.
-
-        Round-off of a stiff body would hide what is left on a soft one.
-        """
-        return _root(np.where(self.is_round_off, 0.0, self.residual[: self.n_bodies]))
+        """Residual of all unknowns (force): to see whether it falls, not whether it is small."""
+        return _root(self.residual[: self.n_bodies])
 
 
 class Parts:
