@@ -149,7 +149,7 @@ def picture(made: History) -> dict[str, Array]:
     for name in ("state", "rate"):
         found[f"{name} of supports"] = problem.unknowns.motions(getattr(committed, name))
     energy = problem.committed_energy
-    found["springs"] = np.array([COMM.allreduce(energy.springs)])
+    found["springs"] = np.array([COMM.allreduce(sum(map(np.sum, energy.springs)))])
     if problem.solver.condensed:
         found["kept"] = problem.solver.system.unknowns.kept
     for c, ways in zip(problem.contacts, energy.contacts, strict=True):
