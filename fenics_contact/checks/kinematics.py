@@ -243,6 +243,8 @@ def linearisation(
         sums = global_sum(comm, [measure @ (contact.pressure > 0), measure.sum()])
         size = float(sums[0] or sums[1]) ** (1 / (d - 1)) or 1.0
         largest = longest(comm, contact.traction)
+        if largest <= np.finfo(float).eps * modulus:  # what an increment to no load leaves
+            largest = 0.0
         turn = largest * longest(comm, deviation.turn)
         push = modulus / size * longest(comm, deviation.gap)
         lost = longest(comm, contact.traction[deviation.lost])
