@@ -243,12 +243,13 @@ def linearisation(
         sums = global_sum(comm, [measure @ (contact.pressure > 0), measure.sum()])
         size = float(sums[0] or sums[1]) ** (1 / (d - 1)) or 1.0
         largest = longest(comm, contact.traction)
+        gap, lost = deviation.gap, deviation.lost
         if largest <= np.finfo(float).eps * modulus:  # what an increment to no load leaves
-            largest = 0.0
+            largest, gap, lost = 0.0, gap[deviation.closing], lost[:0]
         turn = largest * longest(comm, deviation.turn)
-        push = modulus / size * longest(comm, deviation.gap)
-        lost = longest(comm, contact.traction[deviation.lost])
-        matters |= not max(turn, push, lost) <= _NEGLIGIBLE * largest
+        push = modulus / size * longest(comm, gap)
+        gone = longest(comm, contact.traction[: len(lost)][lost])
+        matters |= not max(turn, push, gone) <= _NEGLIGIBLE * largest
     if not matters:
         return {c.name: Linearisation() for c in contacts}
     pairs = list(zip(deviations, contacts, strict=True))
