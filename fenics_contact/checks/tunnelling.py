@@ -244,6 +244,7 @@ class RigidObstacleProbe:
     Attributes:
         x: Where the places are on the undeformed Γc, (n, gdim) (length).
         resisted: See `Probe`.
+        points: The points in the frame of the obstacle, (n_points, gdim) (length).
     """
 
     def __init__(self, contact: Contact, known: RigidObstacleProbe | None = None) -> None:
@@ -259,16 +260,16 @@ class RigidObstacleProbe:
         self._places = places = contact.facet_places
         self._sampler: ObstacleSampler = opposite.sampler
         self._comm = contact.surface.mesh.comm
-        self._now = values.x + values.jump
-        self._gap, self._normal = self._sampler.sample(self._now)
+        self.points = values.x + values.jump
+        self._gap, self._normal = self._sampler.sample(self.points)
         self._facet, self._reference = self._deepest()
         self.x, _ = places.facets.positions(self._facet, self._reference)
-        self._z = self._at(self._now)
+        self._z = self._at(self.points)
         self._distance, _ = self._sampler.sample(self._z)
         self._data = self._sampler.data()
         self._start = values.x + opposite.committed_jump
         if known is not None and not opposite.turns:
-            self._start = known._now
+            self._start = known.points
         closed = contact.status != Status.OPEN
         deep = np.where(closed, np.maximum(values.penetration, -self._gap), 0.0)[places.rows]
         self.resisted = [(places.facets.corner_vertices(), deep.max(axis=1, initial=0.0))]
@@ -286,7 +287,7 @@ class RigidObstacleProbe:
         places, size = self._places, self._places.size
         facet, at = places.facet, places.reference
         found = [(facet, at)]
-        distance, normal = self._sampler.sample(places.values(self._now, facet, at))
+        distance, normal = self._sampler.sample(places.values(self.points, facet, at))
         units = np.vstack([np.zeros(at.shape[1]), np.eye(at.shape[1])])
         # The distance changes by no more than the way: farther obstacles do not reach the facet.
         going = distance < size[facet]
@@ -295,13 +296,13 @@ class RigidObstacleProbe:
                 break
             facet, at, distance, normal = facet[going], at[going], distance[going], normal[going]
             origin, *ends = (
-                places.values(self._now, facet, np.broadcast_to(unit, at.shape)) for unit in units
+                places.values(self.points, facet, np.broadcast_to(unit, at.shape)) for unit in units
             )
             tangents = np.stack([end - origin for end in ends], axis=2)
             step = np.maximum(distance, 0.1 * size[facet])[:, None] * normal
             moved = at + np.einsum("nij,nj->ni", np.linalg.pinv(tangents), step)
             moved = places.facets.clipped(moved)
-            deeper, normal = self._sampler.sample(places.values(self._now, facet, moved))
+            deeper, normal = self._sampler.sample(places.values(self.points, facet, moved))
             going = deeper < distance - 1e-3 * size[facet]
             at, distance = moved, deeper
             found.append((facet[going], at[going]))
@@ -326,7 +327,7 @@ class RigidObstacleProbe:
         rows = places.rows[self._facet]
         planes = _below(
             self._z,
-            self._now[rows] + self._gap[rows][..., None] * self._normal[rows],
+            self.points[rows] + self._gap[rows][..., None] * self._normal[rows],
             -self._normal[rows],
         )
         size = places.size[self._facet]
@@ -422,6 +423,7 @@ class OpposingBodyProbe:
     Attributes:
         x: Where they are on the undeformed surfaces, those of Γc first, (n, gdim) (length).
         resisted: See `Probe`: on the facets of Γc, and on those opposite.
+        u: The displacement.
     """
 
     def __init__(
@@ -436,15 +438,15 @@ class OpposingBodyProbe:
         """
         search = contact.pairs.search
         assert search is not None
-        self._search, self._u = search, contact.u.copy()
-        self._before = before if known is None else known._u
+        self._search, self.u = search, contact.u.copy()
+        self._before = before if known is None else known.u
         self._comm = contact.surface.mesh.comm
         self._rows = contact.quadrature.point_rows()
         values = contact.values
         found = search.present_hits(values.x, values.normal, contact.u, values.depth)
         deepest = global_max(self._comm, values.depth)
-        self._here = _Side(search.rays.here, self._u, found.facet, found.reference)
-        self._there = _Side(search.rays.there, self._u, *search.rays.there.facets.lattice())
+        self._here = _Side(search.rays.here, self.u, found.facet, found.reference)
+        self._there = _Side(search.rays.there, self.u, *search.rays.there.facets.lattice())
         self._hits, self._back = found.hits, self._there.trace_back(search.rays, deepest)
         self.x = np.concatenate([self._here.undeformed, self._there.undeformed])
         n = contact.quadrature.n_points
