@@ -161,7 +161,10 @@ class Deviation:
             return cls(zero, turn, values.normal, nothing, nothing)
         true = np.where(contact.paired, values.gap, 0.0) + change
         size = np.linalg.norm(values.x, axis=1) + contact.quadrature.facet_sizes
-        closing = told & ~closed & (true < -_ROUND_OFF * size)
+        apart = _ROUND_OFF * size
+        if not contact.rigid:  # facets that meet at angles make as much of a gap where points close
+            apart += longest(contact.surface.mesh.comm, np.nan_to_num(change[closed]))
+        closing = told & ~closed & (true < -apart)
         lost = told & closed & np.isnan(change)
         gap = np.where(told & closed & ~lost, change, np.where(closing, true, 0.0))
         return cls(gap, turn, normal, lost, closing)

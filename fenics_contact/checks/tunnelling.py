@@ -271,7 +271,8 @@ class RigidObstacleProbe:
         if known is not None and not opposite.turns:
             self._start = known.points
         closed = contact.status != Status.OPEN
-        deep = np.where(closed, np.maximum(values.penetration, -self._gap), 0.0)[places.rows]
+        # A penetration that the law knows of is its own matter, with no stiffness as well.
+        deep = np.maximum(values.penetration, np.where(closed, -self._gap, 0.0))[places.rows]
         self.resisted = [(places.facets.corner_vertices(), deep.max(axis=1, initial=0.0))]
 
     def _at(self, field: Array) -> Array:
@@ -452,8 +453,8 @@ class OpposingBodyProbe:
         n = contact.quadrature.n_points
         gap, partner = self._hits.distance[:n], self._hits.facet[:n]
         closed = contact.status != Status.OPEN
-        deep = np.where(closed, np.maximum(values.penetration, -np.nan_to_num(gap)), 0.0)
-        met = closed & (partner >= 0)
+        deep = np.maximum(values.penetration, np.where(closed, -np.nan_to_num(gap), 0.0))
+        met = (deep > 0) & (partner >= 0)
         self.resisted = [
             (
                 self._here.side.facets.corner_vertices(),

@@ -53,7 +53,8 @@ class FacetPlaces:
         if d == 3 and self.facets.simplex:
             n_basis = (degree + 1) * (degree + 2) // 2
         self._basis = polynomials(d, self.facets.simplex, min(n_points, n_basis))
-        table = tabulate(self._basis, 0, at)[0, :, :, 0].reshape(n_facets, n_points, -1)
+        table = tabulate(self._basis, 0, at)[0, :, :, 0]
+        table = table.reshape(n_facets, n_points, self._basis.dim)
         self._coefficients = np.linalg.pinv(table) if n_facets else table.swapaxes(1, 2)
 
     def values(self, field: Array, facet: Index, reference: Array) -> Array:
