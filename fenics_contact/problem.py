@@ -137,9 +137,9 @@ class ContactProblem:
                 energy). By default "newton", but "lbfgs" for a linear bulk that is solved by
                 multigrid, which Newton's method would set up in every iteration; condensed, the
                 first increment begins with "continuation". Where friction meets contact 50 to 1e5
-                times as stiff as the bulk "primal_dual" comes before them, if it can be had. With a
-                mixed function the equations are those of a saddle point: "alternating" is refused
-                there.
+                times as stiff as the bulk, "primal_dual" follows a failure, if it can be had, and
+                "continuation" comes last. With a mixed function the equations are those of a
+                saddle point: "alternating" is refused there.
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
                 paper has 0; 1 needs a third of the iterations once a point sticks.

@@ -19,7 +19,7 @@ from fenics_contact.systems import linear
 __all__ = ["OVERLOADED", "InnerSnes", "Method", "Newton", "OwnMethod", "SnesMethod", "Tools"]
 
 # Iterations without a lower residual after which another method takes over.
-_PATIENCE = 14
+_PATIENCE = 20
 
 _REASONS = PETSc.SNES.ConvergedReason
 # Why a method ends that has found an `Equations.overload`: SNES has no such reason, and does not

@@ -475,15 +475,14 @@ class Solver:
         tries = [(start, self.method) for start in starts]
         goes_on = self.may_go_on()
         if goes_on:
+            others = [(starts[0], "primal_dual")] if self._is_stiff() else []
             last = [(starts[0], _LAST_RESORT)]
             # From nothing, where many points close at once, Newton's method is slow to give up; a
             # later round of multipliers does not start from nothing.
             first = cold and ahead > 0.0 and self._automatic and self.condensed
-            tries = [*last, *tries] if first else [*tries, *last]
+            tries = [*last, *tries, *others] if first else [*tries, *others, *last]
             if self._hurries:
                 tries = [tries[0], *last, *tries[1:-1]]
-        if goes_on and self._is_stiff():
-            tries.insert(0 if self._automatic else len(tries) - 1, (starts[0], "primal_dual"))
         if overloaded:
             tries.insert(0, (starts[0], "alternating"))
         suspected = cold or overloaded
