@@ -134,11 +134,13 @@ class ContactProblem:
                 it is stuck), "primal_dual" (tractions of the points are unknowns beside
                 displacements: friction on stiff contact of a linear bulk), or "alternating"
                 (minimum problems in turn, each by Newton's method with a line search on the
-                energy). By default "newton", but "lbfgs" for a linear bulk that is solved by
-                multigrid, which Newton's method would set up in every iteration; condensed, the
-                first increment begins with "continuation". Where friction meets contact 50 to 1e5
-                times as stiff as the bulk, "primal_dual" follows a failure, if it can be had, and
-                "continuation" comes last. With a mixed function the equations are those of a
+                energy). By default "lbfgs" on all unknowns, where a
+                factorisation costs as much as dozens of iterations, and condensed, where it costs
+                as much as ten, "newton", with "continuation" for the first increment, and again
+                "newton" where that is stuck; "newton" for a nonlinear bulk, too, whose tangent
+                changes, and for bodies whose partners do, with finite kinematics. Where
+                friction meets contact 50 to 1e5 times as stiff as the bulk "primal_dual" comes
+                before them, if it can be had. With a mixed function the equations are those of a
                 saddle point: "alternating" is refused there.
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The

@@ -13,8 +13,7 @@
 Outcomes: "right" (and "another": right by its equations, but not the solution found apart, where
 friction leaves several), "refused" (with the error's class and what it says), "wrong" (the
 package said it is solved and it is not), "crashed" (an error that is no refusal), "slow", and
-"unjudged" (the judge itself failed). What is refused is tried by each of the package's methods
-alone: one that solves it contradicts the refusal, which then is a fault of the choice between them.
+"unjudged" (the judge itself failed).
 
 Scenes are solved in processes of their own, many in one: `mpirun` for several ranks. One that hangs
 or dies is noted, and the next process goes on behind it.
@@ -45,14 +44,12 @@ from typing import Any
 
 from scenes.processes import command, environment
 
-__all__ = ["Outcome", "contradicted", "features", "minimise", "play", "table"]
+__all__ = ["Outcome", "features", "minimise", "play", "table"]
 
 Scene = dict[str, Any]
 
 OUTCOMES = ("right", "another", "refused", "wrong", "crashed", "slow", "unjudged")
-FIELDS = ("seed", "ranks", "outcome", "kind", "increments", "seconds", "features", "detail", "by")
-# Methods of the package that are tried alone on what it refuses.
-METHODS = ("newton", "continuation", "primal_dual", "lbfgs")
+FIELDS = ("seed", "ranks", "outcome", "kind", "increments", "seconds", "features", "detail")
 # What refusals say, by what they are about.
 CATEGORIES = {
     "half of its radius": "too deep",
@@ -88,7 +85,6 @@ class Outcome:
         seconds: For the package and the judge.
         detail: In words.
         worst: Largest figure of every check, in units of what is allowed.
-        by: Of what is refused, though a method of the package solves it alone: that method's name.
     """
 
     outcome: str
@@ -97,7 +93,6 @@ class Outcome:
     seconds: float
     detail: list[str]
     worst: dict[str, float]
-    by: str = ""
 
 
 # ---- one scene -----------------------------------------------------------------------------------
@@ -237,22 +232,6 @@ def play(
     return Outcome(outcome, kind, len(records), time.perf_counter() - start, detail, worst)
 
 
-def contradicted(scene: Scene, comm: Any = None, *, limit: float | None = None) -> str:
-    """The first method that alone solves a scene, and rightly; empty if none does. Collective.
-
-    Args:
-        scene: A scene that is refused.
-        comm: Ranks; by default one alone.
-        limit: As for `play`.
-    """
-    for method in METHODS:
-        found = play(scene | {"method": method, "alone": True}, comm, limit=limit)
-        outcome = found.outcome if comm is None else comm.bcast(found.outcome)
-        if outcome in ("right", "another"):
-            return method
-    return ""
-
-
 def _ahead(scene: Scene, records: list[dict[str, Any]]) -> tuple[int, float] | None:
     """Stage and load parameter of the next increment that was asked for."""
     from verification import fuzz_scenes
@@ -353,10 +332,6 @@ def _work(seeds: list[int], arguments: argparse.Namespace) -> None:
         if outcome.outcome == "slow" and comm.size == 1:
             # Forms may have been compiled meanwhile.
             outcome = play(scene, None, limit=arguments.limit)
-        refused = comm.bcast(outcome.outcome == "refused" and "NotConverged" in outcome.kind)
-        if refused and "ration" not in scene:
-            several = comm if comm.size > 1 else None
-            outcome.by = contradicted(scene, several, limit=arguments.limit)
         gc.collect()
         comm.barrier()
         if comm.rank == 0:
@@ -443,7 +418,6 @@ def run(arguments: argparse.Namespace) -> Counter[str]:
             writer.writerow(row)
         with lock:
             counts[found["outcome"]] += 1
-            counts["refused, solved by a method alone"] += bool(found.get("by"))
             if found["outcome"] in ("wrong", "crashed", "unjudged") or arguments.verbose:
                 detail = found["detail"][0] if found["detail"] else ""
                 print(
@@ -592,11 +566,6 @@ def minimise(
 # ---- the table -----------------------------------------------------------------------------------
 
 
-def _by(row: dict[str, str]) -> str:
-    """What solves alone what is refused, for a table; files of earlier runs do not say."""
-    return f", though {row['by']} alone solves it" if row.get("by") else ""
-
-
 def table(paths: list[str]) -> str:
     """Outcomes by feature and refusals by category, as Markdown."""
     rows = []
@@ -619,9 +588,7 @@ def table(paths: list[str]) -> str:
         lines.append(f"| {name} | {counts.total()} | " + " | ".join(cells) + " |")
     lines += ["", "| outcome | why | scenes |", "|---|---|---|"]
     why = Counter(
-        (r["outcome"], f"{r['kind']}{_by(r)}")
-        for r in rows
-        if r["outcome"] not in ("right", "another")
+        (r["outcome"], r["kind"]) for r in rows if r["outcome"] not in ("right", "another")
     )
     lines += [f"| {o} | {k or '–'} | {n} |" for (o, k), n in why.most_common()]
     return "\n".join(lines)

@@ -378,7 +378,7 @@ class Made:
             method=scene.get("method"),
             condensation=scene.get("condensation"),
             petsc_options=options,
-            fallback="ration" not in scene and not scene.get("alone"),
+            fallback="ration" not in scene,
         )
 
 

@@ -14,7 +14,6 @@ from petsc4py import PETSc
 from fenics_contact.methods.callbacks import Callbacks
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.options import Defaults
-from fenics_contact.systems import linear
 
 __all__ = ["OVERLOADED", "InnerSnes", "Method", "Newton", "OwnMethod", "SnesMethod", "Tools"]
 
@@ -31,8 +30,8 @@ class Method(ABC):
     """A way to solve equations from a start: on the main SNES, or an `OwnMethod`."""
 
     @classmethod
-    def main_options(cls) -> Mapping[str, Any]:
-        """Options of the main SNES; by default none of its own."""
+    def main_options(cls, *, linear: bool) -> Mapping[str, Any]:
+        """Options of the main SNES, for a linear bulk or another; by default none of its own."""
         return {}
 
     @abstractmethod
@@ -191,17 +190,14 @@ class SnesMethod(Method):
         self._callbacks = Callbacks(equations.full.unknowns.comm)
         self.consistent = False
         self.enough = np.inf
-        # Iterations in all, where SNES is given those that are left.
-        self._limit: int | None = None
 
     @property
     def max_it(self) -> int:
         """Iterations in all before it is given up."""
-        return int(self.snes.getTolerances()[3]) if self._limit is None else self._limit
+        return int(self.snes.getTolerances()[3])
 
     @max_it.setter
     def max_it(self, limit: int) -> None:
-        self._limit = None
         self.snes.setTolerances(max_it=limit)
 
     def attach(self, *, consistent: bool) -> None:
@@ -241,67 +237,21 @@ class Newton(SnesMethod):
     """Newton's method with the consistent tangent."""
 
     @classmethod
-    def main_options(cls) -> Mapping[str, Any]:
-        """See `Method.main_options`: steps of a nonlinear bulk are halved until the residual falls.
+    def main_options(cls, *, linear: bool) -> Mapping[str, Any]:
+        """See `Method.main_options`.
 
-        Its norm has kinks where points change their status, and to fit a parabola or a cubic to it,
-        as `bt` does otherwise, makes steps too short.
+        With a nonlinear bulk the tangent far from a solution need not point downwards along which
+        `cp` looks for a root, and cells may turn inside out, whereupon `bt` steps shorter.
         """
-        return {
-            "snes_type": "newtonls",
-            "snes_max_it": 100,
-            "snes_linesearch_type": "bt",
-            "snes_linesearch_order": 1,
-            "snes_linesearch_max_it": 40,
-        }
+        options: dict[str, Any] = {"snes_type": "newtonls", "snes_max_it": 100}
+        if not linear:
+            options |= {"snes_linesearch_type": "bt", "snes_linesearch_max_it": 40}
+        return options
 
     def solve(self) -> tuple[int, int]:
-        """See `Method.solve`: a full step, then SNES with its line search."""
-        limit, made = self.max_it, self._make_full_step()
-        self._limit = limit
-        self.snes.setTolerances(max_it=limit - made)
-        try:
-            iterations, reason = self._callbacks.solve(self.snes, self._equations.solution)
-        finally:
-            self.snes.setTolerances(max_it=limit)
-            self._limit = None
-        # `cp` takes a step across the residual, F·y = 0, for the end of all.
+        """See `Method.solve`."""
+        iterations, reason = self._callbacks.solve(self.snes, self._equations.solution)
+        # `cp` takes a step across the residual, F·y = 0, for the end of all: see `_COMMON`.
         if reason == _REASONS.CONVERGED_FNORM_ABS:
             reason = int(_REASONS.DIVERGED_LINE_SEARCH)
-        return made + iterations, reason
-
-    def _make_full_step(self) -> int:
-        """With a nonlinear bulk, make a whole step of Newton's method. Collective.
-
-        A start is an equilibrium under another load, and its residual no measure of a step. Where a
-        slender body turns, a linear step stretches it by the square of the angle, and to stretch it
-        takes forces that are orders of magnitude larger than to bend it: a line search that has the
-        residual fall takes steps of some thousandths. The next full step takes the stretch away.
-
-        Returns:
-            Iterations made, 1 or 0.
-        """
-        equations, solution = self._equations, self._equations.solution
-        newton = self.snes.getType() == PETSc.SNES.Type.NEWTONLS
-        if equations.full.bulk.linear or not newton or self.max_it < 1:
-            return 0
-        norms = equations.residual(solution, equations.function)
-        if equations.solved() or not np.isfinite(norms.total):
-            return 0
-        matrix, ksp = equations.matrix(self.consistent), self.snes.getKSP()
-        equations.assemble_tangent(solution, matrix)
-        start, step = solution.copy(), solution.duplicate()
-        ksp.setOperators(matrix)
-        ksp.solve(equations.function, step)
-        made = ksp.getConvergedReason() > 0
-        if made:
-            solution.axpy(-1.0, step)
-            norms = equations.residual(solution, equations.function)
-            made = bool(np.isfinite(norms.total))
-        if not made:  # SNES tells why, or makes it shorter
-            linear.forget_failure(ksp.getPC())
-            start.copy(solution)
-        equations.watch.start()  # by the residual from here on
-        for vector in (start, step):
-            vector.destroy()
-        return int(made)
+        return iterations, reason

@@ -13,7 +13,7 @@ from fenics_contact.checks.overload import CLEARLY
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.method import SnesMethod
 
-__all__ = ["LINE_SEARCH", "QuasiNewton"]
+__all__ = ["QuasiNewton"]
 
 # Rounds in a row that do not lower the residual before the increment is given up: the potential may
 # fall for long before the residual does.
@@ -28,16 +28,6 @@ _IDLE = 1e-3
 # next one starts where that was.
 _ASTRAY = 1e3
 
-# The paper's line search: |ρ·Ψ(ΔU + sρ)| ≤ c_L |ρ·Ψ(ΔU)|. With the single secant step that is
-# `cp`'s default it takes three times the iterations, and fails at stiffness it can solve.
-LINE_SEARCH = {
-    "snes_linesearch_type": "cp",
-    "snes_linesearch_rtol": 0.1,
-    "snes_linesearch_max_it": 20,
-    # `cp` takes |F·y| below this for convergence of the whole; the residual itself is tested here.
-    "snes_linesearch_atol": 1e-300,
-}
-
 _REASONS = PETSc.SNES.ConvergedReason
 
 
@@ -49,10 +39,11 @@ class QuasiNewton(SnesMethod):
     ) -> None:
         """No H₀ yet; see `SnesMethod`."""
         super().__init__(equations, snes, gives_up)
+        self._limit: int | None = None
         self._refreshed = False
 
     @classmethod
-    def main_options(cls) -> Mapping[str, Any]:
+    def main_options(cls, *, linear: bool) -> Mapping[str, Any]:
         """See `Method.main_options`."""
         return {
             "snes_type": "qn",
@@ -61,8 +52,16 @@ class QuasiNewton(SnesMethod):
             "snes_qn_restart_type": "none",  # Powell's uses K where K⁻¹ is meant
             "snes_qn_m": 20,
             "qn_mat_lmvm_eps": 0.0,  # else pairs are dropped by a test that depends on the units
-            **LINE_SEARCH,
         }
+
+    @property
+    def max_it(self) -> int:
+        """Iterations in all before it is given up."""
+        return super().max_it if self._limit is None else self._limit
+
+    @max_it.setter
+    def max_it(self, limit: int) -> None:
+        self._limit = limit
 
     def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
         """H₀ is made between the rounds, and kept during one."""

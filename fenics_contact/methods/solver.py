@@ -27,7 +27,7 @@ from fenics_contact.methods.method import OVERLOADED, Method, Newton, OwnMethod,
 from fenics_contact.methods.neighbourhood import linearised, respond
 from fenics_contact.methods.options import Defaults, take_command_line
 from fenics_contact.methods.primal_dual import PrimalDual
-from fenics_contact.methods.quasi_newton import LINE_SEARCH, QuasiNewton
+from fenics_contact.methods.quasi_newton import QuasiNewton
 from fenics_contact.methods.rounds import INNER, solve_in_rounds
 from fenics_contact.methods.starts import Starts
 from fenics_contact.systems import linear
@@ -42,7 +42,7 @@ __all__ = ["METHODS", "Settings", "Solver"]
 
 logger = logging.getLogger("fenics_contact")
 
-# Iterations that Newton's method gets where it may wander, see `Solver._hurries`.
+# Iterations that Newton's method gets where it may be slow, see `Solver._hurries`.
 _ENOUGH = 15
 # Increments expected where nothing is said.
 _EXPECTED = 4
@@ -63,8 +63,15 @@ _COMMON: dict[str, Any] = {
     "snes_rtol": 1e-9,
     "snes_stol": 0.0,
     "snes_max_it": 1000,
+    # The paper's line search: |ρ·Ψ(ΔU + sρ)| ≤ c_L |ρ·Ψ(ΔU)|. With the single secant step that is
+    # `cp`'s default it takes three times the iterations, and fails at stiffness it can solve.
+    "snes_linesearch_type": "cp",
+    "snes_linesearch_rtol": 0.1,
+    "snes_linesearch_max_it": 20,
     # Bodies without contact are led to it before: no step of the iteration needs to be long.
     compat.LONGEST_STEP: 100.0,
+    # `cp` takes |F·y| below this for convergence of the whole; the residual itself is tested here.
+    "snes_linesearch_atol": 1e-300,
 }
 # Without prefix: of the vectors. By default PETSc takes products with several of them by BLAS: with
 # PETSc 3.25 the last digits of L-BFGS changed so from a history to the same one again.
@@ -278,10 +285,14 @@ class Solver:
         return obstacle is None
 
     def _choose_method(self) -> str:
-        """Newton's method; L-BFGS where multigrid would have to be set up for every tangent."""
+        """Newton's where a tangent is cheap, or another one is due with every step.
+
+        Pairs that follow the bodies go from facet to facet, and of no older tangent is much left.
+        By multigrid another one has to be set up.
+        """
         full = self._full
-        multigrid = full.linear_kind == "multigrid" and not self.condensed
-        return "lbfgs" if multigrid and full.bulk.linear else "newton"
+        anew = not full.bulk.linear or (full.follows and full.linear_kind != "multigrid")
+        return "newton" if self.condensed or anew else "lbfgs"
 
     def _choose_linear_solver(self) -> str:
         """How to solve systems over all unknowns, one of `linear.KINDS`. Collective."""
@@ -474,15 +485,16 @@ class Solver:
         starts = [s / equations.length for s in self.starts.of(ahead, rate, cold)]
         tries = [(start, self.method) for start in starts]
         goes_on = self.may_go_on()
-        if goes_on:
-            others = [(starts[0], "primal_dual")] if self._is_stiff() else []
-            last = [(starts[0], _LAST_RESORT)]
-            # From nothing, where many points close at once, Newton's method is slow to give up; a
-            # later round of multipliers does not start from nothing.
-            first = cold and ahead > 0.0 and self._automatic and self.condensed
-            tries = [*last, *tries, *others] if first else [*tries, *others, *last]
+        first = cold and ahead > 0.0  # and no later round of multipliers
+        if goes_on and first and self._automatic and self.condensed:
+            # From nothing, Newton's method on the stiff problem often gives up first.
+            tries = [(starts[0], _LAST_RESORT), *tries]
+        elif goes_on:
+            tries.append((starts[0], _LAST_RESORT))
             if self._hurries:
-                tries = [tries[0], *last, *tries[1:-1]]
+                tries = [tries[0], tries[-1], *tries[:-1]]
+        if goes_on and self._is_stiff():
+            tries.insert(0 if self._automatic else len(tries) - 1, (starts[0], "primal_dual"))
         if overloaded:
             tries.insert(0, (starts[0], "alternating"))
         suspected = cold or overloaded
@@ -500,8 +512,6 @@ class Solver:
                 logger.info("%s", attempts[-1])
             if reason == OVERLOADED:
                 break
-            if number == 0 and not self._full.bulk.linear:
-                self._check_balance(starts[0] * equations.length)
             if goes_on and not suspected and self._is_overloaded():
                 # Minimum problems tell whether it is so, from where the increment starts.
                 suspected = True
@@ -521,34 +531,23 @@ class Solver:
         suits = self.methods["primal_dual"].suits and self.method != "primal_dual"
         return suits and _STIFF < self.equations.hardness() < _TOO_STIFF
 
-    @property
-    def _hurries(self) -> bool:
-        """Whether Newton's method gets few iterations before stiffness is led up from soft.
-
-        Where pairs follow the bodies it may wander from partner to partner without falling at all,
-        for how long depends on round-off.
-        """
-        return self._full.follows and not self._quasi_newton and self.may_go_on()
-
-    def _check_balance(self, start: Array) -> None:
-        """Refuse a load on a nonlinear body that contact cannot balance. Collective.
-
-        Its loads and what holds it may change as it deforms: this is no reason not to try.
-
-        Raises:
-            ValueError: See `RigidMotions.check_balance`.
-        """
-        self.system.set_state(start)
-        for contact in self._full.contacts:
-            contact.evaluate()
-        self.equations.motions.check_balance(self._full.load, self._full.operators)
-
     def _is_overloaded(self) -> bool:
         """Whether friction cannot bear the load by the pressures at ``solution``. Collective."""
         self.equations.set_state(self.equations.solution)
         for contact in self._full.contacts:
             contact.evaluate()
         return self.equations.friction_needed() > 1.0
+
+    @property
+    def _hurries(self) -> bool:
+        """Whether Newton's method gets few iterations before stiffness is led up from soft.
+
+        With friction on a nonlinear bulk points go from stick to slip one after another, each by a
+        factorisation, while the residual falls slowly. Where pairs follow the bodies it may wander
+        from partner to partner without falling at all, for how long depends on round-off.
+        """
+        slow = not (self._full.bulk.linear or self.equations.has_potential) or self._full.follows
+        return slow and not self._quasi_newton and self.may_go_on()
 
     def _outcome(self, reason: int) -> str:
         """What became of an attempt, in words. Collective."""
@@ -569,15 +568,9 @@ class Solver:
         )
 
     def _main_options(self) -> dict[str, Any]:
-        """Those of the main SNES, where the caller says nothing.
-
-        Linear bodies, and what is no method of Newton's if the caller names it, get L-BFGS' line
-        search, which finds a root along the step and may make it longer.
-        """
-        named = self.options.get(self._settings.prefix + "snes_type")
-        halves = named in (None, *_NEWTONS) and not self._full.bulk.linear
-        line_search = {} if halves else LINE_SEARCH
-        return {**_COMMON, **METHODS[self.method].main_options(), **line_search}
+        """Those of the main SNES, where the caller says nothing."""
+        linear = self._full.bulk.linear
+        return {**_COMMON, **METHODS[self.method].main_options(linear=linear)}
 
     # ---- the neighbourhood of a solution ---------------------------------------------------------
 
