@@ -165,8 +165,10 @@ class Deviation:
         if not contact.rigid:  # facets that meet at angles make as much of a gap where points close
             apart += longest(contact.surface.mesh.comm, np.nan_to_num(change[closed]))
         closing = told & ~closed & (true < -apart)
-        lost = told & closed & np.isnan(change)
-        gap = np.where(told & closed & ~lost, change, np.where(closing, true, 0.0))
+        # At the very end of the opposite surface points keep their pairs while they do not slide.
+        slid = np.linalg.norm(values.slide, axis=1) > _SLID * contact.quadrature.facet_sizes
+        lost = told & closed & slid & np.isnan(change)
+        gap = np.where(told & closed & ~lost, np.nan_to_num(change), np.where(closing, true, 0.0))
         return cls(gap, turn, normal, lost, closing)
 
     def springs(self, contact: Contact) -> LinearSprings:

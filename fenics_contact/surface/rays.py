@@ -29,6 +29,8 @@ __all__ = ["BEHIND", "REASONS", "Hits", "Partner", "Rays", "Side", "interpolatio
 # interference of a body with itself), and one whose cell shares a node with it (the lips of a
 # slit, meshed differently).
 _OWN, _JOINED = 0.5, 0.05
+# Of the height of a cell: places that are one.
+_TOUCHING = 1e-9
 # Why a point has no opposite, the likeliest last.
 _NOTHING, _FAR, BEHIND, _ITSELF = range(4)
 REASONS = {
@@ -115,7 +117,8 @@ class _Admission:
         height = one.height[here]
         near = np.abs(distance) <= self._support.search_distance
         depth = np.maximum(height, other.height[there]) if release is None else release
-        depth = np.maximum(depth, 2 * self._deep[here])
+        # What touches lies behind by round-off as often as in front.
+        depth = np.maximum(depth, 2 * self._deep[here]) + _TOUCHING * height
         ahead = distance >= -depth
         foreign = one.body[here] != other.body[there]
         same = np.flatnonzero(~foreign)
