@@ -28,6 +28,9 @@ _ROUND_OFF = 40 * np.finfo(float).eps
 # The largest share of forces that round-off excuses: of loads, of contact forces on a body that no
 # condition holds, and on one of both sides of every contact.
 MOST_EXCUSED = 1e-5
+# Contact forces that are a smaller share of the forces on a body are none: of one led to its first
+# touch by other forces they are the round-off of where it lies.
+_UNLOADED_FORCE_RATIO = 1e-12
 # Forces below which numbers have lost digits: what is left of a load that has been taken away.
 _LEAST = np.finfo(float).tiny / np.finfo(float).eps
 
@@ -166,7 +169,7 @@ class Parts:
         for row, pairs in zip(exact, self._pairs, strict=True):
             for one, other in (pairs.T, pairs.T[::-1]):
                 np.minimum.at(row, one, round_off[other])
-        acts = pushes > exact
+        acts = pushes > np.maximum(exact, _UNLOADED_FORCE_RATIO * force)
         # A displacement that nothing holds may grow without bounds, and would excuse anything.
         limited = (loads > 0) | (acts.any(axis=0) & ~self._held)
         floor = np.where(limited, np.minimum(round_off, MOST_EXCUSED * force), round_off)
