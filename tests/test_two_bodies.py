@@ -380,8 +380,9 @@ def _pressed_by(cell, times, *, degree=1, own=LOWER, kinematics="finite", given=
 def test_a_surface_too_coarse_for_its_points_is_warned_of(cell, degree, times, caplog) -> None:
     """Once, in the log of the first rank and on all, with a degree that helps; so does swapping.
 
-    Reference: the force with Γc on the fine block. By default 18, 3 and 22 % of it are missing,
-    more than 2 %; with the degree that is told 0.4 % at most, less than 1 %.
+    Reference: the force with Γc on the fine block. By default 18 and 22 % of it are missing, more
+    than 2 %, and on tetrahedra, where it is 3 %, it is refused: edges of the fine block enter Γc.
+    With the degree that is told 0.4 % at most are missing, less than 1 %.
     """
     problem, contact, texts = _pressed_by(cell, times, degree=degree)
     wanted = times * (2 * degree + 2) - 2
@@ -389,8 +390,13 @@ def test_a_surface_too_coarse_for_its_points_is_warned_of(cell, degree, times, c
     assert f"{times} times" in texts[0] and f"quadrature_degree={wanted})" in texts[0]
     told = [r.getMessage() for r in caplog.records if r.name == "fenics_contact"]
     assert told.count(texts[0]) == (COMM.rank == 0)
-    problem.solve()
-    coarse, forces = contact.resultants().normal_force, []
+    if cell == "tetrahedron":
+        raised_everywhere(problem.solve, fc.NotConverged, "has crossed")
+        coarse = 0.0
+    else:
+        problem.solve()
+        coarse = contact.resultants().normal_force
+    forces = []
     for options in ({"own": UPPER}, {"given": wanted}):
         problem, contact, texts = _pressed_by(cell, times, degree=degree, **options)
         assert not texts
