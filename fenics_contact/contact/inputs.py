@@ -189,6 +189,9 @@ class Inputs:
             array = np.asarray(None)
         if array.dtype.kind not in "iuf":
             rows = isinstance(value, list | tuple)
+            if rows:  # numbers of UFL's objects differ from rank to rank
+                symbols = (isinstance(v, ufl.core.expr.Expr) for v in value)
+                value = [type(v).__name__ if s else v for v, s in zip(value, symbols, strict=True)]
             of_components = ", such as ufl.as_vector([way, 0.0])" if rows else ""
             raise TypeError(
                 f"{self._name}: {name} is {value!r}; give numbers, a fem.Constant, a fem.Function "
