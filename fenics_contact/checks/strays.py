@@ -61,7 +61,7 @@ def strays(
     found = {}
     for b in np.flatnonzero(gone):
         way = float(np.linalg.norm(ways[b]))
-        rest = float(most[~gone & scales.coupled_with(b)].max(initial=most[b]))
+        rest = float(most[~gone & scales.coupled_with(int(b))].max(initial=most[b]))
         if way > max(_FAR * rest, _STILL * scales.size[b]):
             found[full.parts.names[b]] = way, rest
     return found

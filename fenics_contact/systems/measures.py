@@ -44,10 +44,11 @@ def check_measures(form: ufl.Form, mesh: dolfinx.mesh.Mesh) -> None:
                 "subdomain_data=tags)"
             )
         dim, what = (tdim, "cells") if kind == "cell" else (tdim - 1, "facets")
-        if hasattr(data, "dim") and not (data.dim == dim and compat.entities_of(data, mesh)):
+        tags: Any = data
+        if hasattr(tags, "dim") and not (tags.dim == dim and compat.entities_of(tags, mesh)):
             raise ValueError(
                 f"F has an integral over {measure}({tag}) whose tags are on entities of dimension "
-                f"{data.dim} of {'this' if compat.entities_of(data, mesh) else 'another'} mesh; "
+                f"{tags.dim} of {'this' if compat.entities_of(tags, mesh) else 'another'} mesh; "
                 f"give it tags of the {what} of the mesh of u"
             )
         if tag == _EVERYWHERE:
