@@ -262,10 +262,9 @@ class RigidObstacleProbe:
         self._comm = contact.surface.mesh.comm
         self.points = values.x + values.jump
         self._gap, self._normal = self._sampler.sample(self.points)
-        self._facet, self._reference = self._deepest()
+        self._facet, self._reference, self._distance = self._deepest()
         self.x, _ = places.facets.positions(self._facet, self._reference)
         self._z = self._at(self.points)
-        self._distance, _ = self._sampler.sample(self._z)
         self._data = self._sampler.data()
         self._start = values.x + opposite.committed_jump
         if known is not None and not opposite.turns:
@@ -279,16 +278,18 @@ class RigidObstacleProbe:
         """A point field at the places."""
         return self._places.values(field, self._facet, self._reference)
 
-    def _deepest(self) -> tuple[Index, Array]:
+    def _deepest(self) -> tuple[Index, Array, Array]:
         """The places, and those that the obstacle comes closest to between them. Collective.
+
+        With the distance of each from the obstacle, (n,) (length).
 
         From every place the tangential part of the way to the obstacle is followed along the facet:
         alternating projections, which end at the closest places of facet and obstacle.
         """
         places, size = self._places, self._places.size
         facet, at = places.facet, places.reference
-        found = [(facet, at)]
         distance, normal = self._sampler.sample(places.values(self.points, facet, at))
+        found = [(facet, at, distance)]
         units = np.vstack([np.zeros(at.shape[1]), np.eye(at.shape[1])])
         # The distance changes by no more than the way: farther obstacles do not reach the facet.
         going = distance < size[facet]
@@ -306,9 +307,9 @@ class RigidObstacleProbe:
             deeper, normal = self._sampler.sample(places.values(self.points, facet, moved))
             going = deeper < distance - 1e-3 * size[facet]
             at, distance = moved, deeper
-            found.append((facet[going], at[going]))
-        facets, references = zip(*found, strict=True)
-        return np.concatenate(facets), np.concatenate(references)
+            found.append((facet[going], at[going], distance[going]))
+        facets, references, distances = zip(*found, strict=True)
+        return np.concatenate(facets), np.concatenate(references), np.concatenate(distances)
 
     def is_valid_for(self, contact: Contact) -> bool:
         """See `Probe`: of an obstacle that neither turns nor changes its shape."""
