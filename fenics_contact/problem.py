@@ -24,13 +24,13 @@ from fenics_contact.checks.given import (
     find_displacement,
 )
 from fenics_contact.checks.judge import Judge
-from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.step import Step
 from fenics_contact.checks.verdict import Attempt, NotConverged, Verdict
 from fenics_contact.contact.contact import Contact, Found
 from fenics_contact.methods.approach import Approach
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
 from fenics_contact.methods.first_touch import FirstTouch
+from fenics_contact.methods.load_balance import LoadBalance
 from fenics_contact.methods.solver import Settings, Solver
 from fenics_contact.parallel import fail_together, global_max, warn
 from fenics_contact.systems import linear
@@ -40,6 +40,7 @@ from fenics_contact.systems.followed import FollowedModulus
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array
@@ -216,14 +217,15 @@ class ContactProblem:
         supports = [
             (contact.name, motion) for contact in self.contacts for motion in contact.motions
         ]
-        self.motions = RigidMotions(
+        self.motions = RigidBodyModes(
             self.displacement,
             self.unknowns,
             self.full.scales,
             [f"{m.kind} {m.way} of the support of {name}" for name, m in supports],
             turning=[motion.turns for _, motion in supports],
         )
-        self.initial_penetration = check_start(self.contacts, self.full.scales.mesh_size)
+        self._balance = LoadBalance(self.motions)
+        self.initial_penetration = check_start(self.contacts)
         self._find_free_motions()
         self.full.scales.begin(self.operators)
         self._judge = Judge(
@@ -254,7 +256,7 @@ class ContactProblem:
         with self.full.stiffness_at_rest() as stiffness:
             self.full.scales.measure_stiffness(stiffness)
             self.motions.find_free(stiffness, self.constrained)
-        self.motions.check_held(self.operators)
+        self._balance.check_constraints(self.operators)
         self.bulk.note_data()
 
     def _unloaded(self) -> _Balance:
@@ -628,7 +630,7 @@ class ContactProblem:
         if self.bulk.has_new_data():
             self._find_free_motions()
         if self.bulk.linear:
-            self.motions.check_balance(load, self.operators)
+            self._balance.check(load, self.operators)
         return load
 
     def _judge_all(self, *, kinematics: bool, assemble: bool) -> tuple[Verdict, EnergyState]:

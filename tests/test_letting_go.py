@@ -12,8 +12,8 @@ import ufl
 from dolfinx import fem
 
 import fenics_contact as fc
-from fenics_contact.checks.strays import strays
 from fenics_contact.elasticity import LinearElastic, NeoHookean
+from fenics_contact.systems.ejected_bodies import find_ejected_bodies
 from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block_mesh, dimension
 from scenes.bodies import Bodies, boxes
 from scenes.comparing import close, gathered
@@ -239,6 +239,6 @@ def test_a_body_that_is_thrown_out_is_told_of():
         for contact in problem.contacts:
             contact.evaluate()
         forces = problem.full.contact_forces()
-        found = strays(problem.full, problem.motions, forces, before)
+        found = find_ejected_bodies(problem.full, problem.motions, forces, before)
         assert [name.split(",")[0] for name in found] == names
         assert all(close(np.array(ways), [2.0, 0.0], 1e-12) for ways in found.values())

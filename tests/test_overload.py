@@ -8,7 +8,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact.checks.overload import find_overload
+from fenics_contact.methods.limit_analysis import find_overload
 from scenes.blocks import TOP, block
 from scenes.comparing import raised_everywhere
 from scenes.elasticity import hold
@@ -36,8 +36,7 @@ def twisted(law, n=6, **options):
 
 def overload(problem):
     """What is found at the present state under the present load."""
-    problem.motions.check_balance(problem.present_load(), problem.operators)
-    return find_overload(problem.motions, problem.operators)
+    return find_overload(problem.motions, problem.operators, problem.present_load())
 
 
 def test_a_twist():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fenics_contact as fc
-from fenics_contact.checks.rigid_motions import unbalanced
+from fenics_contact.methods.load_balance import unbalanced
 from scenes.blocks import block
 from scenes.comparing import raised_everywhere
 

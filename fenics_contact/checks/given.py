@@ -29,10 +29,11 @@ __all__ = [
 
 logger = logging.getLogger("fenics_contact")
 
-# Gaps smaller than this, relative to the mesh, are none: coordinates are no more exact.
-_TOUCHING = 1e-12
-# Round-off of coordinates that leaves too little of what is next to them, relative to the mesh.
-_LOST = 1e-7
+# Gaps relative to the coordinates that they are differences of, and differences of unit normals,
+# that are round-off.
+_SAME_PLACE = 1e-12
+# Largest round-off of coordinates, relative to the facets of Γc.
+_COORDINATE_ROUND_OFF = 1e-5
 # How parts of a mixed function are prescribed.
 _OF_A_PART = (
     "; on a part of a mixed one it is dirichletbc(value, dofs, W.sub(0)), where dofs are those of "
@@ -175,14 +176,13 @@ def _facets_held(contact: Contact, constrained: Array) -> int:
     return int(np.count_nonzero(held[facet_nodes(space, facets)].all(axis=1)))
 
 
-def check_start(contacts: Sequence[Contact], size: float) -> float:
+def check_start(contacts: Sequence[Contact]) -> float:
     """Refuse input out of range; warn of what makes forces wrong without an error. Collective.
 
     These are bodies in their supports, points too few for what is opposite, one support twice.
 
     Args:
         contacts: Of a problem.
-        size: Of the mesh (length).
 
     Returns:
         Largest penetration of the undeformed body (length), 0 if none; an interference by a
@@ -194,17 +194,18 @@ def check_start(contacts: Sequence[Contact], size: float) -> float:
     worst = 0.0
     for contact in contacts:
         comm = contact.surface.mesh.comm
-        far = global_max(comm, np.abs(contact.surface.mesh.geometry.x))
-        if not far * np.finfo(np.float64).eps <= _LOST * size:
+        extent = global_max(comm, np.abs(contact.points))
+        smallest = global_min(comm, contact.quadrature.facet_sizes, empty=np.inf)
+        if not extent * np.finfo(np.float64).eps <= _COORDINATE_ROUND_OFF * smallest:
             raise ValueError(
-                f"{contact.name}: a mesh of size {size:.3g} is as far from the origin as "
-                f"{far:.3g}, where coordinates are round-off; move mesh and supports next to the "
-                "origin"
+                f"{contact.name}: facets of Γc of size {smallest:.3g} have coordinates as large as "
+                f"{extent:.3g}, of which double precision keeps 16 digits; move mesh and supports "
+                "next to the origin"
             )
         contact.check_input()
         contact.inputs.check_side(contact.values, gap_prescribed=contact.gap_prescribed)
         gap = global_min(comm, contact.opposite.undeformed_gap(contact.values))
-        if gap < -_TOUCHING * size and not contact.gap_prescribed:
+        if gap < -_SAME_PLACE * extent and not contact.gap_prescribed:
             worst = max(worst, -gap)
             if comm.rank == 0:
                 logger.warning(
@@ -213,7 +214,7 @@ def check_start(contacts: Sequence[Contact], size: float) -> float:
                     -gap,
                 )
         _warn_of_few_points(contact)
-    _warn_of_doubles(contacts, size)
+    _warn_of_doubles(contacts)
     return worst
 
 
@@ -231,12 +232,12 @@ def _warn_of_few_points(contact: Contact) -> None:
         )
 
 
-def _warn_of_doubles(contacts: Sequence[Contact], size: float) -> None:
+def _warn_of_doubles(contacts: Sequence[Contact]) -> None:
     """Say which two contacts share the force of what is one support. Collective."""
     if len(contacts) < 2:
         return
     comm, pairs = contacts[0].surface.mesh.comm, list(combinations(contacts, 2))
-    shared = comm.allreduce(np.array([_n_doubled(*pair, size) for pair in pairs]))
+    shared = comm.allreduce(np.array([_n_doubled(*pair) for pair in pairs]))
     for (one, other), n_facets in zip(pairs, shared, strict=True):
         if n_facets:
             warn(
@@ -248,7 +249,7 @@ def _warn_of_doubles(contacts: Sequence[Contact], size: float) -> None:
             )
 
 
-def _n_doubled(one: Contact, other: Contact, size: float) -> int:
+def _n_doubled(one: Contact, other: Contact) -> int:
     """Facets of this rank where two supports of one kind that move as one are at one place."""
     mine, theirs = one.support, other.support
     if one.free_motion or other.free_motion:  # each moves by its own force
@@ -261,9 +262,10 @@ def _n_doubled(one: Contact, other: Contact, size: float) -> int:
     for contact, rows in zip((one, other), shared, strict=True):
         points, values = contact.quadrature.point_rows()[rows], contact.values
         # Means, as rules may differ, and the order of points on a facet does.
-        gap = contact.opposite.undeformed_gap(values) / size
+        gap = contact.opposite.undeformed_gap(values)
         places.append([a[points].mean(axis=1) for a in (gap, values.normal)])
         facing &= np.all(values.paired[points], axis=1)
     gaps, normals = (np.abs(a - b) for a, b in zip(*places, strict=True))
-    same = (gaps <= _TOUCHING) & np.all(normals <= _TOUCHING, axis=1)
+    extent = np.abs(one.points).max(initial=0.0)
+    same = (gaps <= _SAME_PLACE * extent) & np.all(normals <= _SAME_PLACE, axis=1)
     return int(np.count_nonzero(same & facing))

@@ -10,14 +10,14 @@ from dolfinx import fem
 from fenics_contact.checks.few_points import warn_of_divided_facets, warn_of_few_points
 from fenics_contact.checks.kinematics import Linearisation, linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
-from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.second_route import SecondRoute
-from fenics_contact.checks.strays import strays
 from fenics_contact.checks.tunnelling import TunnellingCheck
 from fenics_contact.checks.verdict import Balance, Verdict, check_laws
 from fenics_contact.parallel import global_sum, warn
+from fenics_contact.systems.ejected_bodies import find_ejected_bodies
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.system import System
 from fenics_contact.types import Array
 
@@ -39,7 +39,7 @@ class Judge:
     """
 
     def __init__(
-        self, full: FullSystem, motions: RigidMotions, *, kinematics: float, second_route: bool
+        self, full: FullSystem, motions: RigidBodyModes, *, kinematics: float, second_route: bool
     ) -> None:
         """Measure the mesh.
 
@@ -120,7 +120,7 @@ class Judge:
             kinematics=self._linearisation(respond) if respond else {},
             kinematics_allowed=self.kinematics,
             deformation=self._deformation(),
-            strays=strays(self._full, self._motions, contacts, began)
+            ejected_bodies=find_ejected_bodies(self._full, self._motions, contacts, began)
             if laws and system is self._full
             else {},
             inverted=self._full.bulk.is_inverted(),
@@ -197,7 +197,7 @@ class Judge:
             forces: What tells how large all forces are, (n_local,) each.
 
         Returns:
-            The sums, (n_bodies, n_per_body) (force), see `RigidMotions.work`; of every body the
+            The sums, (n_bodies, n_per_body) (force), see `RigidBodyModes.work`; of every body the
             number of its unknowns, and the sum of the absolute forces, (2, n_bodies).
         """
         motions, n = self._motions.of_bodies, len(self._motions.of_bodies)

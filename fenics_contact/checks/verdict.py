@@ -114,7 +114,7 @@ class Verdict:
     kinematics: dict[str, Linearisation] = field(default_factory=dict)
     kinematics_allowed: float = np.inf
     deformation: dict[str, float] = field(default_factory=dict)
-    strays: dict[str, tuple[float, float]] = field(default_factory=dict)
+    ejected_bodies: dict[str, tuple[float, float]] = field(default_factory=dict)
     created: float = 0.0
     inverted: bool = False
     routes: dict[str, Balance] = field(default_factory=dict)
@@ -256,7 +256,7 @@ class Verdict:
                 "it, or stiffness and loads are in other units than lengths; or accept it: "
                 "ContactProblem(kinematics=inf)"
             )
-        for name, (way, others) in self.strays.items():
+        for name, (way, others) in self.ejected_bodies.items():
             found.append(
                 f"{name} is thrown out: it has gone {way:.2g} and touches nothing, where nothing "
                 f"else has moved by more than {others:.2g}; load in smaller steps (increments() "

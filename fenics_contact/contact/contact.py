@@ -633,17 +633,18 @@ class Contact(PointResults):
         counted = None if self._aloft is None else self.history.rows()
         return Found(points, self.opposite.committed_fields(values), counted)
 
-    def set_down(self, felt: Mask, *, released: bool) -> None:
+    def set_down(self, moved: Mask, released: Mask) -> None:
         """Let slip be counted from the state evaluated last, where points bore nothing before.
 
         `restore` takes it back. Collective.
 
         Args:
-            felt: Which points feel what was set down.
-            released: Whether nothing was borne by then: what some points bore is round-off.
+            moved: Which points moved as bodies were set down, (n_points,).
+            released: Of these, the points of bodies that bore no force by then, (n_points,): the
+                tractions committed there are round-off.
         """
         bore = self.history.values("normal_traction") != 0.0
-        self._count_from_here(felt if released else felt & ~bore)
+        self._count_from_here(released | (moved & ~bore))
 
     def count_slip_from_here(self) -> None:
         """Let slip be counted from the state evaluated last, at which surfaces first touch.

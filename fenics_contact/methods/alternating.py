@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from fenics_contact.checks.overload import CLEARLY
 from fenics_contact.contact.contact import Contact
+from fenics_contact.methods.limit_analysis import CLEARLY
 from fenics_contact.methods.method import OVERLOADED, InnerSnes, OwnMethod, Tools
 from fenics_contact.types import Array
 
@@ -223,7 +223,7 @@ class Alternation(OwnMethod):
     def _assemble(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
         equations = self._equations
         equations.evaluate(x)
-        if not equations.held():
+        if not equations.is_constrained():
             equations.assemble(matrix, equations.stiffnesses(everywhere=True))
             return
         # Where all slips, what nothing but friction holds would be loose.

@@ -8,10 +8,10 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
-from fenics_contact.checks.rigid_motions import RigidMotions, rubbing
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import agreed, gather_rows, global_max, global_min, global_sum
 from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.rigid_body_modes import RigidBodyModes, tangential_gram
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Approach"]
@@ -65,7 +65,7 @@ class Approach:
             None: none has.
     """
 
-    def __init__(self, full: FullSystem, motions: RigidMotions) -> None:
+    def __init__(self, full: FullSystem, motions: RigidBodyModes) -> None:
         """Nothing has moved yet.
 
         Args:
@@ -95,34 +95,36 @@ class Approach:
         for contact in full.contacts:
             contact.evaluate()
         finite = all(contact.finite for contact in full.contacts)
-        outside = motions.driving(load)
-        borne = full.borne(committed=finite)
-        idle = borne < _IDLE * outside
-        which = self._untouched()
-        if len(which) < len(motions.free) and motions.turning:
-            # A support that turns freely is rolled by what its points slip, and first touch is a
+        groups, load_size = motions.groups(), motions.generalised_load(load)
+        borne = full.contact_force_sizes(committed=finite)
+        idle = (borne < _IDLE * load_size)[groups] & (not first)
+        untouched = self._untouched()
+        if len(untouched) < len(motions.free) and motions.turning:
+            # An obstacle that turns freely is rolled by what its points slip, and first touch is a
             # point that does not tell.
-            which = which[motions.of_any_body()[which]]
-        if not first:
-            every = np.arange(len(motions.free))
-            carried = self._carried() if finite and not idle else None
-            if idle:
-                which = every
-            elif carried is not None:
-                # Bodies slip then by what they did: set down they slip by what has moved, too.
-                here = full.state()
-                self._move(every, carried)
-                self.carried = full.state()
-                if len(which) == len(every) and not len(self._untouched()):
-                    self._follow_stiffness()
-                    return False
-                self._go(here)
+            untouched = untouched[motions.of_any_body()[untouched]]
+        which = np.union1d(untouched, np.flatnonzero(idle))
+        carried = self._carried(~idle) if finite and not first and not idle.all() else None
+        if carried is not None:
+            # Bodies slip then by what they did: set down they slip by what has moved, too.
+            here = full.state()
+            self._move(np.arange(len(idle)), carried)
+            self.carried = full.state()
+            if not idle.any() and len(which) == len(idle) and not len(self._untouched()):
+                self._follow_stiffness()
+                return False
+            self._go(here)
         if len(which):
-            self._set_down(load, which, released=borne < _LEFT * outside)
-        return first or idle
+            # Those that bore no more than round-off were let go.
+            released = (borne < _LEFT * load_size)[groups[which]]
+            self._set_down(load, which, released)
+        return first or bool(idle.any())
 
-    def _carried(self) -> Array | None:
-        """How supports that have moved take bodies along. Collective.
+    def _carried(self, chosen: Mask) -> Array | None:
+        """How obstacles that have moved take bodies along. Collective.
+
+        Args:
+            chosen: Which of the free motions may be taken along, (n_free,).
 
         Returns:
             Coefficients of the free motions; None: no support has moved.
@@ -140,6 +142,7 @@ class Approach:
             if not contact.law.has_tangential:
                 jumps = np.sum(jumps * points.normal, axis=2, keepdims=True) * points.normal
             weights = contact.measure * np.abs(points.arrays["normal_traction"])
+            jumps = np.where(chosen[:, None, None], jumps, 0.0)
             gram += np.einsum("mqd,q,nqd->mn", jumps, weights, jumps)
             work += np.einsum("mqd,q,qd->m", jumps, weights, way)
         gram, work = global_sum(comm, gram), global_sum(comm, work)
@@ -158,7 +161,7 @@ class Approach:
             touched += (np.abs(jumps[:, closed]) > _FELT).any(axis=(1, 2))
         touched = global_sum(self._full.unknowns.comm, touched)
         # What turns about a point does not move there.
-        return np.flatnonzero(~(motions.together() @ (touched > 0)))
+        return np.flatnonzero(~(motions.of_same_body() @ (touched > 0)))
 
     def _go(self, state: Array) -> None:
         """Make a state the present one. Collective."""
@@ -166,10 +169,15 @@ class Approach:
         for contact in self._full.contacts:
             contact.evaluate()
 
-    def _set_down(self, load: Array, which: Index, *, released: bool) -> None:
+    def _set_down(self, load: Array, which: Index, released: Mask) -> None:
         """Move bodies that touch nothing to where they rest, or to first touch. Collective.
 
         Slip is counted from there, for until then nothing is touched.
+
+        Args:
+            load: As in `lead`.
+            which: Numbers of their free motions.
+            released: Which of these are of bodies that were let go, (n_which,).
         """
         full = self._full
         aloft = full.state()
@@ -189,7 +197,7 @@ class Approach:
         if not self._motions.of_any_body()[which].any():
             return
         for contact, jumps in zip(full.contacts, self._felt(which)[1], strict=True):
-            contact.set_down(_feeling(jumps), released=released)
+            contact.set_down(_feeling(jumps), _feeling(jumps[released]))
 
     def _follow_stiffness(self) -> None:
         """Take that of a nonlinear bulk which has turned. Collective."""
@@ -301,7 +309,7 @@ class Approach:
         for contact, jumps in zip(self._full.contacts, free.jumps, strict=True):
             values, weights = contact.values, contact.quadrature.weights
             closing = np.einsum("mqd,qd->qm", jumps, values.normal)
-            grams += [rubbing(contact, jumps, weights), (closing.T * weights) @ closing]
+            grams += [tangential_gram(contact, jumps, weights), (closing.T * weights) @ closing]
             there = contact.paired & _feeling(jumps)
             rows.append(np.column_stack([closing, values.gap])[there])
         rubs, presses = global_sum(comm, grams)

@@ -14,15 +14,15 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from fenics_contact.checks.chattering import StatusWatch
-from fenics_contact.checks.overload import Overload, find_overload
-from fenics_contact.checks.rigid_motions import RigidMotions
-from fenics_contact.checks.strays import strays
 from fenics_contact.contact.values import Status
+from fenics_contact.methods.active_set_monitor import ActiveSetMonitor
+from fenics_contact.methods.limit_analysis import Overload, find_overload
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.systems.balance import Norms
+from fenics_contact.systems.ejected_bodies import find_ejected_bodies
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.hierarchy import Hierarchy
+from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.system import System
 from fenics_contact.types import Array
 
@@ -66,7 +66,7 @@ class Equations:
     """
 
     def __init__(
-        self, full: FullSystem, motions: RigidMotions, *, alpha: float, phi: float
+        self, full: FullSystem, motions: RigidBodyModes, *, alpha: float, phi: float
     ) -> None:
         """Nothing is assembled yet.
 
@@ -80,7 +80,7 @@ class Equations:
         self.length = full.scales.mesh_size
         self._bulk, self._comm = full.bulk, full.unknowns.comm
         self._alpha, self._phi = alpha, phi
-        self.watch = StatusWatch(full.contacts)
+        self.watch = ActiveSetMonitor(full.contacts)
         nothing: Array = np.zeros(full.n_bodies)
         self.norms = Norms(nothing, nothing, nothing, nothing, nothing.size)
         self.start = nothing
@@ -122,7 +122,9 @@ class Equations:
         contacts = self.system.contact_forces()
         total = sum(contacts, self.system.bulk_force())
         system = self.system
-        thrown = system is self.full and strays(self.full, self.motions, contacts, self.began)
+        thrown = system is self.full and find_ejected_bodies(
+            self.full, self.motions, contacts, self.began
+        )
         if thrown or self._bulk.is_inverted() or system.is_twisted() or system.is_degenerate():
             total[:] = np.nan  # a line search takes a shorter step
         self.norms = self.system.norms(total, contacts, self.start)
@@ -164,7 +166,10 @@ class Equations:
         1 where it can be borne, or nothing can be told; infinite where there is no friction at all;
         see `find_overload`.
         """
-        self.overload = find_overload(self.motions, self.full.operators)
+        self.overload = None
+        if self._bulk.linear:  # a deformation may turn the loads on another, and what holds it
+            load, operators = self.full.load, self.full.operators
+            self.overload = find_overload(self.motions, operators, load)
         return self.overload.factor if self.overload else 1.0
 
     # ---- matrices --------------------------------------------------------------------------------
@@ -255,15 +260,15 @@ class Equations:
             contact.evaluate()
         self.watch.note(residual)
 
-    def held(self) -> bool:
+    def is_constrained(self) -> bool:
         """Whether the closed points hold all free motions. Collective."""
-        return self.motions.held(self.full.operators)
+        return self.motions.is_constrained(self.full.operators)
 
     def holding_tangents(self) -> Iterable[PETSc.Mat]:
         """`tangents`, or more where they would let a body go anywhere. Collective."""
-        if self.held() and not self._touches():
+        if self.is_constrained() and not self._touches():
             # Where all slips, what nothing but friction holds is loose along Γc.
-            stick = self.motions.to_stick(self.full.operators)
+            stick = self.motions.points_to_pin(self.full.operators)
             if stick is None:
                 return self.tangents()
             return chain(self.tangents(), self._springs([(0.0, points) for points in stick]))
@@ -276,15 +281,16 @@ class Equations:
 
     def _driven(self) -> bool:
         """Whether the load on the free motions is felt beside the residual. Collective."""
-        return self.motions.driving(self.full.load) > _OPEN_SHARE * self.norms.total
+        load = self.motions.generalised_load(self.full.load)
+        return bool(load.max(initial=0.0) > _OPEN_SHARE * self.norms.total)
 
     def _touches(self) -> bool:
         """Whether points that are closed bear next to nothing of the load on the free motions.
 
         Those of a body that was set down are closed by round-off, some of many. Collective.
         """
-        driving = self.motions.driving(self.full.load)
-        return driving > 0 and self.full.borne() < _OPEN_SHARE * driving
+        load = self.motions.generalised_load(self.full.load)
+        return bool(np.any(self.full.contact_force_sizes() < _OPEN_SHARE * load))
 
     def _springs(
         self, shares: Iterable[tuple[npt.ArrayLike, npt.ArrayLike]]

@@ -136,7 +136,7 @@ class PrimalDual(OwnMethod):
         equations.residual(x, f)  # of the law as it is: that it vanishes ends the iteration
         for points in self._points:
             points.follow(moderate / max(self._hardness, moderate), self._damping)
-        everywhere = not equations.held()
+        everywhere = not equations.is_constrained()
         for points in self._points:
             points.linearise(everywhere=everywhere)
         total = f.duplicate()

@@ -9,8 +9,8 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact import compat
-from fenics_contact.checks.overload import CLEARLY
 from fenics_contact.methods.equations import Equations
+from fenics_contact.methods.limit_analysis import CLEARLY
 from fenics_contact.methods.method import SnesMethod
 
 __all__ = ["QuasiNewton"]
@@ -120,7 +120,7 @@ class QuasiNewton(SnesMethod):
         equations = self._equations
         self._clear_pairs(consistent=False)
         equations.evaluate(equations.solution)
-        self._refreshed = not idle and equations.held()
+        self._refreshed = not idle and equations.is_constrained()
         equations.make_h0(everywhere=not self._refreshed)
 
     def _refresh(self) -> bool:
@@ -134,7 +134,7 @@ class QuasiNewton(SnesMethod):
         if not np.isfinite(equations.full.bulk.scale):
             return False
         self._refreshed = True
-        tangent = not equations.has_potential and equations.held()
+        tangent = not equations.has_potential and equations.is_constrained()
         parts = equations.tangents() if tangent else equations.stiffnesses(everywhere=False)
         consistent = tangent and not equations.by_cycle
         self._clear_pairs(consistent=consistent)

@@ -120,7 +120,7 @@ def _shrink(equations: Equations, load_before: Array) -> None:
         touched[full.label[operator.touched]] = 1.0
         mine = global_sum(full.unknowns.comm, touched) > 0.0
         if not sizes[1, mine].any():  # bodies between others have no load of their own
-            mine[:] = True
+            mine = np.isin(full.scales.group, full.scales.group[mine])
         now, before = (float(np.linalg.norm(size[mine])) for size in sizes)
         if _NOTHING * before < now < _FELL * before:
             operator.contact.multipliers.shrink(now / before)

@@ -14,7 +14,6 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.arguments import check_instance, is_number
-from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.checks.verdict import Attempt
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.contact import Contact
@@ -34,6 +33,7 @@ from fenics_contact.systems import linear
 from fenics_contact.systems.choice import linear_kind, obstacle_to_condensation
 from fenics_contact.systems.condensed import CondensedSystem
 from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Selection
 from fenics_contact.types import Array, Indices
@@ -142,7 +142,7 @@ class Solver:
         starts: Where the iteration starts from.
     """
 
-    def __init__(self, full: FullSystem, motions: RigidMotions, settings: Settings) -> None:
+    def __init__(self, full: FullSystem, motions: RigidBodyModes, settings: Settings) -> None:
         """Choose system and method. Collective.
 
         Args:
@@ -610,7 +610,7 @@ class Solver:
                     full.update_stiffness()
                 for contact in full.contacts:
                     contact.evaluate()
-                if not self.equations.held():
+                if not self.equations.is_constrained():
                     return None
                 closed = [contact.status != Status.OPEN for contact in full.contacts]
                 springs = [c.springs(s, s) for c, s in zip(full.contacts, closed, strict=True)]

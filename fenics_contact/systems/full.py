@@ -199,18 +199,20 @@ class FullSystem(System):
         forces = [motion.force for c in self.contacts for motion in c.motions]
         return self.unknowns.joined(residual, -np.array(forces))
 
-    def borne(self, *, committed: bool = False) -> float:
-        """Sum of the sizes of contact forces, now or as they were committed. Collective.
+    def contact_force_sizes(self, *, committed: bool = False) -> Array:
+        """Sums of the sizes of contact forces, now or committed, (n_groups,) (force). Collective.
 
-        Not their resultants: those of a body that friction has locked are zero. With finite
-        kinematics a support that moves away leaves nothing of what was borne.
+        By group of coupled parts; see `ReferenceScales.group`. Not their resultants: those of a
+        body that friction has locked are zero. With finite kinematics an obstacle that moves away
+        leaves nothing of the forces.
         """
-        total = 0.0
-        for contact in self.contacts:
+        total: Array = np.zeros(self.scales.n_groups)
+        for number, contact in enumerate(self.contacts):
             points = contact.committed().points if committed else contact.values
             if points is not None:
-                total += contact.measure @ np.abs(points.total_traction).sum(axis=1)
-        return float(global_sum(self.unknowns.comm, total))
+                force = contact.measure * np.abs(points.total_traction).sum(axis=1)
+                np.add.at(total, self.scales.group_of_points(number), force)
+        return global_sum(self.unknowns.comm, total)
 
     @property
     def follows(self) -> bool:

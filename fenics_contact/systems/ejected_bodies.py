@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.parallel import global_sum
 from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.types import Array
 
-__all__ = ["strays"]
+__all__ = ["find_ejected_bodies"]
 
 # How many times as far as all else a body may go. Blocks thrown out from between two others went
 # ten times as far; one that is let go springs back by as much as it changes its shape.
@@ -20,8 +20,8 @@ _FAR = 3.0
 _STILL = 1e-6
 
 
-def strays(
-    full: FullSystem, motions: RigidMotions, contacts: Sequence[Array], began: Array
+def find_ejected_bodies(
+    full: FullSystem, motions: RigidBodyModes, contacts: Sequence[Array], began: Array
 ) -> dict[str, tuple[float, float]]:
     """Bodies that have gone away, and on which no force acts. Collective.
 
@@ -42,7 +42,9 @@ def strays(
     """
     scales = full.scales
     fixed = [not contact.opposite.follows for contact in full.contacts]
-    looked_at = motions.loose() & scales.unloaded & ~scales.touching[fixed].any(axis=0)
+    looked_at = (
+        motions.unconstrained_bodies() & scales.unloaded & ~scales.touching[fixed].any(axis=0)
+    )
     if not looked_at.any():
         return {}
     # What has a load is not in equilibrium, and may be on its way to be set down.

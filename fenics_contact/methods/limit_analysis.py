@@ -16,9 +16,9 @@ import numpy as np
 import scipy.optimize
 from mpi4py import MPI
 
-from fenics_contact.checks.rigid_motions import RigidMotions
 from fenics_contact.parallel import agreed, global_max, global_sum
 from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.types import Array
 
 __all__ = ["CLEARLY", "Overload", "find_overload"]
@@ -62,21 +62,24 @@ class Overload:
         )
 
 
-def find_overload(motions: RigidMotions, operators: Sequence[ContactOperator]) -> Overload | None:
+def find_overload(
+    motions: RigidBodyModes, operators: Sequence[ContactOperator], load: Array
+) -> Overload | None:
     """The worst motion by which the load outdoes friction at its present limits. Collective.
 
     Whatever is found does; where the search is not at its end there may be worse.
 
     Args:
-        motions: Which of them are free, and what the load checked last does on them.
+        motions: Which of them are free.
         operators: Of evaluated contacts, over all unknowns.
+        load: External forces at this rank's unknowns (force).
 
     Returns:
         None where friction can bear the load, or nothing can be told: supports that turn, places
         that follow the bodies, tangential forces without limit, friction bounds that depend on
         the motion itself.
     """
-    comm, wanted = motions.comm, motions.resultant
+    comm, wanted = motions.comm, motions.load_resultant(load, operators)
     contacts = [operator.contact for operator in operators]
     rubbing = [c for c in contacts if c.law.has_friction]
     unlimited = any(c.law.has_tangential and not c.law.has_friction for c in contacts)

@@ -1,8 +1,4 @@
-"""Rigid motions that the Dirichlet conditions leave free: who holds them, can the load be balanced.
-
-A body held by contact alone is ordinary. One that nothing holds, or a load that pulls it off its
-support, has no solution: both are found here, before any iteration.
-"""
+"""Rigid-body modes: those that Dirichlet conditions leave free, and whether contact holds them."""
 
 from __future__ import annotations
 
@@ -11,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 from petsc4py import PETSc
 
 from fenics_contact import compat
@@ -27,22 +22,16 @@ from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["RigidMotions", "rubbing", "unbalanced"]
+__all__ = ["RigidBodyModes", "tangential_gram"]
 
 
 # Relative sizes below which an energy, a work or a share of a mode counts as zero. One clamped dof
 # among N gives 1/N, so that the first must lie below any 1/N; the others are far above round-off.
 _FREE = 1e-12
 _FELT = 1e-10
-_BALANCED = 1e-8
-# Directions by which the friction cone is enclosed in space: a polygon around the circle, so that a
-# balance that exists is never denied.
-_CONE_SIDES = 64
-# As many of these, of all points and directions alike, nearly always balance what all of them do.
-_SOME_RAYS = 2000
 
 
-class RigidMotions:
+class RigidBodyModes:
     """The rigid motions of every body of a mesh, and those of them that are free.
 
     A body is a part of the mesh connected by its displacements. Rotations are about the body's
@@ -55,8 +44,6 @@ class RigidMotions:
             multiplied to be one of order one (length); 0 for the others.
         of_bodies: Their fields at this rank's unknowns, (n_bodies, n_per_body, n_local).
         free: Coefficients of the free motions, shape (n_free, n_motions).
-        resultant: Work on them of the load that was checked last, but for those by which supports
-            turn (force); none before.
     """
 
     def __init__(
@@ -104,10 +91,8 @@ class RigidMotions:
         shape = n_bodies, n_modes // n_bodies, unknowns.n_local
         self.of_bodies = self._modes[:n_modes].reshape(shape)
         self.free: Array = np.zeros((0, n_modes))
-        self.resultant: Array = np.zeros(0)
         self._free_fields: Array = np.zeros((0, unknowns.n_local))
         self._free_sizes = self._free_fields  # of their entries
-        self._balanced: list[Array] = []
         # Masks of points that were found to hold all motions, and of which contacts.
         self._holding: list[Mask] = []
         self._holders: weakref.WeakSet[ContactOperator] = weakref.WeakSet()
@@ -159,7 +144,6 @@ class RigidMotions:
         self._scales.held = np.all(~np.hstack(self._moved()), axis=0)
         self._free_fields = self.free @ self._modes
         self._free_sizes = np.abs(self._free_fields)
-        self._balanced = []
         self._holding = []
         for vector in (work, image):
             vector.destroy()
@@ -184,7 +168,7 @@ class RigidMotions:
         bodies = moves[:, :n_modes].reshape(-1, n_bodies, n_motions).any(axis=2)
         return bodies, moves[:, n_modes:]
 
-    def together(self) -> Mask:
+    def of_same_body(self) -> Mask:
         """Which two of the free motions are of one body, (n_free, n_free)."""
         parts = np.hstack(self._moved()).astype(np.float64)
         return np.asarray(parts @ parts.T > 0)
@@ -194,7 +178,7 @@ class RigidMotions:
         bodies, _ = self._moved()
         return np.asarray(bodies.any(axis=1))
 
-    def loose(self) -> Mask:
+    def unconstrained_bodies(self) -> Mask:
         """Which bodies a free motion moves, (n_bodies,)."""
         bodies, _ = self._moved()
         return np.asarray(bodies.any(axis=0))
@@ -288,7 +272,7 @@ class RigidMotions:
         ]
         return " with ".join(terms)
 
-    def held(self, operators: Sequence[ContactOperator]) -> bool:
+    def is_constrained(self, operators: Sequence[ContactOperator]) -> bool:
         """Whether the points that are closed now hold every free motion. Collective.
 
         Args:
@@ -310,12 +294,12 @@ class RigidMotions:
         if self.comm.allreduce(not known or any(lacks)) == 0:
             return True
         every = np.arange(len(self.free))
-        held = not self._loose(operators, every, closed_only=True).size
+        held = not self.unconstrained(operators, every, closed_only=True).size
         if held:
             self._holding, self._holders = bearing, weakref.WeakSet(operators)
         return held
 
-    def to_stick(self, operators: Sequence[ContactOperator]) -> list[Mask] | None:
+    def points_to_pin(self, operators: Sequence[ContactOperator]) -> list[Mask] | None:
         """Which points to hold, of those that slip, lest tangents let a body go. Collective.
 
         The tangent of friction is none along it. As few as can be, of those that bear most. Motions
@@ -327,8 +311,8 @@ class RigidMotions:
         Returns:
             A mask of the points of each; None: nothing lets a body go.
         """
-        rows, ways = self._straight(), []
-        loose = self._loose(operators, rows, closed_only=True, slips=True)
+        rows, ways = self.straight(), []
+        loose = self.unconstrained(operators, rows, closed_only=True, slips=True)
         if not len(loose):
             return None
         for operator in operators:
@@ -347,23 +331,7 @@ class RigidMotions:
         hold[mine[(mine >= 0) & (mine < len(hold))]] = True
         return np.split(hold, numbers[1:-1])
 
-    def check_held(self, operators: Sequence[ContactOperator]) -> None:
-        """Refuse a free motion that no contact feels, even if all of Γc were closed. Collective.
-
-        Raises:
-            ValueError: It names the motion.
-        """
-        loose = self._loose(operators, np.arange(len(self.free)), closed_only=False) @ self.free
-        if loose.size:
-            motions = "; ".join(self.describe(row) for row in loose)
-            finite = any(operator.contact.finite for operator in operators)
-            why = "nothing, to first order, holds" if finite else "nothing will ever hold"
-            raise ValueError(
-                f"{why} the body against this rigid motion: {motions}. Add a Dirichlet condition "
-                "on it, or friction"
-            )
-
-    def _loose(
+    def unconstrained(
         self,
         operators: Sequence[ContactOperator],
         rows: Index,
@@ -384,7 +352,7 @@ class RigidMotions:
         n_free = len(rows)
         gram: Array = np.zeros((n_free, n_free))
         area: Array = np.zeros(n_free)
-        together = self.together()[np.ix_(rows, rows)].astype(np.float64)
+        together = self.of_same_body()[np.ix_(rows, rows)].astype(np.float64)
         for operator in operators:
             contact, values = operator.contact, operator.contact.values
             modes = self.at_points(operator)[rows]
@@ -399,13 +367,13 @@ class RigidMotions:
             if slips:
                 way = _slip(contact)
                 modes = modes - np.einsum("mqd,qd->mq", modes, way)[:, :, None] * way
-            gram += rubbing(contact, modes, weights)
+            gram += tangential_gram(contact, modes, weights)
         gram, area = global_sum(self.comm, gram), global_sum(self.comm, area)
         scale = 1 / np.sqrt(np.where(area > 0, area, 1.0))
         sizes, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
         return agreed(self.comm, (vectors * scale[:, None])[:, sizes < _FELT].T)
 
-    def _straight(self) -> Index:
+    def straight(self) -> Index:
         """Numbers of the free motions but for those by which supports turn."""
         return np.flatnonzero(~np.any(self.free[:, self._turning] != 0.0, axis=1))
 
@@ -419,163 +387,38 @@ class RigidMotions:
 
         But for those by which supports turn: what presses may have no moment.
         """
-        return global_sum(self.comm, (self._free_fields @ forces)[self._straight()])
+        return global_sum(self.comm, (self._free_fields @ forces)[self.straight()])
 
-    def driving(self, load: Array) -> float:
-        """The largest of the `resultants` of a load, by size. Collective."""
-        return float(np.abs(self.resultants(load)).max(initial=0.0))
+    def load_size(self, load: Array) -> Array:
+        """What a load could do at most on each of the modes of `resultants` (force). Collective."""
+        return global_sum(self.comm, (self._free_sizes @ np.abs(load))[self.straight()])
 
-    def check_balance(self, load: Array, operators: Sequence[ContactOperator]) -> None:
-        """Refuse a load whose resultant no admissible contact forces can balance. Collective.
-
-        The contact may push anywhere on Γc, and rub within the friction cone: a necessary
-        condition only, but it finds a body pulled off its support, tipped over its edge or pushed
-        along it.
+    def load_resultant(self, load: Array, operators: Sequence[ContactOperator]) -> Array:
+        """`resultants` of a load and of normal tractions that a law prescribes. Collective.
 
         Args:
             load: External forces at this rank's unknowns (force).
             operators: Of evaluated contacts, over all unknowns.
-
-        Raises:
-            ValueError: It gives the resultant and the motion.
         """
-        rows = self._straight()  # arms turn with a support: what it cannot bear here it may there
-        self.resultant = np.zeros(len(rows))
-        if not len(rows):
-            return
-        named, resultant = self.free[rows], self.resultants(load)
-        # What the load could do at most, were all of it along the motion: the scale of "zero".
-        size = float(global_sum(self.comm, (self._free_sizes @ np.abs(load))[rows]).max())
-        contacts = [operator.contact for operator in operators]
-        for operator, contact in zip(operators, contacts, strict=True):
-            if not contact.law.has_normal_stiffness:  # a prescribed normal traction is a load
+        resultant = self.resultants(load)
+        for operator in operators:
+            contact = operator.contact
+            if not contact.law.has_normal_stiffness:
                 force = -contact.values.parameters["pressure"][:, None] * contact.values.normal
-                modes = self.at_points(operator)[rows]
+                modes = self.at_points(operator)[self.straight()]
                 work = np.einsum("mqd,qd,q->m", modes, force, contact.measure)
                 resultant += global_sum(self.comm, work)
-        self.resultant = resultant
-        if np.abs(resultant).max() <= _BALANCED * size:
-            return
-        # A history often has one direction of load and one support: what balanced it does again.
-        data = [resultant / np.abs(resultant).max()]
-        for contact in contacts:
-            data += [contact.values.normal, _bearing_normals(contact)]
-            data += [contact.values.friction_bound_ratio]
-            data += [np.array([contact.pairs.number])]
-        known = len(data) == len(self._balanced) and all(map(_alike, data, self._balanced))
-        if self.comm.allreduce(not known) == 0:
-            return
-        rays = np.concatenate([self._rays(operator, rows) for operator in operators], axis=0)
-        # Unit columns: a ray's length has no meaning, and badly scaled ones spoil the solution. One
-        # of rounding only, such as that of tangential forces on a motion across them, is none.
-        length = np.linalg.norm(rays, axis=1)
-        felt = length > _FELT
-        rays = rays[felt] / length[felt, None]
-        rest = np.abs(resultant).max()
-        if len(rays):
-            rest *= agreed(self.comm, unbalanced(rays.T, -resultant / rest))
-        if rest > _BALANCED * max(size, np.abs(resultant).max()):
-            scale = np.abs(resultant).max()
-            limits = scale * agreed(self.comm, _borne(rays.T, -resultant / scale)) + 0.0  # no -0
-            size = max(size, scale)
-            beyond = [i for i, r in enumerate(resultant) if abs(r) > limits[i] + _BALANCED * size]
-            said = [
-                f"({self.describe(named[i])}) is {resultant[i]:.6g}, of which contact can "
-                f"bear at most {limits[i]:.6g} with the rest as it is"
-                for i in beyond
-            ]
-            worst = int(np.argmax(np.abs(resultant)))
-            said = said or [f"({self.describe(named[worst])}) is {resultant[worst]:.6g}"]
-            raise ValueError(
-                "no contact force can balance the load: its resultant along the free motion "
-                f"{', and along '.join(said)}. Contact can only push along its normals and rub "
-                "within the friction cone. Check the sign and size of the load, and the normals, "
-                "or add a Dirichlet condition"
-            )
-        self._balanced = data
+        return resultant
 
-    def _rays(self, operator: ContactOperator, rows: Index) -> Array:
-        """Generalised forces of every admissible direction at every point: (n_rays, n_rows).
+    def groups(self) -> Index:
+        """Group of coupled parts that each free motion moves, (n_free,)."""
+        return np.asarray(self._scales.group[np.argmax(np.hstack(self._moved()), axis=1)])
 
-        On some of the free motions, by their numbers.
-        """
-        contact, values = operator.contact, operator.contact.values
-        normal = values.normal
-        d = normal.shape[1]
-        directions = []
-        law = contact.law
-        if law.has_tangential:
-            if d == 2:
-                around = [np.column_stack([-normal[:, 1], normal[:, 0]])]
-                around.append(-around[0])
-            else:
-                around = _around(normal)
-            ratio = values.friction_bound_ratio[:, None]
-            ratio = ratio if d == 2 else ratio / np.cos(np.pi / _CONE_SIDES)
-            bounded = np.isfinite(ratio)  # by the normal force
-            pushes = -_bearing_normals(contact) * law.has_normal_stiffness
-            directions = [
-                np.where(bounded, pushes + np.where(bounded, ratio, 0.0) * t, t) for t in around
-            ]
-        if law.has_normal_stiffness:
-            pushes = -_bearing_normals(contact)
-            directions += [pushes, -pushes] if law.has_tension else [pushes]
-        modes = self.at_points(operator)[rows]
-        rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
-        return gather_rows(self.comm, np.concatenate(rays).reshape(-1, len(rows)))
-
-
-def _alike(one: Array, other: Array) -> bool:
-    return one.shape == other.shape and np.allclose(one, other, rtol=0.0, atol=1e-12)
-
-
-def unbalanced(rays: Array, resultant: Array) -> float:
-    """The least Σ|resultant - rays·x| over x ≥ 0; rays (n_free, n_rays) of unit length.
-
-    Least squares without negatives find at once that there is nothing left, of some of the rays
-    quicker than of all, but where there is they may end far from their optimum: then a linear
-    programme, which takes ten times as long.
-    """
-    m, n = rays.shape
-    for tried in (rays[:, :: n // _SOME_RAYS + 1], rays):
-        try:
-            forces = scipy.optimize.nnls(tried, resultant)[0]
-        except RuntimeError:
-            continue  # too many iterations
-        if np.abs(tried @ forces - resultant).sum() < _BALANCED:
-            return 0.0
-    tolerance = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
-    found = scipy.optimize.linprog(
-        np.concatenate([np.zeros(n), np.ones(2 * m)]),
-        A_eq=np.hstack([rays, np.eye(m), -np.eye(m)]),
-        b_eq=resultant,
-        options=tolerance,
-    )
-    # What the programme cannot tell is left to the solution itself to show.
-    return float(found.fun) if found.status == 0 else 0.0
-
-
-def _borne(rays: Array, wanted: Array) -> Array:
-    """How much of each component of a force rays can make, all others as wanted, (n_free,).
-
-    Of the sign that is wanted; NaN where the others alone cannot be made.
-
-    Args:
-        rays: (n_free, n_rays) of unit length.
-        wanted: The force, (n_free,).
-    """
-    found = np.full(len(wanted), np.nan)
-    if not rays.size:
-        return found
-    for i, value in enumerate(wanted):
-        rest = np.where(np.arange(len(wanted)) == i, 0.0, wanted)
-        along = np.zeros((len(wanted), 1))
-        along[i] = -1.0 if value >= 0 else 1.0
-        cost = np.append(np.zeros(rays.shape[1]), -1.0)
-        made = scipy.optimize.linprog(cost, A_eq=np.hstack([rays, along]), b_eq=rest)
-        if made.status == 0:
-            found[i] = made.x[-1]
-    return found
+    def generalised_load(self, load: Array) -> Array:
+        """The largest of the `resultants` of a load, by size, (n_groups,) (force). Collective."""
+        largest: Array = np.zeros(self._scales.n_groups)
+        np.maximum.at(largest, self.groups()[self.straight()], np.abs(self.resultants(load)))
+        return largest
 
 
 def _plain(rows: Array) -> Array:
@@ -596,23 +439,6 @@ def _plain(rows: Array) -> Array:
     return rows / np.abs(rows).max(axis=1, initial=1.0)[:, None] if rows.size else rows
 
 
-def _bearing_normals(contact: Contact) -> Array:
-    """Normals at the points, zero where k_n is: there is no foundation there, (n_points, gdim)."""
-    values = contact.values
-    bears = np.asarray(values.parameters.get("k_n", 1.0)) > 0
-    return np.where(bears[..., None], values.normal, 0.0)
-
-
-def _around(normal: Array) -> list[Array]:
-    """Unit vectors around each normal in space, `_CONE_SIDES` of them."""
-    least = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
-    first = np.cross(normal, least)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(normal, first)
-    angles = 2 * np.pi * np.arange(_CONE_SIDES) / _CONE_SIDES
-    return [np.cos(a) * first + np.sin(a) * second for a in angles]
-
-
 def _slip(contact: Contact) -> Array:
     """Along the friction of the points that slip against it, of length 1 or 0, (n_points, gdim).
 
@@ -625,7 +451,7 @@ def _slip(contact: Contact) -> Array:
     return np.asarray(traction * (slips / np.where(slips, size, 1.0))[:, None], dtype=np.float64)
 
 
-def rubbing(contact: Contact, modes: Array, weights: Array) -> Array:
+def tangential_gram(contact: Contact, modes: Array, weights: Array) -> Array:
     """Products along Γc, where it resists, of n motions by their jumps, (n, n_points, gdim)."""
     if not contact.law.has_tangential:
         return np.zeros((len(modes), len(modes)))

@@ -10,7 +10,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import gather_rows, global_sum
 
-__all__ = ["StatusWatch"]
+__all__ = ["ActiveSetMonitor"]
 
 # Changes of a point's status since the residual last fell that make it a chattering one, and the
 # share by which it has to fall to count.
@@ -18,7 +18,7 @@ _CHANGES = 3
 _FALL = 0.9
 
 
-class StatusWatch:
+class ActiveSetMonitor:
     """Looks at the status of all points from iteration to iteration.
 
     Attributes:

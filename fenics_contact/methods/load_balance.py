@@ -1,0 +1,254 @@
+"""Whether admissible contact forces can balance a load, before any iteration.
+
+A body that contact alone holds is ordinary. One that nothing will ever hold, or a load that pulls
+it off its obstacle, has no solution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.optimize
+import scipy.sparse.csgraph
+
+from fenics_contact.contact.contact import Contact
+from fenics_contact.parallel import agreed, gather_rows
+from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.systems.rigid_body_modes import RigidBodyModes
+from fenics_contact.types import Array, Index
+
+__all__ = ["LoadBalance", "unbalanced"]
+
+# Generalised forces relative to the largest that the load could exert, and entries of unit modes at
+# the points, that are zero.
+_BALANCED, _FELT = 1e-8, 1e-10
+# Directions by which the friction cone is enclosed in space: a polygon around the circle, so that a
+# balance that exists is never denied.
+_CONE_SIDES = 64
+# As many of these, of all points and directions alike, nearly always balance what all of them do.
+_SOME_RAYS = 2000
+
+
+class LoadBalance:
+    """Static admissibility of loads on the free rigid-body modes of a problem."""
+
+    def __init__(self, modes: RigidBodyModes) -> None:
+        """Take the modes; nothing is checked yet."""
+        self._modes = modes
+        # The geometry of contact that was looked at last: this rank's part of it, admissible
+        # generalised forces of all ranks, and of every group of modes the resultant balanced last.
+        self._geometry: list[Array] = []
+        self._rays: Array = np.zeros((0, 0))
+        self._groups: list[tuple[Index, Array]] = []
+
+    def check_constraints(self, operators: Sequence[ContactOperator]) -> None:
+        """Refuse a free mode that no contact resists, even if all of Γc were closed. Collective.
+
+        Args:
+            operators: Of evaluated contacts, over all unknowns.
+
+        Raises:
+            ValueError: It names the mode.
+        """
+        modes = self._modes
+        every = np.arange(len(modes.free))
+        loose = modes.unconstrained(operators, every, closed_only=False) @ modes.free
+        if loose.size:
+            motions = "; ".join(modes.describe(row) for row in loose)
+            finite = any(operator.contact.finite for operator in operators)
+            why = "nothing, to first order, holds" if finite else "nothing will ever hold"
+            raise ValueError(
+                f"{why} the body against this rigid motion: {motions}. Add a Dirichlet condition "
+                "on it, or friction"
+            )
+
+    def check(self, load: Array, operators: Sequence[ContactOperator]) -> None:
+        """Refuse a load whose resultant no admissible contact forces can balance. Collective.
+
+        The contact may push anywhere on Γc, and rub within the friction cone: a necessary
+        condition only, but it finds a body pulled off its obstacle, tipped over its edge or pushed
+        along it. Bodies that no contact couples are looked at apart.
+
+        Args:
+            load: External forces at this rank's unknowns (force).
+            operators: Of evaluated contacts, over all unknowns.
+
+        Raises:
+            ValueError: It gives the resultant and the mode.
+        """
+        modes = self._modes
+        rows = modes.straight()  # arms turn with an obstacle: what it cannot bear here it may there
+        resultant = modes.load_resultant(load, operators)
+        # What the load could do at most, were all of it along the mode: the scale of "zero".
+        size = np.maximum(modes.load_size(load), np.abs(resultant))
+        if not np.any(np.abs(resultant) > _BALANCED * size):
+            return
+        self._update_rays(operators, rows)
+        beyond: list[str] = []
+        for number, (group, balanced) in enumerate(self._groups):
+            wanted, largest = -resultant[group], np.abs(resultant[group]).max()
+            if not largest > _BALANCED * size[group].max():
+                continue
+            # A history often has one direction of load: what balanced it does again.
+            direction = wanted / largest
+            if _alike(direction, balanced):
+                continue
+            rays = self._rays[:, group]
+            # Unit columns: a ray's length has no meaning, and badly scaled ones spoil the solution.
+            # One of rounding only, such as of tangential forces on a mode across them, is none.
+            length = np.linalg.norm(rays, axis=1)
+            rays = rays[length > _FELT] / length[length > _FELT, None]
+            comm, rest = modes.comm, float(np.abs(direction).max())
+            if len(rays):
+                rest = agreed(comm, unbalanced(rays.T, direction))
+            allowed = _BALANCED * size[group].max() / largest
+            if rest > allowed:
+                limits = agreed(comm, _largest_forces(rays.T, direction)) + 0.0  # no -0
+                beyond += self._describe(rows[group], direction, limits, allowed, largest)
+            else:
+                self._groups[number] = group, direction
+        if beyond:
+            raise ValueError(
+                "no contact force can balance the load: its resultant along the free motion "
+                f"{', and along '.join(beyond)}. Contact can only push along its normals and rub "
+                "within the friction cone. Check the sign and size of the load, and the normals, "
+                "or add a Dirichlet condition"
+            )
+
+    def _describe(
+        self, rows: Index, wanted: Array, limits: Array, allowed: float, largest: float
+    ) -> list[str]:
+        """What of a resultant, relative to its largest component, contact cannot bear, in words."""
+        named = [self._modes.describe(self._modes.free[row]) for row in rows]
+        # NaN: not even the other components can be borne.
+        found = [
+            f"({name}) is {-largest * force:.6g}, of which contact can bear at most "
+            f"{largest * limit:.6g} with the rest as it is"
+            for name, force, limit in zip(named, wanted, limits, strict=True)
+            if abs(force) > limit + allowed
+        ]
+        worst = int(np.argmax(np.abs(wanted)))
+        return found or [f"({named[worst]}) is {-largest * wanted[worst]:.6g}"]
+
+    def _update_rays(self, operators: Sequence[ContactOperator], rows: Index) -> None:
+        """Find the admissible generalised forces, and modes that these couple. Collective."""
+        modes, geometry = self._modes, [self._modes.free]
+        for contact in (operator.contact for operator in operators):
+            geometry += [contact.values.normal, _bearing_normals(contact)]
+            geometry += [contact.values.friction_bound_ratio, np.array([contact.pairs.number])]
+        known = len(geometry) == len(self._geometry)
+        known = known and all(map(_alike, geometry, self._geometry))
+        if modes.comm.allreduce(int(not known)) == 0:
+            return
+        self._geometry = geometry
+        rays = [
+            _admissible_forces(operator, modes.at_points(operator)[rows]) for operator in operators
+        ]
+        self._rays = gather_rows(modes.comm, np.concatenate([np.zeros((0, len(rows))), *rays]))
+        felt = (np.abs(self._rays) > _FELT).astype(np.float64)
+        couples = felt.T @ felt + modes.of_same_body()[np.ix_(rows, rows)]
+        n_groups, label = scipy.sparse.csgraph.connected_components(couples, directed=False)
+        groups = [np.flatnonzero(label == group) for group in range(n_groups)]
+        self._groups = [(group, np.zeros(0)) for group in groups]
+
+
+def _admissible_forces(operator: ContactOperator, modes: Array) -> Array:
+    """Generalised forces of every admissible direction at this rank's points, (n_rays, n_modes).
+
+    Args:
+        operator: Of the contact.
+        modes: At its points, (n_modes, n_points, gdim).
+    """
+    contact, values = operator.contact, operator.contact.values
+    normal, law = values.normal, contact.law
+    d = normal.shape[1]
+    directions = []
+    if law.has_tangential:
+        if d == 2:
+            around = [np.column_stack([-normal[:, 1], normal[:, 0]])]
+            around.append(-around[0])
+        else:
+            around = _around(normal)
+        ratio = values.friction_bound_ratio[:, None]
+        ratio = ratio if d == 2 else ratio / np.cos(np.pi / _CONE_SIDES)
+        bounded = np.isfinite(ratio)  # by the normal force
+        pushes = -_bearing_normals(contact) * law.has_normal_stiffness
+        directions = [
+            np.where(bounded, pushes + np.where(bounded, ratio, 0.0) * t, t) for t in around
+        ]
+    if law.has_normal_stiffness:
+        pushes = -_bearing_normals(contact)
+        directions += [pushes, -pushes] if law.has_tension else [pushes]
+    rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
+    return np.concatenate([np.zeros((0, len(modes))), *rays])
+
+
+def _alike(one: Array, other: Array) -> bool:
+    return one.shape == other.shape and np.allclose(one, other, rtol=0.0, atol=1e-12)
+
+
+def unbalanced(rays: Array, resultant: Array) -> float:
+    """The least Σ|resultant - rays·x| over x ≥ 0; rays (n_free, n_rays) of unit length.
+
+    Least squares without negatives find at once that there is nothing left, of some of the rays
+    quicker than of all, but where there is they may end far from their optimum: then a linear
+    programme, which takes ten times as long.
+    """
+    m, n = rays.shape
+    for tried in (rays[:, :: n // _SOME_RAYS + 1], rays):
+        try:
+            forces = scipy.optimize.nnls(tried, resultant)[0]
+        except RuntimeError:
+            continue  # too many iterations
+        if np.abs(tried @ forces - resultant).sum() < _BALANCED:
+            return 0.0
+    tolerance = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+    found = scipy.optimize.linprog(
+        np.concatenate([np.zeros(n), np.ones(2 * m)]),
+        A_eq=np.hstack([rays, np.eye(m), -np.eye(m)]),
+        b_eq=resultant,
+        options=tolerance,
+    )
+    # What the programme cannot tell is left to the solution itself to show.
+    return float(found.fun) if found.status == 0 else 0.0
+
+
+def _largest_forces(rays: Array, wanted: Array) -> Array:
+    """The largest of each component of a force that rays can make, all others as wanted, (n_free,).
+
+    Of the sign that is wanted; NaN where the others alone cannot be made.
+
+    Args:
+        rays: (n_free, n_rays) of unit length.
+        wanted: The force, (n_free,).
+    """
+    found = np.full(len(wanted), np.nan)
+    if not rays.size:
+        return found
+    for i, value in enumerate(wanted):
+        rest = np.where(np.arange(len(wanted)) == i, 0.0, wanted)
+        along = np.zeros((len(wanted), 1))
+        along[i] = -1.0 if value >= 0 else 1.0
+        cost = np.append(np.zeros(rays.shape[1]), -1.0)
+        made = scipy.optimize.linprog(cost, A_eq=np.hstack([rays, along]), b_eq=rest)
+        if made.status == 0:
+            found[i] = made.x[-1]
+    return found
+
+
+def _bearing_normals(contact: Contact) -> Array:
+    """Normals at the points, zero where k_n is: there is no foundation there, (n_points, gdim)."""
+    values = contact.values
+    bears = np.asarray(values.parameters.get("k_n", 1.0)) > 0
+    return np.where(bears[..., None], values.normal, 0.0)
+
+
+def _around(normal: Array) -> list[Array]:
+    """Unit vectors around each normal in space, `_CONE_SIDES` of them."""
+    least = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
+    first = np.cross(normal, least)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(normal, first)
+    angles = 2 * np.pi * np.arange(_CONE_SIDES) / _CONE_SIDES
+    return [np.cos(a) * first + np.sin(a) * second for a in angles]
