@@ -76,6 +76,7 @@ BUSY = {
     "stiff": Busy(E=1e6, moved=(0.0, -1e-2)),
     "soft": Busy(E=1e-6, load=(0.0, -1e-2)),
     "light": Busy(load=(1e-8, -1e-7)),
+    "heavy": Busy(E=1e8, load=(0.0, -1e-2)),
     "far away": Busy(place=1e4, load=(0.0, -1e-2), wall=1e3),
 }
 

@@ -156,6 +156,34 @@ def out_of_range(busy):
     return Play(scene, [lambda: None], contact)
 
 
+def half_as_steep(busy):
+    """A distance that changes by 2 per length."""
+    scene = Beside({"block": Box()}, busy)
+    scene.hold("block", TOP, 0, 1, value=-1e-3)
+    floor = fc.Obstacle(distance=lambda x: 2 * x[1])
+    contact = scene.contact("block", BOTTOM, floor, fc.Frictionless(), name="floor")
+    return Play(scene, [lambda: None], contact)
+
+
+def through_a_plate(busy):
+    """A block moved through a plate of a fiftieth of its size, in one increment."""
+    scene = Beside({"block": Box()}, busy)
+    down = scene.bodies.constant()
+    scene.hold("block", TOP, 0, 1, value=down)
+    plate = fc.Obstacle(distance=lambda x: abs(x[1] + 0.1) - 0.01)
+    contact = scene.contact("block", BOTTOM, plate, fc.Frictionless(), name="plate")
+    return Play(scene, setting(down, -0.5), contact)
+
+
+def beyond_its_limit(busy):
+    """A block pushed along its floor by more than a given limit of friction."""
+    scene = Beside({"block": Box()}, busy)
+    scene.load("block", TOP, 1, scene.bodies.constant(-1e-3))
+    scene.load("block", TOP, 0, scene.bodies.constant(4e-4))
+    contact = scene.contact("block", BOTTOM, FLOOR, fc.Tresca(1.0, 3e-4), name="floor")
+    return Play(scene, [lambda: None], contact)
+
+
 REFUSED = {
     pops_out: "friction would drive the slip",
     too_soft: "times its size",
@@ -166,6 +194,9 @@ REFUSED = {
     pushed_aside: "no contact force can balance",
     without_number: "not finite",
     out_of_range: "friction",
+    half_as_steep: "changes by 2 per length",
+    through_a_plate: "has crossed",
+    beyond_its_limit: "overload",
 }
 
 
@@ -239,8 +270,24 @@ def rubbed(busy):
     return _pushed(busy, 2e-4, -1e-3)
 
 
+def pressed_again(busy):
+    """A block on a floor with friction that is pressed, let go, and pressed and pushed again."""
+    scene = Beside({"block": Box()}, busy)
+    press, push = scene.bodies.constant(), scene.bodies.constant()
+    scene.load("block", TOP, 1, press)
+    scene.load("block", TOP, 0, push)
+    contact = scene.contact("block", BOTTOM, FLOOR, fc.Coulomb(0.3), name="floor")
+
+    def to(down, aside):
+        press.value, push.value = -down, aside
+
+    loads = [(1e-3, 1e-4), (0.0, 0.0), (1e-3, -2e-4)]
+    return Play(scene, [lambda load=load: to(*load) for load in loads], contact)
+
+
 HOLD = {
     "stacked": stacked,
+    "pressed again": pressed_again,
     **{f"on a spring of {k:g} E": _on_a_spring(k) for k in (1e-4, 1e-6, 1e-8)},
     "rubbed": rubbed,
 }
