@@ -314,13 +314,6 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
             "an `Obstacle` is measured where it bears.",
             "Smaller facets where the support may come, or the `quadrature_degree` that is told.",
         ),
-        "times as short": (
-            "Γc has slid to where the body opposite is meshed more finely than where Γc began, by "
-            "which its points were counted. From here on the finer facets pass between them: a "
-            "block on facets of a twentieth of its own lacked 19 % of the force.",
-            "Let the finer surface be Γc, or give its `quadrature_degree`, as is told. Earlier "
-            "increments, before the warning, are as they were.",
-        ),
         "opposite surface ends": (
             "With finite kinematics a point of Γc bears or not, as its normal meets the other body "
             "or passes its end. Facets that an end divides bear much of the force, and one point "

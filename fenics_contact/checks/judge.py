@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from dolfinx import fem
 
-from fenics_contact.checks.few_points import warn_of_divided_facets, warn_of_few_points
 from fenics_contact.checks.kinematics import Linearisation, linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
+from fenics_contact.checks.quadrature_resolution import warn_of_divided_facets, warn_of_few_points
 from fenics_contact.checks.second_route import SecondRoute
 from fenics_contact.checks.tunnelling import TunnellingCheck
 from fenics_contact.checks.verdict import Balance, Verdict, check_laws

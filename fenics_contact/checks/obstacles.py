@@ -45,14 +45,9 @@ class ObstacleCheck:
         ends = global_min(comm, slopes, empty=1.0), global_max(comm, slopes, empty=1.0)
         slope = max(ends, key=lambda value: abs(value - 1.0))
         depth = 0.0
-        if contact.finite and not contact.support.is_flat:
-            curvature = contact.opposite.curvature()[closed]
-            sunk = contact.values.penetration[closed]
-            # At a centre of curvature there is none, and no eigenvalues to look for.
-            known = np.isfinite(curvature).all(axis=(1, 2))
-            bend = np.full(len(sunk), np.inf)
-            bend[known] = np.linalg.eigvalsh(curvature[known]).max(axis=1, initial=0.0)
-            depth = global_max(comm, sunk * bend)
+        curvature = contact.opposite.largest_curvature()
+        if curvature is not None and not contact.support.is_flat:
+            depth = global_max(comm, (contact.values.penetration * curvature)[closed])
         rubs = contact.law.has_friction and comm.allreduce(int(closed.any())) > 0
         turn = abs(contact.opposite.turned_by(contact.values)) if rubs else 0.0
         return cls(slope, depth, turn)

@@ -170,10 +170,6 @@ class FollowedOpposite(BodyOpposite):
         """See `Opposite`: of the committed bodies."""
         return self._present.turned(vectors)
 
-    def times_as_long(self) -> Array:
-        """See `Opposite`."""
-        return self._present.times_as_long()
-
     @property
     def _update(self) -> str:
         """At a commit never: they follow all the time, whatever the support says."""

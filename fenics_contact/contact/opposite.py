@@ -400,10 +400,11 @@ class Opposite(ABC):
         """
         return lambda places, share: places
 
-    def times_as_long(self) -> Array | None:
-        """How many times as long as the facet it meets is the one that a point is of, (n_points,).
+    def largest_curvature(self) -> Array | None:
+        """Largest principal curvature of a rigid obstacle at X + u, (n_points,) (1/length).
 
-        0 of points that meet none; None where points do not see what lies opposite by themselves.
+        0 where all are negative, infinite at a centre of curvature. None where displacements are
+        taken as small, and between bodies.
         """
         return None
 

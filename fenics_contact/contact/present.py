@@ -253,13 +253,6 @@ class PresentPairs(Pairs):
         """See `Pairs.linear_gap`: nothing is linearised."""
         return self.true_gap(values)[0]
 
-    def times_as_long(self) -> Array:
-        """See `Opposite.times_as_long`."""
-        assert self._present is not None
-        met, here = self._present.hits.facet, self._rays.here
-        own = here.length[here.first + self._rays.facet]
-        return np.where(met >= 0, own / self._rays.there.length[met], 0.0)
-
     # ---- derivatives -----------------------------------------------------------------------------
 
     @property

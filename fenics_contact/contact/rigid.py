@@ -27,7 +27,6 @@ from fenics_contact.contact.point_law import PointLaw, PointTangent
 from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues
 from fenics_contact.supports.base import Placement, SampledSupport
-from fenics_contact.surface.surface import POINTS_PER_RADIUS
 from fenics_contact.types import Array
 
 __all__ = ["MovingOpposite", "RigidOpposite"]
@@ -169,13 +168,13 @@ class MovingOpposite(Opposite):
         by_place = -np.stack(turns, axis=1)
         return np.asarray(by_place + by_place.swapaxes(1, 2)) / 2
 
-    def times_as_long(self) -> Array:
-        """See `Opposite`: a support counts as facets of a share of its radius of curvature."""
-        bend = self.curvature()
-        known = np.isfinite(bend).all(axis=(1, 2))
-        sharpest = np.zeros(len(bend))
-        sharpest[known] = np.linalg.eigvalsh(bend[known]).max(axis=1, initial=0.0)
-        return POINTS_PER_RADIUS * sharpest * self._parts.quadrature.facet_sizes
+    def largest_curvature(self) -> Array:
+        """See `Opposite`."""
+        curvature = self.curvature()
+        largest = np.full(len(curvature), np.inf)
+        known = np.isfinite(curvature).all(axis=(1, 2))
+        largest[known] = np.linalg.eigvalsh(curvature[known]).max(axis=1, initial=0.0)
+        return largest
 
     def rotation_in_increment(self, values: PointValues) -> Callable[[Array, Array | float], Array]:
         """See `Opposite`."""

@@ -19,7 +19,7 @@ from mpi4py import MPI
 from fenics_contact.parallel import agreed, global_max, global_sum
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Index
 
 __all__ = ["CLEARLY", "Overload", "find_overload"]
 
@@ -67,7 +67,8 @@ def find_overload(
 ) -> Overload | None:
     """The worst motion by which the load outdoes friction at its present limits. Collective.
 
-    Whatever is found does; where the search is not at its end there may be worse.
+    Groups of bodies that no contact couples are looked at apart. Whatever is found does; where the
+    search is not at its end there may be worse.
 
     Args:
         motions: Which of them are free.
@@ -75,19 +76,46 @@ def find_overload(
         load: External forces at this rank's unknowns (force).
 
     Returns:
-        None where friction can bear the load, or nothing can be told: supports that turn, places
+        None where friction can bear the load, or nothing can be told: obstacles that turn, places
         that follow the bodies, tangential forces without limit, friction bounds that depend on
         the motion itself.
     """
-    comm, wanted = motions.comm, motions.load_resultant(load, operators)
-    contacts = [operator.contact for operator in operators]
+    if motions.turning:
+        return None
+    (wanted, _), groups = motions.load_resultant(load, operators), motions.groups()
+    found: list[Overload] = []
+    for group in np.unique(groups):
+        overload = _worst_motion(motions, operators, np.flatnonzero(groups == group), wanted)
+        if overload is not None:
+            found.append(overload)
+    return max(found, key=lambda overload: overload.factor) if found else None
+
+
+def _worst_motion(
+    motions: RigidBodyModes, operators: Sequence[ContactOperator], rows: Index, wanted: Array
+) -> Overload | None:
+    """`find_overload` for the free motions of one group, by their numbers. Collective.
+
+    Args:
+        motions: See `find_overload`.
+        operators: See `find_overload`.
+        rows: Numbers of the motions, (n,).
+        wanted: Work of the load on all free motions (force).
+    """
+    comm, wanted = motions.comm, wanted[rows]
+    size = np.abs(wanted).max(initial=0.0)
+    if not size > 0:
+        return None
+    coupled = []
+    for operator in operators:
+        modes = motions.at_points(operator)[rows]
+        if global_max(comm, np.abs(modes)) > 0.0:
+            coupled.append((operator.contact, modes))
+    contacts = [contact for contact, _ in coupled]
     rubbing = [c for c in contacts if c.law.has_friction]
     unlimited = any(c.law.has_tangential and not c.law.has_friction for c in contacts)
     unlimited |= any(c.acting.own.bound_depends_on_motion for c in rubbing)
     if unlimited or not rubbing or any(c.finite or c.law.has_tension for c in contacts):
-        return None
-    size = np.abs(wanted).max(initial=0.0)
-    if motions.turning or not size > 0:
         return None
     finite = all(
         np.isfinite(v).all()
@@ -97,9 +125,8 @@ def find_overload(
     if not comm.allreduce(finite, op=MPI.LAND):  # unknown, or of a state that has gone astray
         return None
     sliding, approaching = [], []
-    for operator, contact in zip(operators, contacts, strict=True):
+    for contact, modes in coupled:
         normal = contact.values.normal
-        modes = motions.at_points(operator)
         along = np.einsum("mqd,qd->mq", modes, normal)
         if contact.law.has_normal_stiffness:
             approaching.append(along[:, contact.paired])
@@ -123,13 +150,13 @@ def find_overload(
         return float(found[0]), found[1:]
 
     # All in units of the load; D ≤ 1 bounds the motion, and the load does on it what it can.
-    rows: list[Array] = []
+    planes: list[Array] = []
     bounds: list[float] = []
     worst, most = None, 0.0
     motion: Array = wanted / size
     for _ in range(_STEPS):
         borne, slope = taken(motion)
-        rows.append(slope / size)
+        planes.append(slope / size)
         bounds.append(1.0)
         pressed = motion @ closing
         largest = np.abs(motion).max()
@@ -137,16 +164,18 @@ def find_overload(
         if deepest > _TOUCHES * largest:
             first = comm.allgather(pressed.size > 0 and pressed.max() == deepest).index(True)
             row = closing[:, np.argmax(pressed)] if comm.rank == first else None
-            rows.append(comm.bcast(row, root=first))
+            planes.append(comm.bcast(row, root=first))
             bounds.append(0.0)
         elif wanted @ motion > most * borne:
             most = float(wanted @ motion) / borne if borne > 0 else np.inf
             worst = motion / largest
-        made = scipy.optimize.linprog(-wanted / size, A_ub=rows, b_ub=bounds, bounds=(-_FAR, _FAR))
+        made = scipy.optimize.linprog(
+            -wanted / size, A_ub=planes, b_ub=bounds, bounds=(-_FAR, _FAR)
+        )
         status, motion = agreed(comm, (made.status, made.x))
         if status != 0 or wanted @ motion / size <= max(1.0, most * (1 + _NEAR)):
             break
     if worst is None or most <= 1.0:
         return None
-    named = np.where(np.abs(worst) < _SLIGHT, 0.0, worst) @ motions.free
+    named = np.where(np.abs(worst) < _SLIGHT, 0.0, worst) @ motions.free[rows]
     return Overload(motions.describe(named), float(wanted @ worst), taken(worst)[0])

@@ -79,16 +79,14 @@ class LoadBalance:
         """
         modes = self._modes
         rows = modes.straight()  # arms turn with an obstacle: what it cannot bear here it may there
-        resultant = modes.load_resultant(load, operators)
-        # What the load could do at most, were all of it along the mode: the scale of "zero".
-        size = np.maximum(modes.load_size(load), np.abs(resultant))
-        if not np.any(np.abs(resultant) > _BALANCED * size):
+        resultant, size = modes.load_resultant(load, operators)
+        if not resultant.any():
             return
         self._update_rays(operators, rows)
         beyond: list[str] = []
         for number, (group, balanced) in enumerate(self._groups):
             wanted, largest = -resultant[group], np.abs(resultant[group]).max()
-            if not largest > _BALANCED * size[group].max():
+            if largest == 0.0:
                 continue
             # A history often has one direction of load: what balanced it does again.
             direction = wanted / largest
@@ -102,7 +100,7 @@ class LoadBalance:
             comm, rest = modes.comm, float(np.abs(direction).max())
             if len(rays):
                 rest = agreed(comm, unbalanced(rays.T, direction))
-            allowed = _BALANCED * size[group].max() / largest
+            allowed = _BALANCED * max(1.0, size[group].max() / largest)
             if rest > allowed:
                 limits = agreed(comm, _largest_forces(rays.T, direction)) + 0.0  # no -0
                 beyond += self._describe(rows[group], direction, limits, allowed, largest)

@@ -29,6 +29,7 @@ __all__ = ["RigidBodyModes", "tangential_gram"]
 # among N gives 1/N, so that the first must lie below any 1/N; the others are far above round-off.
 _FREE = 1e-12
 _FELT = 1e-10
+_BALANCED = 1e-8
 
 
 class RigidBodyModes:
@@ -389,26 +390,31 @@ class RigidBodyModes:
         """
         return global_sum(self.comm, (self._free_fields @ forces)[self.straight()])
 
-    def load_size(self, load: Array) -> Array:
-        """What a load could do at most on each of the modes of `resultants` (force). Collective."""
-        return global_sum(self.comm, (self._free_sizes @ np.abs(load))[self.straight()])
-
-    def load_resultant(self, load: Array, operators: Sequence[ContactOperator]) -> Array:
+    def load_resultant(
+        self, load: Array, operators: Sequence[ContactOperator]
+    ) -> tuple[Array, Array]:
         """`resultants` of a load and of normal tractions that a law prescribes. Collective.
 
         Args:
             load: External forces at this rank's unknowns (force).
             operators: Of evaluated contacts, over all unknowns.
+
+        Returns:
+            Them, 0 where they are round-off, and what the load could do at most, were all of it
+            along the mode: (n_straight,) (force).
         """
-        resultant = self.resultants(load)
+        rows = self.straight()
+        sums = np.stack([self._free_fields @ load, self._free_sizes @ np.abs(load)])[:, rows]
         for operator in operators:
             contact = operator.contact
             if not contact.law.has_normal_stiffness:
-                force = -contact.values.parameters["pressure"][:, None] * contact.values.normal
-                modes = self.at_points(operator)[self.straight()]
-                work = np.einsum("mqd,qd,q->m", modes, force, contact.measure)
-                resultant += global_sum(self.comm, work)
-        return resultant
+                force = contact.measure * contact.values.parameters["pressure"]
+                along = np.einsum(
+                    "mqd,qd->mq", self.at_points(operator)[rows], contact.values.normal
+                )
+                sums += np.stack([-along @ force, np.abs(along) @ force])
+        resultant, size = global_sum(self.comm, sums)
+        return np.where(np.abs(resultant) <= _BALANCED * size, 0.0, resultant), size
 
     def groups(self) -> Index:
         """Group of coupled parts that each free motion moves, (n_free,)."""
