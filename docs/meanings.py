@@ -95,7 +95,7 @@ GROUPS: list[tuple[str, list[str], str]] = [
     ),
     (
         "Loads that nothing balances, bodies that nothing holds",
-        ["checks.rigid_motions"],
+        ["methods.load_balance"],
         "Found before any iteration, by the rigid motions that Dirichlet conditions leave to each "
         "body. Contact can only push along its normals and rub within the cone of friction. Look "
         "at "

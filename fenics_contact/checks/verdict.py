@@ -95,8 +95,8 @@ class Verdict:
             than five times its size.
         deformation: Of every body its largest displacement, rigid motion apart, by its size, or by
             how far its Dirichlet values differ, if that is more.
-        strays: Bodies that nothing touches any more, how far they have gone, and how far anything
-            else has (length), by their names; see `strays`.
+        ejected_bodies: Bodies that nothing touches any more, how far they have gone, and how far
+            anything else has (length), by their names; see `find_ejected_bodies`.
         created: Share of the energy exchanged that friction has given; see `Energy.created`.
         inverted: Whether cells of a nonlinear bulk are turned inside out.
         routes: By contact the largest difference of its nodal forces from those that DOLFINx
