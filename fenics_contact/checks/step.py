@@ -61,10 +61,11 @@ class Step:
         """One line for people.
 
         Of every contact "force" is ∫ -r_n, "friction ∫|τ|" the sum of the sizes over the points,
-        and "resultant" the force on the body, in which tractions of opposite ways cancel. What the
-        verdict cannot tell from zero is 0 (`Balance.is_loaded`). What small displacements leave out
-        is said from 1 % of force or pressure on. Where forces and areas are per unit thickness
-        (`Resultants.per_thickness`) the line ends with these words.
+        and "resultant" the force on the body, in which tractions of opposite ways cancel. A contact
+        whose forces are no more than the residual that passes has "no contact force"
+        (`Balance.is_loaded`): how many of its points stick or slip is round-off. What small
+        displacements leave out is said from 1 % of force or pressure on. Where forces and areas are
+        per unit thickness (`Resultants.per_thickness`) the line ends with these words.
         """
         parts = [f"increment {self.increment}"]
         if self.load is not None:
@@ -72,6 +73,9 @@ class Step:
         parts.append(self._made())
         parts.append(self._residual())
         for name, r in self.contacts.items():
+            if not self._is_loaded(name):
+                parts.append(f"{name}: no contact force")
+                continue
             normal, friction, resultant = self._forces(name)
             parts.append(
                 f"{name}: force {normal}, friction ∫|τ| {friction}, resultant {resultant}, "
@@ -98,10 +102,13 @@ class Step:
             return "no forces"
         return f"residual {self.verdict.relative_residual:.1e} of the forces"
 
+    def _is_loaded(self, contact: str) -> bool:
+        return self.verdict.equations[contact].is_loaded
+
     def _forces(self, contact: str) -> tuple[str, str, str]:
         """Normal force, friction and resultant of a contact; 0 where it is not loaded."""
         r = self.contacts[contact]
-        loaded = float(self.verdict.equations[contact].is_loaded)
+        loaded = float(self._is_loaded(contact))
         normal, friction = (f"{loaded * f:.6g}" for f in (r.normal_force, r.tangential_force))
         return normal, friction, _components(loaded * r.force)
 
@@ -122,7 +129,7 @@ class Step:
                 name,
                 *self._forces(name),
                 f"{r.area:.4g}",
-                *(str(number) for number in (r.stick, r.slip, r.open)),
+                *(str(n) if self._is_loaded(name) else "–" for n in (r.stick, r.slip, r.open)),
             )
             for name, r in self.contacts.items()
         ]
