@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic, NeoHookean
@@ -21,6 +22,7 @@ from scenes.elasticity import displacement_space, hold
 from scenes.tags import between, near
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+COMM = MPI.COMM_WORLD
 BULKS = {"linear": LinearElastic, "rubber": NeoHookean}
 
 
@@ -153,6 +155,38 @@ class OnASlab:
         step = self.problem.solve()
         self.problem.commit()
         return step
+
+
+@pytest.mark.parametrize("bulk", BULKS)
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+def test_a_block_in_a_bowl_slips_on_both_edges(kinematics, bulk):
+    """The curvature of the bowl alone holds it against rolling, and friction of 0.05 does not.
+
+    Reference: statics of the outermost points, to 1 %, by which the bowl closes on the bent block.
+    With finite kinematics the load was cut to 1/256 of it, and refused.
+    """
+    radius, friction, load = 2.0, 0.05, 0.02
+    edges = [np.linspace(-0.5, 0.5, 7), np.linspace(0.0, 1.0, 7)]
+    body = Bodies(boxes([edges], {BOTTOM: near(1, 0.0), TOP: near(1, 1.0)}), 1.0, 0.3)
+    if bulk == "rubber":
+        body.F = NeoHookean(body.u, 1.0, 0.3, "plane strain").residual(body.v)
+    down = body.constant()
+    body.F += down * body.v[1] * body.ds(TOP)
+    bowl = fc.Cylinder((0.0, np.sqrt(radius**2 - 0.25)), radius, inside=True)
+    law = fc.Coulomb(friction)
+    contact = body.contact(BOTTOM, bowl, law, kinematics=kinematics)
+    problem = body.problem(contact, kinematics=np.inf)
+
+    def press(value):
+        down.value = value
+
+    steps = list(fc.increments(problem, press, 0.0, load, steps=4, max_cuts=0))
+    assert sum(step.iterations for step in steps) <= 40
+    found = contact.resultants()
+    assert found.stick + found.slip == 2  # one may be at its limit, and not beyond it
+    x = np.abs(gathered(COMM, contact.points)[:, 0]).max()
+    sine, cosine = x / radius, np.sqrt(1 - (x / radius) ** 2)
+    assert close(found.normal_force, load / (cosine - friction * sine), 0.01)
 
 
 def test_blocks_of_rubber_that_are_let_go_touch():

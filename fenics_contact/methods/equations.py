@@ -271,7 +271,10 @@ class Equations:
             stick = self.motions.points_to_pin(self.full.operators)
             if stick is None:
                 return self.tangents()
-            return chain(self.tangents(), self._springs([(0.0, points) for points in stick]))
+            # By the share of the forces that is not in balance yet: a mode that friction leaves
+            # free, and curvature does not, converges quadratically.
+            share = min(1.0, float(self.norms.excess(1.0)[: self.norms.n_bodies].max()))
+            return chain(self.tangents(), self._springs([(0.0, share * p) for p in stick]))
         if self._driven():
             # H₀ of the whole surface, as for the start of the quasi-Newton iteration.
             return self.stiffnesses(everywhere=True)
