@@ -28,7 +28,7 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of the cases of a test, one in four is run each time, and the rest by ``pytest -m slow``.
+    """Of the cases of a test, one in six is run each time, and the rest by ``pytest -m slow``.
 
     Which ones is drawn from their names, so that they lie anywhere among the products of what is
     varied, and are the same on all ranks and in all runs. Two at least; all of what is marked
@@ -48,7 +48,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             cases[item.nodeid.partition("[")[0]].append(item)
     for those in cases.values():
         those.sort(key=lambda item: zlib.crc32(item.nodeid.encode()))
-        for item in those[max(2, ceil(len(those) / 4)) :]:
+        for item in those[max(2, ceil(len(those) / 6)) :]:
             item.add_marker(pytest.mark.slow)
 
 
