@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from fenics_contact.checks.tunnelling import TunnellingCheck
 from scenes.processes import ROOT, environment
 from verification import (
     finite_reference,
     finite_scenes,
     fuzz,
+    fuzz_features,
     fuzz_models,
     fuzz_scenes,
     present_scenes,
@@ -430,6 +432,92 @@ def test_a_raw_error_counts_as_a_crash_and_a_refusal_as_a_refusal():
     outcome = played(bad)
     assert outcome.outcome == "refused"
     assert outcome.kind.startswith("ValueError: ")
+
+
+# ---- additional features -------------------------------------------------------------------------
+
+# A block with its top held, and a thin plate below it that is led up.
+PLATE = copy.deepcopy(ONE) | {
+    "drive": "support",
+    "holds": [[0, "top", [0, 1], "still"]],
+    "stages": [{"steps": 1, "normal": 2.0, "side": 0.0, "across": 0.0}],
+    "cuts": 0,
+}
+PLATE["contacts"][0]["support"] = {
+    **{"kind": "rod", "shape": "plate", "radius": 0.01, "half": 0.4, "tilt": 0.0},
+    **{"at": 0.5, "clearance": 0.001, "moving": "displacement"},
+}
+
+
+def _through():
+    """The plate is led 0.3 through the bottom of the block."""
+    scene = copy.deepcopy(PLATE)
+    scene["stages"][0]["normal"] = 300.0
+    return scene
+
+
+@serial
+@pytest.mark.parametrize("busy", fuzz_features.BUSY)
+def test_a_scene_beside_an_unrelated_body_is_right(busy):
+    assert played(ONE | {"busy": busy}).outcome == "right"
+
+
+@serial
+@pytest.mark.parametrize("scene", [ONE, TURNING, TWO], ids=["small", "support", "bodies"])
+def test_a_scene_that_is_carried_far_is_right(scene):
+    carried = copy.deepcopy(scene) | {"carry": [20.0, 5.0]}
+    if scene is not TWO:
+        carried["contacts"][0]["support"].setdefault("moving", "carried")
+    assert played(carried).outcome == "right"
+
+
+@serial
+def test_a_plate_that_is_pressed_is_right_and_one_led_through_is_refused():
+    assert played(PLATE).outcome == "right"
+    assert played(_through()).outcome == "refused"
+
+
+@serial
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+def test_a_plate_that_passes_unseen_is_found(kinematics, monkeypatch):
+    monkeypatch.setattr(TunnellingCheck, "evaluate", lambda self, before: {})
+    scene = _through()
+    if kinematics == "finite":
+        scene |= {"kinematics": "finite", "bulk": "linear"}
+        scene["stages"][0]["turn"] = 0.0
+    outcome = played(scene)
+    assert outcome.outcome == "wrong"
+    assert "crossed" in outcome.kind
+
+
+@serial
+def test_a_body_that_is_passed_through_unseen_is_found(monkeypatch):
+    """The block goes 0.3 deep into the slab, between the two points of its top."""
+    monkeypatch.setattr(TunnellingCheck, "evaluate", lambda self, before: {})
+    scene = copy.deepcopy(TWO)
+    scene["contacts"][0]["support"] |= {"body": 1, "side": "bottom"}
+    scene["contacts"][0] |= {"body": 0, "side": "top"}
+    scene["bodies"][0]["n"], scene["contacts"][0]["quadrature"] = [2, 2], 1
+    scene["stages"] = [dict(scene["stages"][0], normal=5.0)]
+    outcome = played(scene)
+    assert outcome.outcome == "wrong"
+    assert "penetration" in outcome.kind
+
+
+@serial
+def test_motion_that_is_not_small_is_found():
+    """A disc pressed against the block is led aside by its radius together with it."""
+    scene = copy.deepcopy(ONE) | {"carry": [0.5, 0.0]}
+    support = {"kind": "ball", "clearance": 0.0, "radius": 1.0, "moving": "carried"}
+    scene["contacts"][0]["support"] = support
+
+    def changed(made, problem):
+        problem.kinematics = np.inf
+
+    assert played(scene).outcome == "refused"
+    outcome = played(scene, changed=changed)
+    assert outcome.outcome == "wrong"
+    assert "kinematics" in outcome.kind
 
 
 # ---- the command ---------------------------------------------------------------------------------

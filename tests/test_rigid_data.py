@@ -265,6 +265,9 @@ def test_from_afar_and_from_nowhere():
     surface = fc.RigidSurface(*ball(5))
     for away in (1e3, 1e8, 1e60):
         assert close(surface.sample(away * x).distance, away - np.ones(2000), 1e-6)
+    # A place at the origin is no division by zero.
+    with np.errstate(all="raise"):
+        assert fc.RigidSurface(*ball(1, 1e3)).sample(np.zeros((1, 3))).distance < 0
     nothing = surface.sample(np.empty((0, 3)))
     assert nothing.distance.shape == (0,) and nothing.curvature.shape == (0, 3, 3)
     flat = fc.RigidProfile(circle(40), closed=True).sample(np.empty((0, 2)))

@@ -18,7 +18,7 @@ import fenics_contact as fc
 from fenics_contact.elasticity import NeoHookean
 from fenics_contact.types import Array
 from scenes.surfaces import ball, box, ring
-from verification.fuzz_made import Made
+from verification.fuzz_made import Made, capsule, geometry
 from verification.fuzz_scenes import Scene, dice, draw_form, element, frictions
 
 __all__ = ["DEGREE", "KINDS", "FiniteMade", "draw", "pieces", "place_of"]
@@ -222,8 +222,10 @@ def draw(
 
 def place_of(scene: Scene, contact: Scene) -> dict[str, Any]:
     """Numbers of a support where it begins, in units of length."""
-    body, given = scene["bodies"][0], contact["support"]
+    body, given = scene["bodies"][contact.get("body", 0)], contact["support"]
     length, d = scene["units"][0], len(body["size"])
+    if given["kind"] == "rod":
+        return geometry(scene, contact)
     size, kind = np.array(body["size"], dtype=float), given["kind"]
     unit = np.eye(d)
     if contact["side"] == "right":
@@ -234,7 +236,7 @@ def place_of(scene: Scene, contact: Scene) -> dict[str, Any]:
     if kind == "halfspace":
         slope = given.get("slope", 0.0)
         normal = (up - slope * unit[0]) / np.hypot(1.0, slope)
-        corner = size[0] * unit[0] if slope > 0 else 0.0
+        corner = np.array(body["origin"]) + (size[0] * unit[0] if slope > 0 else 0.0)
         return {"point": (corner - clearance * normal) * length, "normal": normal}
     radius = given["radius"] * max(size[:-1])
     if kind.endswith("inside"):
@@ -356,7 +358,8 @@ class FiniteMade(Made):
         by_body, by_support = np.zeros(d), np.zeros(d)
         if scene["drive"] == "prescribed":
             by_body = -down * up
-            if not any("moving" in c["support"] for c in scene["contacts"]):
+            moving = {c["support"].get("moving") for c in scene["contacts"]}
+            if not moving & {"displacement", "force"}:
                 by_body = by_body + way
             else:
                 by_support = -way
@@ -375,6 +378,7 @@ class FiniteMade(Made):
         for i in range(d):
             self.push[i].value = max(force, 0.02 * scene["strain"] * self.moduli[0] * area)
             self.pull[i].value = by_support[i] * self.length
+        self.apply_features(stage, t)
 
     def turn(self, contact: Scene) -> tuple[Array, Array | None] | None:
         """A point of the axis, and its direction in space; None: it does not turn."""
@@ -398,6 +402,8 @@ class FiniteMade(Made):
         move: dict[str, Any] = {}
         if given.get("moving") == "displacement":
             move["displacement"] = self.shift
+        elif given.get("moving") == "carried":
+            move["displacement"] = self.carried
         elif given.get("moving") == "force":
             free = given["free"]
             move["displacement"] = fc.Motion(
@@ -419,8 +425,8 @@ class FiniteMade(Made):
         if kind.startswith("cylinder"):
             axis = None if d == 2 else given.get("axis", (0.0, 1.0, 0.0))
             return fc.Cylinder(where["center"], where["radius"], axis, inside=inside, **move)
-        if kind in ("capsule", "torus"):
-            shape = _capsule if kind == "capsule" else _torus
+        if kind in ("capsule", "rod", "torus"):
+            shape = _torus if kind == "torus" else capsule
             return fc.Obstacle(distance=lambda x: shape(self.mesh, where, x), **move)
         points, numbers = pieces(self.scene, contact)
         if kind in ("facets", "box"):
@@ -440,15 +446,6 @@ def _constant(mesh: Any, value: Any) -> Any:
     from dolfinx import fem
 
     return fem.Constant(mesh, value)
-
-
-def _capsule(mesh: Any, where: dict[str, Any], x: Any) -> Any:
-    """Distance from a segment along x, less the radius (UFL)."""
-    low, high = (_constant(mesh, end) for end in where["ends"])
-    radius = _constant(mesh, float(where["radius"]))
-    along = ufl.max_value(low[0], ufl.min_value(high[0], x[0]))
-    arm = x - ufl.as_vector([along, *(low[i] for i in range(1, len(low)))])
-    return ufl.sqrt(ufl.dot(arm, arm)) - radius
 
 
 def _torus(mesh: Any, where: dict[str, Any], x: Any) -> Any:

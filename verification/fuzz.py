@@ -7,6 +7,7 @@
     docker/run python verification/fuzz.py --finite --scenes 300 --alike 12 --resume finite.csv
     docker/run python verification/fuzz.py --bodies --scenes 300 --alike 24 --resume bodies.csv
     docker/run python verification/fuzz.py --bodies --extreme --scenes 300 --resume extreme.csv
+    docker/run python verification/fuzz.py --mixed --scenes 3000 --alike 48 --resume mixed.csv
     docker/run python verification/fuzz.py --replay scene.json --minimise
     docker/run python verification/fuzz.py --table results.csv        # Markdown
 
@@ -203,6 +204,11 @@ def play(
     try:
         with warnings.catch_warnings(), _limited(3 * limit if limit and comm.size == 1 else None):
             warnings.simplefilter("ignore")
+            if "busy" in scene:  # the second solution knows nothing of the unrelated body
+                scene = {name: value for name, value in scene.items() if name != "busy"}
+                for record in records:
+                    del record["contacts"][len(scene["contacts"]) :]
+                    record["energy"] = None
             judge = make_judge(scene) if records or outcome != "right" else None
             for record in records:
                 if spoiled is not None:
@@ -242,6 +248,8 @@ def _ahead(scene: Scene, records: list[dict[str, Any]]) -> tuple[int, float] | N
 
 def features(scene: Scene) -> list[str]:
     """What a scene has, for tables."""
+    from verification import fuzz_features
+
     found = [scene["layout"], scene["cell"], f"degree {scene['degree']}", f"drive {scene['drive']}"]
     found += [f"{n} {scene[n]}" for n in ("bulk", "form") if n in scene]
     for contact in scene["contacts"]:
@@ -265,6 +273,7 @@ def features(scene: Scene) -> list[str]:
     found += ["two scales"] if scene["share"] != 1.0 else []
     sizes = [s["normal"] for s in scene["stages"] if s["normal"] > 0]
     found += ["levels"] if sizes and max(sizes) > 50 * min(sizes) else []
+    found += fuzz_features.feature_names(scene)
     found += _unlikeness(scene) if scene.get("kinematics") == "present" else []
     found += ["off"] if any(s["normal"] <= 0 for s in scene["stages"]) else []
     return sorted(set(found))
@@ -287,10 +296,22 @@ def _unlikeness(scene: Scene) -> list[str]:
 
 def _drawn(seed: int, arguments: argparse.Namespace, ranks: int) -> Scene:
     """The scene of a seed, in a family with the other seeds next to it, if so asked."""
-    from verification import finite_scenes, fuzz_scenes, present_scenes
+    from verification import finite_scenes, fuzz_features, fuzz_scenes, present_scenes
 
     family = seed // arguments.alike if arguments.alike > 1 else None
     options = {"without": tuple(arguments.without), "ranks": ranks, "family": family}
+    if arguments.mixed:
+        number, scene = seed if family is None else family, fuzz_scenes.draw
+        if number % 8 in (2, 5):
+            scene = finite_scenes.draw
+        elif number % 8 == 7:
+            scene = present_scenes.draw
+            options["extreme"] = number % 16 == 7
+        # What takes longest is in some of the families alone.
+        rare = {"space": number % 8 in (0, 5), "multipliers": number % 3 == 0}
+        rare["method"] = number % 2 == 0
+        options["without"] += tuple(name for name, some in rare.items() if not some)
+        return fuzz_features.add_features(scene(seed, **options), seed, options["without"])
     if arguments.bodies:
         return present_scenes.draw(seed, **options, extreme=arguments.extreme)
     return (finite_scenes if arguments.finite else fuzz_scenes).draw(seed, **options)
@@ -343,6 +364,7 @@ def _batch(seeds: list[int], arguments: argparse.Namespace) -> Iterator[dict[str
     words = ["--work", ",".join(map(str, seeds)), "--limit", arguments.limit]
     words += ["--alike", arguments.alike] + ["--finite"] * arguments.finite
     words += ["--bodies"] * arguments.bodies + ["--extreme"] * arguments.extreme
+    words += ["--mixed"] * arguments.mixed
     words += [v for name in arguments.without for v in ("--without", name)]
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
@@ -469,6 +491,8 @@ def _simpler(scene: Scene) -> Iterator[Scene]:
         "form",
         "bend",
         "cuts",
+        "busy",
+        "carry",
     ):
         if name in scene:
             yield from changed(lambda s, n=name: s.pop(n))
@@ -622,6 +646,9 @@ def main() -> int:
     )
     parser.add_argument(
         "--extreme", action="store_true", help="bodies as unlike as can be; with --bodies"
+    )
+    parser.add_argument(
+        "--mixed", action="store_true", help="scenes of all three kinds, with additional features"
     )
     parser.add_argument("--table", nargs="+", help="print the table of files of results")
     parser.add_argument("--verbose", action="store_true", help="a line for every scene")

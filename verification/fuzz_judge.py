@@ -17,13 +17,15 @@ import scipy.spatial.distance
 from verification import fuzz_models, fuzz_scenes
 from verification import reference_solver as reference
 
-__all__ = ["Judge"]
+__all__ = ["UNRESISTED", "Judge", "along"]
 
 Array = np.ndarray
 
 # Residual in units of what the solver was asked for: SNES stops below 1, the verdict passes 2; the
 # norms here are per body, so that those of all bodies together may be larger by some.
 _RESIDUAL = 30.0
+# Of the displacement before, what of it the sum with a step may leave.
+_STEPPED = 16 * np.finfo(float).eps
 # Share of K u that rounding may leave.
 _ROUNDING = 1000 * np.finfo(float).eps
 # Results that are sums over the points, made twice from the same u.
@@ -39,10 +41,32 @@ _INSIDE = 1e-2
 # How well bodies are set down, by their size, and how rigidly, by their way; and contact forces, by
 # the load, that are round-off of a body that was let go.
 _DOWN, _LEFT, _ROUND_OFF = 1e-6, 1e-7, 1e-13
+# Penetration between points, beyond what these resist, by the length of a facet. The package allows
+# 15 % where tangent planes explain it, and 2 % for the rule.
+UNRESISTED = 0.2
+# Change of the contact force where geometry is taken at the deformed places; the package allows 20
+# % by an estimate of the first order.
+_GEOMETRY_CHANGE = 0.5
+# Depth, by the length of a facet, of a narrow rod that no point resists: the package allows 5 % and
+# 2 % for the rule.
+_BETWEEN_POINTS = 0.07
+# Parts of an increment in which a rod is followed.
+_PARTS = 64
 # Forces of the nearest exact solution, and of one found apart.
 _NEAREST, _APART = 1e-5, 1e-4
 # The latter where multipliers of friction are not determined at the edge of Γc.
 _EDGE = 1e-2
+
+
+def along(surface: Any, u: Array, n: int = 9) -> tuple[Array, Array, Array]:
+    """Places all over a surface: displaced by u, undeformed, and the facet of each."""
+    grid = np.linspace(0, 1, n if surface.d == 2 else 5)
+    at = np.stack([g.ravel() for g in np.meshgrid(*[grid] * (surface.d - 1))], axis=1)
+    if surface.simplex:
+        at = at[at.sum(axis=1) <= 1 + 1e-12]
+    facet = np.repeat(np.arange(len(surface.facets)), len(at))
+    xi = np.tile(at, (len(surface.facets), 1))
+    return surface.place(facet, xi, u)[0], surface.place(facet, xi)[0], facet
 
 
 class Judge:
@@ -74,8 +98,10 @@ class Judge:
             self._curved += _SMOOTHED
         self.problem, made, self._load = self._model(scene)
         self._bulge = sum(map(abs, scene.get("bend", []))) * made.length
+        self._carried = made.length * float(np.abs(scene.get("carry", [0.0])).max())
         self._between_points: dict[int, float] = {}  # by contact, the most that was pushed there
         self._apart = self._model(scene)[0]
+        self.problem.far = self._apart.far = self._carried
         self._moduli = made.moduli
         n, m = self.problem.body.places.size, len(self.problem.motions())
         self._u, self._motion = np.zeros(n), np.zeros(m)
@@ -83,6 +109,7 @@ class Judge:
         self._old = [c.start() for c in self.problem.contacts]
         self._own_old = [c.start() for c in self._apart.contacts]
         self._before: dict[str, Any] | None = None
+        self._rods: dict[int, tuple[Array, Array, Array]] = {}  # by contact; see `_check_crossed`
         self._lost = False  # the history apart
         self._tree = None
 
@@ -114,7 +141,8 @@ class Judge:
         rtol = record["rtol"]
 
         miss = np.abs(u[load.fixed] - load.values).max(initial=0.0)
-        self._check(name, "conditions", miss, 1e-12 * max(np.abs(u).max(initial=0.0), 1e-300))
+        allowed = 1e-12 * max(np.abs(u).max(), 1e-300) + _STEPPED * np.abs(self._u).max()
+        self._check(name, "conditions", miss, allowed)
         self._check_equations(name, now, rtol)
         for i, (c, f, r) in enumerate(
             zip(problem.contacts, found, record["contacts"], strict=True)
@@ -122,6 +150,8 @@ class Judge:
             self._check_results(f"{name}, contact {i}", c, f, r)
             self._check_multipliers(f"{name}, contact {i}", c, f, r, load.fixed)
         self._check_through(name, u, found, now)
+        self._check_geometry(name, u, load, motion, found)
+        self._check_kinematics(name, u, motion, load, old, now)
         self._check_energy(name, record, u, motion, load, found, now)
         self._check_nearest(name, record, u, motion, load, old, found, now)
         self._check_apart(name, record, load, now)
@@ -182,6 +212,8 @@ class Judge:
             if told is None:
                 continue
             u = self._numbered(told["u"])
+            if told["rigid"] and np.abs(u - before).max() <= _ROUND_OFF * size:
+                continue  # another body was set down
             if told["rigid"]:
                 then, now = (problem.respond(v, self._motion, load, old) for v in (before, u))
                 deep, deeper = (
@@ -382,11 +414,10 @@ class Judge:
         self._check(name, "reported traction", traction, (same * peak + rounding) * w.max())
         self._check(name, "weights", np.abs(apart[:, 0]).max(), 1e-9 * w.max())
 
-    @staticmethod
-    def _traction_rounding(contact: Any, found: dict) -> float:
+    def _traction_rounding(self, contact: Any, found: dict) -> float:
         """Rounding of u_n - s and of u_t, times the stiffness (stress)."""
         places = np.abs(found["closing"]).max() + np.abs(found["relative"]).max()
-        reach = np.abs(contact.x).max() + places
+        reach = np.abs(contact.x).max() + places + self._carried
         stiff = contact.k_n.max() + contact.k_t.max()
         return float(8 * np.finfo(float).eps * stiff * reach)
 
@@ -469,6 +500,107 @@ class Judge:
                 self._between_points[i] = max(pushed, self._between_points.get(i, 0.0))
             self._check(f"{name}, contact {i}", "passed through", pushed, allowed)
 
+    def _check_geometry(
+        self, name: str, u: Array, load: Any, motion: Array, found: list[dict]
+    ) -> None:
+        """Depth of Γc in rigid supports where it has moved to, beyond what points resist."""
+        shifts = self.problem.shifts(load, motion)
+        for i, (c, f, shift) in enumerate(zip(self.problem.contacts, found, shifts, strict=True)):
+            if c.near is None or not c.law.has_normal or c.law.tension:
+                continue
+            x, _, facet = along(c.here, u)
+            deep = -c.near(x, shift)[0]
+            corners = c.here.corner_vertices
+            borne = np.zeros(corners.max() + 1)
+            np.maximum.at(borne, corners[c.facet], np.maximum(f["closing"], 0.0)[:, None])
+            resisted = borne[corners].max(axis=1)[facet]
+            bulge = self._bulges(self.scene["contacts"][i])
+            share = (deep - resisted - bulge) / c.here.lengths()[facet]
+            self._check(f"{name}, contact {i}", "penetration", share.max(), UNRESISTED)
+            if c.spine is not None and c.d == 2:
+                self._check_crossed(f"{name}, contact {i}", i, u, c.spine_at(shift))
+
+    def _check_crossed(self, name: str, i: int, u: Array, spine: Array) -> None:
+        """Whether the middle line of a rod has come through Γc, over all increments.
+
+        Its places are followed on straight paths. What comes in by a side that is not Γc, which
+        nobody looks at, does not count. Γc must be a graph over x.
+        """
+        contact = self.problem.contacts[i]
+        if i not in self._rods:
+            began = contact.spine_at(contact.at_rest())
+            self._rods[i] = (0.0 * u, began, np.zeros(len(began), dtype=int))
+        before, start, state = self._rods[i]
+        first, at, _ = along(contact.here, before)
+        last = along(contact.here, u)[0]
+        order = np.argsort(at[:, 0])
+        height = np.zeros(len(spine))
+        for share in np.linspace(0, 1, _PARTS + 1):
+            x = (first + share * (last - first))[order]
+            q = start + share * (spine - start)
+            height = q[:, 1] - np.interp(q[:, 0], x[:, 0], x[:, 1])
+            over = (q[:, 0] > x[:, 0].min()) & (q[:, 0] < x[:, 0].max())
+            # Not over Γc 0, below it -1, through it 1, in the body by another way 2.
+            inside = np.where(state == -1, 1, np.where(state == 0, 2, state))
+            state = np.where(over, np.where(height > 0, inside, -1), 0)
+        self._rods[i] = (u, spine, state)
+        through = np.where(state == 1, height, 0.0).max()
+        facet = float(contact.here.lengths().max())
+        wide = np.ptp(spine[:, 0]) > 2 * facet
+        self._check(name, "crossed", through, (0.02 if wide else _BETWEEN_POINTS) * facet)
+
+    def _check_kinematics(
+        self, name: str, u: Array, motion: Array, load: Any, old: list[Any], now: dict[str, Any]
+    ) -> None:
+        """Whether contact forces stay where geometry is taken at the places that u leads to."""
+        problem = self.problem
+        kept = [(c.place, c.interpolation, c.paired) for c in problem.contacts]
+        shifts = problem.shifts(load, motion)
+        changed = False
+        try:
+            for c, shift in zip(problem.contacts, shifts, strict=True):
+                jump, paired = c.jump(u), c.paired
+                gap, normal = c.placed(shift)
+                if c.near is not None:
+                    x = c.x + jump
+                    changed |= self._differ(c, jump, shift, *c.near(x, shift), gap, normal)
+
+                    def place(s: Array, c: Any = c, x: Array = x, jump: Array = jump) -> Any:
+                        gap, normal = c.near(x, s)
+                        return gap + np.sum(jump * normal, axis=1), normal
+
+                    c.place = place
+                elif c.anew is not None and c.repair is None:
+                    c.interpolation, gap, c.paired = c.anew(u)
+                    both = paired & c.paired
+                    off = np.abs((c.jump(u) - jump)[both]).max(initial=0.0)
+                    near = off <= 1e-9 * np.ptp(c.here.body.places, axis=0).max()
+                    changed |= not near or bool((paired != c.paired).any())
+                    c.place = lambda s, gap=gap, normal=normal: (gap, normal + 0 * s)
+            if not changed:
+                return
+            near, moved = problem.increment_of(u, motion, load, old, 1e-9)
+            forces = self._forces(near, load, problem.respond(near, moved, load, old))["contacts"]
+        except (reference.Failed, np.linalg.LinAlgError) as failure:
+            self.unjudged.append(f"{name}: kinematics: {failure}")
+            return
+        finally:
+            for c, (place, interpolation, paired) in zip(problem.contacts, kept, strict=True):
+                c.place, c.interpolation, c.paired = place, interpolation, paired
+        for i, force in enumerate(forces):
+            size = max(self._size(now, "contacts", i), force["size"])
+            off = abs(force["normal"] - now["contacts"][i]["normal"])
+            self._check(f"{name}, contact {i}", "kinematics", off, _GEOMETRY_CHANGE * size)
+
+    @staticmethod
+    def _differ(
+        c: Any, jump: Array, shift: Array, far: Array, normal: Array, gap: Array, old: Array
+    ) -> bool:
+        """Whether distance and normal at the deformed places are others than those taken."""
+        off = np.abs(far - gap + np.sum(jump * old, axis=1)).max()
+        size = np.ptp(c.here.body.places, axis=0).max()
+        return bool(off > 1e-9 * size or np.abs(normal - old).max() > 1e-6)
+
     def _between(self, i: int) -> set[tuple[Any, Any]]:
         """The two surfaces of a contact, as body and side."""
         given = self.scene["contacts"][i]
@@ -510,6 +642,8 @@ class Judge:
         work += sum(0.5 * f @ s for f, s in zip(forces, ways, strict=True))
         now |= {"outside": outside, "inside": inside, "shifts": load.shifts, "pushes": pushes}
         energy = record["energy"]
+        if energy is None:
+            return
         penalty = all(c.project is None for c in problem.contacts)
         scale = np.abs(outside) @ np.abs(way) + abs(springs) + abs(slid)
         if before is not None:

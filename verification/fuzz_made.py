@@ -17,10 +17,10 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact import compat
 from fenics_contact.types import Array
-from verification import fuzz_forms
+from verification import fuzz_features, fuzz_forms
 from verification.fuzz_scenes import TOP, Scene, frictions
 
-__all__ = ["Made", "geometry", "history", "tag_of"]
+__all__ = ["Made", "capsule", "geometry", "history", "tag_of"]
 
 
 def _arrays(scene: Scene) -> tuple[Array, Array, Array]:
@@ -95,6 +95,8 @@ class Made:
     """A scene as mesh, forms and constants, on any number of ranks.
 
     Attributes:
+        n_own: Number of bodies of the scene; an unrelated one comes after them.
+        carried: Translation of all bodies and supports of the scene.
         F: The residual with coefficients by cell and plain measures; the package gets it as the
             scene says that it is written (`fuzz_forms.written`).
         set_down: Where slip is counted from anew in this increment, by the names of contacts:
@@ -104,6 +106,8 @@ class Made:
 
     def __init__(self, scene: Scene, comm: MPI.Comm) -> None:
         """Make mesh, bulk form and conditions. Collective."""
+        self.n_own = len(scene["bodies"])
+        scene = fuzz_features.with_busy_body(scene)
         self.scene, self.comm = scene, comm
         self.set_down: dict[str, dict[str, Any]] = {}
         self.length, self.force = scene["units"]
@@ -139,6 +143,9 @@ class Made:
         self.F = self.bulk(self.E, dx) - self.loads(dx, ds)
         self.bcs: list[fem.DirichletBC] = []
         self.moved: list[fem.Constant] = []
+        self._still: list[tuple[int, fem.Constant]] = []
+        self._busy: list[tuple[int, fem.Constant]] = []
+        self.busy_bcs: list[fem.DirichletBC] = []
         for body, side, components, how in scene["holds"]:
             facets = self.facets_of(body, side)
             for i in components:
@@ -148,8 +155,14 @@ class Made:
                 self.bcs.append(fem.dirichletbc(value, dofs, space))
                 if how == "moved":
                     self.moved.append((body, i, value))
+                elif how == "still":
+                    self._still.append((i, value))
+                else:
+                    self._busy.append((i, value))
+                    self.busy_bcs.append(self.bcs[-1])
         self.contacts: list[fc.Contact] = []
         self.shift = fem.Constant(self.mesh, np.zeros(d))
+        self.carried = fem.Constant(self.mesh, np.zeros(d))
         self.push = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
         self.pull = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
 
@@ -251,7 +264,9 @@ class Made:
         self.traction.x.array.reshape(-1, d)[self._cells] = tractions[self.box]
         heavy = np.zeros(d)
         heavy[-1] = -scene.get("weight", 0.0) * strain * self.stress / self.length
-        self.weight.x.array.reshape(-1, d)[self._cells] = heavy * (t if stage == 0 else 1.0)
+        heavy = heavy * (t if stage == 0 else 1.0)
+        own = (self.box < self.n_own)[:, None]
+        self.weight.x.array.reshape(-1, d)[self._cells] = np.where(own, heavy, 0.0)
         for body, i, value in self.moved:
             share = scene["share"] if driven.index(body) else 1.0
             size = scene["bodies"][body]["size"][-1] * self.length
@@ -263,10 +278,35 @@ class Made:
             for i in range(d):
                 self.push[i].value = -way[i] * strain * self.moduli[0] * area
                 self.pull[i].value = -way[i] * strain * size
+        self.apply_features(stage, t)
+
+    def apply_features(self, stage: int, t: float) -> None:
+        """Carry all bodies and supports along, and keep the unrelated body busy."""
+        d, scene = self.d, self.scene
+        self.carried.value[:] = 0.0
+        if "carry" in scene:
+            share = (stage + t) / len(scene["stages"]) * self.length
+            self.carried.value[[0, d - 1]] = share * np.array(scene["carry"])
+        for i, value in self._still:
+            value.value = self.carried.value[i]
+        for _, i, value in self.moved:
+            value.value += self.carried.value[i]
+        self.shift.value[:] += self.carried.value
+        if "busy" not in scene:
+            return
+        # Up and down, the same at the same place of the load path.
+        busy, share = fuzz_features.BUSY[scene["busy"]], abs(np.sin(1.3 * (stage + t)))
+        way, load = np.zeros(d), np.zeros(d)
+        way[[0, d - 1]] = busy.get("moved", [0.0, 0.0])
+        load[[0, d - 1]] = busy.get("load", [0.0, 0.0])
+        for i, value in self._busy:
+            value.value = share * way[i] * self.length
+        rows = self.traction.x.array.reshape(-1, d)
+        rows[self._cells[self.box == self.n_own]] = share * load * self.moduli[-1]
 
     def driven(self) -> list[int]:
         """Numbers of the bodies that the loads act on."""
-        return [0, 1] if self.scene["layout"] == "apart" else [len(self.scene["bodies"]) - 1]
+        return [0, 1] if self.scene["layout"] == "apart" else [self.n_own - 1]
 
     # ---- the package -------------------------------------------------------------------------
 
@@ -318,6 +358,8 @@ class Made:
         shift = None
         if given.get("moving") == "displacement":
             shift = self.shift
+        elif given.get("moving") == "carried":
+            shift = self.carried
         elif given.get("moving") == "force":
             free = given["free"]
             shift = fc.Motion(
@@ -333,6 +375,8 @@ class Made:
             gap, curve, middle = numbers
             direction = fem.Constant(self.mesh, -np.asarray(where["normal"]))
             return fc.Obstacle(gap + curve * (x[0] - middle) ** 2, direction, displacement=shift)
+        if kind == "rod":
+            return fc.Obstacle(distance=lambda x: capsule(self.mesh, where, x), displacement=shift)
         inside = given["kind"].endswith("inside")
         if kind == "ball":
             return fc.Ball(where["center"], where["radius"], inside=inside, displacement=shift)
@@ -382,6 +426,18 @@ class Made:
         )
 
 
+def capsule(mesh: dolfinx.mesh.Mesh, where: dict[str, Any], x: Any) -> Any:
+    """Distance from a segment, less the radius; of a rod in space in the plane across y (UFL)."""
+    low, high = (np.array(end, dtype=float) for end in where["ends"])
+    arm = x - fem.Constant(mesh, low)
+    if (high != low).any():
+        way = fem.Constant(mesh, high - low)
+        along = ufl.dot(arm, way) / ufl.dot(way, way)
+        arm = arm - ufl.max_value(0.0, ufl.min_value(1.0, along)) * way
+    parts = [arm[i] for i in range(len(low)) if where.get("flat", np.ones(len(low)))[i]]
+    return ufl.sqrt(sum(part**2 for part in parts)) - fem.Constant(mesh, float(where["radius"]))
+
+
 _SHAPE = {"modes": "modes", "transverse_friction": "transverse", "direction": "direction"}
 
 
@@ -411,6 +467,16 @@ def geometry(scene: Scene, contact: Scene) -> dict[str, Any]:
             "middle": middle[0] * length,
             "normal": up,
         }
+    if given["kind"] == "rod":
+        half = np.zeros(d)
+        half[[0, d - 1]] = given["half"] * np.array([np.cos(given["tilt"]), np.sin(given["tilt"])])
+        centre = low + given["at"] * size * np.eye(d)[0]
+        centre[-1] -= clearance + given["radius"] + abs(half[-1])
+        flat = np.ones(d)
+        flat[1:-1] = 0.0
+        where = {"center": centre, "ends": np.stack([centre - half, centre + half])}
+        where |= {"radius": given["radius"]}
+        return {name: value * length for name, value in where.items()} | {"flat": flat}
     radius = given["radius"] * max(size[:-1])
     if not given["kind"].endswith("inside"):
         return {"center": (middle - (radius + clearance) * up) * length, "radius": radius * length}

@@ -20,7 +20,7 @@ from verification.fuzz_made import Made, geometry, tag_of
 from verification.fuzz_scenes import Scene
 from verification.reference_geometry import Body, Surface
 
-__all__ = ["body_of", "contact_of", "model"]
+__all__ = ["body_of", "capsule_at", "contact_of", "model"]
 
 
 def _scaled(value: float | None, contact: Scene) -> float:
@@ -94,6 +94,8 @@ def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float],
             shift, push = np.zeros(d), np.zeros(d)
             if moving == "displacement":
                 shift = made.shift.value.copy()
+            elif moving == "carried":
+                shift = made.carried.value.copy()
             elif moving == "force":
                 for i in range(d):
                     if i in contact["support"]["free"]:
@@ -230,6 +232,8 @@ def contact_of(
         place=None,
         interpolation=here.interpolation(facet, xi),
         weights=weights,
+        here=here,
+        facet=facet,
         k_n=stiffness(law.get("k_n")),
         k_t=stiffness(law.get("k_t")),
         law=the_law,
@@ -237,7 +241,21 @@ def contact_of(
         free=free,
         project=_projection(here, facet, xi, weights, max(1, degree - 1)) if augmented else None,
     )
+    if contact["support"]["kind"] == "rod":
+        low, high = geometry(scene, contact)["ends"]
+        made_model.spine = low + np.linspace(0, 1, 21)[:, None] * (high - low)
     return made_model, (facet, xi)
+
+
+def capsule_at(x: Array, where: dict[str, Any]) -> tuple[Array, Array]:
+    """Distance of places from a capsule, (n,), and minus its gradient, (n, d)."""
+    low, high = where["ends"]
+    way = high - low
+    share = (x - low) @ way / max(way @ way, np.finfo(float).tiny)
+    arm = x - low - np.clip(share.real, 0.0, 1.0)[:, None] * way
+    arm = arm * where.get("flat", 1.0)
+    far = np.sqrt(np.sum(arm * arm, axis=1))
+    return far - where["radius"], -arm / far[:, None]
 
 
 def _contact(made: Made, contact: Scene, here: Surface, opposite: Any) -> Any:
@@ -246,7 +264,10 @@ def _contact(made: Made, contact: Scene, here: Surface, opposite: Any) -> Any:
     made_model, (facet, xi) = contact_of(made, contact, here, there=there)
     scene, given, x = made.scene, contact.get("gap"), made_model.x
     if there is None:
-        place = _placement(contact["support"]["kind"], geometry(scene, contact), x)
+        kind, where = contact["support"]["kind"], geometry(scene, contact)
+        place = _placement(kind, where, x)
+        if given is None and kind != "obstacle":
+            made_model.near = lambda x, shift: _placement(kind, where, x)(shift)
         if given is not None:
             bare = place
 
@@ -272,6 +293,13 @@ def _contact(made: Made, contact: Scene, here: Surface, opposite: Any) -> Any:
         made_model.back = lambda u: reference_geometry.penetration(there, here, u, thickness)
     if contact["support"]["update"] == "increment":
         made_model.repair = repair
+    if given is None:
+
+        def anew(u: Array) -> tuple[Array, Array, Array]:
+            matrix, gap, paired = reference_geometry.pair(here, there, (facet, xi), u=u)
+            return np.where(paired[:, None], interpolation - matrix, 0.0), gap, paired
+
+        made_model.anew = anew
     return made_model
 
 
@@ -284,6 +312,8 @@ def _placement(kind: str, where: dict[str, Any], x: Array) -> Any:
         normal = -np.asarray(where["normal"])
         gap = where["gap"] + where["curve"] * (x[:, 0] - where["middle"]) ** 2
         return lambda s: (gap + s @ normal, np.tile(normal, (len(x), 1)) + 0 * s)
+    if kind == "rod":
+        return lambda s: capsule_at(x - s, where)
     sign = -1.0 if kind.endswith("inside") else 1.0
     flat = np.ones(x.shape[1])
     if kind.startswith("cylinder") and len(flat) == 3:

@@ -12,10 +12,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import matplotlib.path
 import numpy as np
+import scipy.spatial
 from mpi4py import MPI
 
-from verification import finite_reference, fuzz_models, present_scenes
+from verification import finite_reference, fuzz_judge, fuzz_made, fuzz_models, present_scenes
 from verification import reference_solver as reference
 
 __all__ = ["PresentContact", "PresentJudge", "PresentProblem", "model"]
@@ -50,16 +52,16 @@ class PresentContact(reference.ContactModel):
     """Γc and the opposite surface at the present places.
 
     Attributes:
-        here, there: The surfaces.
-        facet, xi: Of the points on ``here``.
+        there: The opposite surface.
+        xi: Reference coordinates of the points on Γc.
+        outlines: In the plane, of the bodies with Γc and opposite: their four sides in turn.
         reach: How far behind a point its partner may be, by pairs of facets (length); or twice as
             deep as points of its facet have been.
     """
 
-    here: Any = None
     there: Any = None
-    facet: Any = None
     xi: Any = None
+    outlines: Any = None
     reach: Any = None
 
     def start(self) -> PresentState:
@@ -242,13 +244,21 @@ def model(scene: dict[str, Any]) -> tuple[PresentProblem, Any, Callable[[int, fl
     contacts = []
     for i, contact in enumerate(scene["contacts"]):
         here, there = surface(11 + i), surface(21 + i)
-        found, (facet, xi) = fuzz_models.contact_of(made, contact, here, PresentContact, there)
-        found.here, found.there, found.facet, found.xi = here, there, facet, xi
+        found, (_, xi) = fuzz_models.contact_of(made, contact, here, PresentContact, there)
+        found.there, found.xi = there, xi
+        found.outlines = [
+            _outline(scene, b, surface) for b in (contact["body"], 1 - contact["body"])
+        ]
         found.reach = np.maximum.outer(here.heights()[0], there.heights()[0])
         contacts.append(found)
     loads = finite_reference.loads_of(made)
     bulk = finite_reference.bulk_of(made, body)
     return PresentProblem(body, contacts, bulk=bulk, parts=_PARTS), made, loads
+
+
+def _outline(scene: dict[str, Any], body: int, surface: Any) -> list[Any]:
+    sides = ("bottom", "right", "top", "left")
+    return [surface(fuzz_made.tag_of(scene, body, side)) for side in sides]
 
 
 class PresentJudge(finite_reference.FiniteJudge):
@@ -289,6 +299,34 @@ class PresentJudge(finite_reference.FiniteJudge):
         for body in forces["bodies"]:
             body["rounding"] = most
         return forces
+
+    def _check_geometry(self, name: str, u: Array, load: Any, motion: Array, found: Any) -> None:
+        """Depth of either surface inside of the other body, in the plane; see `Judge`."""
+        for i, (c, f) in enumerate(zip(self.problem.contacts, found, strict=True)):
+            if c.d != 2 or not c.law.has_normal:
+                continue
+            borne = max(float(np.max(f["closing"][f["hit"] >= 0], initial=0.0)), 0.0)
+            size = max(float(c.here.lengths().max()), self._bulge)
+            loops = [self._loop(sides, u) for sides in c.outlines]
+            for own, (surface, opposite) in enumerate(((c.here, c.there), (c.there, c.here))):
+                x = fuzz_judge.along(surface, u)[0]
+                inside = matplotlib.path.Path(loops[1 - own]).contains_points(x)
+                wall = scipy.spatial.cKDTree(fuzz_judge.along(opposite, u, 65)[0])
+                deep = np.where(inside, wall.query(x)[0], 0.0).max()
+                value = deep - borne
+                self._check(
+                    f"{name}, contact {i}", "penetration", value, fuzz_judge.UNRESISTED * size
+                )
+
+    @staticmethod
+    def _loop(sides: list[Any], u: Array) -> Array:
+        """Places around a body, anticlockwise from its lower left corner."""
+        rows = []
+        for k, side in enumerate(sides):
+            x, start, _ = fuzz_judge.along(side, u)
+            order = np.argsort(start[:, k % 2])
+            rows.append(x[order[::-1] if k > 1 else order])
+        return np.concatenate(rows)
 
     def _unique(self) -> bool:
         return False

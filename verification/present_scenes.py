@@ -208,7 +208,7 @@ class PresentMade(FiniteMade):
         super().__init__(scene, comm, bulk=bulk)
         self._held: list[tuple[int, Any]] = []
         if scene["drive"] == "prescribed":  # places by turns take functions
-            self.bcs = []
+            self.bcs = list(self.busy_bcs)
             for body, side, *_ in scene["holds"]:
                 value = fem.Function(self.V)
                 facets = self.facets_of(body, side)
@@ -226,7 +226,7 @@ class PresentMade(FiniteMade):
     def apply(self, stage: int, t: float) -> None:
         """Set all loads."""
         scene, d, now = self.scene, self.d, self.drives(stage, t)
-        slab, block = scene["bodies"]
+        slab, block = scene["bodies"][:2]
         way = np.zeros(d)
         way[0] = now["side"] * block["size"][0]
         if d == 3:
@@ -234,20 +234,22 @@ class PresentMade(FiniteMade):
         down = now["normal"] * scene["strain"]
         if scene["drive"] == "force":
             rows = self.traction.x.array.reshape(-1, d)
-            rows[self._cells] = -down * min(self.moduli) * np.eye(d)[-1]
+            rows[self._cells] = -down * min(self.moduli[: self.n_own]) * np.eye(d)[-1]
             for _, i, value in self.moved:
                 value.value = way[i] * self.length
+            self.apply_features(stage, t)
             return
         way[-1] = -down * block["size"][-1]
         middle = 0.5 * np.array(slab["size"]) * self.length
         pivot = (np.array(block["origin"]) + 0.5 * np.array(block["size"])) * self.length
         whole, own = turn(d, now["spin"]), turn(d, now["turn"])
         x = self.V.tabulate_dof_coordinates()[:, :d]
+        self.apply_features(stage, t)
         for body, value in self._held:
             place = x
             if body == 1:
                 place = pivot + (x - pivot) @ own.T + way * self.length
-            moved = middle + (place - middle) @ whole.T - x
+            moved = middle + (place - middle) @ whole.T + self.carried.value - x
             value.x.array[:] = moved.ravel()
 
     def support(self, contact: Scene) -> Any:

@@ -69,6 +69,13 @@ class ContactModel:
         repair: Pairs the points anew at a displacement; None where pairs stay.
         back: ∫ of the penetration as the opposite surface sees it at a displacement; None where
             the support is rigid.
+        here: Γc.
+        facet: On it, of every point.
+        near: Function of places (n, d) and where the support is: distance (n,) and minus its
+            gradient (n, d); None where the support is no rigid shape.
+        spine: Middle line of a rod where it began, (n, d); None of other supports.
+        anew: Function of u: interpolation, gap and pairs of bodies where they have moved to; None
+            where the support is rigid.
     """
 
     x: Array
@@ -83,6 +90,11 @@ class ContactModel:
     project: Array | None = None
     repair: Any = None
     back: Any = None
+    here: Any = None
+    facet: Any = None
+    near: Any = None
+    spine: Any = None
+    anew: Any = None
     _placed: tuple[Any, ...] = field(default=(None, b"", ()), init=False, repr=False)
 
     @property
@@ -152,6 +164,10 @@ class ContactModel:
     def at_rest(self) -> Any:
         """Where the support began, as `respond` takes it."""
         return np.zeros(self.d)
+
+    def spine_at(self, shift: Any) -> Array:
+        """The middle line of a rod, (n, d)."""
+        return self.spine + shift
 
     def counted_from(self, found: dict[str, Array], old: Any, idle: Array) -> Any:
         """History with slip of some points, (n,), counted from a state that is not committed."""
@@ -361,10 +377,17 @@ def _change(new: list[State], old: list[State]) -> tuple[float, float]:
 
 @dataclass(eq=False)
 class Problem:
-    """A linear bulk and contacts, dense."""
+    """A linear bulk and contacts, dense.
+
+    Attributes:
+        body: The bulk.
+        contacts: The contacts.
+        far: How far all bodies are carried (length), of which gaps have a round-off.
+    """
 
     body: Body
     contacts: list[ContactModel]
+    far: float = 0.0
     _reduced: Reduced | None = field(default=None, init=False, repr=False)
 
     def motions(self) -> list[tuple[int, int]]:
@@ -434,9 +457,14 @@ class Problem:
             ]
             change, scale = _change(new, old)
             old = new
-            if change <= 1e-9 * scale:
+            if change <= 1e-9 * scale + self.rounding():
                 return u, motion, old
         raise Failed("multipliers do not settle")
+
+    def rounding(self) -> float:
+        """Of tractions, by how far bodies are carried (stress)."""
+        stiff = max(float((c.k_n + c.k_t).max()) for c in self.contacts)
+        return 16 * float(np.finfo(float).eps) * stiff * self.far
 
     def increment_of(
         self, u: Array, motion: Array, load: Load, old: list[State], rtol: float

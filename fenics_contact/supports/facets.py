@@ -119,7 +119,7 @@ class Facets:
         d = x.shape[1]
         # From afar all facets are as far away as round-off can tell: the rest of the way is added.
         reach = np.linalg.norm(x, axis=1)
-        share = np.minimum(_AFAR * self.size / np.maximum(reach, 1e-300), 1.0)
+        share = _AFAR * self.size / np.maximum(reach, _AFAR * self.size)
         x, rest = share[:, None] * x, (1.0 - share) * reach
         facet = self._search.closest(x, self._distance, _SAME * self.size)
         foot, feature = self._foot(x, facet)
