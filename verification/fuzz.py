@@ -72,7 +72,7 @@ _REPORTED = ("reported", "energy springs", "energy dissipation", "multipliers")
 # Packages that compile forms.
 _JIT = ("ffcx", "cffi", "ufl")
 # Scenes in one process.
-_BATCH = 40
+_BATCH = 120
 
 
 @dataclass
