@@ -218,8 +218,7 @@ def play(
                     break
             ahead = _ahead(scene, records)
             if outcome in ("refused", "slow") and judge is not None and not judge.wrong and ahead:
-                solved = judge.solvable(*ahead)
-                kind += " (solved apart)" if solved else " (not solved apart)"
+                kind += f" ({judge.look_ahead(*ahead)})"
         if judge is not None:
             worst = judge.worst
             if judge.wrong:
@@ -317,8 +316,12 @@ def _drawn(seed: int, arguments: argparse.Namespace, ranks: int) -> Scene:
     return (finite_scenes if arguments.finite else fuzz_scenes).draw(seed, **options)
 
 
-def _keep_forms() -> None:
-    """Load a compiled form once in this process: FFCx reads all of its folder every time."""
+def _keep_forms() -> dict[Any, Any]:
+    """Load a compiled form once in this process: FFCx reads all of its folder every time.
+
+    Returns:
+        The forms loaded so far, by their names.
+    """
     from ffcx.codegeneration import jit
 
     look_up, found = jit.get_cached_module, {}
@@ -333,6 +336,7 @@ def _keep_forms() -> None:
         return found[key]
 
     jit.get_cached_module = kept
+    return found
 
 
 def _work(seeds: list[int], arguments: argparse.Namespace) -> None:
@@ -341,7 +345,7 @@ def _work(seeds: list[int], arguments: argparse.Namespace) -> None:
 
     from mpi4py import MPI
 
-    _keep_forms()
+    forms = _keep_forms()
     comm = MPI.COMM_WORLD
     if comm.size > 1:
         gc.disable()  # destructors are collective: together, between scenes
@@ -349,9 +353,10 @@ def _work(seeds: list[int], arguments: argparse.Namespace) -> None:
         scene = _drawn(seed, arguments, comm.size)
         if comm.rank == 0:
             print(json.dumps({"begins": seed}), flush=True)
+        loaded = len(forms)
         outcome = play(scene, comm if comm.size > 1 else None, limit=arguments.limit)
-        if outcome.outcome == "slow" and comm.size == 1:
-            # Forms may have been compiled meanwhile.
+        if outcome.outcome == "slow" and comm.size == 1 and len(forms) > loaded:
+            # They were compiled or loaded meanwhile.
             outcome = play(scene, None, limit=arguments.limit)
         gc.collect()
         comm.barrier()

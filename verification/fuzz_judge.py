@@ -44,9 +44,9 @@ _DOWN, _LEFT, _ROUND_OFF = 1e-6, 1e-7, 1e-13
 # Penetration between points, beyond what these resist, by the length of a facet. The package allows
 # 15 % where tangent planes explain it, and 2 % for the rule.
 UNRESISTED = 0.2
-# Change of the contact force where geometry is taken at the deformed places; the package allows 20
-# % by an estimate of the first order.
-_GEOMETRY_CHANGE = 0.5
+# Change of the contact force where geometry is taken at the deformed places; the package refuses it
+# from 20 % on, by an estimate of the first order.
+_GEOMETRY_CHANGE, _REFUSED_CHANGE = 0.5, 0.2
 # Depth, by the length of a facet, of a narrow rod that no point resists: the package allows 5 % and
 # 2 % for the rule.
 _BETWEEN_POINTS = 0.07
@@ -123,10 +123,7 @@ class Judge:
         """Judge one committed increment."""
         name = f"stage {record['stage']} at {record['load']:.4g}"
         problem, load = self.problem, self._load(record["stage"], record["load"])
-        for i, friction in enumerate(fuzz_scenes.frictions(self.scene, record["stage"])):
-            if friction is not None:
-                for history in (problem, self._apart):
-                    history.contacts[i].law.friction = friction
+        self._change_friction(record["stage"])
         self._take_set_down(name, record, load)
         u = self._numbered(record["u"])
         motion = np.array([record["contacts"][c]["motion"][i] for c, i in problem.motions()])
@@ -165,14 +162,36 @@ class Judge:
         self._pair_anew(problem, self._old, u)
         self._before, self._u, self._motion = now, u, motion
 
-    def solvable(self, stage: int, t: float) -> bool:
-        """Whether the reference finds a solution at the next load after those taken."""
-        u, motion = self._u, self._motion
+    def look_ahead(self, stage: int, t: float) -> str:
+        """Whether the reference finds a solution at the next load after those taken.
+
+        Returns:
+            "not solved apart"; "solved apart"; or "rightly" with what does not hold of the geometry
+            there.
+        """
+        load = self._load(stage, t)
+        self._change_friction(stage)
         try:
-            self.problem.solve(u, motion, self._load(stage, t), self._old)
+            u, motion, old = self.problem.solve(self._u, self._motion, load, self._old)
         except (reference.Failed, np.linalg.LinAlgError):
-            return False
-        return True
+            return "not solved apart"
+        before, self.wrong, self.worst = (self.wrong, self.worst), [], {}
+        found = self.problem.respond(u, motion, load, old)
+        now = self._forces(u, load, found)
+        self._check_through("", u, found, now)
+        self._check_geometry("", u, load, motion, found)
+        self._check_kinematics("", u, motion, load, old, now)
+        limits = {"kinematics": _REFUSED_CHANGE / _GEOMETRY_CHANGE}
+        off = sorted(n for n, share in self.worst.items() if share > limits.get(n, 1.0))
+        self.wrong, self.worst = before
+        return f"rightly: {', '.join(off)}" if off else "solved apart"
+
+    def _change_friction(self, stage: int) -> None:
+        """Give both histories the friction of a stage."""
+        for i, friction in enumerate(fuzz_scenes.frictions(self.scene, stage)):
+            if friction is not None:
+                for history in (self.problem, self._apart):
+                    history.contacts[i].law.friction = friction
 
     def _check(self, where: str, what: str, value: float, allowed: float, text: str = "") -> bool:
         with np.errstate(all="ignore"):
@@ -580,6 +599,8 @@ class Judge:
             if not changed:
                 return
             near, moved = problem.increment_of(u, motion, load, old, 1e-9)
+            if np.abs(near - u).max() > 0.25 * np.ptp(problem.body.places, axis=0).max():
+                raise reference.Failed("what follows from the geometry is far away")
             forces = self._forces(near, load, problem.respond(near, moved, load, old))["contacts"]
         except (reference.Failed, np.linalg.LinAlgError) as failure:
             self.unjudged.append(f"{name}: kinematics: {failure}")
