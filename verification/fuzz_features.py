@@ -65,7 +65,10 @@ def add_features(scene: Scene, seed: int, without: tuple[str, ...] = ()) -> Scen
 
 def _can_be_carried(scene: Scene) -> bool:
     """Whether conditions and supports can lead all bodies along."""
-    moving = [c["support"].get("moving") for c in scene["contacts"]]
+    supports = [c["support"] for c in scene["contacts"]]
+    moving = [s.get("moving") for s in supports]
+    if "kinematics" not in scene and {s["kind"] for s in supports} - {"halfspace", "body"}:
+        return False  # where a curved support has gone its normals are others
     kept = {h[0] for h in scene["holds"] if 0 in h[2]}
     return "force" not in moving and len(kept) == len(scene["bodies"])
 
@@ -102,7 +105,7 @@ def _add_rod(scene: Scene, chance: Any, pick: Any, log: Any, within: Any) -> Non
     clearance = within(0.0, 0.05) if chance(0.6) else 0.0
     support = {"kind": "rod", "shape": shape, "radius": radius, "half": half, "tilt": tilt}
     support |= {"clearance": clearance, "at": within(-0.1, 1.1), "moving": "displacement"}
-    depth = log(-4, -1.3) * height
+    depth = (log(-4, -1.3) if finite else log(-5, -2.3)) * height
     whole = 2 * (radius + half * abs(np.sin(tilt)))
     reach = width + 2 * half * abs(np.cos(tilt))
     press = clearance + depth

@@ -47,6 +47,8 @@ UNRESISTED = 0.2
 # Change of the contact force where geometry is taken at the deformed places; the package refuses it
 # from 20 % on, by an estimate of the first order.
 _GEOMETRY_CHANGE, _REFUSED_CHANGE = 0.5, 0.2
+# How far away, by the size of the mesh, a solution is another one.
+_FAR = 0.1
 # Depth, by the length of a facet, of a narrow rod that no point resists: the package allows 5 % and
 # 2 % for the rule.
 _BETWEEN_POINTS = 0.07
@@ -508,7 +510,7 @@ class Judge:
             # these.
             differ = 0.1 * max(self._bulge, *(float(np.ptp(found[j]["closing"])) for j in same))
             if self.scene["contacts"][i].get("scheme") == "vertex":
-                differ += self._bulge
+                differ += self._bulge + 0.02 * float(contact.here.lengths().max())
             allowed += float(contact.k_n.mean() * contact.weights.sum()) * differ
             allowed += 1e3 * sum(b["rounding"] for b in now["bodies"])
             # Fewer points than a facet has nodes do not hold all of it, by the user's choice or
@@ -599,7 +601,7 @@ class Judge:
             if not changed:
                 return
             near, moved = problem.increment_of(u, motion, load, old, 1e-9)
-            if np.abs(near - u).max() > 0.25 * np.ptp(problem.body.places, axis=0).max():
+            if np.abs(near - u).max() > _FAR * np.ptp(problem.body.places, axis=0).max():
                 raise reference.Failed("what follows from the geometry is far away")
             forces = self._forces(near, load, problem.respond(near, moved, load, old))["contacts"]
         except (reference.Failed, np.linalg.LinAlgError) as failure:
