@@ -337,3 +337,22 @@ def test_multipliers_of_a_light_body_beside_a_heavy_one():
     The largest pressure was 1.6 % off, because what the springs bore was small by the other's.
     """
     assert close(_on_multipliers(["heavy", "light"]), _on_multipliers(["light"]), 1e-6)
+
+
+@pytest.mark.parametrize("method", ["newton", "primal_dual"])
+def test_a_body_that_is_led_aside_after_a_restart_of_the_solver(method):
+    """Its forces are the round-off of its displacement alone, which is allowed for as before."""
+    scene = Beside({"block": Box()}, [BUSY["led aside"]], E=1e3)
+    press = scene.bodies.constant()
+    scene.load("block", TOP, 1, press)
+    scene.hold("block", LEFT, 0)
+    floor = scene.contact("block", BOTTOM, FLOOR, fc.Coulomb(0.3), name="floor")
+    play = Play(scene, setting(press, -0.1, -0.2, -0.3), floor, method=method)
+    commit = play.problem.commit
+
+    def restarting():
+        commit()
+        play.problem.restart_solver()
+
+    play.problem.commit = restarting
+    assert close(play.run()[0], [0.0, 0.3], 1e-9)

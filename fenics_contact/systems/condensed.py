@@ -208,6 +208,9 @@ class CondensedSystem(System):
         self._full.forget()
         if self._condensation is not None:
             self._condensation.forget()
+            # As `update` leaves it, also at unknowns that no matrix of contact has.
+            assert self._full.stiffness is not None
+            self._full.take_diagonal(self._full.stiffness)
 
     def matrix(self, *, symmetric: bool) -> PETSc.Mat:
         """A new operator, S and contact side by side."""
