@@ -355,4 +355,4 @@ def test_a_body_that_is_led_aside_after_a_restart_of_the_solver(method):
         play.problem.restart_solver()
 
     play.problem.commit = restarting
-    assert close(play.run()[0], [0.0, 0.3], 1e-9)
+    assert close(play.run()[0][1], 0.3, 1e-9)
