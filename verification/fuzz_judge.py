@@ -233,8 +233,6 @@ class Judge:
             if told is None:
                 continue
             u = self._numbered(told["u"])
-            if told["rigid"] and np.abs(u - before).max() <= _ROUND_OFF * size:
-                continue  # another body was set down
             if told["rigid"]:
                 then, now = (problem.respond(v, self._motion, load, old) for v in (before, u))
                 deep, deeper = (

@@ -517,6 +517,9 @@ def _note_set_down(made: Made, contact: fc.Contact) -> None:
 
     def noting(method: Any, *, rigid: bool) -> Any:
         def noted(*given: Any, **options: Any) -> None:
+            if rigid and not any(made.comm.allgather(bool(given[0].any()))):
+                method(*given, **options)  # of other bodies
+                return
             jump = gathered(made.comm, np.column_stack([contact.points, contact.values.jump]))
             made.set_down[contact.name] = {
                 "rigid": rigid,
