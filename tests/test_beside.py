@@ -356,3 +356,17 @@ def test_a_body_that_is_led_aside_after_a_restart_of_the_solver(method):
 
     play.problem.commit = restarting
     assert close(play.run()[0][1], 0.3, 1e-9)
+
+
+def test_a_light_load_beside_a_stiff_body():
+    """1e-9 of E, beside forces 1e13 times as large that do not grow with it: 1e-6 of its force.
+
+    A load is a combination of earlier ones if it is on every body, and not on the stiffest alone.
+    """
+    scene = Beside({"block": Box(n=(4, 4))}, [BUSY["stiff"]])
+    press = scene.bodies.constant()
+    scene.load("block", TOP, 1, press)
+    scene.hold("block", LEFT, 0)
+    floor = scene.contact("block", BOTTOM, FLOOR, fc.Frictionless(), name="floor")
+    play = Play(scene, setting(press, -1e-9, -3e-9, -4e-9), floor)
+    assert close(play.run()[0][1] / 4e-9, 1.0, 1e-6)

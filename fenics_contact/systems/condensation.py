@@ -16,7 +16,8 @@ import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact.parallel import collective_errors, global_sum
+from fenics_contact.parallel import collective_errors, global_max, global_sum
+from fenics_contact.systems.balance import Labels, by_body
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.dissection import Dissection, Eliminated
 from fenics_contact.systems.unknowns import Selection
@@ -25,8 +26,8 @@ from fenics_contact.types import Array, Index, Indices, Mask
 __all__ = ["Condensation", "Response"]
 
 
-# Directions of loads whose particular solutions are kept, and the remainder, relative to the load,
-# below which a load is a combination of them.
+# Directions of loads whose particular solutions are kept, and the remainder, relative to the load
+# on each body, below which a load is a combination of them.
 _DIRECTIONS = 4
 _SAME = 1e-14
 
@@ -51,6 +52,7 @@ class Condensation:
         constrained: Mask,
         *,
         prefix: str = "",
+        label: Labels | None = None,
     ) -> None:
         """Factor. Collective.
 
@@ -60,6 +62,7 @@ class Condensation:
             unknowns: The unknowns to keep.
             constrained: Mask of the prescribed unknowns among all of this rank, (n_local,).
             prefix: Of the options of the factorisation.
+            label: Body of every unknown of this rank, (n_local,); by default there is one body.
 
         Raises:
             RuntimeError: The stiffness is singular even with the kept unknowns held.
@@ -69,6 +72,9 @@ class Condensation:
         outside = np.ones(constrained.size, dtype=np.bool_)
         outside[unknowns.kept] = False
         self._held = np.flatnonzero(outside & constrained).astype(np.int32)
+        label = np.zeros(constrained.size, dtype=np.intp) if label is None else label
+        self._label = np.concatenate([label, label[self._held]])
+        self._n_bodies = 1 + int(global_max(self._comm, label, empty=0))
         self._right, self._left = stiffness.createVecs()
         self.directions: list[tuple[Array, Response]] = []
         self._scale = bulk.scale
@@ -118,14 +124,16 @@ class Condensation:
         # The loads of a history are a few fields, each times a number: what was found for earlier
         # ones serves as far as the new one is a combination of them.
         rest: Array = np.concatenate([force, self._scale * state[self._held]])
-        size = self._norm(rest)
+        sizes = self._norms(rest)
         shares: list[float] = []
         for direction, _ in self.directions:
             shares.append(float(global_sum(self._comm, direction @ rest)))
             rest -= shares[-1] * direction
         responses = [response for _, response in self.directions]
-        remainder = self._norm(rest)
-        if remainder > _SAME * size:
+        remainders = self._norms(rest)
+        # A load on one body is small beside those on others, and is none of their round-off.
+        if (remainders > _SAME * sizes).any():
+            remainder = float(np.linalg.norm(remainders))
             known = bool(np.isfinite(remainder))
             shares.append(remainder if known else 1.0)
             scaled = np.asarray(rest / shares[-1], dtype=np.float64)
@@ -138,9 +146,9 @@ class Condensation:
         else:
             self.response = Response.none(force.size, self._unknowns.n_local)
 
-    def _norm(self, values: Array) -> float:
-        """Over all ranks, without overflow. Collective."""
-        return float(np.linalg.norm(self._comm.allgather(float(np.linalg.norm(values)))))
+    def _norms(self, values: Array) -> Array:
+        """Of forces, and values held, on every body, (n_bodies,). Collective."""
+        return by_body(self._comm, [values], self._label, self._n_bodies)[0]
 
     def _respond(self, given: Array) -> Response:
         """By one back-substitution, and one more if values are prescribed and the force is none."""

@@ -121,7 +121,12 @@ class CondensedSystem(System):
         self._condensation = self._fixed = None  # their memory first
         self.ready = False
         self._condensation = Condensation(
-            stiffness, self.bulk, self.unknowns, self._full.constrained, prefix=self._prefix
+            stiffness,
+            self.bulk,
+            self.unknowns,
+            self._full.constrained,
+            prefix=self._prefix,
+            label=self._full.label,
         )
         self.mark = object()
         self.ready = True
