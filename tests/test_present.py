@@ -532,7 +532,8 @@ def test_where_a_surface_has_no_tangent_plane_there_is_no_residual():
     pair = Pair("tetrahedron", LAWS["coulomb"], kinematics="finite")
     bcs = [hold(pair.u, pair.tags, tag, i) for tag in (BOTTOM, TOP) for i in range(3)]
     form = residual(pair.u, ufl.TestFunction(pair.u.function_space), 100.0, 0.3)
-    problem = fc.ContactProblem(form, pair.u, bcs=bcs, contacts=[pair.contact])
+    whole = {"bcs": bcs, "contacts": [pair.contact], "condensation": False}
+    problem = fc.ContactProblem(form, pair.u, **whole)
     x = pair.nodes
     line = x.copy()
     line[np.isclose(x[:, 2], 0.5), 1] = 0.5
@@ -544,19 +545,53 @@ def test_where_a_surface_has_no_tangent_plane_there_is_no_residual():
         assert not problem.full.is_twisted()
 
 
-def test_condensation_is_refused():
-    """Pairs follow the bodies: there is nothing constant to condense onto."""
-    mesh, tags = two_blocks("triangle", (4, 3), (1.0, 0.6), 0.17)
-    u = fem.Function(displacement_space(mesh, 1))
-    v = ufl.TestFunction(u.function_space)
-    contact = fc.Contact(
-        u,
-        fc.ContactSurface(mesh, tags, UPPER),
-        fc.DeformableBody(tags, LOWER),
-        fc.Frictionless(),
-        kinematics="finite",
-    )
-    bcs = [hold(u, tags, tag, i) for tag in (BOTTOM, TOP) for i in range(2)]
-    form = ufl.inner(ufl.sym(ufl.grad(u)), ufl.grad(v)) * ufl.dx
-    with pytest.raises(ValueError, match="pairs follow the bodies"):
-        fc.ContactProblem(form, u, bcs=bcs, contacts=[contact], condensation=True)
+@pytest.mark.parametrize(
+    ("cell", "degree"), [("triangle", 1), ("quadrilateral", 2), ("tetrahedron", 1)]
+)
+def test_condensed_as_on_all_unknowns(cell, degree):
+    """Static condensation of a linear bulk keeps all nodes of both surfaces: the same history.
+
+    One factorisation serves a block that is pressed, and dragged over facets of the other.
+    """
+    found = []
+    for condensation in (True, False):
+        pair = Pair(cell, fc.Coulomb(0.3), degree=degree, kinematics="finite")
+        mesh, tags, last = pair.mesh, pair.tags, pair.d - 1
+        side, down = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
+        bcs = [hold(pair.u, tags, BOTTOM, i) for i in range(pair.d)]
+        bcs += [
+            hold(pair.u, tags, TOP, i, {0: side, last: down}.get(i, 0.0)) for i in range(pair.d)
+        ]
+        problem = fc.ContactProblem(
+            residual(pair.u, ufl.TestFunction(pair.u.function_space), 1e3, 0.3),
+            pair.u,
+            bcs=bcs,
+            contacts=[pair.contact],
+            condensation=condensation,
+            petsc_options={"snes_rtol": 1e-12},
+        )
+        history = []
+        for number, place in enumerate([(0, -1), (0, -2), (10, -2), (20, -3), (10, -2)]):
+            side.value, down.value = 0.01 * np.array(place)
+            step = problem.solve(field=False)
+            problem.commit()
+            assert step.complete  # all of u is looked at, whatever was asked for
+            assert not condensation or step.factorisations == (number == 0)
+            history.append([*step.contacts["contact"].force, *step.contacts["contact"].moment])
+        found.append((np.array(history), pair.u.x.array.copy()))
+    for condensed, whole in zip(*found, strict=True):
+        assert condensed == pytest.approx(whole, rel=0, abs=1e-10 * np.abs(whole).max())
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_condensation_needs_bodies_that_are_held(held):
+    """A body that nothing but contact holds may be thrown out, which all unknowns tell."""
+    pair = Pair("triangle", fc.Coulomb(0.3), kinematics="finite")
+    tags = (BOTTOM, TOP) if held else (BOTTOM,)
+    bcs = [hold(pair.u, pair.tags, tag, i) for tag in tags for i in range(2)]
+    form = residual(pair.u, ufl.TestFunction(pair.u.function_space), 1e3, 0.3)
+    given = (form, pair.u), {"bcs": bcs, "contacts": [pair.contact]}
+    assert fc.ContactProblem(*given[0], **given[1]).solver.condensed == held
+    if not held:
+        with pytest.raises(ValueError, match="pairs follow bodies that nothing else holds"):
+            fc.ContactProblem(*given[0], **given[1], condensation=True)

@@ -171,9 +171,14 @@ class FollowedOpposite(BodyOpposite):
         return self._present.turned(vectors)
 
     @property
-    def _update(self) -> str:
-        """At a commit never: they follow all the time, whatever the support says."""
-        return "never"
+    def pairs_anew(self) -> bool:
+        """See `Opposite`: they are, and wherever else the bodies go."""
+        return True
+
+    @property
+    def may_pair_anew(self) -> bool:
+        """See `Opposite`: not at a commit alone, whatever the support says."""
+        return False
 
     @property
     def degenerate(self) -> bool:
@@ -212,7 +217,7 @@ class FollowedOpposite(BodyOpposite):
     def resume(self, depth: Array, evaluate: Callable[[], PointValues], *, anew: bool) -> None:
         """See `Opposite`."""
         self._present.commit()
-        super().resume(depth, evaluate, anew=anew)
+        super().resume(depth, evaluate, anew=False)
 
     def commit(self, values: PointValues) -> Array | None:
         """See `Opposite`."""

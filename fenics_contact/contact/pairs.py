@@ -133,6 +133,14 @@ class Pairs:
         self.acts.x.array[: self._quadrature.n_points] = self.paired
         self.acts.x.scatter_forward()
 
+    @property
+    def reach(self) -> PETSc.Mat:
+        """A map whose columns are the dofs that these pairs, or later ones, may couple.
+
+        Collective. Of pairs that stay it is `jump_map`.
+        """
+        return self.jump_map
+
     def depth(self, normal_displacement: Array) -> Array:
         """Depth of points in the opposite, whatever gap is prescribed: (n_points,) (length)."""
         assert self.distance is not None

@@ -20,6 +20,7 @@ follow: the derivative by all unknowns is C by q, point by point, between sparse
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -33,8 +34,9 @@ from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Kinematics, Law, Response
 from fenics_contact.parallel import global_max
 from fenics_contact.supports.deformable import DeformableBody
+from fenics_contact.surface.facets import facet_nodes
 from fenics_contact.surface.fields import PointFields
-from fenics_contact.surface.rays import Hits
+from fenics_contact.surface.rays import Hits, interpolation_matrix
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.types import Array, Mask
 
@@ -202,6 +204,16 @@ class PresentPairs(Pairs):
             start = self.turned(traction.values("traction"))
         values = {"gap": now.gap, "normal": now.normal, "slip": slip, "traction": start}
         self.felt.commit(values)
+
+    @cached_property
+    def reach(self) -> PETSc.Mat:
+        """The nodes on the facets of both surfaces, facet by facet; see `Pairs.reach`."""
+        assert self.search is not None
+        space, facets = self._u.function_space, (self._quadrature.surface.facets, self._rays.facets)
+        local = np.concatenate([facet_nodes(space, f) for f in facets])
+        nodes = space.dofmap.index_map.local_to_global(local.ravel().astype(np.int32))
+        every, nodes = np.arange(len(local)), nodes.reshape(local.shape)
+        return interpolation_matrix(space, len(local), every, nodes, np.ones(local.shape))
 
     @property
     def way(self) -> Array:

@@ -59,7 +59,7 @@ def touched(
     found = np.zeros(unknowns.n_local, dtype=np.bool_)
     found[unknowns.n_dofs :] = True
     for number, operator in enumerate(operators):
-        mine = operator.touched if points is None else operator.touched_by(points[number])
+        mine = operator.reachable if points is None else operator.touched_by(points[number])
         found[mine] = True
     return np.flatnonzero(found).astype(np.int32)
 

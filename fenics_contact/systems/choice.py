@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fenics_contact.systems import linear
-from fenics_contact.systems.condensed import worthwhile
+from fenics_contact.systems.candidates import touched
+from fenics_contact.systems.condensed import all_kept, worthwhile
 from fenics_contact.systems.full import FullSystem
 
 __all__ = ["linear_kind", "obstacle_to_condensation"]
@@ -41,8 +42,10 @@ def obstacle_to_condensation(
         obstacle = "the bulk is not linear in u"
     elif full.displacement.mixed:
         obstacle = "displacements are a part of what is solved for"
-    elif full.follows:
-        obstacle = "pairs follow the bodies wherever they go"
+    elif full.follows and not full.scales.held.all():
+        obstacle = "pairs follow bodies that nothing else holds"
+    elif full.follows and not all_kept(unknowns.n_global, _n_touched(full), gdim):
+        obstacle = "pairs follow the bodies to more of them than can be kept"
     elif named:
         obstacle = f"the options name a linear solver ({', '.join(named)})"
     elif linear_solver == "multigrid":
@@ -65,6 +68,11 @@ def obstacle_to_condensation(
     if not obstacle and linear.quicker(full.size_to_factor, gdim, condensed_for=increments):
         obstacle = f"multigrid is quicker for {n} unknowns"
     return obstacle or None
+
+
+def _n_touched(full: FullSystem) -> int:
+    """How many unknowns contact touches, or may touch with other pairs. Collective."""
+    return int(full.unknowns.comm.allreduce(touched(full.operators, full.unknowns).size))
 
 
 def linear_kind(

@@ -77,8 +77,12 @@ class ContactOperator:
         self._at_points = self._map.createVecLeft()
 
     def _find_within(self) -> Mask | None:
-        """See the attribute. Collective."""
-        if not isinstance(self.unknowns, Selection):
+        """See the attribute. Collective.
+
+        Of pairs that follow the bodies all that they may couple is selected, but for the round-off
+        of functions that are zero on facets.
+        """
+        if not isinstance(self.unknowns, Selection) or self.contact.opposite.follows:
             return None
         pointers, columns, values = self.contact.pairs.jump_map.getValuesCSR()
         row = np.repeat(np.arange(pointers.size - 1), np.diff(pointers))
@@ -116,13 +120,26 @@ class ContactOperator:
         """This rank's unknowns that the points feel or act on, ascending. Collective."""
         return self.touched_by(np.ones(self.contact.quadrature.n_points, dtype=np.bool_))
 
+    @property
+    def reachable(self) -> Indices:
+        """Those that they may feel or act on with later pairs, too, ascending. Collective."""
+        pairs, displacement = self.contact.pairs, self.contact.displacement
+        if not self.contact.opposite.follows:
+            return self.touched
+        reach = self.unknowns.widened(displacement.lifted(pairs.reach))
+        return self._coupled(reach, np.ones(reach.getLocalSize()[0]))
+
     def touched_by(self, chosen: Mask) -> Indices:
         """Those that some of this rank's points feel or act on, ascending. Collective."""
-        pointers, columns, values = self._map.getValuesCSR()
+        return self._coupled(self._map, np.repeat(chosen, self._gdim))
+
+    def _coupled(self, matrix: PETSc.Mat, rows: Array | Mask) -> Indices:
+        """Columns of a matrix with an entry in chosen rows, and the angle. Collective."""
+        pointers, columns, values = matrix.getValuesCSR()
         csr = (pointers, columns, (values != 0.0).astype(np.float64))
-        marks = PETSc.Mat().createAIJ(self._map.getSizes(), csr=csr, comm=self._map.comm)
+        marks = PETSc.Mat().createAIJ(matrix.getSizes(), csr=csr, comm=matrix.comm)
         points, counts = marks.createVecLeft(), marks.createVecRight()
-        points.array[:] = np.repeat(chosen, self._gdim)
+        points.array[:] = rows
         marks.multTranspose(points, counts)
         felt = counts.array_r > 0.0
         if self._turn is not None and self.unknowns.has_motions_here:
@@ -171,7 +188,8 @@ class ContactOperator:
             A new matrix over the unknowns (force/length).
         """
         blocks = self.contact.area[:, None, None] * stiffness
-        if isinstance(self.unknowns, Selection) and self._turn is None:
+        follows = self.contact.opposite.follows  # then nothing is worth to be prepared
+        if isinstance(self.unknowns, Selection) and self._turn is None and not follows:
             return self._product(blocks)
         if self._turn is None:
             return self._sandwiched(blocks, self._map)
