@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import scipy.spatial
+from numpy.polynomial.polynomial import polyval
 
 from fenics_contact.parallel import gather_rows
 from fenics_contact.surface.projection import near_pairs
@@ -14,9 +15,7 @@ from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Crossings", "MovingFacets", "find_crossings"]
 
-# A path is looked at in this many parts for each facet's length, and in so many at most; in each a
-# facet is crossed at most once.
-_PARTS_PER_FACET, _MOST_PARTS = 4, 64
+# Of the time at which the plane of a facet is crossed.
 _BISECTIONS = 40
 # How far outside of a facet, in its own coordinates, a path may cross it: neighbours overlap.
 _OVERLAP = 1e-9
@@ -106,11 +105,6 @@ def _crossings(start: Array, end: Array, vertices: Index, facets: MovingFacets) 
     if not len(place):
         return nothing
     pieces = [[0, 1]] if d == 2 else [[0, 1, 2], [0, 2, 3]][: facets.start.shape[1] - 2]
-    way = np.linalg.norm(end - start, axis=1).max() + np.linalg.norm(
-        facets.end - facets.start, axis=2
-    ).max(initial=0.0)
-    size = np.linalg.norm(facets.end[:, 1] - facets.end[:, 0], axis=1).min()
-    n = int(np.clip(np.ceil(_PARTS_PER_FACET * way / size), 1, _MOST_PARTS))
     found = [nothing]
     for piece in pieces:
         moving = _Pairs(
@@ -120,19 +114,12 @@ def _crossings(start: Array, end: Array, vertices: Index, facets: MovingFacets) 
             facets.end[facet][:, piece],
             facets.sign[facet],
         )
-        was = moving.side(0.0)
-        for k in range(1, n + 1):
-            now = moving.side(k / n)
-            rows = np.flatnonzero((was >= 0) != (now >= 0))
-            if len(rows):
-                time = moving.bisect(rows, (k - 1) / n, k / n)
-                met = moving.meets(rows, time)
-                rows, time = rows[met], time[met]
-                inward = was[rows] >= 0
-                normal, depth = moving.normal(rows, time), -moving.distance(rows)
-                columns = place[rows], time, np.where(inward, 1.0, -1.0), depth, normal
-                found.append(np.column_stack(columns))
-            was = now
+        rows, time, inward = moving.through()
+        met = moving.meets(rows, time)
+        rows, time, inward = rows[met], time[met], inward[met]
+        normal, depth = moving.normal(rows, time), -moving.distance(rows)
+        columns = place[rows], time, np.where(inward, 1.0, -1.0), depth, normal
+        found.append(np.column_stack(columns))
     return np.concatenate(found)
 
 
@@ -179,16 +166,31 @@ class _Pairs:
         arm, _ = self._at(1.0, rows)
         return np.asarray(np.sum(arm * self.normal(rows, np.ones(len(rows))), axis=1))
 
-    def bisect(self, rows: Index, low: float, high: float) -> Array:
-        """When the plane is crossed, (n,)."""
-        a: Array = np.full(len(rows), low)
-        b: Array = np.full(len(rows), high)
-        front = self.side(low, rows) >= 0
+    def through(self) -> tuple[Index, Array, Mask]:
+        """Pairs of which the place goes through the plane of the facet, when, and whether inwards.
+
+        `side` is a polynomial of degree d in time, and monotone between its turning points: in each
+        part the plane is crossed once or not at all.
+        """
+        d = self.start.shape[1]
+        times = np.arange(d + 1) / d
+        values = np.stack([self.side(time) for time in times])
+        cubic = np.zeros((4, len(self.start)))  # ascending powers
+        cubic[: d + 1] = np.linalg.solve(np.vander(times, increasing=True), values)
+        with np.errstate(all="ignore"):
+            half = -(
+                cubic[2] + np.copysign(np.sqrt(cubic[2] ** 2 - 3 * cubic[1] * cubic[3]), cubic[2])
+            )
+            turns = np.clip(np.nan_to_num([half / (3 * cubic[3]), cubic[1] / half]), 0.0, 1.0)
+        knots = np.stack([np.zeros_like(half), *np.sort(turns, axis=0), np.ones_like(half)])
+        front = np.stack([values[0], *polyval(knots[1:3], cubic, tensor=False), values[-1]]) >= 0
+        part, rows = np.nonzero(front[1:] != front[:-1])
+        low, high, inward = knots[part, rows], knots[part + 1, rows], front[part, rows]
         for _ in range(_BISECTIONS):
-            middle = (a + b) / 2
-            same = (self.side(middle, rows) >= 0) == front
-            a, b = np.where(same, middle, a), np.where(same, b, middle)
-        return b
+            middle = (low + high) / 2
+            same = (polyval(middle, cubic[:, rows], tensor=False) >= 0) == inward
+            low, high = np.where(same, middle, low), np.where(same, high, middle)
+        return rows, high, inward
 
     def meets(self, rows: Index, time: Array) -> Mask:
         """Whether the place is on the facet then."""

@@ -422,6 +422,10 @@ class SurfaceQuadrature:
 
         Row i is that of ``surface.facets[i]``.
         """
+        return self._point_rows
+
+    @cached_property
+    def _point_rows(self) -> npt.NDArray[np.int32]:
         parents = self.surface.parent_facets()
         return self.space().dofmap.list[: parents.size][np.argsort(parents)]
 
