@@ -22,6 +22,7 @@ __all__ = [
     "fail_together",
     "gather_rows",
     "global_max",
+    "global_mean",
     "global_min",
     "global_sum",
     "longest",
@@ -137,6 +138,12 @@ def global_max(comm: MPI.Comm, values: Array, empty: float = 0.0) -> float:
 def global_min(comm: MPI.Comm, values: Array, empty: float = 0.0) -> float:
     """Smallest entry over the ranks; ``empty`` where no rank has one; NaN wins. Collective."""
     return -global_max(comm, -np.asarray(values), -empty)
+
+
+def global_mean(comm: MPI.Comm, vectors: Array) -> Array:
+    """Mean of the rows of all ranks, (d,); zero if there are none. Collective."""
+    sums = global_sum(comm, [*vectors.sum(axis=0), len(vectors)])
+    return np.asarray(sums[:-1] / max(sums[-1], 1.0))
 
 
 def longest(comm: MPI.Comm, vectors: Array) -> float:

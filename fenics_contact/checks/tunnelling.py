@@ -23,7 +23,7 @@ from mpi4py import MPI
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.obstacle_sampler import ObstacleSampler
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import gather_rows, global_max, global_sum
+from fenics_contact.parallel import gather_rows, global_max, global_mean, global_min
 from fenics_contact.surface.crossings import MovingFacets, find_crossings
 from fenics_contact.surface.rays import Hits, Rays, Side
 from fenics_contact.types import Array, Index, Mask
@@ -445,10 +445,12 @@ class OpposingBodyProbe:
         self._comm = contact.surface.mesh.comm
         self._rows = contact.quadrature.point_rows()
         values = contact.values
-        found = search.present_hits(values.x, values.normal, contact.u, values.depth)
+        here, there = search.rays.here, search.rays.there
         deepest = global_max(self._comm, values.depth)
-        self._here = _Side(search.rays.here, self.u, found.facet, found.reference)
-        self._there = _Side(search.rays.there, self.u, *search.rays.there.facets.lattice())
+        near, opposite = search.nearby(self.u, self._before, deepest)
+        found = search.present_hits(values.x, values.normal, contact.u, values.depth, near)
+        self._here = _Side(here, self.u, found.facet, found.reference)
+        self._there = _Side(there, self.u, *there.facets.lattice(opposite))
         self._hits, self._back = found.hits, self._there.trace_back(search.rays, deepest)
         self.x = np.concatenate([self._here.undeformed, self._there.undeformed])
         n = contact.quadrature.n_points
@@ -465,12 +467,16 @@ class OpposingBodyProbe:
         ]
         # What lies aside of the normals may be nearer than what they meet.
         depth, allowed = self.depth(ResistedDepth.of(self._comm, [], []))
-        self._clear = -global_max(self._comm, np.maximum(depth, 0.0) - allowed)
+        # So may facets beyond the `nearby` ones, which are a height away at least.
+        clear = allowed - np.maximum(depth, 0.0)
+        heights = np.concatenate([here.height, there.height])
+        self._clear = global_min(self._comm, np.append(clear, heights))
 
     def is_valid_for(self, contact: Contact) -> bool:
         """See `Probe`: by the largest displacements on both surfaces since."""
-        ways = [side.at(contact.u) - side.place for side in (self._here, self._there)]
-        common = _mean(self._comm, np.concatenate(ways))
+        change = (contact.u.x.array - self.u.x.array).reshape(-1, self.x.shape[1])
+        ways = [change[side.side.facets.nodes.ravel()] for side in (self._here, self._there)]
+        common = global_mean(self._comm, np.concatenate(ways))
         most = (global_max(self._comm, np.linalg.norm(way - common, axis=1)) for way in ways)
         return bool(sum(most) <= self._clear)
 
@@ -524,7 +530,7 @@ class OpposingBodyProbe:
             return np.zeros(len(allowed), dtype=np.bool_)
         here, there, n = self._here, self._there, len(self._here.facet)
         # What both surfaces have in common of their motion crosses nothing.
-        shift = _mean(self._comm, here.place - here.at(self._before))
+        shift = global_mean(self._comm, here.place - here.at(self._before))
         found = [
             one.crossed(self._before, shift, other, allowed[part])
             for one, other, part in ((here, there, slice(n)), (there, here, slice(n, None)))
@@ -610,12 +616,6 @@ class _Side:
         through = leaves & (_dot(entry, met.normal[last]) < _OPPOSITE_SIDES)
         found[place] = through | (~leaves & (met.depth[last] > allowed[place]))
         return found
-
-
-def _mean(comm: MPI.Comm, vectors: Array) -> Array:
-    """Mean of the vectors of all ranks, (gdim,); zero if there are none. Collective."""
-    sums = global_sum(comm, [*vectors.sum(axis=0), len(vectors)])
-    return np.asarray(sums[:-1] / max(sums[-1], 1.0))
 
 
 def _across(tangents: Array) -> Array:

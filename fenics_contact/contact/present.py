@@ -34,7 +34,6 @@ from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Kinematics, Law, Response
 from fenics_contact.parallel import global_max
 from fenics_contact.supports.deformable import DeformableBody
-from fenics_contact.surface.facets import facet_nodes
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.rays import Hits, interpolation_matrix
 from fenics_contact.surface.surface import SurfaceQuadrature
@@ -209,8 +208,8 @@ class PresentPairs(Pairs):
     def reach(self) -> PETSc.Mat:
         """The nodes on the facets of both surfaces, facet by facet; see `Pairs.reach`."""
         assert self.search is not None
-        space, facets = self._u.function_space, (self._quadrature.surface.facets, self._rays.facets)
-        local = np.concatenate([facet_nodes(space, f) for f in facets])
+        space, sides = self._u.function_space, (self._rays.here, self._rays.there)
+        local = np.concatenate([side.facets.nodes for side in sides])
         nodes = space.dofmap.index_map.local_to_global(local.ravel().astype(np.int32))
         every, nodes = np.arange(len(local)), nodes.reshape(local.shape)
         return interpolation_matrix(space, len(local), every, nodes, np.ones(local.shape))

@@ -63,6 +63,7 @@ class FacetSet:
 
     Attributes:
         cells: Cell of every facet, (n_facets,).
+        nodes: Of the displacement on every facet, numbered on this rank, (n_facets, n_nodes).
         outward: Sign by which the facet's own orientation points out of the body, (n_facets,).
     """
 
@@ -76,7 +77,7 @@ class FacetSet:
         mesh = space.mesh
         self.space, self._x, self._d = space, mesh.geometry.x, mesh.topology.dim
         d = self._d
-        self.cells = facet_cells(mesh, facets)
+        self.cells, self.nodes = facet_cells(mesh, facets), facet_nodes(space, facets)
         local = local_facets(mesh, facets)
         cell_type = basix.CellType[mesh.topology.cell_name()]
         geometry, topology = basix.geometry(cell_type), basix.topology(cell_type)
@@ -105,7 +106,20 @@ class FacetSet:
 
     def _in_cell(self, facet: Index, place: Array) -> Array:
         """Reference coordinates of the cell from those of the facet: (n, d)."""
-        return self._origin[facet] + np.einsum("pij,pj->pi", self._edges[facet], place)
+        along = self._edges[facet] @ place[:, :, None]
+        return np.asarray(self._origin[facet] + along[:, :, 0])
+
+    def _weights(self, basis: Any, facet: Index, points: Array) -> Array:
+        """Values of a basis, then derivatives by the facet's coordinates, (n, d, n_basis).
+
+        Args:
+            basis: Of the cells.
+            facet: Facet of every point, (n,).
+            points: Reference coordinates of the cell, (n, d).
+        """
+        table = np.swapaxes(tabulate(basis, 1, points)[..., 0], 0, 1)
+        slopes = np.swapaxes(self._edges[facet], 1, 2) @ table[:, 1:]
+        return np.concatenate([table[:, :1], slopes], axis=1)
 
     def positions(
         self, facet: Index, place: Array, u: fem.Function | None = None
@@ -118,16 +132,12 @@ class FacetSet:
             u: Displacement to add; none: the undeformed body.
         """
         points = self._in_cell(facet, place)
-        table = tabulate(self._geometry_basis, 1, points)[..., 0]
         nodes = self._x[self._nodes[facet]][:, :, : self._d]
-        position = np.einsum("pk,pkd->pd", table[0], nodes)
-        gradient = np.einsum("jpk,pkd->pdj", table[1:], nodes)
+        found = self._weights(self._geometry_basis, facet, points) @ nodes
         if u is not None:
-            table = tabulate(self._basis, 1, points)[..., 0]
             values = u.x.array.reshape(-1, self.space.dofmap.bs)[self._dofs[facet]]
-            position = position + np.einsum("pk,pkd->pd", table[0], values)
-            gradient = gradient + np.einsum("jpk,pkd->pdj", table[1:], values)
-        return position, np.einsum("pdj,pjk->pdk", gradient, self._edges[facet])
+            found += self._weights(self._basis, facet, points) @ values
+        return found[:, 0], np.swapaxes(found[:, 1:], 1, 2)
 
     def normals(self, facet: Index, place: Array, u: fem.Function | None = None) -> Array:
         """Outward unit normals, (n, d), of the body displaced by ``u``."""
@@ -141,9 +151,16 @@ class FacetSet:
 
     def moved_corners(self, u: fem.Function | None) -> Array:
         """Corners displaced by ``u``, (n_facets, n_corners, d)."""
+        n, k = len(self.cells), len(self._corners)
+        facet, place = np.repeat(np.arange(n), k), np.tile(self._corners, (n, 1))
+        return self.positions(facet, place, u)[0].reshape(n, k, self._d)
+
+    def balls(self, u: fem.Function | None) -> tuple[Array, Array]:
+        """Balls around the facets displaced by ``u``: middles, (n_facets, d), and radii."""
         every = np.arange(len(self.cells))
-        at = [self.positions(every, np.tile(p, (len(every), 1)), u)[0] for p in self._corners]
-        return np.stack(at, axis=1)
+        middle, _ = self.positions(every, self._middle.repeat(len(every), axis=0), u)
+        away = np.linalg.norm(self.moved_corners(u) - middle[:, None], axis=2)
+        return middle, _BENT * away.max(axis=1, initial=0.0)
 
     def mean_normals(self) -> Array:
         """Outward unit normals at the facets' middles, (n_facets, d)."""
@@ -156,8 +173,11 @@ class FacetSet:
         every = np.arange(len(self.cells))
         return np.repeat(every, len(places)), np.tile(places, (len(every), 1))
 
-    def lattice(self) -> tuple[Index, Array]:
-        """Every facet with its corners, the middles of its edges and its own middle.
+    def lattice(self, facets: Index | None = None) -> tuple[Index, Array]:
+        """Facets with their corners, the middles of their edges and their own middle.
+
+        Args:
+            facets: Which ones; by default all of this rank.
 
         Returns:
             The facets, (n,), and reference coordinates on them, (n, d - 1).
@@ -166,8 +186,8 @@ class FacetSet:
         if self._d == 3:
             edges = (self._corners + np.roll(self._corners, -1, axis=0)) / 2
             places = np.vstack([places, edges])
-        every = np.arange(len(self.cells))
-        return np.repeat(every, len(places)), np.tile(places, (len(every), 1))
+        facets = np.arange(len(self.cells)) if facets is None else facets
+        return np.repeat(facets, len(places)), np.tile(places, (len(facets), 1))
 
     def clipped(self, reference: Array) -> Array:
         """Reference coordinates of the places, (n, d - 1), moved onto the facet."""
@@ -205,8 +225,7 @@ class FacetSet:
 
     def slopes(self, facet: Index, place: Array) -> Array:
         """Derivatives of the weights of `interpolation` by the places, (n, d - 1, n_basis)."""
-        table = tabulate(self._basis, 1, self._in_cell(facet, place))[1:, :, :, 0]
-        return np.einsum("jpk,pji->pik", table, self._edges[facet])
+        return self._weights(self._basis, facet, self._in_cell(facet, place))[:, 1:]
 
     def search(
         self, x: Array, ray: Array, u: fem.Function | None, counts: Rule
@@ -226,10 +245,7 @@ class FacetSet:
         best = (np.full(n, -1), np.zeros((n, d - 1)), np.full(n, np.inf))
         if n_facets == 0 or n == 0:
             return best
-        every = np.arange(n_facets)
-        middle, _ = self.positions(every, self._middle.repeat(n_facets, axis=0), u)
-        reach = np.linalg.norm(self.moved_corners(u) - middle[:, None], axis=2).max(axis=1)
-        radius = _BENT * reach
+        middle, radius = self.balls(u)
         near = min(_NEAREST, n_facets)
         away, candidates = scipy.spatial.cKDTree(middle).query(x, k=[*range(1, near + 1)])
         point, facet = np.repeat(np.arange(n), near), candidates.reshape(-1)
@@ -241,8 +257,7 @@ class FacetSet:
         # The nearest need not be the ones ahead: a long facet, or a far one. Where something was
         # met, all that is nearer has its middle within its own radius of there.
         missed = best[0] < 0
-        size = 1.1 * reach.max()
-        unsure = ~missed & (away[:, -1] < np.abs(best[2]) + size)
+        unsure = ~missed & (away[:, -1] < np.abs(best[2]) + radius.max())
         for rows in (np.flatnonzero(missed), np.flatnonzero(unsure)):
             step = max(1, _CHUNK // n_facets)
             for i in range(0, len(rows), step):

@@ -23,7 +23,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from fenics_contact.parallel import collective_errors, gather_rows, global_max
+from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_mean
 from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.facets import tabulate
 from fenics_contact.surface.projection import (
@@ -31,6 +31,7 @@ from fenics_contact.surface.projection import (
     cut_lines,
     cut_polygons,
     facing_pairs,
+    near_pairs,
     polynomials,
 )
 from fenics_contact.surface.rays import BEHIND, Hits, Rays, Side
@@ -53,6 +54,7 @@ class PresentHits:
 
     Attributes:
         u: Values of the displacement.
+        facets: Facets of this rank whose lattice is among the places.
         facet, reference: Facet of this rank and reference coordinates of every place: the points,
             then those of `FacetSet.lattice`.
         normal: Outward unit normals there, (n, d).
@@ -60,6 +62,7 @@ class PresentHits:
     """
 
     u: Array
+    facets: Index
     facet: Index
     reference: Array
     normal: Array
@@ -207,6 +210,40 @@ class Pairing:
         np.maximum.at(largest, self._facet, values)
         return np.concatenate(self._comm.allgather(largest))
 
+    def nearby(
+        self, u: fem.Function, before: fem.Function | None, depth: float
+    ) -> tuple[Index, Index]:
+        """Facets of this rank, of Γc and opposite, that may meet one of the other side. Collective.
+
+        Beyond them no ray meets a body from inside, and nothing was crossed on the way.
+
+        Args:
+            u: Displacement of the bodies.
+            before: That from which on they have gone straight on; None: they have always been here.
+            depth: Largest penetration of the points (length).
+        """
+        comm, sides = self._comm, self._sides
+        ends = [side.facets.balls(u) for side in sides]
+        starts = ends if before is None else [side.facets.balls(before) for side in sides]
+        ways = [end[0] - start[0] for start, end in zip(starts, ends, strict=True)]
+        shift = global_mean(comm, ways[0])  # by which all have moved together
+        balls = []
+        for side, start, end, way in zip(sides, starts, ends, ways, strict=True):
+            half = (way - shift) / 2
+            radius = np.maximum(start[1], end[1]) + np.linalg.norm(half, axis=1)
+            height = side.height[side.first : side.first + len(half)]
+            balls.append((end[0] - half, radius + height))
+        (one, reach), (other, size) = ([gather_rows(comm, v) for v in ball] for ball in balls)
+        reach = reach + max(2 * depth, self._support.release or 0.0)
+        tree = scipy.spatial.cKDTree(other)
+        here, there = near_pairs(tree, one, reach + size.max(initial=0.0))
+        close = np.linalg.norm(one[here] - other[there], axis=1) <= reach[here] + size[there]
+        found = []
+        for side, number in zip(self._sides, (here[close], there[close]), strict=True):
+            mine = np.unique(number) - side.first
+            found.append(mine[(mine >= 0) & (mine < len(side.facets.cells))])
+        return found[0], found[1]
+
     def true_gap(
         self, x: Array, along: Array, u: fem.Function, penetration: Array
     ) -> tuple[Array, Array]:
@@ -227,15 +264,29 @@ class Pairing:
         return found.hits.distance[:n], found.normal[:n].copy()
 
     def present_hits(
-        self, x: Array, along: Array, u: fem.Function, penetration: Array
+        self,
+        x: Array,
+        along: Array,
+        u: fem.Function,
+        penetration: Array,
+        facets: Index | None = None,
     ) -> PresentHits:
         """What the present normals of Γc meet, at points and between; once a state. Collective.
 
-        Args: see `true_gap`.
+        Args:
+            x: See `true_gap`.
+            along: See `true_gap`.
+            u: See `true_gap`.
+            penetration: See `true_gap`.
+            facets: Of this rank on whose lattice to look, too; by default those of the last call.
         """
-        known = self._present is not None and np.array_equal(self._present.u, u.x.array)
-        if self._comm.allreduce(int(not known)) or self._present is None:
-            facet, reference = self._here.lattice()
+        present = self._present
+        known = present is not None and np.array_equal(present.u, u.x.array)
+        if present is not None and facets is not None:
+            known &= np.array_equal(present.facets, facets)
+        if self._comm.allreduce(int(not known)) or present is None:
+            facets = np.zeros(0, dtype=np.int64) if facets is None else facets
+            facet, reference = self._here.lattice(facets)
             facet = np.concatenate([self._facet, facet])
             reference = np.concatenate([self._located(x, along), reference])
             normal = self._here.normals(facet, reference, u)
@@ -244,8 +295,9 @@ class Pairing:
             hits = self.rays.follow(
                 facet, reference, normal, u, deep, undeformed=undeformed, before=u
             )
-            self._present = PresentHits(u.x.array.copy(), facet, reference, normal, hits)
-        return self._present
+            present = PresentHits(u.x.array.copy(), facets, facet, reference, normal, hits)
+            self._present = present
+        return present
 
     def _located(self, x: Array, along: Array) -> Array:
         """Reference coordinates of the points on their facets, (n_points, d - 1)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import basix
@@ -65,9 +66,9 @@ def facing_pairs(
 def near_pairs(tree: scipy.spatial.cKDTree, centre: Array, reach: Array) -> tuple[Any, Any]:
     """Pairs of places (n, d) and of those in a tree, no farther than each one's reach, (n,)."""
     found = tree.query_ball_point(centre, reach)
-    first = np.repeat(np.arange(len(centre)), [len(f) for f in found])
-    second = np.concatenate([np.zeros(0, dtype=int), *(np.asarray(f, dtype=int) for f in found)])
-    return first, second
+    counts = np.fromiter(map(len, found), dtype=np.int64, count=len(centre))
+    second = np.fromiter(itertools.chain.from_iterable(found), np.int64, count=counts.sum())
+    return np.repeat(np.arange(len(centre)), counts), second
 
 
 def cut_lines(
