@@ -25,6 +25,7 @@ from fenics_contact.contact.obstacle_sampler import ObstacleSampler
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import gather_rows, global_max, global_mean, global_min
 from fenics_contact.surface.crossings import MovingFacets, find_crossings
+from fenics_contact.surface.facets import across
 from fenics_contact.surface.rays import Hits, Rays, Side
 from fenics_contact.types import Array, Index, Mask
 
@@ -513,7 +514,7 @@ class OpposingBodyProbe:
         n, here = self._rows.size, self._here
         ray, tangents = here.normal[:n], self._hits.partner.tangents[:n]
         through = here.place[:n] + self._hits.distance[:n, None] * ray
-        normal = _across(tangents)
+        normal = across(tangents)
         normal *= -np.sign(_dot(normal, ray))[:, None]
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         normal /= np.where(length > 0, length, 1.0)
@@ -591,11 +592,11 @@ class _Side:
         """The facets of this rank in the increment, its start moved by a shift."""
         facets = self.side.facets
         flat = facets.moved_corners(None)
-        across = _across(np.swapaxes(flat[:, 1 : flat.shape[2]] - flat[:, :1], 1, 2))
+        normal = across(np.swapaxes(flat[:, 1 : flat.shape[2]] - flat[:, :1], 1, 2))
         return MovingFacets(
             facets.moved_corners(before) + shift,
             facets.moved_corners(self._u),
-            np.sign(_dot(across, facets.mean_normals())),
+            np.sign(_dot(normal, facets.mean_normals())),
             facets.vertices(),
         )
 
@@ -616,13 +617,6 @@ class _Side:
         through = leaves & (_dot(entry, met.normal[last]) < _OPPOSITE_SIDES)
         found[place] = through | (~leaves & (met.depth[last] > allowed[place]))
         return found
-
-
-def _across(tangents: Array) -> Array:
-    """Vectors across tangents (n, gdim, gdim - 1), of any length and sign, (n, gdim)."""
-    if tangents.shape[1] == 2:
-        return np.column_stack([tangents[:, 1, 0], -tangents[:, 0, 0]])
-    return np.asarray(np.cross(tangents[:, :, 0], tangents[:, :, 1]), dtype=np.float64)
 
 
 def _below(place: Array, through: Array, normal: Array) -> Array:

@@ -148,12 +148,13 @@ class PresentPairs(Pairs):
         here, facet, (place, undeformed) = self._rays.here.facets, self._rays.facet, self._where
         if self._committed is None:
             x, tangents = here.positions(facet, place, self._before)
-            normal = here.normals(facet, place, self._before)
-            self._committed = _Committed(x, normal, _reciprocal(tangents))
+            normal = here.outward_normals(facet, tangents)
+            self._committed = _Committed(x, normal, _reciprocal(tangents)[0])
         before = self._committed
         _, tangents = here.positions(facet, place, self._u)
-        self.degenerate = bool(self._mesh.comm.allreduce(int(not _metric(tangents)[1].all())))
-        normal = here.normals(facet, place, self._u)
+        along, spans = _reciprocal(tangents)
+        self.degenerate = bool(self._mesh.comm.allreduce(int(not spans.all())))
+        normal = here.outward_normals(facet, tangents)
         deep = np.maximum(self.search.largest(history.values("penetration")), 0.0)
         if not global_max(self._mesh.comm, np.abs(self._before.x.array)) > 0:
             deep = np.maximum(deep, self._at_rest[1])
@@ -170,7 +171,7 @@ class PresentPairs(Pairs):
         gradient += normal[:, :, None] * before.normal[:, None, :]
         rotation = _polar(gradient)
         stretch = np.einsum("qji,qjk->qik", rotation, gradient)
-        self._present = _Present(_reciprocal(tangents), normal, gap, hits, way, rotation, stretch)
+        self._present = _Present(along, normal, gap, hits, way, rotation, stretch)
         self._set_pairs(hits.matrix(self._u.function_space), paired)
         if self.number == 1:
             self._warn_of_unpaired(hits.reason)
@@ -279,10 +280,8 @@ class PresentPairs(Pairs):
         space, d, n = self._u.function_space, self._gdim, len(place)
         partner = self._present.hits.partner
         nodes, weights = here.interpolation(facet, place)
-        own = np.concatenate([weights[:, None], here.slopes(facet, place)], axis=1)
-        other = np.concatenate([partner.weights[:, None], partner.slopes], axis=1)
         # (n, 2 d) functionals of each component, own before the partner's.
-        values = np.concatenate([own, other], axis=1)
+        values = np.concatenate([weights, partner.weights], axis=1)
         at = np.concatenate(
             [np.broadcast_to(v[:, None], (n, d, v.shape[1])) for v in (nodes, partner.nodes)],
             axis=1,
@@ -431,15 +430,18 @@ def _metric(vectors: Array) -> tuple[Array, Mask]:
         return metric, np.atleast_1d(np.linalg.det(metric) > _FLAT)
 
 
-def _reciprocal(tangents: Array) -> Array:
-    """Vectors a^α with a^α·a_β = δ_αβ, in the tangent plane: (n, d, d - 1); or 0 of no plane."""
+def _reciprocal(tangents: Array) -> tuple[Array, Mask]:
+    """Vectors a^α with a^α·a_β = δ_αβ, in the tangent plane: (n, d, d - 1); or 0 of no plane.
+
+    And where there is a tangent plane, (n,).
+    """
     metric, spans = _metric(tangents)
     metric[~spans] = np.eye(metric.shape[1])
     size = np.linalg.norm(tangents, axis=1, keepdims=True)
     unit = np.zeros_like(tangents)
     np.divide(tangents, size, out=unit, where=spans[:, None, None])
     found = np.swapaxes(np.linalg.solve(metric, np.swapaxes(unit, 1, 2)), 1, 2)
-    return np.divide(found, size, out=np.zeros_like(found), where=spans[:, None, None])
+    return np.divide(found, size, out=np.zeros_like(found), where=spans[:, None, None]), spans
 
 
 def _polar(gradient: Array) -> Array:

@@ -10,6 +10,7 @@ import scipy.spatial
 from numpy.polynomial.polynomial import polyval
 
 from fenics_contact.parallel import gather_rows
+from fenics_contact.surface.facets import across
 from fenics_contact.surface.projection import near_pairs
 from fenics_contact.types import Array, Index, Mask
 
@@ -143,12 +144,7 @@ class _Pairs:
 
     def _across(self, tangents: Array, rows: Index | slice) -> Array:
         """Outward normals, of any length."""
-        across: Any
-        if tangents.shape[1] == 1:
-            across = np.stack([tangents[:, 0, 1], -tangents[:, 0, 0]], axis=1)
-        else:
-            across = np.cross(tangents[:, 0], tangents[:, 1])
-        return np.asarray(self.sign[rows][:, None] * across)
+        return self.sign[rows][:, None] * across(np.swapaxes(tangents, 1, 2))
 
     def side(self, time: Array | float, rows: Index | slice = slice(None)) -> Array:
         """Positive in front of the facet, negative behind it."""

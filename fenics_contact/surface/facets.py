@@ -14,7 +14,7 @@ from dolfinx import fem
 from fenics_contact import compat
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["FacetSet", "facet_cells", "facet_nodes", "local_facets", "tabulate"]
+__all__ = ["FacetSet", "across", "facet_cells", "facet_nodes", "local_facets", "tabulate"]
 
 # Of points, facets, places on them and signed distances: which of these hits count.
 Rule: TypeAlias = Callable[[Index, Index, Array, Array], Mask]
@@ -141,13 +141,12 @@ class FacetSet:
 
     def normals(self, facet: Index, place: Array, u: fem.Function | None = None) -> Array:
         """Outward unit normals, (n, d), of the body displaced by ``u``."""
-        _, tangents = self.positions(facet, place, u)
-        if self._d == 2:
-            across: Array = np.column_stack([tangents[:, 1, 0], -tangents[:, 0, 0]])
-        else:
-            across = np.asarray(np.cross(tangents[:, :, 0], tangents[:, :, 1]), dtype=np.float64)
-        outward = across * (self.outward[facet] * _side(tangents, across))[:, None]
-        return outward / np.linalg.norm(outward, axis=1, keepdims=True)
+        return self.outward_normals(facet, self.positions(facet, place, u)[1])
+
+    def outward_normals(self, facet: Index, tangents: Array) -> Array:
+        """Outward unit normals, (n, d), across the tangents of `positions`."""
+        outward = self.outward[facet, None] * across(tangents)
+        return np.asarray(outward / np.linalg.norm(outward, axis=1, keepdims=True))
 
     def moved_corners(self, u: fem.Function | None) -> Array:
         """Corners displaced by ``u``, (n_facets, n_corners, d)."""
@@ -217,15 +216,14 @@ class FacetSet:
         return nodes.reshape(local.shape)
 
     def interpolation(self, facet: Index, place: Array) -> tuple[Index, Array]:
-        """Global nodes and weights of the displacement at places: (n, n_basis) each."""
-        weights = tabulate(self._basis, 0, self._in_cell(facet, place))[0, :, :, 0]
-        local = self._dofs[facet].ravel().astype(np.int32)
-        nodes = self.space.dofmap.index_map.local_to_global(local)
-        return nodes.reshape(weights.shape), weights
+        """Global nodes of the displacement at places, (n, n_basis), and their weights.
 
-    def slopes(self, facet: Index, place: Array) -> Array:
-        """Derivatives of the weights of `interpolation` by the places, (n, d - 1, n_basis)."""
-        return self._weights(self._basis, facet, self._in_cell(facet, place))[:, 1:]
+        The weights, (n, d, n_basis), are values, then derivatives by the places.
+        """
+        local = self._dofs[facet]
+        nodes = self.space.dofmap.index_map.local_to_global(local.ravel().astype(np.int32))
+        weights = self._weights(self._basis, facet, self._in_cell(facet, place))
+        return nodes.reshape(local.shape), weights
 
     def search(
         self, x: Array, ray: Array, u: fem.Function | None, counts: Rule
@@ -249,7 +247,9 @@ class FacetSet:
         near = min(_NEAREST, n_facets)
         away, candidates = scipy.spatial.cKDTree(middle).query(x, k=[*range(1, near + 1)])
         point, facet = np.repeat(np.arange(n), near), candidates.reshape(-1)
-        _, off = _along_and_off(middle[facet] - x[point], ray[point])
+        arm = middle[facet] - x[point]
+        along = np.einsum("nd,nd->n", arm, ray[point])
+        off = np.linalg.norm(arm - along[:, None] * ray[point], axis=1)
         hopeful = off <= radius[facet]
         self._keep_nearest(x, ray, (point[hopeful], facet[hopeful]), u, best, counts)
         if near == n_facets:
@@ -262,7 +262,7 @@ class FacetSet:
             step = max(1, _CHUNK // n_facets)
             for i in range(0, len(rows), step):
                 some = rows[i : i + step]
-                along, off = _along_and_off(middle[None] - x[some, None], ray[some, None])
+                along, off = _every_along_and_off(middle, x[some], ray[some])
                 hopeful = off <= radius[None]
                 hopeful &= np.abs(along) <= np.abs(best[2][some, None]) + radius[None]
                 row, facet = np.nonzero(hopeful)
@@ -337,10 +337,20 @@ def tabulate(element: Any, derivatives: int, points: Array) -> Array:
     return np.zeros((n_tables, 0, element.dim, 1))
 
 
-def _along_and_off(arm: Array, ray: Array) -> tuple[Array, Array]:
-    """How far arms (…, d) reach along unit rays, and aside of them: (…)."""
-    along = np.asarray(np.einsum("...d,...d->...", arm, ray))
-    return along, np.asarray(np.linalg.norm(arm - along[..., None] * ray, axis=-1))
+def across(tangents: Array) -> Array:
+    """Vectors across tangents (n, d, d - 1), (n, d), with which these are oriented positively."""
+    if tangents.shape[1] == 2:
+        return np.column_stack([-tangents[:, 1, 0], tangents[:, 0, 0]])
+    return np.asarray(np.cross(tangents[:, :, 0], tangents[:, :, 1]), dtype=np.float64)
+
+
+def _every_along_and_off(middle: Array, x: Array, ray: Array) -> tuple[Array, Array]:
+    """How far places (m, d) are along each unit ray from x, (n, d), and aside of it: (n, m)."""
+    origin = middle.mean(axis=0)  # from afar differences of squares would lose their digits
+    there, here = middle - origin, x - origin
+    along = ray @ there.T - np.sum(here * ray, axis=1)[:, None]
+    away = np.sum(here**2, axis=1)[:, None] + np.sum(there**2, axis=1) - 2 * here @ there.T
+    return along, np.sqrt(np.maximum(away - along**2, 0.0))
 
 
 def _side(tangents: Array, direction: Array) -> Array:

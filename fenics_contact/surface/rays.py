@@ -147,8 +147,8 @@ class Partner:
     """What moves with the places met, (n, …); zeros where nothing was.
 
     Attributes:
-        nodes, weights: Of the displacement there, global numbers, (n, n_basis).
-        slopes: Derivatives of the weights by the facet's coordinates, (n, d - 1, n_basis).
+        nodes: Of the displacement there, global numbers, (n, n_basis).
+        weights: Of the nodes, and their derivatives by the facet's coordinates, (n, d, n_basis).
         tangents: Of the displaced surface by these, (n, d, d - 1) (length).
         before: The place in the bodies as they were displaced before, (n, d) (length).
         tangents_before: Likewise, (n, d, d - 1).
@@ -156,7 +156,6 @@ class Partner:
 
     nodes: Index
     weights: Array
-    slopes: Array
     tangents: Array
     before: Array
     tangents_before: Array
@@ -183,7 +182,7 @@ class Hits:
     def matrix(self, space: fem.FunctionSpace) -> PETSc.Mat:
         """Displacements of the places met, (d n, n_dofs); empty rows elsewhere. Collective."""
         met = np.flatnonzero(self.facet >= 0)
-        nodes, weights = self.partner.nodes[met], self.partner.weights[met]
+        nodes, weights = self.partner.nodes[met], self.partner.weights[met, 0]
         return interpolation_matrix(space, len(self.facet), met, nodes, weights)
 
 
@@ -298,14 +297,9 @@ class Rays:
         place, _ = facets.positions(facet, where)
         first = facet + target.first, place, nodes, weights
         if before is None:
-            return *first, *(np.zeros((len(facet), 0)) for _ in range(4))
+            return *first, *(np.zeros((len(facet), 0)) for _ in range(3))
         _, tangents = facets.positions(facet, where, u)
-        return (
-            *first,
-            facets.slopes(facet, where),
-            tangents,
-            *facets.positions(facet, where, before),
-        )
+        return *first, tangents, *facets.positions(facet, where, before)
 
 
 def interpolation_matrix(

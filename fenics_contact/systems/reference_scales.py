@@ -209,10 +209,10 @@ class ReferenceScales:
             label: Part of each of these unknowns.
         """
         own, opposite = self._sides(operator, number, label)
-        found = [np.column_stack([own, other]) for other in opposite.T]
-        found += [np.column_stack([own, np.full_like(own, m)]) for m in self._motions[number]]
-        mine = np.unique(np.concatenate(found), axis=0)
-        return np.unique(np.concatenate(self._comm.allgather(mine)), axis=0)
+        others = [*opposite.T, *(np.full_like(own, m) for m in self._motions[number])]
+        n = len(self.group)
+        mine = np.unique(np.concatenate([n * own + other for other in others]))
+        return np.column_stack(divmod(np.unique(np.concatenate(self._comm.allgather(mine))), n))
 
     def _sides(self, operator: ContactOperator, number: int, label: Index) -> tuple[Index, Index]:
         """The part on both sides of each of this rank's points. Collective.
