@@ -289,7 +289,11 @@ class RigidObstacleProbe:
         """
         places, size = self._places, self._places.size
         facet, at = places.facet, places.reference
-        distance, normal = self._sampler.sample(places.values(self.points, facet, at))
+        # The points come first.
+        rows = places.rows.ravel()
+        between = places.values(self.points, facet[rows.size :], at[rows.size :])
+        known, more = (self._gap[rows], self._normal[rows]), self._sampler.sample(between)
+        distance, normal = (np.concatenate(both) for both in zip(known, more, strict=True))
         found = [(facet, at, distance)]
         units = np.vstack([np.zeros(at.shape[1]), np.eye(at.shape[1])])
         # The distance changes by no more than the way: farther obstacles do not reach the facet.
@@ -461,10 +465,10 @@ class OpposingBodyProbe:
         met = (deep > 0) & (partner >= 0)
         self.resisted = [
             (
-                self._here.side.facets.corner_vertices(),
+                here.corners[here.own],
                 deep[self._rows].max(axis=1, initial=0.0),
             ),
-            (self._there.corners[partner[met]], deep[met]),
+            (there.corners[partner[met]], deep[met]),
         ]
         # What lies aside of the normals may be nearer than what they meet.
         depth, allowed = self.depth(ResistedDepth.of(self._comm, [], []))
@@ -487,7 +491,7 @@ class OpposingBodyProbe:
         on = np.concatenate([here.number, back.facet])  # the facet of Γc, of those of all ranks
         opposite = np.concatenate([hits.facet, there.number])
         resisted_here, resisted_there = (
-            np.where(number >= 0, resisted.at(side.corners)[number], 0.0)
+            np.where(number >= 0, resisted.at(side.side.corners)[number], 0.0)
             for side, number in ((here, on), (there, opposite))
         )
         deep = np.maximum(resisted_here, resisted_there)
@@ -546,7 +550,6 @@ class _Side:
         side: The surface.
         facet, reference: Facet of this rank and reference coordinates of every place.
         number: Of the facet among those of all ranks, (n,).
-        corners: Vertices at the corners of the facets of all ranks, (n_facets, n_corners).
         undeformed, place: Where the places are, (n, gdim) (length).
         normal: Outward unit normals of the deformed surface there, (n, gdim).
     """
@@ -563,7 +566,6 @@ class _Side:
         self._u, self.side = u, side
         self.facet, self.reference, self.number = facet, reference, side.first + facet
         self._comm = side.facets.space.mesh.comm
-        self.corners: Index = np.concatenate(self._comm.allgather(side.facets.corner_vertices()))
         self.undeformed, self.place = self.at(None), self.at(u)
         self.normal = side.facets.normals(facet, reference, u)
 
@@ -590,19 +592,13 @@ class _Side:
 
     def moving(self, before: fem.Function, shift: Array) -> MovingFacets:
         """The facets of this rank in the increment, its start moved by a shift."""
-        facets = self.side.facets
-        flat = facets.moved_corners(None)
-        normal = across(np.swapaxes(flat[:, 1 : flat.shape[2]] - flat[:, :1], 1, 2))
-        return MovingFacets(
-            facets.moved_corners(before) + shift,
-            facets.moved_corners(self._u),
-            np.sign(_dot(normal, facets.mean_normals())),
-            facets.vertices(),
-        )
+        side, facets = self.side, self.side.facets
+        start, end = facets.moved_corners(before) + shift, facets.moved_corners(self._u)
+        return MovingFacets(start, end, facets.outward, side.vertices[side.own])
 
     def crossed(self, before: fem.Function, shift: Array, other: _Side, allowed: Array) -> Mask:
         """Which places have crossed the other surface, (n,). Collective."""
-        vertices = self.side.facets.vertices()[self.facet]
+        vertices = self.side.vertices[self.number]
         start = self.at(before) + shift
         facets = other.moving(before, shift)
         met = find_crossings(self._comm, start, self.place, vertices, facets)

@@ -191,7 +191,7 @@ class Pairing:
         corners = facets.moved_corners(None)
         normal = facets.normals(facet, place).reshape(n, corners.shape[1] + 1, self._d)[:, :-1]
         size = np.linalg.norm(corners - corners.mean(axis=1)[:, None], axis=2).max(axis=1)
-        vertex = np.concatenate(comm.allgather(facets.corner_vertices()))
+        vertex = side.corners
         flat = _angle(normal, facets.mean_normals()[:, None])
         normal, size, flat = (gather_rows(comm, values) for values in (normal, size, flat))
         _, number = np.unique(vertex, return_inverse=True)
@@ -231,8 +231,7 @@ class Pairing:
         for side, start, end, way in zip(sides, starts, ends, ways, strict=True):
             half = (way - shift) / 2
             radius = np.maximum(start[1], end[1]) + np.linalg.norm(half, axis=1)
-            height = side.height[side.first : side.first + len(half)]
-            balls.append((end[0] - half, radius + height))
+            balls.append((end[0] - half, radius + side.height[side.own]))
         (one, reach), (other, size) = ([gather_rows(comm, v) for v in ball] for ball in balls)
         reach = reach + max(2 * depth, self._support.release or 0.0)
         tree = scipy.spatial.cKDTree(other)

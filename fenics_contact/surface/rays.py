@@ -47,10 +47,12 @@ class Side:
     Attributes:
         facets: Those of this rank.
         first: Number of this rank's first facet among all.
+        own: The numbers of this rank's facets among all.
         height: Of every facet's cell over it, (n,) (length).
         length: The longest distance between two corners of the undeformed facet, (n,).
         body: Number of the connected part it bounds, (n,).
         vertices: Of its cell, global, (n, n_vertices).
+        corners: Those of the facet, in their order around it, (n, n_corners).
         middle: Of the undeformed facet, (n, d).
     """
 
@@ -66,7 +68,9 @@ class Side:
         own = facets.vertices()
         corners = facets.moved_corners(None)
         self.first = comm.exscan(len(own)) or 0
+        self.own = slice(self.first, self.first + len(own))
         self.vertices = np.concatenate(comm.allgather(own))
+        self.corners: Index = np.concatenate(comm.allgather(facets.corner_vertices()))
         self.body = np.concatenate(comm.allgather(body[facets.space.dofmap.list[facets.cells, 0]]))
         self.height = np.concatenate(comm.allgather(facets.heights()))
         between = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=3)
