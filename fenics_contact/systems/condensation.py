@@ -14,9 +14,10 @@ import dolfinx
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from mpi4py import MPI
 from petsc4py import PETSc
 
-from fenics_contact.parallel import collective_errors, global_max, global_sum
+from fenics_contact.parallel import collective_errors, global_sum
 from fenics_contact.systems.balance import Labels, by_body
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.dissection import Dissection, Eliminated
@@ -74,7 +75,7 @@ class Condensation:
         self._held = np.flatnonzero(outside & constrained).astype(np.int32)
         label = np.zeros(constrained.size, dtype=np.intp) if label is None else label
         self._label = np.concatenate([label, label[self._held]])
-        self._n_bodies = 1 + int(global_max(self._comm, label, empty=0))
+        self._n_bodies = 1 + self._comm.allreduce(int(label.max(initial=0)), op=MPI.MAX)
         self._right, self._left = stiffness.createVecs()
         self.directions: list[tuple[Array, Response]] = []
         self._scale = bulk.scale
