@@ -25,12 +25,12 @@ version = release = re.search(
     r'__version__ = "(.*)"', (HERE.parent / "fenics_contact" / "_version.py").read_text()
 ).group(1)
 
-extensions = ["myst_parser", "autoapi.extension", "sphinx.ext.napoleon"]
+extensions = ["myst_parser", "autoapi.extension", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
 # The parts of benchmarks.md, which has all of them.
 exclude_patterns = ["benchmarks/*/*.md", "_generated"]
 
 myst_heading_anchors = 3
-myst_enable_extensions = ["colon_fence"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 
 # Docstrings have code, and names of the package, in single backticks: a link where there is one.
 default_role = "py:obj"
