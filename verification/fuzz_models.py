@@ -22,6 +22,9 @@ from verification.reference_geometry import Body, Surface
 
 __all__ = ["body_of", "capsule_at", "contact_of", "model"]
 
+# How far a point at the rim of Γc may slide, by the length of a facet, and stay with its opposite.
+_AT_RIM = 0.05
+
 
 def _scaled(value: float | None, contact: Scene) -> float:
     """Factor of E/h."""
@@ -288,6 +291,7 @@ def _contact(made: Made, contact: Scene, here: Surface, opposite: Any) -> Any:
         made_model.place = lambda shift: (gap + normal @ shift, normal + 0 * shift)
 
     repair(None)
+    gap = made_model.place(np.zeros(made.d))[0]
     if given is None and not made_model.law.tension:
         thickness = scene.get("thickness", 1.0)
         made_model.back = lambda u: reference_geometry.penetration(there, here, u, thickness)
@@ -296,8 +300,13 @@ def _contact(made: Made, contact: Scene, here: Surface, opposite: Any) -> Any:
     if given is None:
 
         def anew(u: Array) -> tuple[Array, Array, Array]:
-            matrix, gap, paired = reference_geometry.pair(here, there, (facet, xi), u=u)
-            return np.where(paired[:, None], interpolation - matrix, 0.0), gap, paired
+            matrix, where, met = reference_geometry.pair(here, there, (facet, xi), u=u)
+            # At the rim a point loses its opposite by any strain.
+            slid = np.linalg.norm(made_model.jump(u), axis=1) > _AT_RIM * here.lengths()[facet]
+            met, lost = met | ~slid, ~met & ~slid
+            rows = np.where(met[:, None], interpolation - matrix, 0.0)
+            rows[lost] = made_model.interpolation[lost]
+            return rows, np.where(lost, gap, where), np.where(lost, made_model.paired, met)
 
         made_model.anew = anew
     return made_model
