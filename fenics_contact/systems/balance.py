@@ -16,7 +16,7 @@ from mpi4py import MPI
 
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["MOST_EXCUSED", "Norms", "Parts", "by_body"]
+__all__ = ["MOST_EXCUSED", "Labels", "Norms", "Parts", "by_body"]
 
 Labels = npt.NDArray[np.intp]
 
