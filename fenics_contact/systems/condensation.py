@@ -75,6 +75,7 @@ class Condensation:
         self._held = np.flatnonzero(outside & constrained).astype(np.int32)
         label = np.zeros(constrained.size, dtype=np.intp) if label is None else label
         self._label = np.concatenate([label, label[self._held]])
+        self._labels = label, unknowns.gathered(label[unknowns.kept].astype(np.float64)).astype(int)
         self._n_bodies = 1 + self._comm.allreduce(int(label.max(initial=0)), op=MPI.MAX)
         self._right, self._left = stiffness.createVecs()
         self.directions: list[tuple[Array, Response]] = []
@@ -125,27 +126,35 @@ class Condensation:
         # The loads of a history are a few fields, each times a number: what was found for earlier
         # ones serves as far as the new one is a combination of them.
         rest: Array = np.concatenate([force, self._scale * state[self._held]])
+        # Each body's by its own numbers: its load is small beside those on others, and is not to be
+        # lost in what of these cancels.
         sizes = self._norms(rest)
-        shares: list[float] = []
+        shares: list[Array] = []
         for direction, _ in self.directions:
-            shares.append(float(global_sum(self._comm, direction @ rest)))
-            rest -= shares[-1] * direction
+            shares.append(self._sums(direction * rest))
+            rest -= shares[-1][self._label] * direction
         responses = [response for _, response in self.directions]
         remainders = self._norms(rest)
-        # A load on one body is small beside those on others, and is none of their round-off.
-        if (remainders > _SAME * sizes).any():
-            remainder = float(np.linalg.norm(remainders))
-            known = bool(np.isfinite(remainder))
-            shares.append(remainder if known else 1.0)
-            scaled = np.asarray(rest / shares[-1], dtype=np.float64)
+        new = remainders > _SAME * sizes
+        if new.any():
+            known = bool(np.isfinite(remainders).all())
+            shares.append(np.where(new, remainders, 0.0) if known else np.ones(len(new)))
+            scaled = rest
+            if known:
+                unit = np.where(new, remainders, 1.0)[self._label]
+                scaled = np.where(new[self._label], rest / unit, 0.0)
             responses.append(self._respond(scaled))
             if known:
                 self.directions.append((scaled, responses[-1]))
                 del self.directions[:-_DIRECTIONS]
         if responses:
-            self.response = Response.combined(shares, responses)
+            self.response = Response.combined(shares, responses, *self._labels)
         else:
             self.response = Response.none(force.size, self._unknowns.n_local)
+
+    def _sums(self, values: Array) -> Array:
+        """By body, (n_bodies,). Collective."""
+        return global_sum(self._comm, np.bincount(self._label, values, minlength=self._n_bodies))
 
     def _norms(self, values: Array) -> Array:
         """Of forces, and values held, on every body, (n_bodies,). Collective."""
@@ -416,18 +425,27 @@ class Response:
         return cls(np.zeros(n), np.zeros(n), np.zeros(n_kept), np.zeros(n_kept))
 
     @classmethod
-    def combined(cls, shares: Sequence[float], responses: Sequence[Response]) -> Response:
-        """The sum of shares of some, at least one."""
+    def combined(
+        cls, shares: Sequence[Array], responses: Sequence[Response], label: Labels, kept: Labels
+    ) -> Response:
+        """The sum of shares of some, at least one.
 
-        def total(parts: Sequence[Array]) -> Array:
-            found = shares[0] * parts[0]
+        Args:
+            shares: Of every response that of each body, (n_bodies,).
+            responses: The responses.
+            label: Body of every unknown, (n_local,).
+            kept: That of the unknowns kept, on the first rank, (n_kept,).
+        """
+
+        def total(parts: Sequence[Array], label: Labels) -> Array:
+            found = shares[0][label] * parts[0]
             for share, part in zip(shares[1:], parts[1:], strict=True):
-                found += share * part
+                found += share[label] * part
             return found
 
         return cls(
-            total([r.field for r in responses]),
-            total([r.forces for r in responses]),
-            total([r.load for r in responses]),
-            total([r.by_values for r in responses]),
+            total([r.field for r in responses], label),
+            total([r.forces for r in responses], label),
+            total([r.load for r in responses], kept),
+            total([r.by_values for r in responses], kept),
         )
