@@ -131,7 +131,7 @@ class PresentPairs(Pairs):
         comm, here = self._mesh.comm, self._rays.here.facets
         if self._where is None:
             assert self.search is not None
-            place, _, _ = here.meet(self._rays.facet, x, normal)
+            place, *_ = here.meet(self._rays.facet, x, normal)
             self._where = place, normal
             met, deep = self.search.at_rest(place, x, normal)
             self._at_rest = np.nan_to_num(met.distance), deep

@@ -44,7 +44,7 @@ class FacetPlaces:
         self.size = quadrature.weights[self.rows].sum(axis=1) ** (1.0 / (d - 1))
         facet = np.repeat(np.arange(n_facets), n_points)
         normal = self.facets.mean_normals()
-        at, _, _ = self.facets.meet(facet, x[self.rows.ravel()], normal[facet])
+        at, *_ = self.facets.meet(facet, x[self.rows.ravel()], normal[facet])
         more, corners = self.facets.lattice()
         self.facet, self.reference = np.append(facet, more), np.concatenate([at, corners])
         # No higher degree than that of geometry and displacement: many points are fitted then.

@@ -274,8 +274,7 @@ class FacetSet:
     ) -> None:
         """Meet the facets of some pairs and keep the nearest hits in ``best``."""
         point, facet = pairs
-        place, distance, met = self.meet(facet, x[point], ray[point], u)
-        _, tangents = self.positions(facet, place, u)
+        place, distance, met, tangents = self.meet(facet, x[point], ray[point], u)
         # Only a facet that looks back at the point can be opposite.
         facing = self.outward[facet] * _side(tangents, ray[point]) < 0
         good = np.flatnonzero(met & facing)
@@ -289,11 +288,12 @@ class FacetSet:
 
     def meet(
         self, facet: Index, x: Array, ray: Array, u: fem.Function | None = None
-    ) -> tuple[Array, Array, Mask]:
+    ) -> tuple[Array, Array, Mask, Array]:
         """Where rays meet given facets, by Newton's method, all at once.
 
         Returns:
-            Places, (n, d - 1); signed distances, (n,); whether the facet itself was met, (n,).
+            Places, (n, d - 1); signed distances, (n,); whether the facet itself was met, (n,); and
+            the tangents of `positions` there.
         """
         d = self._d
         place: Array = self._middle.repeat(len(facet), axis=0)
@@ -326,7 +326,7 @@ class FacetSet:
             met &= place.sum(axis=1) <= 1 + _OVERLAP
         else:
             met &= np.all(place <= 1 + _OVERLAP, axis=1)
-        return place, distance, met
+        return place, distance, met, tangents
 
 
 def tabulate(element: Any, derivatives: int, points: Array) -> Array:

@@ -301,7 +301,7 @@ class Pairing:
     def _located(self, x: Array, along: Array) -> Array:
         """Reference coordinates of the points on their facets, (n_points, d - 1)."""
         if self._place is None:
-            self._place, _, _ = self._here.meet(self._facet, x, along)
+            self._place, *_ = self._here.meet(self._facet, x, along)
         return self._place
 
     def linear_gap(
@@ -452,7 +452,7 @@ class Pairing:
         cut = cut_lines if d == 2 else cut_polygons
         pairs = facing_pairs(moved_here, mean, there, looks, away)
         facet, other, points, weights, share = cut(moved_here, mean, there, pairs, self._degree())
-        places, _, _ = here.meet(facet, points, mean[facet], u)
+        places, *_ = here.meet(facet, points, mean[facet], u)
         return facet, other, places, weights, share
 
     def _degree(self) -> int:
