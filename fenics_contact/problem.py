@@ -135,14 +135,12 @@ class ContactProblem:
                 it is stuck), "primal_dual" (tractions of the points are unknowns beside
                 displacements: friction on stiff contact of a linear bulk), or "alternating"
                 (minimum problems in turn, each by Newton's method with a line search on the
-                energy). By default "lbfgs" on all unknowns, where a
-                factorisation costs as much as dozens of iterations, and condensed, where it costs
-                as much as ten, "newton", with "continuation" for the first increment, and again
-                "newton" where that is stuck; "newton" for a nonlinear bulk, too, whose tangent
-                changes, and for bodies whose partners do, with finite kinematics. Where
-                friction meets contact 50 to 1e5 times as stiff as the bulk "primal_dual" comes
-                before them, if it can be had. With a mixed function the equations are those of a
-                saddle point: "alternating" is refused there.
+                energy). By default "newton", but "lbfgs" for a linear bulk that is solved by
+                multigrid, which Newton's method would set up in every iteration. Where friction
+                meets contact 50 to 1e5 times as stiff as the bulk "primal_dual", if it can be had,
+                comes first where nothing was in contact before, and else after a failure;
+                "continuation" comes last. With a mixed function the equations are those of a saddle
+                point: "alternating" is refused there.
             alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
             phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
                 paper has 0; 1 needs a third of the iterations once a point sticks.

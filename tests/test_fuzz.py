@@ -84,6 +84,36 @@ def test_scenes_of_finite_kinematics_are_right(number):
         assert outcome.increments and {"equations", "apart", "nearest"} <= set(outcome.worst)
 
 
+@pytest.mark.mpi
+@pytest.mark.parametrize("seed", [720024, 720031, 720034, 720046])
+def test_a_body_that_hovers_between_two_others_is_set_down(seed):
+    """A block between one that is moved and a cavity: nothing holds it until both bear.
+
+    Without load it is at rest anywhere between the two, and a method that drags one surface past
+    the other on its way finds it where they cross between the points of Γc, which is refused.
+    """
+    without = ("multipliers", "motion", "accuracy", "method", "ration", "restart", "units")
+    scene = fuzz_scenes.draw(seed, without=(*without, "increment"), family=seed // 24)
+    outcome = played(scene)
+    assert outcome.outcome in ("right", "another"), outcome
+
+
+@serial
+def test_a_refusal_that_another_method_contradicts_is_counted(monkeypatch):
+    """The methods are asked one after another, each alone, and what is not right is no answer."""
+    asked = []
+
+    def play(scene, comm=None, **_):
+        assert scene["ration"]
+        asked.append(scene["method"])
+        outcome = {"newton": "refused", "continuation": "wrong"}.get(scene["method"], "another")
+        return fuzz.Outcome(outcome, "", 1, 0.0, [], {})
+
+    monkeypatch.setattr(fuzz, "play", play)
+    assert fuzz.contradicted({"seed": 1}) == "primal_dual"
+    assert asked == ["newton", "continuation", "primal_dual"]
+
+
 @serial
 def test_a_step_across_the_residual_is_no_solution():
     """A support held by a prescribed pressure alone: PETSc's line search ends all where F·y = 0.

@@ -14,7 +14,8 @@
 Outcomes: "right" (and "another": right by its equations, but not the solution found apart, where
 friction leaves several), "refused" (with the error's class and what it says), "wrong" (the
 package said it is solved and it is not), "crashed" (an error that is no refusal), "slow", and
-"unjudged" (the judge itself failed).
+"unjudged" (the judge itself failed). What is refused is tried by each of the package's methods
+alone: one that solves it contradicts the refusal, which then is a fault of the choice between them.
 
 Scenes are solved in processes of their own, many in one: `mpirun` for several ranks. One that hangs
 or dies is noted, and the next process goes on behind it.
@@ -45,12 +46,14 @@ from typing import Any
 
 from scenes.processes import command, environment
 
-__all__ = ["Outcome", "features", "minimise", "play", "table"]
+__all__ = ["Outcome", "contradicted", "features", "minimise", "play", "table"]
 
 Scene = dict[str, Any]
 
 OUTCOMES = ("right", "another", "refused", "wrong", "crashed", "slow", "unjudged")
-FIELDS = ("seed", "ranks", "outcome", "kind", "increments", "seconds", "features", "detail")
+FIELDS = ("seed", "ranks", "outcome", "kind", "increments", "seconds", "features", "detail", "by")
+# Methods of the package that are tried alone on what it refuses, and their iterations at most.
+METHODS = {"newton": 100, "continuation": 100, "primal_dual": 100, "lbfgs": 1000}
 # What refusals say, by what they are about.
 CATEGORIES = {
     "half of its radius": "too deep",
@@ -86,6 +89,7 @@ class Outcome:
         seconds: For the package and the judge.
         detail: In words.
         worst: Largest figure of every check, in units of what is allowed.
+        by: Of what is refused, though a method of the package solves it alone: that method's name.
     """
 
     outcome: str
@@ -94,6 +98,7 @@ class Outcome:
     seconds: float
     detail: list[str]
     worst: dict[str, float]
+    by: str = ""
 
 
 # ---- one scene -----------------------------------------------------------------------------------
@@ -237,6 +242,22 @@ def play(
     return Outcome(outcome, kind, len(records), time.perf_counter() - start, detail, worst)
 
 
+def contradicted(scene: Scene, comm: Any = None, *, limit: float | None = None) -> str:
+    """The first method that alone solves a scene, and rightly; empty if none does. Collective.
+
+    Args:
+        scene: A scene that is refused.
+        comm: Ranks; by default one alone.
+        limit: As for `play`.
+    """
+    for method, most in METHODS.items():  # no other method takes over where iterations are rationed
+        found = play(scene | {"method": method, "ration": most}, comm, limit=limit)
+        outcome = found.outcome if comm is None else comm.bcast(found.outcome)
+        if outcome in ("right", "another"):
+            return method
+    return ""
+
+
 def _ahead(scene: Scene, records: list[dict[str, Any]]) -> tuple[int, float] | None:
     """Stage and load parameter of the next increment that was asked for."""
     from verification import fuzz_scenes
@@ -358,6 +379,10 @@ def _work(seeds: list[int], arguments: argparse.Namespace) -> None:
         if outcome.outcome == "slow" and comm.size == 1 and len(forms) > loaded:
             # They were compiled or loaded meanwhile.
             outcome = play(scene, None, limit=arguments.limit)
+        refused = comm.bcast(outcome.outcome == "refused" and "NotConverged" in outcome.kind)
+        if refused and "ration" not in scene:
+            several = comm if comm.size > 1 else None
+            outcome.by = contradicted(scene, several, limit=arguments.limit)
         gc.collect()
         comm.barrier()
         if comm.rank == 0:
@@ -445,6 +470,7 @@ def run(arguments: argparse.Namespace) -> Counter[str]:
             writer.writerow(row)
         with lock:
             counts[found["outcome"]] += 1
+            counts["refused, solved by a method alone"] += bool(found.get("by"))
             if found["outcome"] in ("wrong", "crashed", "unjudged") or arguments.verbose:
                 detail = found["detail"][0] if found["detail"] else ""
                 print(
@@ -595,6 +621,11 @@ def minimise(
 # ---- the table -----------------------------------------------------------------------------------
 
 
+def _by(row: dict[str, str]) -> str:
+    """What solves alone what is refused, for a table; files of earlier runs do not say."""
+    return f", though {row['by']} alone solves it" if row.get("by") else ""
+
+
 def table(paths: list[str]) -> str:
     """Outcomes by feature and refusals by category, as Markdown."""
     rows = []
@@ -617,7 +648,9 @@ def table(paths: list[str]) -> str:
         lines.append(f"| {name} | {counts.total()} | " + " | ".join(cells) + " |")
     lines += ["", "| outcome | why | scenes |", "|---|---|---|"]
     why = Counter(
-        (r["outcome"], r["kind"]) for r in rows if r["outcome"] not in ("right", "another")
+        (r["outcome"], f"{r['kind']}{_by(r)}")
+        for r in rows
+        if r["outcome"] not in ("right", "another")
     )
     lines += [f"| {o} | {k or '–'} | {n} |" for (o, k), n in why.most_common()]
     return "\n".join(lines)

@@ -285,14 +285,10 @@ class Solver:
         return obstacle is None
 
     def _choose_method(self) -> str:
-        """Newton's where a tangent is cheap, or another one is due with every step.
-
-        Pairs that follow the bodies go from facet to facet, and of no older tangent is much left.
-        By multigrid another one has to be set up.
-        """
+        """Newton's method; L-BFGS where multigrid would have to be set up for every tangent."""
         full = self._full
-        anew = not full.bulk.linear or (full.follows and full.linear_kind != "multigrid")
-        return "newton" if self.condensed or anew else "lbfgs"
+        multigrid = full.linear_kind == "multigrid" and not self.condensed
+        return "lbfgs" if multigrid and full.bulk.linear else "newton"
 
     def _choose_linear_solver(self) -> str:
         """How to solve systems over all unknowns, one of `linear.KINDS`. Collective."""
@@ -471,7 +467,7 @@ class Solver:
         stiffness_changed: bool,
         overloaded: bool,
     ) -> tuple[int, list[Attempt]]:
-        """Iterate from one start after another, then by continuation. Collective.
+        """Iterate by one method after another from the same start. Collective.
 
         Where friction could not bear the load in the round of multipliers before, minimum problems
         tell soonest whether it can now.
@@ -482,24 +478,20 @@ class Solver:
         equations = self.equations
         reason, attempts = int(_REASONS.DIVERGED_LINEAR_SOLVE), []
         factored = self.starts.factored
-        starts = [s / equations.length for s in self.starts.of(ahead, rate, cold)]
-        tries = [(start, self.method) for start in starts]
-        goes_on = self.may_go_on()
-        first = cold and ahead > 0.0  # and no later round of multipliers
-        if goes_on and first and self._automatic and self.condensed:
-            # From nothing, Newton's method on the stiff problem often gives up first.
-            tries = [(starts[0], _LAST_RESORT), *tries]
-        elif goes_on:
-            tries.append((starts[0], _LAST_RESORT))
-            if self._hurries:
-                tries = [tries[0], tries[-1], *tries[:-1]]
-        if goes_on and self._is_stiff():
-            tries.insert(0 if self._automatic else len(tries) - 1, (starts[0], "primal_dual"))
+        start = self.starts.choose(ahead, rate, cold) / equations.length
+        methods, goes_on = [self.method], self.may_go_on()
+        if goes_on:
+            stiff = ["primal_dual"] if self._is_stiff() else []
+            # From nothing, where many points close at once; a later round of multipliers does not
+            # start from nothing.
+            first = self._automatic and cold and ahead > 0.0
+            methods = [*stiff, *methods] if first else [*methods, *stiff]
+            methods.append(_LAST_RESORT)
         if overloaded:
-            tries.insert(0, (starts[0], "alternating"))
+            methods.insert(0, "alternating")
         suspected = cold or overloaded
-        for number, (start, method) in enumerate(tries):
-            self.main.enough = _ENOUGH if self._hurries and number == 0 else np.inf
+        for number, method in enumerate(methods):
+            self.main.enough = _ENOUGH if self._hurries else np.inf
             equations.solution.array[:] = start
             equations.watch.start()
             if stiffness_changed:
@@ -515,7 +507,7 @@ class Solver:
             if goes_on and not suspected and self._is_overloaded():
                 # Minimum problems tell whether it is so, from where the increment starts.
                 suspected = True
-                tries.insert(number + 1, (starts[0], "alternating"))
+                methods.insert(number + 1, "alternating")
         equations.set_state(equations.solution)
         own = self.methods.get(method)
         newton = (self._factors if own is None else own.by_newton) and not self._quasi_newton

@@ -1,4 +1,4 @@
-"""Where the iteration for an increment starts: states that may be near its solution, best first."""
+"""Where the iteration for an increment starts: of several states the one nearest to equilibrium."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fenics_contact.types import Array
 __all__ = ["Starts"]
 
 
-# A start with up to this many times the residual of the best is taken first if its points slip.
+# A start with up to this many times the residual of the best is taken if its points slip.
 _FAR = 100.0
 # By how much a step makes the residual larger where the load has turned round: 4 measured in
 # fretting. Where contact grows it does so too, and the step goes on in the direction of the last.
@@ -47,7 +47,7 @@ class Starts:
 
     Attributes:
         factored: Whether the consistent tangent factored last is that of a solution.
-        predict: Whether a step on it may come first.
+        predict: Whether a step on it may be chosen.
         carried: The state in which bodies have gone with supports that moved; None: none has.
     """
 
@@ -95,22 +95,22 @@ class Starts:
             displacement = contact.opposite.present_jump()
             self._borne.append(_Borne(contact.values, contact.acting.tangent(), displacement))
 
-    def of(self, ahead: float, rate: Array | None, cold: bool) -> list[Array]:
-        """Unknowns of the system to start from, nearest to equilibrium first. Collective.
+    def choose(self, ahead: float, rate: Array | None, cold: bool) -> Array:
+        """Choose the unknowns of the system to start from: what is nearest to equilibrium of these.
 
-        The present state; that state moved on by as much as the last increment moved it: in
-        proportional loading that is the solution; that state with one step of Newton's method on
-        the tangent of the last solution; with a nonlinear bulk what `_followed` finds; `_carried`
-        where supports have moved and no values prescribed have; bodies that have gone with such
-        supports as rigid ones; and the state moved, or the present one, with supports that turn
-        freely rolled to where they are now: where all points would slip no tangent tells by how
-        much.
+        Collective. The present state; that state moved on by as much as the last increment moved
+        it: in proportional loading that is the solution; that state with one step of Newton's
+        method on the tangent of the last solution; with a nonlinear bulk what `_followed` finds;
+        `_carried` where supports have moved and no values prescribed have; bodies that have gone
+        with such supports as rigid ones; and the state moved, or the present one, with supports
+        that turn freely rolled to where they are now: where all points would slip no tangent tells
+        by how much.
 
         At the present state itself no point has slipped yet, and all closed ones stick: from there
         Newton's method takes ten steps to let them slip again, one after another from the edge of
         the contact inwards; and a body that others slide over is dragged along by all of the way,
         in a state that is near equilibrium and far from the solution. The start by a step on the
-        tangent of the last solution has the right ones slipping, and comes first unless it is far
+        tangent of the last solution has the right ones slipping, and is chosen unless it is far
         off; or unless the load has turned round, so that slipping points stick: then the step goes
         back, and to go on is worse than to stay, by a step as by the last increment.
 
@@ -169,7 +169,7 @@ class Starts:
             worse = worse and residuals[0] < residuals[first] / _TURNED
             if not (worse and self._goes_back(starts[first] - present, rate)):
                 residuals[first] = 0.0
-        return [starts[i] for i in np.argsort(residuals, kind="stable")]
+        return starts[int(np.argmin(residuals))]
 
     def _goes_back(self, step: Array, rate: Array | None) -> bool:
         """Whether a step of the system is against the last increment. Collective."""
