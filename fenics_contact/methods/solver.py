@@ -504,8 +504,8 @@ class Solver:
                 logger.info("%s", attempts[-1])
             if reason == OVERLOADED:
                 break
-            if goes_on and not suspected and self._is_overloaded():
-                # Minimum problems tell whether it is so, from where the increment starts.
+            if goes_on and not suspected and self._is_overloaded(start):
+                # Minimum problems tell whether it is so.
                 suspected = True
                 methods.insert(number + 1, "alternating")
         equations.set_state(equations.solution)
@@ -523,8 +523,12 @@ class Solver:
         suits = self.methods["primal_dual"].suits and self.method != "primal_dual"
         return suits and _STIFF < self.equations.hardness() < _TOO_STIFF
 
-    def _is_overloaded(self) -> bool:
-        """Whether friction cannot bear the load by the pressures at ``solution``. Collective."""
+    def _is_overloaded(self, start: Array) -> bool:
+        """Whether friction cannot bear the load by the pressures at a start. Collective.
+
+        Those where a method has failed tell nothing.
+        """
+        self.equations.solution.array[:] = start
         self.equations.set_state(self.equations.solution)
         for contact in self._full.contacts:
             contact.evaluate()
