@@ -12,6 +12,7 @@ from fenics_contact.methods.limit_analysis import find_overload
 from scenes.blocks import TOP, block
 from scenes.comparing import raised_everywhere
 from scenes.elasticity import hold
+from scenes.rubber import rubber
 from scenes.tags import sides
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
@@ -156,6 +157,39 @@ def test_a_tight_fit_held_by_soft_multipliers_is_none(by, share, stiffness, meth
     found = contact.resultants()
     assert found.force[0] == pytest.approx(-share * MU * force, rel=10 * tolerance)
     assert found.normal_force == pytest.approx(force, rel=(1 + modulus / stiffness) * tolerance)
+
+
+# Body forces on an area of 2, and what the error must say of their resultant and of the contact.
+NOT_HELD = {
+    "falls": ((0.0, -1.0), "translation along y) is -2, of which contact can bear at most 0 "),
+    "pushed": ((2.0, 5.0), "translation along x) is 4, of which contact can bear at most 3 "),
+}
+
+
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+@pytest.mark.parametrize("what", NOT_HELD)
+def test_rubber_that_nothing_holds_any_more(what, kinematics):
+    """Pressed against a ceiling by a body force of 5, then let fall, or pushed by too much.
+
+    The error names the motion, what the load is along it and what contact bears of that at most,
+    0 or μ N = 0.3 · 10: statics. One failure of Newton's method, 20 iterations that do not lower
+    the residual after the first few, is enough to look.
+    """
+    scene = rubber("quadrilateral", n=(8, 4))
+    force = fem.Constant(scene.mesh, np.array([0.0, 5.0]))
+    v = ufl.TestFunction(scene.u.function_space)
+    scene.F -= ufl.inner(force, v) * ufl.dx(scene.mesh)
+    scene.bcs.clear()
+    ceiling = fc.HalfSpace((0.0, 1.0), (0.0, -1.0))
+    contact = {"kinematics": kinematics}
+    problem, _ = scene.problem(ceiling, fc.Coulomb(MU), contact=contact, kinematics=np.inf)
+    problem.solve()
+    problem.commit()
+    made: list[int] = []
+    problem.snes.setMonitor(lambda snes, iteration, norm: made.append(iteration))
+    force.value[:], text = NOT_HELD[what]
+    raised_everywhere(problem.solve, ValueError, text)
+    assert len(made) <= 30
 
 
 @pytest.mark.whole

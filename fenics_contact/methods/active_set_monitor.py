@@ -23,20 +23,21 @@ class ActiveSetMonitor:
 
     Attributes:
         idle: Looks since the residual last fell.
+        first: Residual at the first look; 0: there was none.
     """
 
     def __init__(self, contacts: Sequence[Contact]) -> None:
         """Take the contacts to look at."""
         self._contacts = contacts
         n = sum(c.quadrature.n_points for c in contacts)
-        self.idle, self._best = 0, np.inf
+        self.idle, self._best, self.first = 0, np.inf, 0.0
         self._status = np.full(n, -1, dtype=np.int8)
         self._changes = np.zeros(n, dtype=np.int64)
         self._seen = np.zeros((len(Status), n), dtype=np.bool_)
 
     def start(self) -> None:
         """Forget what was seen."""
-        self.idle, self._best = 0, np.inf
+        self.idle, self._best, self.first = 0, np.inf, 0.0
         self._status[:], self._changes[:], self._seen[:] = -1, 0, False
 
     def note(self, residual: float) -> None:
@@ -47,6 +48,7 @@ class ActiveSetMonitor:
         """
         if not self._contacts:
             return
+        self.first = self.first or residual
         status = np.concatenate([c.status for c in self._contacts])
         seen = status == np.arange(len(Status))[:, None]
         if residual < _FALL * self._best:

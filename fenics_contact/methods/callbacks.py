@@ -101,20 +101,32 @@ class Callbacks:
             lost = compat.NOT_FINITE
             return int(self._run(reason, otherwise=lost)) if np.isfinite(norms[2]) else lost
 
-        def compute(_: Any, x: PETSc.Vec, f: PETSc.Vec) -> None:
-            if self._is_last(x):
-                f.array[:] = self._last[1]
-                return
-            self._last = ()
-            self._run(residual, x, f)
-            if self._error is not None:
-                f.set(np.nan)
-            else:
-                self._last = x.array_r.copy(), f.array_r.copy()
-
-        snes.setFunction(compute, vector)
+        snes.setFunction(lambda _, x, f: self._compute(residual, x, f), vector)
         snes.setJacobian(lambda _, x, J, P: self._run(jacobian, x, J), matrix)
         snes.setConvergenceTest(test)
+
+    def set_level_function(
+        self,
+        snes: PETSc.SNES,
+        residual: Callable[[PETSc.Vec, PETSc.Vec], None],
+        vector: PETSc.Vec,
+        measure: Callable[[PETSc.Vec], float],
+    ) -> None:
+        """Give the line search of SNES a measure of the residual that it is to lower.
+
+        Args:
+            snes: The solver.
+            residual: As for `attach`.
+            vector: For the residual, not that of SNES.
+            measure: Of a residual that is finite.
+        """
+
+        def level(_: Any, x: PETSc.Vec) -> float:
+            self._compute(residual, x, vector)
+            finite = np.isfinite(vector.norm())
+            return float(self._run(measure, vector, otherwise=np.nan)) if finite else np.nan
+
+        snes.setObjective(level)
 
     def set_objective(self, snes: PETSc.SNES, energy: Callable[[PETSc.Vec], float]) -> None:
         """Give the line search of SNES what it is to lower."""
@@ -153,10 +165,23 @@ class Callbacks:
             )
         return snes.getIterationNumber(), reason
 
+    def _compute(
+        self, residual: Callable[[PETSc.Vec, PETSc.Vec], None], x: PETSc.Vec, f: PETSc.Vec
+    ) -> None:
+        if self._is_last(x):
+            f.array[:] = self._last[1]
+            return
+        self._last = ()
+        self._run(residual, x, f)
+        if self._error is not None:
+            f.set(np.nan)
+        else:
+            self._last = x.array_r.copy(), f.array_r.copy()
+
     def _is_last(self, x: PETSc.Vec) -> bool:
         """Whether the residual was computed last at just this x. Collective.
 
-        The line search `cp` asks for it once more at the step that it takes, half of all times.
+        Line searches ask for it once more at the step that they take, `cp` half of all times.
         """
         same = bool(self._last) and np.array_equal(x.array_r, self._last[0])
         return bool(self._comm.allreduce(not same) == 0)

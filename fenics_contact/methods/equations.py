@@ -32,8 +32,8 @@ __all__ = ["Equations"]
 # An open point keeps this share of its stiffness in H₀: enough that a body held by contact alone
 # stays held when its whole surface is open, too little to be felt as a wrong tangent.
 _OPEN_SHARE = 1e-3
-# Share of the contact stiffness of all of Γc, once a body is let go: with a hundredth a pin that
-# comes out of its hub by itself flew on by 0.7 % of the way.
+# Share of the contact stiffness of all of Γc, where an iteration begins in which a body is let go:
+# with a hundredth a pin that comes out of its hub by itself flew on by 0.7 % of the way.
 _LET_GO = 0.1
 # An unknown with less than this share of the stiffness of its body has none.
 _FELT = 1e-12
@@ -278,8 +278,11 @@ class Equations:
         if self._driven():
             # H₀ of the whole surface, as for the start of the quasi-Newton iteration.
             return self.stiffnesses(everywhere=True)
-        # A body is let go: to be held that firmly it would hardly spring back.
-        weak = [(_LET_GO, _LET_GO)] * len(self.contacts)
+        # A body is let go, and springs back the less the firmer it is held. By the same springs to
+        # the end the residual would fall linearly: they weaken as it falls.
+        left = self.norms.total / self.watch.first if self.watch.first else 1.0
+        share = _LET_GO * float(np.sqrt(min(1.0, left)))
+        weak = [(share, share)] * len(self.contacts)
         return chain(self.tangents(), self._springs(weak))
 
     def _driven(self) -> bool:

@@ -14,11 +14,13 @@ from petsc4py import PETSc
 from fenics_contact.methods.callbacks import Callbacks
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.options import Defaults
+from fenics_contact.systems import linear
+from fenics_contact.types import Array
 
 __all__ = ["OVERLOADED", "InnerSnes", "Method", "Newton", "OwnMethod", "SnesMethod", "Tools"]
 
 # Iterations without a lower residual after which another method takes over.
-_PATIENCE = 20
+_PATIENCE = 14
 
 _REASONS = PETSc.SNES.ConvergedReason
 # Why a method ends that has found an `Equations.overload`: SNES has no such reason, and does not
@@ -30,7 +32,7 @@ class Method(ABC):
     """A way to solve equations from a start: on the main SNES, or an `OwnMethod`."""
 
     @classmethod
-    def main_options(cls, *, linear: bool) -> Mapping[str, Any]:
+    def main_options(cls, *, linear_bulk: bool) -> Mapping[str, Any]:
         """Options of the main SNES, for a linear bulk or another; by default none of its own."""
         return {}
 
@@ -172,7 +174,6 @@ class SnesMethod(Method):
     Attributes:
         snes: The solver.
         gives_up: Whether to stop where the residual does not fall any more.
-        enough: Iterations after which to stop, whether it falls or not.
     """
 
     def __init__(
@@ -189,7 +190,6 @@ class SnesMethod(Method):
         self._equations = equations
         self._callbacks = Callbacks(equations.full.unknowns.comm)
         self.consistent = False
-        self.enough = np.inf
 
     @property
     def max_it(self) -> int:
@@ -227,8 +227,7 @@ class SnesMethod(Method):
         """Why SNES ends here, or that it goes on, as SNES has it."""
         if self._equations.solved():
             return int(_REASONS.CONVERGED_FNORM_RELATIVE)
-        slow = self.snes.getIterationNumber() >= self.enough
-        if slow or (self._equations.watch.idle > _PATIENCE and self.gives_up()):
+        if self._equations.watch.idle > _PATIENCE and self.gives_up():
             return int(_REASONS.DIVERGED_LINE_SEARCH)
         return int(_REASONS.ITERATING)
 
@@ -237,16 +236,59 @@ class Newton(SnesMethod):
     """Newton's method with the consistent tangent."""
 
     @classmethod
-    def main_options(cls, *, linear: bool) -> Mapping[str, Any]:
+    def main_options(cls, *, linear_bulk: bool) -> Mapping[str, Any]:
         """See `Method.main_options`.
 
-        With a nonlinear bulk the tangent far from a solution need not point downwards along which
-        `cp` looks for a root, and cells may turn inside out, whereupon `bt` steps shorter.
+        With a nonlinear bulk steps are halved until `_level` falls.
         """
         options: dict[str, Any] = {"snes_type": "newtonls", "snes_max_it": 100}
-        if not linear:
-            options |= {"snes_linesearch_type": "bt", "snes_linesearch_max_it": 40}
+        if not linear_bulk:
+            options |= {
+                "snes_linesearch_type": "bt",
+                "snes_linesearch_order": 1,
+                "snes_linesearch_alpha": 0.0,
+                "snes_linesearch_max_it": 40,
+            }
         return options
+
+    def attach(self, *, consistent: bool) -> None:
+        """See `SnesMethod.attach`; the line search gets its level function."""
+        super().attach(consistent=consistent)
+        self._sizes: Array | None = None
+        this: Newton = weakref.proxy(self)
+        self._callbacks.set_level_function(
+            self.snes,
+            lambda x, f: this._compute_residual(x, f),
+            self._equations.function.duplicate(),
+            lambda f: this._level(f),
+        )
+
+    def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
+        super()._compute_jacobian(x, J)
+        self._sizes = None
+
+    def _level(self, f: PETSc.Vec) -> float:
+        """min(|J⁻¹f| / |J⁻¹f₀|, |f| / |f₀|)² of a trial residual f. Collective.
+
+        J is the tangent and f₀ the residual of the iterate from which the line search starts, where
+        it asks first. The first ratio is the natural level function (P. Deuflhard, Newton Methods
+        for Nonlinear Problems, 2004, section 3.3): a step is taken if the simplified Newton
+        correction behind it is smaller than the step. Where a slender body turns a linear step
+        stretches it by the square of the angle, which takes forces orders of magnitude larger than
+        to bend it, and where stiff contact closes a little too deep forces are large, too; the next
+        correction is small. Where points change their status neither need fall along a step: it is
+        taken if one does.
+        """
+        ksp, correction = self.snes.getKSP(), f.duplicate()
+        ksp.solve(f, correction)
+        found = ksp.getConvergedReason() > 0
+        linear.forget_failure(ksp.getPC())
+        sizes = np.array([correction.norm() if found else np.inf, f.norm()])
+        correction.destroy()
+        if self._sizes is None:
+            self._sizes = sizes
+            return 1.0
+        return float(np.min(sizes / self._sizes)) ** 2
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`."""

@@ -42,8 +42,6 @@ __all__ = ["METHODS", "Settings", "Solver"]
 
 logger = logging.getLogger("fenics_contact")
 
-# Iterations that Newton's method gets where it may be slow, see `Solver._hurries`.
-_ENOUGH = 15
 # Increments expected where nothing is said.
 _EXPECTED = 4
 
@@ -478,7 +476,7 @@ class Solver:
         equations = self.equations
         reason, attempts = int(_REASONS.DIVERGED_LINEAR_SOLVE), []
         factored = self.starts.factored
-        start = self.starts.choose(ahead, rate, cold) / equations.length
+        start: Array = np.divide(self.starts.choose(ahead, rate, cold), equations.length)
         methods, goes_on = [self.method], self.may_go_on()
         if goes_on:
             stiff = ["primal_dual"] if self._is_stiff() else []
@@ -491,7 +489,6 @@ class Solver:
             methods.insert(0, "alternating")
         suspected = cold or overloaded
         for number, method in enumerate(methods):
-            self.main.enough = _ENOUGH if self._hurries else np.inf
             equations.solution.array[:] = start
             equations.watch.start()
             if stiffness_changed:
@@ -504,6 +501,8 @@ class Solver:
                 logger.info("%s", attempts[-1])
             if reason == OVERLOADED:
                 break
+            if number == 0 and not self._full.bulk.linear:
+                self._check_balance(start)
             if goes_on and not suspected and self._is_overloaded(start):
                 # Minimum problems tell whether it is so.
                 suspected = True
@@ -523,27 +522,31 @@ class Solver:
         suits = self.methods["primal_dual"].suits and self.method != "primal_dual"
         return suits and _STIFF < self.equations.hardness() < _TOO_STIFF
 
+    def _check_balance(self, start: Array) -> None:
+        """Refuse a load on a nonlinear body that contact cannot balance at a start. Collective.
+
+        What its loads and supports are may change as it deforms: this is no reason not to try.
+
+        Raises:
+            ValueError: See `RigidMotions.check_balance`.
+        """
+        self._evaluate(start)
+        self.equations.motions.check_balance(self._full.load, self._full.operators)
+
     def _is_overloaded(self, start: Array) -> bool:
         """Whether friction cannot bear the load by the pressures at a start. Collective.
 
         Those where a method has failed tell nothing.
         """
+        self._evaluate(start)
+        return self.equations.friction_needed() > 1.0
+
+    def _evaluate(self, start: Array) -> None:
+        """Evaluate contacts on all of Γc at a start. Collective."""
         self.equations.solution.array[:] = start
         self.equations.set_state(self.equations.solution)
         for contact in self._full.contacts:
             contact.evaluate()
-        return self.equations.friction_needed() > 1.0
-
-    @property
-    def _hurries(self) -> bool:
-        """Whether Newton's method gets few iterations before stiffness is led up from soft.
-
-        With friction on a nonlinear bulk points go from stick to slip one after another, each by a
-        factorisation, while the residual falls slowly. Where pairs follow the bodies it may wander
-        from partner to partner without falling at all, for how long depends on round-off.
-        """
-        slow = not (self._full.bulk.linear or self.equations.has_potential) or self._full.follows
-        return slow and not self._quasi_newton and self.may_go_on()
 
     def _outcome(self, reason: int) -> str:
         """What became of an attempt, in words. Collective."""
@@ -565,8 +568,8 @@ class Solver:
 
     def _main_options(self) -> dict[str, Any]:
         """Those of the main SNES, where the caller says nothing."""
-        linear = self._full.bulk.linear
-        return {**_COMMON, **METHODS[self.method].main_options(linear=linear)}
+        linear_bulk = self._full.bulk.linear
+        return {**_COMMON, **METHODS[self.method].main_options(linear_bulk=linear_bulk)}
 
     # ---- the neighbourhood of a solution ---------------------------------------------------------
 
