@@ -22,6 +22,7 @@ from fenics_contact.methods.alternating import Alternation
 from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.kept import Kept
+from fenics_contact.methods.load_balance import LoadBalance
 from fenics_contact.methods.method import OVERLOADED, Method, Newton, OwnMethod, SnesMethod, Tools
 from fenics_contact.methods.neighbourhood import linearised, respond
 from fenics_contact.methods.options import Defaults, take_command_line
@@ -528,10 +529,10 @@ class Solver:
         What its loads and supports are may change as it deforms: this is no reason not to try.
 
         Raises:
-            ValueError: See `RigidMotions.check_balance`.
+            ValueError: See `LoadBalance.check`.
         """
         self._evaluate(start)
-        self.equations.motions.check_balance(self._full.load, self._full.operators)
+        LoadBalance(self.equations.motions).check(self._full.load, self._full.operators)
 
     def _is_overloaded(self, start: Array) -> bool:
         """Whether friction cannot bear the load by the pressures at a start. Collective.
