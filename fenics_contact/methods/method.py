@@ -235,6 +235,13 @@ class SnesMethod(Method):
 class Newton(SnesMethod):
     """Newton's method with the consistent tangent."""
 
+    def __init__(
+        self, equations: Equations, snes: PETSc.SNES, gives_up: Callable[[], bool]
+    ) -> None:
+        """See `SnesMethod`."""
+        super().__init__(equations, snes, gives_up)
+        self._sizes: Array | None = None  # of the correction and the residual at the iterate
+
     @classmethod
     def main_options(cls, *, linear_bulk: bool) -> Mapping[str, Any]:
         """See `Method.main_options`.
@@ -254,7 +261,7 @@ class Newton(SnesMethod):
     def attach(self, *, consistent: bool) -> None:
         """See `SnesMethod.attach`; the line search gets its level function."""
         super().attach(consistent=consistent)
-        self._sizes: Array | None = None
+        self._sizes = None
         this: Newton = weakref.proxy(self)
         self._callbacks.set_level_function(
             self.snes,
