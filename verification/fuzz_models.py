@@ -269,6 +269,7 @@ def _contact(made: Made, contact: Scene, here: Surface, opposite: Any) -> Any:
     if there is None:
         kind, where = contact["support"]["kind"], geometry(scene, contact)
         place = _placement(kind, where, x)
+        made_model.radius = float(where.get("radius", 0.0))
         if given is None and kind != "obstacle":
             made_model.near = lambda x, shift: _placement(kind, where, x)(shift)
         if given is not None:

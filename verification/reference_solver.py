@@ -73,6 +73,7 @@ class ContactModel:
         facet: On it, of every point.
         near: Function of places (n, d) and where the support is: distance (n,) and minus its
             gradient (n, d); None where the support is no rigid shape.
+        radius: Of a round support, whose round-off gaps have (length).
         spine: Middle line of a rod where it began, (n, d); None of other supports.
         anew: Function of u: interpolation, gap and pairs of bodies where they have moved to; None
             where the support is rigid.
@@ -93,6 +94,7 @@ class ContactModel:
     here: Any = None
     facet: Any = None
     near: Any = None
+    radius: float = 0.0
     spine: Any = None
     anew: Any = None
     _placed: tuple[Any, ...] = field(default=(None, b"", ()), init=False, repr=False)
