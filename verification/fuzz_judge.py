@@ -507,8 +507,9 @@ class Judge:
             # few points do not tell, and what a facet bulges between its corners is not seen from
             # these.
             differ = 0.1 * max(self._bulge, *(float(np.ptp(found[j]["closing"])) for j in same))
+            differ += 0.02 * float(contact.here.lengths().max())
             if self.scene["contacts"][i].get("scheme") == "vertex":
-                differ += self._bulge + 0.02 * float(contact.here.lengths().max())
+                differ += self._bulge
             allowed += float(contact.k_n.mean() * contact.weights.sum()) * differ
             allowed += 1e3 * sum(b["rounding"] for b in now["bodies"])
             # Fewer points than a facet has nodes do not hold all of it, by the user's choice or
@@ -608,9 +609,11 @@ class Judge:
         finally:
             for c, (place, interpolation, paired) in zip(problem.contacts, kept, strict=True):
                 c.place, c.interpolation, c.paired = place, interpolation, paired
-        for i, force in enumerate(forces):
-            size = max(self._size(now, "contacts", i), force["size"])
-            off = abs(force["normal"] - now["contacts"][i]["normal"])
+        for i in range(len(forces)):
+            # Of both sides of one contact which bears what is not determined.
+            same = [j for j in range(len(forces)) if self._between(j) == self._between(i)]
+            size = max(max(self._size(now, "contacts", j), forces[j]["size"]) for j in same)
+            off = abs(sum(forces[j]["normal"] - now["contacts"][j]["normal"] for j in same))
             allowed = _GEOMETRY_CHANGE * size + 30 * max(b["rounding"] for b in now["bodies"])
             self._check(f"{name}, contact {i}", "kinematics", off, allowed)
 
@@ -668,6 +671,7 @@ class Judge:
             return
         penalty = all(c.project is None for c in problem.contacts)
         scale = np.abs(outside) @ np.abs(way) + abs(springs) + abs(slid)
+        scale += sum(np.abs(f) @ np.abs(s) for f, s in zip(forces, ways, strict=True))
         if before is not None:
             scale += np.abs(before["outside"]) @ np.abs(way)
         allowed = max(1e-6, 300 * record["rtol"], self._curved) * scale
