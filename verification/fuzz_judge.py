@@ -436,7 +436,7 @@ class Judge:
     def _traction_rounding(self, contact: Any, found: dict) -> float:
         """Rounding of u_n - s and of u_t, times the stiffness (stress)."""
         places = np.abs(found["closing"]).max() + np.abs(found["relative"]).max()
-        reach = np.abs(contact.x).max() + places + self._carried + 2 * contact.radius
+        reach = np.abs(contact.x).max() + places + 4 * self._carried + 2 * contact.radius
         stiff = contact.k_n.max() + contact.k_t.max()
         return float(8 * np.finfo(float).eps * stiff * reach)
 
