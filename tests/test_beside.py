@@ -285,8 +285,22 @@ def pressed_again(busy):
     return Play(scene, [lambda load=load: to(*load) for load in loads], contact)
 
 
+def pressed_by_its_floor(busy):
+    """A held block on which a floor is pressed by a force, and led aside: at its friction limit."""
+    scene = Beside({"block": Box()}, busy)
+    scene.hold("block", TOP, 0, 1)
+    push, aside = scene.bodies.constant(1e-2), scene.bodies.constant(2e-2)
+    motion = fc.Motion(force=[None, push], displacement=[aside, None])
+    floor = fc.HalfSpace((0, -0.02), (0, 1), displacement=motion)
+    contact = scene.contact(
+        "block", BOTTOM, floor, fc.Coulomb(0.5), name="floor", kinematics="finite"
+    )
+    return Play(scene, [lambda: None], contact)
+
+
 HOLD = {
     "stacked": stacked,
+    "pressed by its floor": pressed_by_its_floor,
     "pressed again": pressed_again,
     **{f"on a spring of {k:g} E": _on_a_spring(k) for k in (1e-4, 1e-6, 1e-8)},
     "rubbed": rubbed,

@@ -71,6 +71,53 @@ def test_a_thin_plate_is_not_crossed_slowly():
     assert np.all(np.diff(forces) > 0)
 
 
+@KINEMATICS
+def test_a_plate_is_not_crossed_after_a_cut(kinematics):
+    """A trial state that was refused is no start of a path, though its displacement is zero."""
+    body = block()
+    up = body.constant(np.zeros(2))
+    body.hold(TOP, 0, 1)
+    obstacle = fc.Obstacle(distance=lambda x: abs(x[1] + 0.05) - 0.01, displacement=up)
+    contact = body.contact(BOTTOM, obstacle, fc.Frictionless(), kinematics=kinematics)
+    problem = body.problem(contact)
+    up.value[1] = 0.7
+    fails(problem, "has crossed")
+    up.value[1] = 0.6
+    fails(problem, "has crossed")
+    up.value[1] = 0.03
+    problem.solve()
+
+
+@KINEMATICS
+@pytest.mark.parametrize("at", [0.55, 0.6, 0.65])
+@pytest.mark.parametrize("steps", [1, 2, 7])
+def test_a_blade_does_not_pierce_a_facet(steps, at, kinematics):
+    """Upright, 0.02 thick, led 0.3 into facets of 0.25: the way out of it is short aside alone.
+
+    Where a point is in it its resistance ends, or it is refused as well: no increment in which the
+    tip is deeper than 7 % of a facet passes.
+    """
+    body = block(n=(4, 2))
+    up = body.constant(np.zeros(2))
+    body.hold(TOP, 0, 1)
+
+    def blade(x):
+        along = ufl.max_value(-0.65, ufl.min_value(-0.05, x[1]))
+        return ufl.sqrt((x[0] - at) ** 2 + (x[1] - along) ** 2) - 0.01
+
+    obstacle = fc.Obstacle(distance=blade, displacement=up)
+    contact = body.contact(BOTTOM, obstacle, fc.Frictionless(), kinematics=kinematics)
+    problem = body.problem(contact)
+    reached = 0.0
+    with pytest.raises(fc.NotConverged):
+        for t in np.linspace(0.0, 0.35, steps + 1)[1:]:
+            up.value[1] = t
+            problem.solve()
+            problem.commit()
+            reached = t
+    assert reached - 0.04 <= 0.07 * 0.25
+
+
 @pytest.mark.parametrize("steps", [1, 4])
 def test_a_blade_is_not_turned_through_a_body(steps):
     """By one radian: beneath it at first, above at last, and no point was in it at either end."""
@@ -106,7 +153,7 @@ def test_a_ball_between_two_points_is_seen(kinematics, at):
     up.value[1] = -0.01
     assert problem.solve().verdict.failures == []
     problem.commit()
-    with pytest.raises(fc.NotConverged, match=r"has crossed|penetrates|too large"):
+    with pytest.raises(fc.NotConverged, match=r"has crossed|penetrates|too large|as deep in"):
         for up.value[1] in (0.01, 0.02, 0.03):
             problem.solve()
             problem.commit()

@@ -158,9 +158,9 @@ class TunnellingCheck:
             for c in contacts
             if not c.gap_prescribed and (not c.rigid or c.opposite.sampler is not None)
         ]
-        # The last probe whose state was committed, and the last one, with the displacement then.
-        self._committed: dict[str, tuple[Array, Probe]] = {}
-        self._last: dict[str, tuple[Array, Probe]] = {}
+        # By contact the last probe of a committed state, and the last one.
+        self._committed: dict[str, Any] = {}
+        self._last: dict[str, Any] = {}
 
     def evaluate(self, before: fem.Function | None) -> dict[str, Tunnelling]:
         """Judge the contacts, evaluated at the end of an increment, by their names. Collective.
@@ -174,7 +174,7 @@ class TunnellingCheck:
         probes, moved = {}, []
         for contact in self._contacts:
             name = contact.name
-            known = self._known(comm, name, before)
+            known = None if before is None else self._known(contact, before)
             if known is not None and known.is_valid_for(contact):
                 probes[name] = known
                 continue
@@ -185,7 +185,7 @@ class TunnellingCheck:
             )
             probes[name] = probe
             moved.append(name)
-            self._last[name] = contact.u.x.array.copy(), probe
+            self._last[name] = probe
         if not moved:
             return {name: Tunnelling() for name in probes}
         parts = [part for probe in probes.values() for part in probe.resisted]
@@ -196,15 +196,14 @@ class TunnellingCheck:
             for name, probe in probes.items()
         }
 
-    def _known(self, comm: MPI.Comm, name: str, before: fem.Function | None) -> Any:
-        """The last probe of a committed state, if the history went on from there. Collective."""
-        if before is None:
-            return None
-        last = self._last.get(name)
-        same = last is not None and np.array_equal(last[0], before.x.array)
-        if comm.allreduce(int(not same)) == 0 and last is not None:
-            self._committed[name] = last
-        return self._committed[name][1] if name in self._committed else None
+    def _known(self, contact: Contact, before: fem.Function) -> Any:
+        """The last probe of a committed state; None if there is none. Collective."""
+        comm, last = contact.surface.mesh.comm, self._last.get(contact.name)
+        # A trial state that was refused may have the displacement, but not the obstacle's place.
+        is_trial = last is None or not last.is_of_committed(contact, before)
+        if comm.allreduce(int(is_trial)) == 0:
+            self._committed[contact.name] = last
+        return self._committed.get(contact.name)
 
 
 def _worst(comm: MPI.Comm, excess: Array, rows: Array) -> Array | None:
@@ -228,6 +227,9 @@ class Probe(Protocol):
 
     x: Array
     resisted: list[tuple[Index, Array]]
+
+    def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
+        """Whether this rank's part is of the committed state, whose displacement is before."""
 
     def is_valid_for(self, contact: Contact) -> bool:
         """Whether nothing can be found at the present state that was not there. Collective."""
@@ -263,7 +265,7 @@ class RigidObstacleProbe:
         self._comm = contact.surface.mesh.comm
         self.points = values.x + values.jump
         self._gap, self._normal = self._sampler.sample(self.points)
-        self._facet, self._reference, self._distance = self._deepest()
+        self._facet, self._reference, self._distance, self._toward = self._deepest()
         self.x, _ = places.facets.positions(self._facet, self._reference)
         self._z = self._at(self.points)
         self._data = self._sampler.data()
@@ -279,10 +281,19 @@ class RigidObstacleProbe:
         """A point field at the places."""
         return self._places.values(field, self._facet, self._reference)
 
-    def _deepest(self) -> tuple[Index, Array, Array]:
+    def _tangents(self, facet: Index) -> Array:
+        """Edges of facets, in the frame of the obstacle, (n, gdim, gdim - 1) (length)."""
+        d = self.points.shape[1]
+        origin, *ends = (
+            self._places.values(self.points, facet, np.broadcast_to(unit, (len(facet), d - 1)))
+            for unit in np.vstack([np.zeros(d - 1), np.eye(d - 1)])
+        )
+        return np.stack([end - origin for end in ends], axis=2)
+
+    def _deepest(self) -> tuple[Index, Array, Array, Array]:
         """The places, and those that the obstacle comes closest to between them. Collective.
 
-        With the distance of each from the obstacle, (n,) (length).
+        With the distance of each from the obstacle, (n,) (length), and the unit normal towards it.
 
         From every place the tangential part of the way to the obstacle is followed along the facet:
         alternating projections, which end at the closest places of facet and obstacle.
@@ -294,27 +305,28 @@ class RigidObstacleProbe:
         between = places.values(self.points, facet[rows.size :], at[rows.size :])
         known, more = (self._gap[rows], self._normal[rows]), self._sampler.sample(between)
         distance, normal = (np.concatenate(both) for both in zip(known, more, strict=True))
-        found = [(facet, at, distance)]
-        units = np.vstack([np.zeros(at.shape[1]), np.eye(at.shape[1])])
+        found = [(facet, at, distance, normal)]
         # The distance changes by no more than the way: farther obstacles do not reach the facet.
         going = distance < size[facet]
         for _ in range(_DESCENT_STEPS):
             if not self._comm.allreduce(int(going.any())):
                 break
             facet, at, distance, normal = facet[going], at[going], distance[going], normal[going]
-            origin, *ends = (
-                places.values(self.points, facet, np.broadcast_to(unit, at.shape)) for unit in units
-            )
-            tangents = np.stack([end - origin for end in ends], axis=2)
+            tangents = self._tangents(facet)
             step = np.maximum(distance, 0.1 * size[facet])[:, None] * normal
             moved = at + np.einsum("nij,nj->ni", np.linalg.pinv(tangents), step)
             moved = places.facets.clipped(moved)
             deeper, normal = self._sampler.sample(places.values(self.points, facet, moved))
             going = deeper < distance - 1e-3 * size[facet]
             at, distance = moved, deeper
-            found.append((facet[going], at[going], distance[going]))
-        facets, references, distances = zip(*found, strict=True)
-        return np.concatenate(facets), np.concatenate(references), np.concatenate(distances)
+            found.append((facet[going], at[going], distance[going], normal[going]))
+        facets, references, distances, normals = map(np.concatenate, zip(*found, strict=True))
+        return facets, references, distances, normals
+
+    def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
+        """See `Probe`: by where the points are in the frame of the obstacle."""
+        committed = contact.values.x + contact.opposite.committed_jump
+        return bool(np.array_equal(self.points, committed))
 
     def is_valid_for(self, contact: Contact) -> bool:
         """See `Probe`: of an obstacle that neither turns nor changes its shape."""
@@ -338,7 +350,37 @@ class RigidObstacleProbe:
             -self._normal[rows],
         )
         size = places.size[self._facet]
-        return -self._distance, _allowed(deep, planes, size, size)
+        allowed = _allowed(deep, planes, size, size)
+        return self._protrusion(allowed, size), allowed
+
+    def _protrusion(self, allowed: Array, size: Array) -> Array:
+        """How far the obstacle protrudes into the body at the places, (n,) (length). Collective.
+
+        The shortest way out of an obstacle that is narrower than a facet leads aside, and is short
+        however far it has pierced Γc. Its tip is looked for along the normal of Γc.
+        """
+        depth = -self._distance
+        some = np.flatnonzero((depth > 0) & (depth <= allowed))
+        facet, place, toward = self._facet[some], self._z[some], self._toward[some]
+        # Half way through an obstacle there is no normal.
+        depth[some[~(np.linalg.norm(toward, axis=1) > 0.5)]] = np.inf
+        inward = -self._places.facets.outward[facet, None] * across(self._tangents(facet))
+        inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+        aside = np.nan_to_num(toward - _dot(toward, inward)[:, None] * inward)
+        length = np.linalg.norm(aside, axis=1, keepdims=True)
+        aside *= size[some, None] / np.where(length > 0, length, 1.0)
+        narrow = length[:, 0] > 0
+        for way in (aside, -aside):
+            narrow &= self._sampler.sample(place + way)[0] >= 0
+        some, place, inward = some[narrow], place[narrow], inward[narrow]
+        reach = allowed[some]
+        while self._comm.allreduce(len(some)):
+            beyond = self._sampler.sample(place + reach[:, None] * inward)[0] < 0
+            beyond &= reach <= size[some] + allowed[some]
+            some, place, inward = some[beyond], place[beyond], inward[beyond]
+            reach = reach[beyond] + _DEPTH_RESOLUTION * size[some]
+            depth[some] = reach
+        return depth
 
     def crossed(self, allowed: Array) -> Mask:
         """See `Probe`.
@@ -476,6 +518,10 @@ class OpposingBodyProbe:
         clear = allowed - np.maximum(depth, 0.0)
         heights = np.concatenate([here.height, there.height])
         self._clear = global_min(self._comm, np.append(clear, heights))
+
+    def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
+        """See `Probe`."""
+        return bool(np.array_equal(self.u.x.array, before.x.array))
 
     def is_valid_for(self, contact: Contact) -> bool:
         """See `Probe`: by the largest displacements on both surfaces since."""

@@ -194,8 +194,8 @@ class Approach:
         self._follow_stiffness()
         # A support pressed by a force comes to a body as one that is led there does, and may be led
         # along by then: slip is counted from where its increment starts.
-        if not self._motions.of_any_body()[which].any():
-            return
+        of_bodies = self._motions.of_any_body()[which]
+        which, released = which[of_bodies], released[of_bodies]
         for contact, jumps in zip(full.contacts, self._felt(which)[1], strict=True):
             contact.set_down(_feeling(jumps), _feeling(jumps[released]))
 
