@@ -33,7 +33,7 @@ logger = logging.getLogger("fenics_contact")
 # that are round-off.
 _SAME_PLACE = 1e-12
 # Largest round-off of coordinates, relative to the facets of Γc.
-_COORDINATE_ROUND_OFF = 1e-5
+_COORDINATE_ROUND_OFF = 2e-7
 # How parts of a mixed function are prescribed.
 _OF_A_PART = (
     "; on a part of a mixed one it is dirichletbc(value, dofs, W.sub(0)), where dofs are those of "

@@ -195,6 +195,8 @@ class Approach:
         # A support pressed by a force comes to a body as one that is led there does, and may be led
         # along by then: slip is counted from where its increment starts.
         of_bodies = self._motions.of_any_body()[which]
+        if not of_bodies.any():
+            return
         which, released = which[of_bodies], released[of_bodies]
         for contact, jumps in zip(full.contacts, self._felt(which)[1], strict=True):
             contact.set_down(_feeling(jumps), _feeling(jumps[released]))

@@ -259,9 +259,11 @@ class Newton(SnesMethod):
         return options
 
     def attach(self, *, consistent: bool) -> None:
-        """See `SnesMethod.attach`; the line search gets its level function."""
+        """See `SnesMethod.attach`; a line search gets its level function."""
         super().attach(consistent=consistent)
         self._sizes = None
+        if self.snes.getType() != PETSc.SNES.Type.NEWTONLS:
+            return
         this: Newton = weakref.proxy(self)
         self._callbacks.set_level_function(
             self.snes,

@@ -212,6 +212,7 @@ class Solver:
         equations.by_cycle = quasi_newton and solver == "multigrid"
         snes = self.snes = PETSc.SNES().create(self._comm)
         snes.setOptionsPrefix(prefix)
+        snes.setType(snes_type)
         snes.setSolution(equations.solution)
         equations.solvers = {}
         for consistent in (False, True):
