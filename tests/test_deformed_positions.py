@@ -89,6 +89,23 @@ def test_a_plate_is_not_crossed_after_a_cut(kinematics):
 
 
 @KINEMATICS
+@pytest.mark.parametrize("at", [0.07, 0.3, 0.55])
+@pytest.mark.parametrize("steps", [1, 2, 4])
+def test_a_pin_does_not_pass_between_places(steps, at, kinematics):
+    """Of the radius 0.01, led 0.6 into facets of 0.25: no place of these is in it at either end."""
+    body = block(n=(4, 2))
+    up = body.constant(np.zeros(2))
+    body.hold(TOP, 0, 1)
+    pin = fc.Ball((at, -0.03), 0.01, displacement=up)
+    contact = body.contact(BOTTOM, pin, fc.Frictionless(), kinematics=kinematics)
+    problem = body.problem(contact)
+    with pytest.raises(fc.NotConverged):
+        for up.value[1] in np.linspace(0.0, 0.6, steps + 1)[1:]:
+            problem.solve()
+            problem.commit()
+
+
+@KINEMATICS
 @pytest.mark.parametrize("at", [0.55, 0.6, 0.65])
 @pytest.mark.parametrize("steps", [1, 2, 7])
 def test_a_blade_does_not_pierce_a_facet(steps, at, kinematics):

@@ -44,7 +44,7 @@ _SAMPLES_PER_FACET, _MOST_SAMPLES = 4, 64
 # Bisections of a part of a path in which the normal turns to the opposite side.
 _BISECTIONS = 20
 # Steps along a facet towards the place that is deepest in an obstacle.
-_DESCENT_STEPS = 8
+_DESCENT_STEPS = 12
 
 
 @dataclass(frozen=True)
@@ -265,13 +265,14 @@ class RigidObstacleProbe:
         self._comm = contact.surface.mesh.comm
         self.points = values.x + values.jump
         self._gap, self._normal = self._sampler.sample(self.points)
-        self._facet, self._reference, self._distance, self._toward = self._deepest()
-        self.x, _ = places.facets.positions(self._facet, self._reference)
-        self._z = self._at(self.points)
         self._data = self._sampler.data()
         self._start = values.x + opposite.committed_jump
         if known is not None and not opposite.turns:
             self._start = known.points
+        self._rotate = opposite.rotation_in_increment(values)
+        self._facet, self._reference, self._distance, self._toward = self._find_places()
+        self.x, _ = places.facets.positions(self._facet, self._reference)
+        self._z = self._at(self.points)
         closed = contact.status != Status.OPEN
         # A penetration that the law knows of is its own matter, with no stiffness as well.
         deep = np.maximum(values.penetration, np.where(closed, -self._gap, 0.0))[places.rows]
@@ -281,47 +282,87 @@ class RigidObstacleProbe:
         """A point field at the places."""
         return self._places.values(field, self._facet, self._reference)
 
-    def _tangents(self, facet: Index) -> Array:
-        """Edges of facets, in the frame of the obstacle, (n, gdim, gdim - 1) (length)."""
-        d = self.points.shape[1]
-        origin, *ends = (
-            self._places.values(self.points, facet, np.broadcast_to(unit, (len(facet), d - 1)))
-            for unit in np.vstack([np.zeros(d - 1), np.eye(d - 1)])
-        )
-        return np.stack([end - origin for end in ends], axis=2)
+    def _find_places(self) -> tuple[Index, Array, Array, Array]:
+        """All places that may be deep in the obstacle now, or on their path. Collective.
 
-    def _deepest(self) -> tuple[Index, Array, Array, Array]:
-        """The places, and those that the obstacle comes closest to between them. Collective.
+        Facets that move by more than their size are looked at in between, too: what passes them
+        leaves no trace in their distance at the end.
 
-        With the distance of each from the obstacle, (n,) (length), and the unit normal towards it.
+        Returns:
+            Facet, reference coordinates, distance (length), and unit normal towards the obstacle,
+            (n, ...).
+        """
+        end = self._rotate(self.points, 1.0)
+        way = np.linalg.norm(end - self._start, axis=1) + np.linalg.norm(end - self.points, axis=1)
+        ways = way[self._places.rows].max(axis=1, initial=0.0) / self._places.size
+        n = int(np.ceil(np.clip(global_max(self._comm, ways, empty=0.0), 1, _MOST_SAMPLES)))
+        facet, reference, distance, normal = self._deepest(self.points)
+        found = []
+        for share in np.arange(1, n) / n:
+            points = self._rotate(self._start + share * (end - self._start), -share)
+            between, at, *_ = self._deepest(points)
+            met = slice(len(self._places.facet), None)
+            found.append((between[met], at[met]))
+        if found:
+            facets, references = (np.concatenate(parts) for parts in zip(*found, strict=True))
+            there = self._sampler.sample(self._places.values(self.points, facets, references))
+            facet, reference = np.append(facet, facets), np.concatenate([reference, references])
+            distance, normal = np.append(distance, there[0]), np.concatenate([normal, there[1]])
+        return facet, reference, distance, normal
+
+    def _deepest(self, points: Array) -> tuple[Index, Array, Array, Array]:
+        """The places of Γc, then those that the obstacle comes closest to between them. Collective.
 
         From every place the tangential part of the way to the obstacle is followed along the facet:
         alternating projections, which end at the closest places of facet and obstacle.
+
+        Args:
+            points: The points of Γc in the frame of the obstacle, (n_points, gdim) (length).
+
+        Returns:
+            See `_find_places`.
         """
         places, size = self._places, self._places.size
         facet, at = places.facet, places.reference
-        # The points come first.
-        rows = places.rows.ravel()
-        between = places.values(self.points, facet[rows.size :], at[rows.size :])
-        known, more = (self._gap[rows], self._normal[rows]), self._sampler.sample(between)
-        distance, normal = (np.concatenate(both) for both in zip(known, more, strict=True))
+        if points is self.points:  # sampled already; the points come first
+            rows = places.rows.ravel()
+            between = places.values(points, facet[rows.size :], at[rows.size :])
+            known, more = (self._gap[rows], self._normal[rows]), self._sampler.sample(between)
+            distance, normal = (np.concatenate(both) for both in zip(known, more, strict=True))
+        else:
+            distance, normal = self._sampler.sample(places.values(points, facet, at))
         found = [(facet, at, distance, normal)]
         # The distance changes by no more than the way: farther obstacles do not reach the facet.
-        going = distance < size[facet]
+        going, scale = distance < size[facet], np.ones(len(facet))
         for _ in range(_DESCENT_STEPS):
-            if not self._comm.allreduce(int(going.any())):
-                break
-            facet, at, distance, normal = facet[going], at[going], distance[going], normal[going]
-            tangents = self._tangents(facet)
-            step = np.maximum(distance, 0.1 * size[facet])[:, None] * normal
+            facet, at, scale = facet[going], at[going], scale[going]
+            distance, normal = distance[going], normal[going]
+            step = (scale * np.maximum(distance, 0.1 * size[facet]))[:, None] * normal
+            tangents = self._tangents(facet, points)
             moved = at + np.einsum("nij,nj->ni", np.linalg.pinv(tangents), step)
             moved = places.facets.clipped(moved)
-            deeper, normal = self._sampler.sample(places.values(self.points, facet, moved))
-            going = deeper < distance - 1e-3 * size[facet]
-            at, distance = moved, deeper
-            found.append((facet[going], at[going], distance[going], normal[going]))
+            going = np.abs(moved - at).max(axis=1, initial=0.0) > 1e-3
+            if not self._comm.allreduce(int(going.any())):
+                break
+            there, toward = self._sampler.sample(places.values(points, facet, moved))
+            deeper = going & (there < distance - 1e-3 * size[facet])
+            # The step has passed over what is narrower than it.
+            scale = np.where(deeper, scale, scale / 2)
+            at = np.where(deeper[:, None], moved, at)
+            distance = np.where(deeper, there, distance)
+            normal = np.where(deeper[:, None], toward, normal)
+            found.append((facet[deeper], at[deeper], distance[deeper], normal[deeper]))
         facets, references, distances, normals = map(np.concatenate, zip(*found, strict=True))
         return facets, references, distances, normals
+
+    def _tangents(self, facet: Index, points: Array) -> Array:
+        """Edges of facets, in the frame of the obstacle, (n, gdim, gdim - 1) (length)."""
+        d = points.shape[1]
+        origin, *ends = (
+            self._places.values(points, facet, np.broadcast_to(unit, (len(facet), d - 1)))
+            for unit in np.vstack([np.zeros(d - 1), np.eye(d - 1)])
+        )
+        return np.stack([end - origin for end in ends], axis=2)
 
     def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
         """See `Probe`: by where the points are in the frame of the obstacle."""
@@ -364,7 +405,9 @@ class RigidObstacleProbe:
         facet, place, toward = self._facet[some], self._z[some], self._toward[some]
         # Half way through an obstacle there is no normal.
         depth[some[~(np.linalg.norm(toward, axis=1) > 0.5)]] = np.inf
-        inward = -self._places.facets.outward[facet, None] * across(self._tangents(facet))
+        inward = -self._places.facets.outward[facet, None] * across(
+            self._tangents(facet, self.points)
+        )
         inward /= np.linalg.norm(inward, axis=1, keepdims=True)
         aside = np.nan_to_num(toward - _dot(toward, inward)[:, None] * inward)
         length = np.linalg.norm(aside, axis=1, keepdims=True)
@@ -387,9 +430,8 @@ class RigidObstacleProbe:
 
         In the increment a place goes straight on, as does the obstacle, which turns evenly.
         """
-        opposite, comm = self._contact.opposite, self._comm
+        comm, rotate = self._comm, self._rotate
         found = np.zeros(len(self._facet), dtype=np.bool_)
-        rotate = opposite.rotation_in_increment(self._contact.values)
         start = self._at(self._start)
         end = rotate(self._z, 1.0)  # in the frame of the start, which does not turn
         straight = np.linalg.norm(end - start, axis=1)
