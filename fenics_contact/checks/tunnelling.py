@@ -333,7 +333,8 @@ class RigidObstacleProbe:
             distance, normal = self._sampler.sample(places.values(points, facet, at))
         found = [(facet, at, distance, normal)]
         # The distance changes by no more than the way: farther obstacles do not reach the facet.
-        going, scale = distance < size[facet], np.ones(len(facet))
+        going: Mask = distance < size[facet]
+        scale: Array = np.ones(len(facet))
         for _ in range(_DESCENT_STEPS):
             facet, at, scale = facet[going], at[going], scale[going]
             distance, normal = distance[going], normal[going]
