@@ -100,6 +100,9 @@ class ReferenceScales:
         self._turning = n_bodies + np.flatnonzero(turns)
         self.held: Mask = np.ones(n_bodies + n_motions, dtype=np.bool_)
         self._own = [_body_of_points(contact, space, body) for contact in contacts]
+        # Pairings whose coupling was found, and the parts on both sides of the points by contact.
+        self._coupled: list[int] | None = None
+        self._partners: list[tuple[Index, Index]] = []
 
     @property
     def force(self) -> Array:
@@ -149,25 +152,34 @@ class ReferenceScales:
             operators: Of the contacts, over all unknowns, at the start of an increment.
         """
         n = len(self.group)
+        if self._coupled != (coupled := [o.contact.pairs.number for o in operators]):
+            self._coupled = coupled
+            self._couple(operators)
         borne: Array = np.zeros(n)
+        for operator, (one, other) in zip(operators, self._partners, strict=True):
+            committed = operator.contact.committed().points
+            if committed is not None:
+                force = operator.contact.measure * np.abs(committed.total_traction).sum(axis=1)
+                borne += np.bincount(one, force, minlength=n)
+                for partner in other.T:
+                    both = np.where(partner == one, 0.0, force)
+                    borne += np.bincount(partner, both, minlength=n)
+        borne = global_sum(self._comm, borne)
+        self.unloaded = self.is_unloaded(borne[: self.n_bodies])
+
+    def _couple(self, operators: Sequence[ContactOperator]) -> None:
+        """Find which parts the pairs of the contacts couple. Collective."""
+        n = len(self.group)
         self.touching = np.zeros((len(operators), self.n_bodies), dtype=np.bool_)
         every: list[Any] = [np.zeros((0, 2), dtype=np.intp)]
         for number, operator in enumerate(operators):
             pairs = self.pairs(operator, number, self.label)
             self.touching[number, pairs[pairs < self.n_bodies]] = True
             every.append(pairs)
-            committed = operator.contact.committed().points
-            if committed is not None:
-                force = operator.contact.measure * np.abs(committed.total_traction).sum(axis=1)
-                one, other = self._sides(operator, number, self.label)
-                np.add.at(borne, one, force)
-                for partner in other.T:
-                    np.add.at(borne, partner, np.where(partner == one, 0.0, force))
-        borne = global_sum(self._comm, borne)
+        self._partners = [self._sides(o, number, self.label) for number, o in enumerate(operators)]
         links = np.concatenate(every)
         graph = scipy.sparse.coo_matrix((np.ones(len(links)), links.T), (n, n))
         _, self.group = scipy.sparse.csgraph.connected_components(graph, directed=False)
-        self.unloaded = self.is_unloaded(borne[: self.n_bodies])
 
     def is_unloaded(self, force: Array) -> Mask:
         """Which bodies bear no force but round-off, by the sum of sizes of the forces on each."""
