@@ -135,8 +135,9 @@ class ContactProblem:
                 it is stuck), "primal_dual" (tractions of the points are unknowns beside
                 displacements: friction on stiff contact of a linear bulk), or "alternating"
                 (minimum problems in turn, each by Newton's method with a line search on the
-                energy). By default "newton", but "lbfgs" for a linear bulk that is solved by
-                multigrid, which Newton's method would set up in every iteration. Where friction
+                energy). By default "newton", but "lbfgs" for a linear bulk on all unknowns
+                that is solved by multigrid, or in space, if conditions hold all bodies and pairs
+                stay: a tangent costs dozens of its iterations there. Where friction
                 meets contact 50 to 1e5 times as stiff as the bulk "primal_dual", if it can be had,
                 comes first where nothing was in contact before, and else after a failure;
                 "continuation" comes last. With a mixed function the equations are those of a saddle

@@ -285,10 +285,18 @@ class Solver:
         return obstacle is None
 
     def _choose_method(self) -> str:
-        """Newton's method; L-BFGS where multigrid would have to be set up for every tangent."""
+        """Newton's method, or L-BFGS where a tangent costs dozens of iterations with an older one.
+
+        So it does of linear bodies in space on all unknowns, and by multigrid, which is set up for
+        it. Bodies that contact alone holds L-BFGS leaves where its H₀ lets them drift.
+        """
         full = self._full
-        multigrid = full.linear_kind == "multigrid" and not self.condensed
-        return "lbfgs" if multigrid and full.bulk.linear else "newton"
+        if self.condensed or not full.bulk.linear:
+            return "newton"
+        if full.linear_kind == "multigrid":
+            return "lbfgs"
+        costly = full.gdim == 3 and full.scales.held.all() and not full.follows
+        return "lbfgs" if costly else "newton"
 
     def _choose_linear_solver(self) -> str:
         """How to solve systems over all unknowns, one of `linear.KINDS`. Collective."""
