@@ -162,7 +162,7 @@ def test_cut_increments_tell_what_was_tried():
     assert first.load == -0.0025 and all(len(step.attempts) == 1 for step in rest)
 
 
-def test_a_first_increment_on_which_continuation_is_stuck():
+def test_a_first_increment_that_cannot_be_alternated():
     """With finite kinematics and friction nothing can be alternated: Newton's method solves it.
 
     On a flat floor both kinematics are one problem: the same force, to the tolerance of 1e-9 of

@@ -296,6 +296,8 @@ class Equations:
         Those of a body that was set down are closed by round-off, some of many. Collective.
         """
         load = self.motions.generalised_load(self.full.load)
+        if not load.any():
+            return False
         return bool(np.any(self.full.contact_force_sizes() < _OPEN_SHARE * load))
 
     def _springs(

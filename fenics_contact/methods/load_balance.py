@@ -97,7 +97,7 @@ class LoadBalance:
             # One of rounding only, such as of tangential forces on a mode across them, is none.
             length = np.linalg.norm(rays, axis=1)
             rays = rays[length > _FELT] / length[length > _FELT, None]
-            comm, rest = modes.comm, float(np.abs(direction).max())
+            comm, rest = modes.comm, 1.0
             if len(rays):
                 rest = agreed(comm, unbalanced(rays.T, direction))
             allowed = _BALANCED * max(1.0, size[group].max() / largest)

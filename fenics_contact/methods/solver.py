@@ -535,7 +535,7 @@ class Solver:
     def _check_balance(self, start: Array) -> None:
         """Refuse a load on a nonlinear body that contact cannot balance at a start. Collective.
 
-        What its loads and supports are may change as it deforms: this is no reason not to try.
+        Loads and obstacles may change as the body deforms: it is checked after a failure alone.
 
         Raises:
             ValueError: See `LoadBalance.check`.

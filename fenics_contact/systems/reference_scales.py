@@ -169,14 +169,15 @@ class ReferenceScales:
 
     def _couple(self, operators: Sequence[ContactOperator]) -> None:
         """Find which parts the pairs of the contacts couple. Collective."""
-        n = len(self.group)
+        n, self._partners = len(self.group), []
         self.touching = np.zeros((len(operators), self.n_bodies), dtype=np.bool_)
         every: list[Any] = [np.zeros((0, 2), dtype=np.intp)]
         for number, operator in enumerate(operators):
-            pairs = self.pairs(operator, number, self.label)
+            sides = self._sides(operator, number, self.label)
+            self._partners.append(sides)
+            pairs = self._pairs(*sides, number)
             self.touching[number, pairs[pairs < self.n_bodies]] = True
             every.append(pairs)
-        self._partners = [self._sides(o, number, self.label) for number, o in enumerate(operators)]
         links = np.concatenate(every)
         graph = scipy.sparse.coo_matrix((np.ones(len(links)), links.T), (n, n))
         _, self.group = scipy.sparse.csgraph.connected_components(graph, directed=False)
@@ -220,7 +221,10 @@ class ReferenceScales:
             number: Of the contact.
             label: Part of each of these unknowns.
         """
-        own, opposite = self._sides(operator, number, label)
+        return self._pairs(*self._sides(operator, number, label), number)
+
+    def _pairs(self, own: Index, opposite: Index, number: int) -> Index:
+        """`pairs` of what `_sides` gave. Collective."""
         others = [*opposite.T, *(np.full_like(own, m) for m in self._motions[number])]
         n = len(self.group)
         mine = np.unique(np.concatenate([n * own + other for other in others]))
