@@ -224,14 +224,16 @@ def tilted(angle, how):
 def test_a_plane_tilted_by_its_displacement_is_no_plane(how):
     """The estimate is the difference to the tilted plane itself; none if shifted.
 
-    To a tenth, or the share squared: it is of first order, and leaves out what is of the second.
+    To a tenth, or once to twice the share squared: it leaves out what is of the second order.
     """
     for angle in (0.03, 0.1):
         told, force = tilted(angle, how)
         exact, reference = tilted(angle, "plane")
         assert exact.worst == 0.0
         missing = np.linalg.norm(force - reference) / np.linalg.norm(force)
-        assert told.force == pytest.approx(missing, abs=max(0.1 * missing, missing**2))
+        assert told.force == pytest.approx(
+            missing, abs=min(max(0.1 * missing, missing**2), 2 * missing**2)
+        )
     told, _ = tilted(0.0, how)
     assert told.worst <= 1e-3
 

@@ -25,7 +25,7 @@ from fenics_contact.surface.facets import facet_cells
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["ReferenceScales"]
+__all__ = ["ReferenceScales", "body_of_points"]
 
 # Contact forces, by stiffness times size of a body, that are round-off.
 _NO_FORCE = 1e-12
@@ -99,7 +99,7 @@ class ReferenceScales:
         turns = [motion.turns for contact in contacts for motion in contact.motions]
         self._turning = n_bodies + np.flatnonzero(turns)
         self.held: Mask = np.ones(n_bodies + n_motions, dtype=np.bool_)
-        self._own = [_body_of_points(contact, space, body) for contact in contacts]
+        self._own = [body_of_points(contact, space, body) for contact in contacts]
         # Pairings whose coupling was found, and the parts on both sides of the points by contact.
         self._coupled: list[int] | None = None
         self._partners: list[tuple[Index, Index]] = []
@@ -244,9 +244,7 @@ class ReferenceScales:
         return own, np.where(other < 0, own[:, None], other)
 
 
-def _body_of_points(
-    contact: Contact, space: fem.FunctionSpace, body: npt.NDArray[np.intp]
-) -> Index:
+def body_of_points(contact: Contact, space: fem.FunctionSpace, body: npt.NDArray[np.intp]) -> Index:
     """The body behind each of this rank's points of Γc, (n_points,)."""
     rows = contact.quadrature.point_rows()
     cells = facet_cells(space.mesh, contact.surface.facets)

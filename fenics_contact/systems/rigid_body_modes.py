@@ -15,10 +15,9 @@ from fenics_contact.contact.values import Status
 from fenics_contact.parallel import agreed, gather_rows, global_sum
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.displacement import Displacement
-from fenics_contact.surface.facets import facet_cells
 from fenics_contact.systems.modes import rigid_motions
 from fenics_contact.systems.operator import ContactOperator
-from fenics_contact.systems.reference_scales import ReferenceScales
+from fenics_contact.systems.reference_scales import ReferenceScales, body_of_points
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array, Index, Mask
 
@@ -244,10 +243,7 @@ class RigidBodyModes:
         contact = operator.contact
         points = contact.points
         travels = np.zeros((n_bodies, n_motions, *points.shape))
-        rows = contact.quadrature.point_rows()
-        cells = facet_cells(space.mesh, contact.surface.facets)
-        own = np.zeros(len(points), dtype=np.intp)
-        own[rows.ravel()] = np.repeat(self._body[space.dofmap.list[cells, 0]], rows.shape[1])
+        own = body_of_points(contact, space, self._body)
         for b in range(n_bodies):
             placed = rigid_motions(points - self._centres[b], self._sizes[b])
             travels[b] = np.where((own == b)[:, None], np.array(list(placed.values())), 0.0)
