@@ -102,7 +102,9 @@ class Case:
         problem, contact, u, load = problems.problem(body, self.degree, self.stiffness, **options)
         try:
             made = list(
-                fc.increments(problem, load, 0.0, body.end, steps=steps, field=field, max_cuts=0)
+                fc.increments(
+                    problem, load, 0.0, body.end, steps=steps, recover_interior=field, max_cuts=0
+                )
             )
         except fc.NotConverged:
             return {"iterations": "none", "factorisations": ""}

@@ -58,7 +58,7 @@ def dragged_cylinder(method: str, stiffness: float) -> Loading:
     body = fc.elasticity.LinearElastic(u, ironing.E, ironing.NU, "plane strain")
     move = fem.Constant(mesh, np.zeros(2))
     cylinder = fc.Cylinder((-1.0, ironing.R), ironing.R, displacement=move)
-    k = fc.Scaled(stiffness)
+    k = fc.RelativeStiffness(stiffness)
     law = fc.Coulomb(ironing.MU, k, k)
     problem = dragged(body, tags, (ironing.BOTTOM, ironing.TOP), cylinder, law, method)
 
@@ -77,7 +77,7 @@ def dragged_ball(method: str, stiffness: float) -> Loading:
     body = fc.elasticity.LinearElastic(u, 1000.0, 0.3, "3D")
     move = fem.Constant(mesh, np.zeros(3))
     ball = fc.Ball((0, 0, 2.0), 2.0, displacement=move)
-    k = fc.Scaled(stiffness)
+    k = fc.RelativeStiffness(stiffness)
     tags = sides(mesh, {1: plane(2, -1), 2: plane(2, 0)})
     problem = dragged(body, tags, (1, 2), ball, fc.Coulomb(0.3, k, k), method)
 
@@ -91,14 +91,14 @@ def dragged(
     body: fc.elasticity.LinearElastic,
     tags: dolfinx.mesh.MeshTags,
     ends: tuple[int, int],
-    support: fc.Support,
+    obstacle: fc.Obstacle,
     law: fc.Coulomb,
     method: str,
 ) -> fc.ContactProblem:
-    """A body clamped at one end, its other one touched by a support."""
+    """A body clamped at one end, its other one touched by an obstacle."""
     u, (held, touched) = body.u, ends
     bcs = [hold(u, tags, held, i) for i in range(len(u))]
-    contact = fc.Contact(u, fc.ContactSurface(u.function_space.mesh, tags, touched), support, law)
+    contact = fc.Contact(u, fc.ContactSurface(u.function_space.mesh, tags, touched), obstacle, law)
     F = body.residual(ufl.TestFunction(u.function_space))
     return fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method=method, fallback=False)
 
@@ -124,7 +124,7 @@ def dragged_block(
     made.hold(top, 0, value=side)
     made.hold(top, *range(1, d - 1))
     made.hold(top, d - 1, value=down)
-    k = fc.Scaled(stiffness)
+    k = fc.RelativeStiffness(stiffness)
     contact = made.contact(upper, lower, fc.Coulomb(0.3, k, k), kinematics="finite")
     problem = made.problem(contact, method=method, fallback=fallback)
 

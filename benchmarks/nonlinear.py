@@ -87,13 +87,13 @@ def run(make: Callable[[int], Made], stiffness: float, method: str, n: int) -> t
     """One history."""
     scene, depth, keep = make(n)
     shift = fem.Constant(scene.mesh, np.zeros(2))
-    k = fc.Scaled(stiffness)
+    k = fc.RelativeStiffness(stiffness)
     kinematics = "small" if depth < 0.1 else "finite"
     problem, _ = scene.problem(
         disc(scene, 0.8, displacement=shift),
         fc.Coulomb(0.3, k, k),
         contact={"kinematics": kinematics},
-        kinematics=np.inf,
+        small_displacement_tolerance=np.inf,
         method=method,
         fallback=False,
     )

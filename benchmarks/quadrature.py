@@ -75,7 +75,7 @@ def study(degree: int, sizes: list[float], folder: Path) -> None:
                     "pressure, error": float(square),
                     "oscillation": float(np.abs(error[at < MIDDLE]).max() / exact.max()),
                     "penetration": step.contacts["contact"].max_penetration,
-                    "rounds": step.rounds,
+                    "rounds": step.augmentations,
                     "iterations": step.iterations,
                 }
     title = f"Quadrature of Γc, displacements of degree {degree}"

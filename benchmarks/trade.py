@@ -75,9 +75,9 @@ def solve(body: Body, setting: Setting, limit: float = LIMIT) -> Row:
     if setting.accuracy not in ("", *PRESETS):
         choices["accuracy"] = float(setting.accuracy)
     elif not setting.accuracy:
-        stiffness = {"k_n": fc.Scaled(setting.k_n)}
+        stiffness = {"k_n": fc.RelativeStiffness(setting.k_n)}
         if body.friction:
-            stiffness["k_t"] = fc.Scaled(setting.k_n * setting.k_t)
+            stiffness["k_t"] = fc.RelativeStiffness(setting.k_n * setting.k_t)
         choices = {"enforcement": setting.enforcement, "tolerance": setting.tolerance}
         options = {"snes_rtol": setting.rtol}
     law: fc.Coulomb | fc.Frictionless
@@ -111,7 +111,7 @@ def solve(body: Body, setting: Setting, limit: float = LIMIT) -> Row:
     return row | {
         "steps": len(steps),
         "iterations": sum(step.iterations for step in steps),
-        "rounds": sum(step.rounds for step in steps),
+        "rounds": sum(step.augmentations for step in steps),
         "finished by": " ".join(sorted({step.method for step in steps})),
         "normal force": resultants.normal_force,
         "friction force": resultants.tangential_force,

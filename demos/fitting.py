@@ -146,7 +146,7 @@ class Fitting:
         return problem, self.u.x.array.copy()
 
     def reaction(self) -> float:
-        """Vertical force that the support at the top exerts. Collective."""
+        """Vertical force that the obstacle at the top exerts. Collective."""
         residual = fem.Function(self.u.function_space)
         fem.assemble_vector(residual.x.array, fem.form(self.F))
         residual.x.scatter_reverse(dolfinx.la.InsertMode.add)

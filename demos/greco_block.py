@@ -78,7 +78,7 @@ def solve(arguments: argparse.Namespace) -> tuple[fc.ContactProblem, dict[str, A
     bcs = [fem.dirichletbc(PETSc.ScalarType(0.0), held, V.sub(0))]
 
     surface = fc.ContactSurface(mesh, tags, BOTTOM)
-    law = fc.Coulomb(FRICTION, k_n=fc.Scaled(30), k_t=fc.Scaled(10))
+    law = fc.Coulomb(FRICTION, k_n=fc.RelativeStiffness(30), k_t=fc.RelativeStiffness(10))
     contact = fc.Contact(u, surface, fc.HalfSpace(point=(0, 0), normal=(0, 1)), law)
     problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method="newton")
     options = {"steps": increments, "estimate": arguments.errors, "progress": "GRECO block"}

@@ -112,7 +112,7 @@ def solve(
     motion = fc.Motion(displacement=(along, None), force=(None, press))
     cylinder = fc.Cylinder(point=(-WAY / 2, R), radius=R, displacement=motion)
     surface = fc.ContactSurface(mesh, tags, TOP)
-    stiffness = fc.Scaled(arguments.stiffness)
+    stiffness = fc.RelativeStiffness(arguments.stiffness)
     contact = fc.Contact(u, surface, cylinder, fc.Coulomb(MU, stiffness, stiffness))
     problem = fc.ContactProblem(
         body.residual(v), u, bcs=bcs, contacts=[contact], method=arguments.solver

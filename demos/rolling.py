@@ -10,7 +10,7 @@ the contact, at last all of them do. Then the disc is dragged by 2 as it is. μ 
 
 References: forces and torque of GetFEM 5.4.2 on the same mesh, with the same penalty (1e4 along the
 normal, 1e3 across), where the disc has been pressed, turned and dragged (1e-7 of the force that
-presses; all increments are in verification/getfem_disc.py). A second route through this package:
+presses; all increments are in verification/getfem_disc.py). A cross-check through this package:
 the block is moved to the other side instead of the disc, and the forces are the same (1e-10). And
 the torque of a disc that slips all over, R times μ times all pressure (2 %: it penetrates by p/k_n,
 up to 0.07). The exit code is 1 if one of them is missed.

@@ -78,7 +78,7 @@ def solve(
     bcs = [fem.dirichletbc(np.zeros(3), top, V)]
     angle, shift = fem.Constant(mesh, 0.0), fem.Constant(mesh, np.zeros(3))
     turn = fc.Rotation(angle, about=(0, 0, 0), axis=(0, 0, 1))
-    screw = fc.Obstacle(distance=thread, displacement=shift, rotation=turn)
+    screw = fc.SignedDistance(thread, displacement=shift, rotation=turn)
     law = fc.Coulomb(friction) if friction else fc.Frictionless()
     surface = fc.ContactSurface(mesh, tags, FOOT)
     contact = fc.Contact(u, surface, screw, law, kinematics="finite", name="flank")

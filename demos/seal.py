@@ -145,13 +145,13 @@ def solve(name: str, cells: int) -> Run:
         fc.Contact(
             u,
             surface,
-            support,
-            fc.Frictionless(fc.Scaled(50)),
+            obstacle,
+            fc.Frictionless(fc.RelativeStiffness(50)),
             kinematics="finite",
             weight=rubber.weight,
             name=called,
         )
-        for called, support in (("lid", lid), ("bed", bed))
+        for called, obstacle in (("lid", lid), ("bed", bed))
     ]
     # Nothing but the two contacts holds the ring.
     problem = fc.ContactProblem(rubber.residual(v, dx, q=q), w, contacts=contacts)

@@ -184,7 +184,7 @@ def solve(
     own, other = (SIDE, SURFACE) if setting.side == "die" else (SURFACE, SIDE)
     if own == SIDE:
         unit *= setting.finer
-    k = fc.Scaled(setting.stiffness * unit)
+    k = fc.RelativeStiffness(setting.stiffness * unit)
     contact = fc.Contact(
         u,
         fc.ContactSurface(mesh, facets, own, quadrature_degree=setting.quadrature),

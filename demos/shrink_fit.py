@@ -124,7 +124,7 @@ def solve(
         u,
         fc.ContactSurface(mesh, tags, SHAFT),
         fc.DeformableBody(tags, HUB),
-        fc.Frictionless(fc.Scaled(arguments.stiffness)),
+        fc.Frictionless(fc.RelativeStiffness(arguments.stiffness)),
         gap=-OVERSIZE,
     )
     problem = fc.ContactProblem(body.residual(v), u, bcs=bcs, contacts=[contact])

@@ -115,20 +115,20 @@ def solve(
     down = fem.Constant(mesh, PETSc.ScalarType(0.0))
     fixed = fem.Constant(mesh, PETSc.ScalarType(0.0))
     held = [(0, AT_X, fixed), (1, AT_Y, fixed)]
-    support: fc.Ball | fc.HalfSpace
+    obstacle: fc.Ball | fc.HalfSpace
     if case == "block":
         held += [(i, HELD, fixed) for i in range(3)]
         ball_moves = ufl.as_vector([0, 0, down])
-        support = fc.Ball(center=(0, 0, R), radius=R, displacement=ball_moves)
+        obstacle = fc.Ball(center=(0, 0, R), radius=R, displacement=ball_moves)
     else:
         held += [(2, HELD, down)]
-        support = fc.HalfSpace(point=(0, 0, 0), normal=(0, 0, 1))
+        obstacle = fc.HalfSpace(point=(0, 0, 0), normal=(0, 0, 1))
     bcs = [
         fem.dirichletbc(value, fem.locate_dofs_topological(V.sub(i), 2, tags.find(tag)), V.sub(i))
         for i, tag, value in held
     ]
-    law = fc.Frictionless(fc.Scaled(arguments.stiffness))
-    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, CONTACT), support, law)
+    law = fc.Frictionless(fc.RelativeStiffness(arguments.stiffness))
+    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, CONTACT), obstacle, law)
     problem = fc.ContactProblem(body.residual(v), u, bcs=bcs, contacts=[contact])
     (step,) = fc.increments(problem, down, 0.0, -arguments.depth)
 

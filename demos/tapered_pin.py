@@ -229,7 +229,7 @@ def make(joint: Joint, cells: int) -> Scene:
         fc.DeformableBody(joined.facets, joined.facet("hub", INSIDE)),
         # Springs of 10 E/h would take 1 % off the interference; soft ones along the joint give way
         # by less than a micrometre, and friction that turns round takes fewer steps.
-        fc.Coulomb(joint.friction, fc.Scaled(100), fc.Scaled(1)),
+        fc.Coulomb(joint.friction, fc.RelativeStiffness(100), fc.RelativeStiffness(1)),
         kinematics="finite",
         weight=steel.weight,
     )

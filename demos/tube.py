@@ -10,7 +10,7 @@ opposite at once: each point looks along its present normal for what of the same
     python demos/tube.py --cells 6
     mpirun -n 2 python demos/tube.py
 
-References. A second route: a quarter of the tube, whose inside is pressed on the plane of symmetry
+References. A cross-check: a quarter of the tube, whose inside is pressed on the plane of symmetry
 as on a rigid half-space. In the whole tube both walls have points and springs, and each spring is
 as long as both go in each other: a quarter of the stiffness gives the same pressure. Forces of the
 bars and of wall on wall are those of the quarter (1e-3: normals of walls that are not flat do not
@@ -153,15 +153,15 @@ def solve(name: str, cells: int, quarters: int) -> Run:
     closing = fem.Constant(mesh, 0.0)
     wall, rim = (fc.ContactSurface(mesh, tags, tag) for tag in (WALL, RIM))
     bars = {"upper": 1.0} if quarters == 1 else {"upper": 1.0, "lower": -1.0}
-    supports: dict[str, Any] = {
+    obstacles: dict[str, Any] = {
         called: fc.Cylinder(
             (0, up * (OUTER + BAR)), BAR, displacement=ufl.as_vector([0, -up * closing / 2])
         )
         for called, up in bars.items()
     }
     contacts = [
-        fc.Contact(u, rim, support, fc.Frictionless(K), kinematics="finite", name=called)
-        for called, support in supports.items()
+        fc.Contact(u, rim, obstacle, fc.Frictionless(K), kinematics="finite", name=called)
+        for called, obstacle in obstacles.items()
     ]
     # Nothing moves aside where x = 0: of the whole tube that is what holds it.
     bcs = [held(UPRIGHT, 0)]

@@ -139,7 +139,9 @@ def press(cells: int, degree: int, stiffness: float) -> Pressed:
     clamped = fem.locate_dofs_topological(V, 1, tags.find(BASE))
     bcs = [fem.dirichletbc(np.zeros(2, dtype=PETSc.ScalarType), clamped, V)]
 
-    law = fc.Coulomb(FRICTION, k_n=fc.Scaled(stiffness), k_t=fc.Scaled(stiffness))
+    law = fc.Coulomb(
+        FRICTION, k_n=fc.RelativeStiffness(stiffness), k_t=fc.RelativeStiffness(stiffness)
+    )
     surface = fc.ContactSurface(mesh, tags, UPPER)
     contact = fc.Contact(u, surface, fc.DeformableBody(tags, LOWER), law)
     # Pressed on without friction, on rollers along the axis; from then on friction holds it.

@@ -15,8 +15,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from meanings import GROUPS, MEANINGS
-
 PACKAGE = Path(__file__).resolve().parent.parent / "fenics_contact"
 HOLE = "…"
 # More ways than this to fill a hole are left open.
@@ -189,6 +187,8 @@ class _Module:
 
 
 _LOGGED = {"warning", "log"}
+# Kinds that have a table of their own; all others are errors.
+KINDS = ("NotConverged", "verdict", "attempt", "warning", "log")
 
 
 def read(package: Path = PACKAGE) -> list[Message]:
@@ -205,42 +205,32 @@ def read(package: Path = PACKAGE) -> list[Message]:
 # ---- pages ---------------------------------------------------------------------------------------
 
 
-def meant(message: Message) -> list[tuple[str, str]]:
-    """What `meanings` says of a message that is no plain error; there must be one."""
-    return [said for piece, said in MEANINGS[message.kind].items() if piece in message.text]
-
-
-def grouped(found: list[Message]) -> list[tuple[str, str, list[Message]]]:
-    """Plain errors by group: title, what they have in common, messages."""
-    errors = [m for m in found if m.kind not in MEANINGS]
-    return [
-        (title, hint, [m for m in errors if m.module in names]) for title, names, hint in GROUPS
-    ]
-
-
 def _cell(text: str) -> str:
     """A text as it stands, in a table of Markdown."""
     return re.sub(r"([\\`*_\[\]<>|#$~{}])", r"\\\1", text)
 
 
-def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    lines = ["| " + " | ".join(cells) + " |" for cells in (header, ("---",) * len(header), *rows)]
-    return "\n".join(lines) + "\n"
+def _table(rows: list[tuple[str, ...]]) -> str:
+    lines = ["| " + " | ".join(cells) + " |" for cells in rows]
+    return "\n".join([lines[0], "| --- " * len(rows[0]) + "|", *lines[1:]]) + "\n"
 
 
 def pages(found: list[Message]) -> dict[str, str]:
-    """The tables, by name of the file that a page includes."""
+    """The tables, by name of the file that a page includes; errors by folder of the package."""
     made = {}
-    for kind in MEANINGS:
-        rows = [
-            (_cell(text), *said)
-            for text, said in {m.text: s for m in found if m.kind == kind for s in meant(m)}.items()
-        ]
-        made[f"{kind}.md"] = _table(("text", "what it means", "what to do"), rows)
-    parts = []
-    for title, hint, messages in grouped(found):
-        rows = list(dict.fromkeys((_cell(m.text), f"`{m.kind}`") for m in messages))
-        parts.append(f"### {title}\n\n{hint}\n\n" + _table(("text", "error"), rows))
+    for kind in KINDS:
+        rows = list(dict.fromkeys((_cell(m.text),) for m in found if m.kind == kind))
+        made[f"{kind}.md"] = _table([("text",), *rows])
+    folders: dict[str, list[tuple[str, ...]]] = {}
+    for m in found:
+        if m.kind not in KINDS:
+            row = (_cell(m.text), f"`{m.kind}`")
+            folders.setdefault(m.module.rpartition(".")[0], []).append(row)
+    parts = [
+        f"### {folder or 'meshes, problem and arguments'}\n\n"
+        + _table([("text", "error"), *dict.fromkeys(rows)])
+        for folder, rows in folders.items()
+    ]
     return made | {"errors.md": "\n".join(parts)}
 
 

@@ -21,14 +21,14 @@ class Rough(fc.Law):
 
     def normal_potential(self, kinematics, parameters):
         """Energy per area, whose derivative by δ is the pressure."""
-        delta = kinematics.normal_displacement - kinematics.gap
+        delta = -kinematics.gap
         return parameters["p0"] * parameters["h"] * ufl.exp(delta / parameters["h"])
 
-    def response(self, kinematics, parameters):
+    def contact_traction(self, kinematics, parameters):
         """Normal traction, opening and penetration; no friction."""
-        delta = kinematics.normal_displacement - kinematics.gap
+        delta = -kinematics.gap
         pressure = parameters["p0"] * ufl.exp(delta / parameters["h"])
-        return fc.Response(-pressure, ufl.max_value(-delta, 0), ufl.max_value(delta, 0))
+        return fc.ContactTraction(-pressure, ufl.max_value(-delta, 0), ufl.max_value(delta, 0))
 
 
 msh = mesh.create_unit_square(MPI.COMM_WORLD, 8, 8)

@@ -34,7 +34,7 @@ F = body.residual(v) + PRESSURE * v[1] * ds(joined.facet("brass", ROOF))
 held = [(0, joined.facet(name, LEFT)) for name in E] + [(1, joined.facet("steel", FLOOR))]
 dofs = [fem.locate_dofs_topological(V.sub(i), 1, joined.facets.find(tag)) for i, tag in held]
 bcs = [fem.dirichletbc(0.0, d, V.sub(i)) for (i, _), d in zip(held, dofs, strict=True)]
-contacts = fc.contact_pairs(u, fc.Frictionless(), distance=0.05, bodies=joined)
+contacts = fc.find_contact_pairs(u, fc.Frictionless(), distance=0.05, bodies=joined)
 fc.ContactProblem(F, u, bcs=bcs, contacts=contacts).solve()
 forces = {contact.name: contact.resultants().normal_force for contact in contacts}
 if joined.mesh.comm.rank == 0:

@@ -33,8 +33,8 @@ body = fc.elasticity.LinearElastic(u, E, nu=0.3, kind="plane stress")
 F = body.residual(v) + PRESSURE * v[1] * ds(TOP)
 held = [(V.sub(i), tags.find(tag)) for i, tag in ((0, LEFT), (1, BOTTOM))]
 bcs = [fem.dirichletbc(0.0, fem.locate_dofs_topological(W, 1, f), W) for W, f in held]
-surface, support = fc.ContactSurface(mesh, tags, ABOVE), fc.DeformableBody(tags, BELOW)
-contact = fc.Contact(u, surface, support, fc.Frictionless(), enforcement="augmented")
+surface, obstacle = fc.ContactSurface(mesh, tags, ABOVE), fc.DeformableBody(tags, BELOW)
+contact = fc.Contact(u, surface, obstacle, fc.Frictionless(), enforcement="augmented")
 fc.ContactProblem(F, u, bcs=bcs, contacts=[contact]).solve()
 shortening = mesh.comm.allreduce(fem.assemble_scalar(fem.form(-u[1] * ds(TOP))))  # mean, on 1 mm
 expected = PRESSURE * HEIGHT * (1 / E_LOWER + 1 / E_UPPER)

@@ -2,7 +2,7 @@
 
     body = elasticity.LinearElastic(u, E, nu, kind="plane stress", thickness=6.4)
     F = body.residual(v) + body.weight * pressure * v[1] * ds(TOP)
-    contact = fc.Contact(u, surface, support, law, weight=body.weight)
+    contact = fc.Contact(u, surface, obstacle, law, weight=body.weight)
 
 Nothing else of the package knows this module: any residual in UFL does as well.
 """

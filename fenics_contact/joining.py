@@ -19,14 +19,14 @@ from fenics_contact.arguments import check_cells, check_instance, is_number
 from fenics_contact.parallel import collective_errors
 from fenics_contact.types import Array, Index
 
-__all__ = ["Joined", "join_meshes"]
+__all__ = ["JoinedMesh", "join_meshes"]
 
 Part: TypeAlias = dolfinx.mesh.Mesh | Sequence[Any]
 Numbers: TypeAlias = Mapping[Hashable, Mapping[int | None, int]]
 
 
 @dataclass(frozen=True)
-class Joined:
+class JoinedMesh:
     """One mesh of several bodies that share no node, and how their tags are numbered in it.
 
     Tags count from 1, body by body in the order given, in each by ascending tag: no two bodies have
@@ -110,7 +110,7 @@ class Joined:
         return known[tag]
 
 
-def join_meshes(parts: Mapping[Hashable, Part] | Iterable[Part]) -> Joined:
+def join_meshes(parts: Mapping[Hashable, Part] | Iterable[Part]) -> JoinedMesh:
     """Put bodies that were meshed apart into one mesh. Collective.
 
     Nodes are never merged: bodies that touch stay apart, and a contact decides what happens between
@@ -157,7 +157,7 @@ def join_meshes(parts: Mapping[Hashable, Part] | Iterable[Part]) -> Joined:
     cell_tags = dolfinx.mesh.meshtags(mesh, d, every, data[:, 0].astype(np.int32))
     facet_tags = _facet_tags(mesh, data[:, 1:])
     mesh.topology.create_connectivity(d - 1, d)  # for Dirichlet conditions on tagged facets
-    return Joined(mesh, cell_tags, facet_tags, names, cell_numbers, facet_numbers)
+    return JoinedMesh(mesh, cell_tags, facet_tags, names, cell_numbers, facet_numbers)
 
 
 Body: TypeAlias = tuple[

@@ -98,7 +98,7 @@ class ContactProblem:
         solver: What solves an increment: system, methods and SNES.
         accuracy: That of the contact that wants most, None if not every contact says one.
         increment: Number of committed increments.
-        kinematics: See the argument.
+        small_displacement_tolerance: See the argument; it may be set between increments.
         initial_penetration: Largest penetration of the undeformed body (length), 0 if none; an
             interference by a prescribed gap is none.
     """
@@ -118,8 +118,8 @@ class ContactProblem:
         linear_solver: str | None = None,
         petsc_options: Mapping[str, Any] | None = None,
         prefix: str = "contact_",
-        kinematics: float = 0.2,
-        second_route: bool = False,
+        small_displacement_tolerance: float = 0.2,
+        cross_check: bool = False,
     ) -> None:
         """Compile the forms, measure the scales and check the input. Collective.
 
@@ -154,25 +154,27 @@ class ContactProblem:
             linear_solver: How systems over all unknowns are solved: "direct" (MUMPS) or "multigrid"
                 (GAMG: a V-cycle as H₀ of L-BFGS, or inside CG and GMRES for Newton's method). By
                 default multigrid for three-dimensional problems that it solves sooner, and where
-                the factors would not fit in half of the memory; supports that move freely need
+                the factors would not fit in half of the memory; obstacles that move freely need
                 "direct". The log says what was chosen.
             petsc_options: Options without prefix; they win over the method's, the command line
                 over both.
             prefix: Prefix of the options.
-            kinematics: Displacements are taken as small; an increment fails where that changes the
-                contact force or the pressure (between two bodies: the force) by more than this
-                share, and is warned of from a hundredth on. Infinite: it never fails.
-            second_route: Whether every verdict also compares the forces on Γc with those that
+            small_displacement_tolerance: Largest relative error of the contact force and pressure
+                (between two bodies: of the force) due to the assumption of small displacements. An
+                increment with a larger estimate fails; from 1 % on there is a warning. With
+                infinity no increment fails for this reason.
+            cross_check: Whether every verdict also compares the forces on Γc with those that
                 DOLFINx assembles from the boundary form; one more form to compile for each contact,
                 and an assembly for each increment.
 
         Raises:
             ValueError: Input that has no sense; the text says what and what to do. On all ranks.
         """
-        if not (is_number(kinematics) and kinematics > 0):
+        tolerance = small_displacement_tolerance
+        if not (is_number(tolerance) and tolerance > 0):
             raise ValueError(
-                f"kinematics is {kinematics!r}; it must be a positive share, such as 0.2, or "
-                "infinite, so that no increment fails by it"
+                f"small_displacement_tolerance is {tolerance!r}; it must be a positive relative "
+                "error, such as 0.2, or infinity to accept every increment"
             )
         self.contacts = listed("contacts", contacts, Contact)
         self._bcs = listed("bcs", bcs, fem.DirichletBC)
@@ -213,23 +215,21 @@ class ContactProblem:
         self.full.update_stiffness()
         self.bulk.check_elastic()
         self._modulus = FollowedModulus(self.bulk, self.displacement, self.contacts)
-        supports = [
+        obstacles = [
             (contact.name, motion) for contact in self.contacts for motion in contact.motions
         ]
         self.motions = RigidBodyModes(
             self.displacement,
             self.unknowns,
             self.full.scales,
-            [f"{m.kind} {m.way} of the support of {name}" for name, m in supports],
-            turning=[motion.turns for _, motion in supports],
+            [f"{m.kind} {m.way} of the obstacle of {name}" for name, m in obstacles],
+            turning=[motion.turns for _, motion in obstacles],
         )
         self._balance = LoadBalance(self.motions)
         self.initial_penetration = check_start(self.contacts)
         self._find_free_motions()
         self.full.scales.begin(self.operators)
-        self._judge = Judge(
-            self.full, self.motions, kinematics=kinematics, second_route=second_route
-        )
+        self._judge = Judge(self.full, self.motions, tolerance=tolerance, cross_check=cross_check)
         self.solver = Solver(self.full, self.motions, settings)
 
         # The present state, and the committed one: unknowns (the present ones are those of u), what
@@ -269,7 +269,7 @@ class ContactProblem:
         """That of the state that another problem has left. Collective."""
         load = self.present_load()
         self.full.begin(load)
-        bulk = self.full.with_supports(self.bulk.assemble_residual())
+        bulk = self.full.with_obstacles(self.bulk.assemble_residual())
         forces: dict[object, Forces] = {self.full.mark: self.full.present_forces(bulk)}
         return _Balance(load, EnergyState.at(forces, self.contacts))
 
@@ -277,37 +277,38 @@ class ContactProblem:
     def snes(self) -> PETSc.SNES:
         """The main PETSc solver.
 
-        `expect`, and with it `increments`, may make it anew before the first solution: monitors
-        that were set on it are kept; anything else is better said by options.
+        Setting `expected_increments`, as `increments` does, may make it anew before the first
+        solution: monitors that were set on it are kept; anything else is better said by options.
         """
         return self.solver.snes
 
     @property
-    def kinematics(self) -> float:
-        """What of small displacements passes; see the argument. It may be set."""
-        return self._judge.kinematics
+    def small_displacement_tolerance(self) -> float:
+        """Accepted error of the small-displacement assumption; see the argument. Settable."""
+        return self._judge.small_displacement_tolerance
 
-    @kinematics.setter
-    def kinematics(self, share: float) -> None:
-        self._judge.kinematics = share
+    @small_displacement_tolerance.setter
+    def small_displacement_tolerance(self, tolerance: float) -> None:
+        self._judge.small_displacement_tolerance = tolerance
 
-    def expect(self, increments: int) -> None:
-        """Say how many increments will be solved: the choice of the solver needs it. Collective.
+    @property
+    def expected_increments(self) -> int:
+        """Number of increments that the choice of the linear solver assumes, 4 unless it is set.
 
-        `increments` does. It matters before the first solution, in three dimensions: a few are
-        solved by multigrid sooner than all unknowns but those of Γc are eliminated for many. Where
-        nothing is said, four are expected.
-
-        Args:
-            increments: Their number, at least 1.
-
-        Raises:
-            ValueError: It is less.
+        `increments` sets it. Set it before the first solution (collective) where a loop of your own
+        solves many increments in three dimensions: static condensation pays for many of them,
+        multigrid for few. After the first solution it has no effect.
         """
-        if increments < 1:
-            raise ValueError(f"increments is {increments}; expect at least 1")
+        return self.solver.expected_increments
+
+    @expected_increments.setter
+    def expected_increments(self, number: int) -> None:
+        if not (isinstance(number, int | np.integer) and number >= 1):
+            raise ValueError(
+                f"expected_increments is {number!r}; it must be an integer, at least 1"
+            )
         if self._fresh:
-            self.solver.expect(increments)
+            self.solver.expect(int(number))
 
     # ---- the neighbourhood of a solution ---------------------------------------------------------
 
@@ -361,18 +362,19 @@ class ContactProblem:
     # ---- solving ---------------------------------------------------------------------------------
 
     @interrupts_held()
-    def solve(self, *, ahead: float = 1.0, field: bool = True) -> Step:
+    def solve(self, *, ahead: float = 1.0, recover_interior: bool = True) -> Step:
         """Solve the next increment with the loads and conditions as they are now. Collective.
 
         The history does not change: `commit` does that.
 
         Args:
             ahead: Size of this increment in units of the last one, for the guess to start from.
-            field: Whether to find all of u. If not, and if the problem is condensed, u may stay
-                behind: then only what contact touches, all results of the contacts included, is
-                that of the increment, and the verdict is on the condensed equations. `complete`
-                brings up the rest, for a fifteenth to a thirtieth of a factorisation. Where not all
-                of Γc is kept u is found all the same, to see that the rest of Γc stays open.
+            recover_interior: Whether to find all of u. If not, and if the problem is condensed, u
+                may stay behind: then only what contact touches, all results of the contacts
+                included, is that of the increment, and the verdict is on the condensed equations.
+                `complete` brings up the rest, for a fifteenth to a thirtieth of a factorisation.
+                Where not all of Γc is kept u is found all the same, to see that the rest of Γc
+                stays open.
 
         Returns:
             What was done, the verdict included.
@@ -404,7 +406,7 @@ class ContactProblem:
                 step = None
                 while step is None:
                     with self.solver.options.present():
-                        step = self._solve(start, ahead, field, tried)
+                        step = self._solve(start, ahead, recover_interior, tried)
                     # Outside, lest a SNES that is made anew takes its options for the caller's.
                     if step is None:
                         self._go_back(*saved)
@@ -505,7 +507,7 @@ class ContactProblem:
         if reason <= 0 or verdict.failures:
             raise self._not_converged(reason, verdict, tried)
         energy = energies.since(self._then.energy, self.contacts, self.full.scales)
-        verdict = replace(verdict, created=energy.created)
+        verdict = replace(verdict, friction_energy_gain=energy.friction_energy_gain)
         if verdict.failures:
             raise self._not_converged(reason, verdict, tried)
         self._judge.warn_of_large_motion(verdict)
@@ -516,7 +518,7 @@ class ContactProblem:
             increment=self.increment + 1,
             reason=reason,
             iterations=sum(attempt.iterations for attempt in tried),
-            rounds=rounds,
+            augmentations=rounds,
             method=tried[-1].method,
             factorisations=solver.equations.factorisations,
             verdict=verdict,
@@ -558,8 +560,9 @@ class ContactProblem:
     def complete(self) -> Verdict | None:
         """Bring all of u up to the increment solved last, if it is behind. Collective.
 
-        See `solve` with ``field=False``, and `increments`. The field is checked apart from how it
-        was found: the product of the bulk's matrix with it must meet loads and contact forces.
+        See `solve` with ``recover_interior=False``, and `increments`. The field is checked apart
+        from how it was found: the product of the bulk's matrix with it must meet loads and contact
+            forces.
 
         Returns:
             The verdict; None if nothing was behind.
@@ -635,7 +638,7 @@ class ContactProblem:
     def _judge_all(self, *, kinematics: bool, assemble: bool) -> tuple[Verdict, EnergyState]:
         """Judge a complete u by assembly, past SNES and its residual, or by K u. Collective."""
         if assemble:
-            bulk = self.full.with_supports(self.bulk.assemble_residual())
+            bulk = self.full.with_obstacles(self.bulk.assemble_residual())
         else:
             bulk = self.full.product_force()
         verdict, found = self._judged(self.full, bulk, kinematics=kinematics)
@@ -745,7 +748,7 @@ class ContactProblem:
             kept=kept,
             constrained=self.constrained,
             increment=self.increment,
-            expected=self.solver.expected,
+            expected=self.expected_increments,
             pairs_anew=tuple(contact.opposite.pairs_anew for contact in self.contacts),
         )
 
@@ -781,7 +784,7 @@ class ContactProblem:
 
     def present_load(self) -> Array:
         """External forces as they are now at this rank's unknowns (force). Collective."""
-        return -self.full.with_supports(self.bulk.update_load())
+        return -self.full.with_obstacles(self.bulk.update_load())
 
     def prescribed_values(self) -> Array:
         """Values of the Dirichlet conditions as they are now, u elsewhere, at the unknowns."""
@@ -800,7 +803,7 @@ class ContactProblem:
             taken: What it gave.
             points: Of every contact what `Contact.take_up` takes.
         """
-        self.expect(taken.expected)
+        self.expected_increments = taken.expected
         self._fresh, self._solved = False, None
         self.solver.keep(np.flatnonzero(taken.kept).astype(np.int32))
         self.increment = taken.increment

@@ -125,11 +125,11 @@ class Beside:
         """Apply a traction to a side."""
         self.bodies.F -= value * self.bodies.v[component] * self.bodies.ds(self.tag(box, side))
 
-    def contact(self, box: str, side: int, support: Any, law: Any, **options: Any) -> fc.Contact:
-        """Contact of a side with a support, or with a side of another box. Collective."""
-        if isinstance(support, tuple):
-            support = fc.DeformableBody(self.bodies.tags, self.tag(*support))
-        return self.bodies.contact(self.tag(box, side), support, law, **options)
+    def contact(self, box: str, side: int, obstacle: Any, law: Any, **options: Any) -> fc.Contact:
+        """Contact of a side with an obstacle, or with a side of another box. Collective."""
+        if isinstance(obstacle, tuple):
+            obstacle = fc.DeformableBody(self.bodies.tags, self.tag(*obstacle))
+        return self.bodies.contact(self.tag(box, side), obstacle, law, **options)
 
     def problem(self, *contacts: fc.Contact, **options: Any) -> fc.ContactProblem:
         """The problem, with the contacts of the busy bodies. Collective."""

@@ -224,14 +224,14 @@ class Block:
 
     def contact(self, law: Any, *, displacement: Any = None, **kwargs: Any) -> fc.Contact:
         """Contact of the bottom, by default with the floor."""
-        support = kwargs.pop("support", None) or self.floor(displacement=displacement)
-        return fc.Contact(self.u, self.surface, support, law, **kwargs)
+        obstacle = kwargs.pop("obstacle", None) or self.floor(displacement=displacement)
+        return fc.Contact(self.u, self.surface, obstacle, law, **kwargs)
 
     def wall(self, law: Any) -> fc.Contact:
         """Contact of the left side with a wall that it just touches."""
         surface = fc.ContactSurface(self.mesh, self.tags, LEFT)
-        support = fc.HalfSpace((0.0,) * self.dim, self.vector(side=1.0))
-        return fc.Contact(self.u, surface, support, law, name="wall")
+        obstacle = fc.HalfSpace((0.0,) * self.dim, self.vector(side=1.0))
+        return fc.Contact(self.u, surface, obstacle, law, name="wall")
 
     def problem(
         self,
@@ -277,7 +277,7 @@ def block(
 def bulge(scene: Block, depth: float = 0.01) -> fc.Obstacle:
     """A floor that is lower to the sides, by the depth times the distance squared."""
     x = ufl.SpatialCoordinate(scene.mesh)
-    return fc.Obstacle(depth * (x[0] - 0.4) ** 2, scene.vector(up=-1.0))
+    return fc.PrescribedGap(depth * (x[0] - 0.4) ** 2, scene.vector(up=-1.0))
 
 
 def kirchhoff(scene: Block) -> ufl.Form:

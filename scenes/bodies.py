@@ -137,13 +137,13 @@ class Bodies:
         self.bcs += [hold(self.u, self.tags, tag, i, value) for i in components]
 
     def contact(
-        self, tag: Any, support: Any, law: Any, *, quadrature: int | None = None, **options: Any
+        self, tag: Any, obstacle: Any, law: Any, *, quadrature: int | None = None, **options: Any
     ) -> fc.Contact:
-        """Contact of a side with a support, or with the sides of a tag or tags. Collective."""
-        if not isinstance(support, fc.Support):
-            support = fc.DeformableBody(self.tags, support)
+        """Contact of a side with an obstacle, or with the sides of a tag or tags. Collective."""
+        if not isinstance(obstacle, fc.Obstacle):
+            obstacle = fc.DeformableBody(self.tags, obstacle)
         surface = fc.ContactSurface(self.mesh, self.tags, tag, quadrature_degree=quadrature)
-        return fc.Contact(self.u, surface, support, law, **options)
+        return fc.Contact(self.u, surface, obstacle, law, **options)
 
     def problem(self, *contacts: fc.Contact, **options: Any) -> fc.ContactProblem:
         """The problem with these contacts. Collective."""

@@ -116,9 +116,9 @@ class BoltedJoint(History):
         for name, (mine, other) in _JOINTS.items():
             gap = {"gap": -self.tight} if name == "head" else {}
             surface = fc.ContactSurface(mesh, tags, mine)
-            support = fc.DeformableBody(tags, other)
+            obstacle = fc.DeformableBody(tags, other)
             law = fc.Coulomb(FRICTION)
-            made = fc.Contact(self.u, surface, support, law, name=name, **gap, **contact)
+            made = fc.Contact(self.u, surface, obstacle, law, name=name, **gap, **contact)
             self.contacts.append(made)
         ds = ufl.Measure("ds", mesh, subdomain_data=tags)(PULLED)
         F = residual(self.u, v, E, NU) - self.pull / (WIDTH * THICKNESS) * v[0] * ds

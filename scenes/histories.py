@@ -47,7 +47,7 @@ class Press(History):
         law: Any = None,
         *,
         cell: str = "quadrilateral",
-        support: str = "fixed",
+        obstacle: str = "fixed",
         bulk: str = "linear",
         wall: bool = False,
         surface: dict | None = None,
@@ -69,11 +69,11 @@ class Press(History):
         self.shift = fem.Constant(mesh, np.zeros(d))
         self.force = fem.Constant(mesh, 0.0)
         self.plastic = fem.Function(fem.functionspace(mesh, ("DG", 0)), name="plastic")
-        self.moves = support
+        self.moves = obstacle
         displacement: Any = None
-        if support == "moving":
+        if obstacle == "moving":
             displacement = self.shift
-        elif support == "force":
+        elif obstacle == "force":
             self.along = fem.Constant(mesh, 0.0)
             displacement = fc.Motion(
                 force=(*(None,) * (d - 1), self.force),
@@ -92,7 +92,7 @@ class Press(History):
             if bulk != "linear with plastic":
                 F += scene.E * stiffening * ufl.tr(eps) ** 3 * ufl.tr(strain(v)) * ufl.dx
             F += scene.E * ufl.tr(eps) * ufl.tr(strain(v)) * ufl.dx
-        contacts = [scene.contact(law, support=ball, name=names[0], **(contact or {}))]
+        contacts = [scene.contact(law, obstacle=ball, name=names[0], **(contact or {}))]
         if wall:
             side = fc.ContactSurface(mesh, scene.tags, RIGHT)
             at = np.full(d, 0.5)
@@ -147,7 +147,7 @@ def picture(made: History) -> dict[str, Array]:
         owned(field)[:] = getattr(committed, name)[: problem.unknowns.n_dofs]
         found[f"committed {name}"] = _nodal(problem, field)
     for name in ("state", "rate"):
-        found[f"{name} of supports"] = problem.unknowns.motions(getattr(committed, name))
+        found[f"{name} of obstacles"] = problem.unknowns.motions(getattr(committed, name))
     energy = problem.committed_energy
     found["springs"] = np.array([COMM.allreduce(sum(map(np.sum, energy.springs)))])
     if problem.solver.condensed:

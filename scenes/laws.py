@@ -28,15 +28,15 @@ class Overclosure(fc.Law):
         """p0 exp(δ/h)."""
         return parameters["p0"] * ufl.exp(closing / parameters["h"])
 
-    def response(self, kinematics, parameters):
+    def contact_traction(self, kinematics, parameters):
         """The pressure, nothing along Γc."""
-        closing = kinematics.normal_displacement - kinematics.gap
+        closing = -kinematics.gap
         pressure = self.pressure(closing, parameters)
-        return fc.Response(-pressure, positive_part(-closing), positive_part(closing))
+        return fc.ContactTraction(-pressure, positive_part(-closing), positive_part(closing))
 
     def normal_potential(self, kinematics, parameters):
         """∫ p dδ."""
-        closing = kinematics.normal_displacement - kinematics.gap
+        closing = -kinematics.gap
         return parameters["h"] * self.pressure(closing, parameters)
 
 
@@ -62,16 +62,16 @@ class Bond(fc.Law):
         """The largest pull, at o = h."""
         return self.k_n * self.h * math.exp(-1)
 
-    def response(self, kinematics, parameters):
+    def contact_traction(self, kinematics, parameters):
         """The pull, nothing along Γc."""
-        opening = kinematics.gap - kinematics.normal_displacement
+        opening = kinematics.gap
         pull = parameters["k_n"] * opening * ufl.exp(-opening / parameters["h"])
-        return fc.Response(pull, positive_part(opening), positive_part(-opening))
+        return fc.ContactTraction(pull, positive_part(opening), positive_part(-opening))
 
     def normal_potential(self, kinematics, parameters):
         """∫ pull do."""
         k_n, h = parameters["k_n"], parameters["h"]
-        opening = kinematics.gap - kinematics.normal_displacement
+        opening = kinematics.gap
         return -k_n * h * (h + opening) * ufl.exp(-opening / h)
 
 
@@ -89,19 +89,21 @@ class Asperities(fc.FrictionLaw):
         """All but friction."""
         return frozenset({"p0", "h", "k_t"})
 
-    def response(self, kinematics, parameters):
+    def contact_traction(self, kinematics, parameters):
         """The pressure, and friction up to μ times it."""
-        closing = kinematics.normal_displacement - kinematics.gap
+        closing = -kinematics.gap
         penetration = positive_part(closing)
         pressure = parameters["p0"] * (ufl.exp(penetration / parameters["h"]) - 1)
         bound = self.friction_bound(kinematics, pressure, parameters)
-        traction, slip = self.slide(kinematics, bound, parameters)
-        return fc.Response(-pressure, positive_part(-closing), penetration, traction, bound, slip)
+        traction, slip = self.return_map(kinematics, bound, parameters)
+        return fc.ContactTraction(
+            -pressure, positive_part(-closing), penetration, traction, bound, slip
+        )
 
     def normal_potential(self, kinematics, parameters):
         """∫ p dδ."""
         p0, h = parameters["p0"], parameters["h"]
-        penetration = positive_part(kinematics.normal_displacement - kinematics.gap)
+        penetration = positive_part(-kinematics.gap)
         return p0 * h * (ufl.exp(penetration / h) - 1) - p0 * penetration
 
 
@@ -119,12 +121,12 @@ class Saturating(fc.FrictionLaw):
         s = parameters["strength"]
         return s * (1 - ufl.exp(-parameters["friction"] * pressure / s))
 
-    def response(self, kinematics, parameters):
+    def contact_traction(self, kinematics, parameters):
         """Unilateral contact, and friction up to the bound."""
-        penetration = positive_part(kinematics.normal_displacement - kinematics.gap)
-        opening = positive_part(kinematics.gap - kinematics.normal_displacement)
+        penetration = positive_part(-kinematics.gap)
+        opening = positive_part(kinematics.gap)
         pressure = parameters["k_n"] * penetration
         bound = self.friction_bound(kinematics, pressure, parameters)
-        traction, slip = self.slide(kinematics, bound, parameters)
+        traction, slip = self.return_map(kinematics, bound, parameters)
         slip = tuple(ufl.conditional(ufl.gt(pressure, 0), mode, 0) for mode in slip)
-        return fc.Response(-pressure, opening, penetration, traction, bound, slip)
+        return fc.ContactTraction(-pressure, opening, penetration, traction, bound, slip)

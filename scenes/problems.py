@@ -43,7 +43,7 @@ class Body:
         held: Components (component, tag) that do not move.
         end: Of the load parameter.
         work: Virtual work of the loads (test function, load parameter, ds).
-        contact: Makes the support, and the gap if it is given apart from the geometry, of the load
+        contact: Makes the obstacle, and the gap if it is given apart from the geometry, of the load
             parameter: arguments of `fc.Contact`.
         displacement: The one to compare.
         glued: Facets held in a linear solve, the unit of time.
@@ -51,7 +51,7 @@ class Body:
         force: That of the contact, about, by which residuals are measured (force).
         h: Height of the cells at Γc: k = stiffness E/h of forms by hand (length).
         by_hand: For them, of the place x and the load parameter: normal from the body to the
-            support, gap, and the support's motion (UFL).
+            obstacle, gap, and the obstacle's motion (UFL).
         push: Start of Newton's method by hand, a displacement, where it needs contact to start.
         history: Whether the result depends on the increments of the load.
     """
@@ -101,7 +101,7 @@ def parts(body: Body, degree: int) -> Parts:
 
 def law(body: Body, stiffness: float) -> fc.Coulomb | fc.Frictionless:
     """Coulomb's or none, k_n = k_t = ``stiffness`` E/h."""
-    k = fc.Scaled(stiffness)
+    k = fc.RelativeStiffness(stiffness)
     return fc.Coulomb(body.friction, k_n=k, k_t=k) if body.friction else fc.Frictionless(k_n=k)
 
 
@@ -193,7 +193,7 @@ def half_cylinder(friction: float, h: float, *, smooth: bool = False, **growth: 
         held=((0, hertz.AXIS),),
         end=hertz.PAPER_LOAD,
         work=lambda v, load, ds: -load * v[1] * ds(hertz.TOP),
-        contact=lambda load: {"support": fc.HalfSpace((0, 0), (0, 1))},
+        contact=lambda load: {"obstacle": fc.HalfSpace((0, 0), (0, 1))},
         displacement=lambda u: float(output.at_node(u, (0.0, hertz.R))[1]),
         force=hertz.R * hertz.PAPER_LOAD,
         h=h,
@@ -226,7 +226,7 @@ def greco_block(cells: int) -> Body:
                 - greco.TOP_PRESSURE * v[1] * ds(greco.TOP)
             )
         ),
-        contact=lambda load: {"support": fc.HalfSpace((0, 0), (0, 1))},
+        contact=lambda load: {"obstacle": fc.HalfSpace((0, 0), (0, 1))},
         displacement=lambda u: 1e3 * float(output.at_node(u, (0.0, 0.0))[0]),
         force=greco.SIZE * greco.TOP_PRESSURE,
         h=greco.SIZE / cells,
@@ -256,7 +256,7 @@ def rings(h: float) -> Body:
         held=((1, s.FLAT), (0, s.UPRIGHT)),
         end=-s.OVERSIZE,
         work=lambda v, load, ds: 0 * v[0] * ds(s.SHAFT),
-        contact=lambda load: {"support": fc.DeformableBody(tags, s.HUB), "gap": load},
+        contact=lambda load: {"obstacle": fc.DeformableBody(tags, s.HUB), "gap": load},
         displacement=lambda u: float(output.at_node(u, (s.INNER, 0))[0]),
         glued=(s.SHAFT, s.HUB),
     )
@@ -387,7 +387,7 @@ def graded(cells: int) -> np.ndarray:
 def _ball(radius: float, load: Any) -> dict[str, Any]:
     """A ball that touches z = 0 at the origin and moves by ``load``."""
     moved = ufl.as_vector([0, 0, load])
-    return {"support": fc.Ball((0, 0, radius), radius, displacement=moved)}
+    return {"obstacle": fc.Ball((0, 0, radius), radius, displacement=moved)}
 
 
 def _by_hand_ball(x: Any, load: Any, radius: float = RADIUS) -> tuple[Any, Any, Any]:

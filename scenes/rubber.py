@@ -59,18 +59,18 @@ class Rubber:
         self.held.interpolate(lambda x: motion(x[:d]) - x[:d])
 
     def contact(
-        self, support: fc.Support, law: Any, *, points_degree: int | None = None, **options: Any
+        self, obstacle: fc.Obstacle, law: Any, *, points_degree: int | None = None, **options: Any
     ) -> fc.Contact:
         """Of the top, by finite kinematics; ``points_degree``: of the rule on Γc."""
         surface = fc.ContactSurface(self.mesh, self.tags, TOP, quadrature_degree=points_degree)
         options = {"kinematics": "finite", "weight": self.body.weight} | options
-        return fc.Contact(self.displacement, surface, support, law, **options)
+        return fc.Contact(self.displacement, surface, obstacle, law, **options)
 
     def problem(
-        self, support: fc.Support, law: Any, *, contact: dict | None = None, **options: Any
+        self, obstacle: fc.Obstacle, law: Any, *, contact: dict | None = None, **options: Any
     ) -> tuple[fc.ContactProblem, fc.Contact]:
         """The problem and its one contact; ``contact``: arguments of `Rubber.contact`."""
-        made = self.contact(support, law, **(contact or {}))
+        made = self.contact(obstacle, law, **(contact or {}))
         problem = fc.ContactProblem(self.F, self.u, bcs=self.bcs, contacts=[made], **options)
         return problem, made
 
@@ -171,7 +171,7 @@ def disc(
     moment: Any = None,
     axis: Sequence[float] = (0, 1, 0),
     shape: str = "ball",
-) -> fc.Support:
+) -> fc.Obstacle:
     """A rigid disc or ball that touches the middle of the top; it turns about its centre.
 
     By ``angle``, or by ``moment``, or not at all.
@@ -245,9 +245,9 @@ class Tool(History):
                 force=(*(None,) * (d - 1), self.down), displacement=(self.side, *still, None)
             )
         turn = {"moment": self.moment} if driven else {"angle": self.angle}
-        support = disc(self.scene, radius, displacement=motion, shape=shape, **turn)
+        obstacle = disc(self.scene, radius, displacement=motion, shape=shape, **turn)
         self.problem, self.contact = self.scene.problem(
-            support,
+            obstacle,
             law or fc.Coulomb(0.3, 1e4, 1e4),
             contact=contact,
             **{"petsc_options": TIGHT, **(solver or {})},

@@ -64,7 +64,7 @@ class Rub:
         stiffness = pressure / length
         if law is None:
             law = fc.Coulomb(0.3, k_n=2e4 * stiffness, k_t=1e4 * stiffness)
-        contact = (contact or {}) | {"support": cushion(d, length=length)}
+        contact = (contact or {}) | {"obstacle": cushion(d, length=length)}
         self.problem, self.contact = self.scene.problem(law, bcs, contact=contact, **options)
 
     def move(self, side: float, down: float) -> None:

@@ -119,7 +119,7 @@ class Slider:
         bcs = [hold(self.u, tags, BOTTOM, i) for i in range(d)]
         bcs += [hold(self.u, tags, TOP, i, value) for i, value in enumerate(self.move)]
         surface = fc.ContactSurface(mesh, tags, UPPER)
-        base = fc.DeformableBody(tags, LOWER, update=update, release=release)
+        base = fc.DeformableBody(tags, LOWER, update_pairs=update, max_initial_penetration=release)
         self.contact = fc.Contact(self.u, surface, base, law, **(contact or {}))
         F = residual(self.u, v, E, 0.3)
         self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=[self.contact], **options)

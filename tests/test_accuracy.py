@@ -27,7 +27,9 @@ def press(law=None, **contact) -> Aslant:
 def truth():
     """Forces with multipliers to 1e-8 and 200 increments."""
     made = press(
-        fc.Coulomb(0.3, fc.Scaled(10), fc.Scaled(10)), enforcement="augmented", tolerance=1e-8
+        fc.Coulomb(0.3, fc.RelativeStiffness(10), fc.RelativeStiffness(10)),
+        enforcement="augmented",
+        tolerance=1e-8,
     )
     made.run(steps=200)
     return quantities(made.problem)
@@ -60,7 +62,11 @@ def test_choices():
 
 def test_what_is_given_wins():
     """Stiffness, enforcement, tolerance, solver and increments of the caller's own."""
-    made = press(fc.Coulomb(0.3, k_n=fc.Scaled(7), k_t=1e3), accuracy="fine", enforcement="penalty")
+    made = press(
+        fc.Coulomb(0.3, k_n=fc.RelativeStiffness(7), k_t=1e3),
+        accuracy="fine",
+        enforcement="penalty",
+    )
     assert made.contact.multipliers is None
     assert float(made.contact.parameters["k_n"].value) == 7.0
     assert float(made.contact.parameters["k_t"].value) == 1e3
@@ -113,7 +119,7 @@ def test_the_mesh_it_takes():
     n = int(np.ceil(1 / budget.h_wanted))
     finer = block("quadrilateral", 2, n=n)
     bcs = [finer.hold(TOP, 0, 0.015), finer.hold(TOP, 1, -0.03)]
-    contact = {"support": cushion(2), "accuracy": wanted}
+    contact = {"obstacle": cushion(2), "accuracy": wanted}
     problem, _ = finer.problem(fc.Frictionless(), bcs, contact=contact, method="newton")
     problem.solve()
     again = fc.estimate_errors(problem, stress(finer.u, finer.E, finer.nu))

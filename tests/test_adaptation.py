@@ -20,7 +20,7 @@ from scenes.indented import AXIS, BASE, TOP, half_block, press
 COMM = MPI.COMM_WORLD
 
 
-def slope(levels: list[fc.Level]) -> float:
+def slope(levels: list[fc.AdaptationLevel]) -> float:
     """Exponent of the energy's error over the dofs."""
     dofs, errors = [level.dofs for level in levels], [level.budget.energy for level in levels]
     return float(np.polyfit(np.log(dofs), np.log(errors), 1)[0])
@@ -78,8 +78,8 @@ def test_curved_sides():
         top = fem.dirichletbc(np.zeros(2), fem.locate_dofs_topological(V, 1, tags.find(OUTSIDE)), V)
         surface = fc.ContactSurface(mesh, tags, INSIDE)
         x = ufl.SpatialCoordinate(mesh)
-        support = fc.Obstacle(gap=-0.01, normal=-x)
-        contact = fc.Contact(u, surface, support, fc.Frictionless(1e4), gap=-0.01)
+        obstacle = fc.PrescribedGap(gap=-0.01, normal=-x)
+        contact = fc.Contact(u, surface, obstacle, fc.Frictionless(1e4), gap=-0.01)
         problem = fc.ContactProblem(body.residual(v), u, bcs=[top], contacts=[contact])
         problem.solve()
         return problem, body.stress, body.strain(u)

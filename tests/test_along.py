@@ -48,11 +48,11 @@ def pin(direction=(0.0, -1.0)):
     return fc.Ball(MIDDLE + 0.1 * np.asarray(direction), 0.92)
 
 
-def evaluated(mesh, tags, which, support):
+def evaluated(mesh, tags, which, obstacle):
     """A contact with the undeformed body, evaluated."""
     u = fem.Function(displacement_space(mesh, 1))
     surface = fc.ContactSurface(mesh, tags, which)
-    contact = fc.Contact(u, surface, support, fc.Frictionless(1e3))
+    contact = fc.Contact(u, surface, obstacle, fc.Frictionless(1e3))
     contact.evaluate()
     return contact
 
@@ -140,8 +140,8 @@ def test_an_oval_hole():
 def test_sides_of_a_block(which, label, n_curves):
     """The coordinate where Γc does not turn back, else the arc length round its corners."""
     mesh, tags = block_mesh("triangle", n=4)
-    support = fc.Ball((0.5, 0.5), 0.505, inside=True)  # bears at the corners, none is cut off
-    contact = evaluated(mesh, tags, which, support)
+    obstacle = fc.Ball((0.5, 0.5), 0.505, inside=True)  # bears at the corners, none is cut off
+    contact = evaluated(mesh, tags, which, obstacle)
     found = along(contact)
     check(contact, found, n_curves)
     on_first(lambda: np.testing.assert_equal(found.label.startswith(label), True))

@@ -75,16 +75,16 @@ def test_a_body_held_by_friction_alone():
     assert close(*forces, 1e-6)
 
 
-def test_a_driven_support():
-    """A support that is pressed by a force, and then dragged by another."""
+def test_a_driven_obstacle():
+    """An obstacle that is pressed by a force, and then dragged by another."""
     motions = []
     for method in ("alternating", "newton"):
         scene = block("quadrilateral", 1, n=4)
         drag = fem.Constant(scene.mesh, 0.0)
-        support = cushion(2, fc.Motion(force=(drag, 5.0)))
+        obstacle = cushion(2, fc.Motion(force=(drag, 5.0)))
         bcs = [scene.hold(TOP, i) for i in range(2)]
         law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
-        problem, contact = scene.problem(law, bcs, contact={"support": support}, method=method)
+        problem, contact = scene.problem(law, bcs, contact={"obstacle": obstacle}, method=method)
         for drag.value in (0.0, 0.4):
             problem.solve()
             problem.commit()
@@ -132,7 +132,7 @@ def test_stiff_contact_from_a_cold_start(factor, friction):
     the order of 1e-3, to 1e-2.
     """
     peaks = []
-    for scaled in (fc.Scaled(1e3), fc.Scaled(factor)):
+    for scaled in (fc.RelativeStiffness(1e3), fc.RelativeStiffness(factor)):
         law = fc.Coulomb(friction, scaled, scaled) if friction else fc.Frictionless(scaled)
         _, problem, _ = pressed("quadrilateral", law, "alternating", n=8, side=0.0)
         step = problem.solve()
@@ -202,7 +202,7 @@ def test_a_nonlinear_bulk():
         scene.F += 1e4 * ufl.dot(scene.u, scene.u) * ufl.dot(scene.u, v) * ufl.dx
         bcs = [scene.hold(TOP, 0, 0.005), scene.hold(TOP, 1, -0.03)]
         law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
-        problem, _ = scene.problem(law, bcs, contact={"support": cushion(2)}, method=method)
+        problem, _ = scene.problem(law, bcs, contact={"obstacle": cushion(2)}, method=method)
         problem.solve()
         ends.append(nodal(scene.u))
     assert close(*ends, 1e-6)

@@ -19,7 +19,7 @@ OTHERS = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.
 # From below upwards; a room may import from itself and from those before it.
 ROOMS = [
     "laws",
-    "supports",
+    "obstacles",
     "surface",
     "contact",
     "systems",
@@ -49,7 +49,7 @@ BY_RELEASE = {
 }
 KNOWN = {
     *("problem", "contact", "system", "solver", "operator", "unknowns", "verdict", "law", "bulk"),
-    *("equations", "method", "surface", "quadrature", "judge", "motions", "opposite", "support"),
+    *("equations", "method", "surface", "quadrature", "judge", "motions", "opposite", "obstacle"),
 }
 
 

@@ -23,7 +23,7 @@ E = 1000.0
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 
 # k h/E: springs no stiffer than a few layers of cells, and springs that are as good as rigid.
-SOFT, STIFF = fc.Scaled(10.0), fc.Scaled(1e5)
+SOFT, STIFF = fc.RelativeStiffness(10.0), fc.RelativeStiffness(1e5)
 AUGMENTED = {"enforcement": "augmented"}
 
 
@@ -53,7 +53,7 @@ def test_patch(cell: str, degree: int) -> None:
     pressure = gathered(COMM, contact.pressure)
     assert close(pressure, np.full_like(pressure, p), 1e-9)
     assert np.abs(gathered(COMM, contact.gap)).max() <= 1e-9 * p / k_n
-    assert step.rounds <= 3
+    assert step.augmentations <= 3
     assert step.verdict.enforcement["contact"] <= 1e-9 and not step.verdict.failures
     # The springs bear nothing: their energy is round-off squared.
     assert abs(step.energy.springs) <= 1e-15 * p**2 / k_n
@@ -94,14 +94,14 @@ LAWS = {
 PATH = [(0.0, 0.02), (0.004, 0.02), (0.012, 0.02), (-0.002, 0.02), (-0.002, -0.01)]
 
 
-def walk(law: str, stiffness: fc.Scaled, path=PATH, **options):
+def walk(law: str, stiffness: fc.RelativeStiffness, path=PATH, **options):
     """A block whose top is moved along the path, on a floor that bulges under it."""
     d, make = LAWS[law]
     cell, n = ("quadrilateral", (6, 3)) if d == 2 else ("hexahedron", (3, 3, 2))
     scene = block(cell, 1, n=n, surface={"quadrature_scheme": "vertex"})
     move = fem.Constant(scene.mesh, np.zeros(d))
     bcs = [fem.dirichletbc(move, scene.facet_dofs(TOP), scene.u.function_space)]
-    contact = {"support": bulge(scene), **options}
+    contact = {"obstacle": bulge(scene), **options}
     problem, contact = scene.problem(make(stiffness), bcs, contact=contact, method="newton")
     found = []
     for side, down in path:
@@ -233,12 +233,12 @@ def test_projection_leaves_no_creep_behind() -> None:
     before = contact.traction.copy()
     problem.commit()
     step = problem.solve()
-    assert step.rounds <= 2
+    assert step.augmentations <= 2
     assert close(gathered(COMM, contact.traction), gathered(COMM, before), 1e-4)
     assert np.abs(gathered(COMM, contact.slip_increment)).max() <= 1e-4 * 1.0 / E
 
 
-# ---- forms, supports, ranks, files ---------------------------------------------------------------
+# ---- forms, obstacles, ranks, files --------------------------------------------------------------
 
 
 @pytest.mark.parametrize("law", ["frictionless", "coulomb", "tresca", "cone", "ellipse"])
@@ -251,7 +251,7 @@ def test_force_and_tangent_with_multipliers(law: str) -> None:
     d, make = LAWS[law]
     cell = "triangle" if d == 2 else "tetrahedron"
     scene = block(cell, 2, n=2, shuffled=True)
-    contact = scene.contact(make(fc.Scaled(3.0)), modulus=E, **AUGMENTED)
+    contact = scene.contact(make(fc.RelativeStiffness(3.0)), modulus=E, **AUGMENTED)
     rows = contact.multipliers.fields.rows()
     rough = wave(d, 3)(contact.points.T).T
     rows[:, 0] = 0.01 * E * np.abs(rough[:, 0])
@@ -298,7 +298,7 @@ def test_soft_springs(degree: int) -> None:
     for k in (0.01, 10.0):
         scene = block("quadrilateral", degree, n=6)
         shift = fem.Constant(scene.mesh, np.zeros(2))
-        law = fc.Coulomb(0.3, k_n=fc.Scaled(k), k_t=fc.Scaled(k))
+        law = fc.Coulomb(0.3, k_n=fc.RelativeStiffness(k), k_t=fc.RelativeStiffness(k))
         held = [scene.hold(TOP, i) for i in range(2)]
         given = AUGMENTED | {"displacement": shift}
         problem, contact = scene.problem(law, held, contact=given)
@@ -306,7 +306,7 @@ def test_soft_springs(degree: int) -> None:
             shift.value[:] = side, 0.01
             step = problem.solve()
             problem.commit()
-            assert step.rounds <= 60
+            assert step.augmentations <= 60
             forces.append(contact.resultants().force)
         assert contact.resultants().slip > 0
     assert close(np.array(forces[:3]), np.array(forces[3:]), 1e-4 if degree == 1 else 2e-3)
@@ -318,7 +318,7 @@ def test_by_hand() -> None:
     for by_hand in (False, True):
         scene = block("quadrilateral", 1, n=4, up=-10.0)
         problem, contact = scene.problem(
-            fc.Frictionless(), scene.rollers(), contact={"support": bulge(scene)} | AUGMENTED
+            fc.Frictionless(), scene.rollers(), contact={"obstacle": bulge(scene)} | AUGMENTED
         )
         if by_hand:
             contact.tolerance = 0.999  # one round of the problem's
@@ -344,7 +344,7 @@ def test_sliding_over_a_body() -> None:
     """
     normal = []
     for k, options in ((10.0, AUGMENTED), (1e4, {}), (10.0, {})):
-        law = fc.Coulomb(0.3, fc.Scaled(k), fc.Scaled(k))
+        law = fc.Coulomb(0.3, fc.RelativeStiffness(k), fc.RelativeStiffness(k))
         made = two_blocks.Slider("triangle", law, start=0.4, contact=options, method="newton")
         steps = [made.step(0.01, 0.0), *(made.step(0.01, 0.1 * i) for i in range(1, 6))]
         last = steps[-1].contacts["contact"]
@@ -354,8 +354,8 @@ def test_sliding_over_a_body() -> None:
     assert normal[2] < 0.97 * normal[1]
 
 
-def test_support_driven_by_a_force() -> None:
-    """The support's free motion with multipliers: the force is carried, nothing penetrates.
+def test_obstacle_driven_by_a_force() -> None:
+    """The obstacle's free motion with multipliers: the force is carried, nothing penetrates.
 
     Reference: the block is held at its top, the floor pressed up by 10; ν = 0: it shortens by
     10/E, so that the floor moves up by that, and by p/k_n = 1e-3 more under the penalty.
@@ -366,7 +366,7 @@ def test_support_driven_by_a_force() -> None:
     problem, contact = scene.problem(
         fc.Coulomb(0.3, k_n=1e4, k_t=1e4),
         bcs,
-        contact={"support": scene.floor(displacement=motion)} | AUGMENTED,
+        contact={"obstacle": scene.floor(displacement=motion)} | AUGMENTED,
     )
     step = problem.solve()
     assert step.contacts["contact"].normal_force == pytest.approx(10.0, rel=1e-8)
@@ -379,7 +379,7 @@ def test_same_on_any_number_of_ranks() -> None:
     for comm in (COMM, MPI.COMM_SELF):
         scene = block("triangle", 2, n=6, up=-10.0, side=1.0, comm=comm)
         law = fc.Coulomb(0.3)
-        contact = {"support": bulge(scene), "tolerance": 1e-6} | AUGMENTED
+        contact = {"obstacle": bulge(scene), "tolerance": 1e-6} | AUGMENTED
         problem, contact = scene.problem(law, [scene.hold(TOP, 0, 0.001)], contact=contact)
         problem.solve()
         found.append(at_points(contact, contact.traction))
@@ -420,7 +420,7 @@ def test_a_plane_of_symmetry_is_as_the_other_half(friction, k):
     friction on the floor was up to 30 % off, by what nothing answers to. To the tolerance of the
     multipliers, which moves tractions by as many times it as there are facets in a row.
     """
-    stiff = {"k_n": fc.Scaled(k), "k_t": fc.Scaled(k)}
+    stiff = {"k_n": fc.RelativeStiffness(k), "k_t": fc.RelativeStiffness(k)}
     forces = []
     for n in (1, 2):
         scene = block("hexahedron", n=(3 * n, 3 * n, 3), size=(n, n, 1), nu=0.45, up=-1.0)
@@ -454,7 +454,7 @@ def test_rounds_end_next_to_a_held_side(shape):
     F = bulk.residual(v) - around * ufl.dot(scene.traction, v) * ds(TOP)
     contact = scene.contact(fc.Coulomb(1.2), enforcement="augmented", weight=around)
     step = fc.ContactProblem(F, scene.u, bcs=scene.rollers(), contacts=[contact]).solve()
-    assert step.rounds < 20
+    assert step.augmentations < 20
     force = contact.resultants().normal_force
     assert force == pytest.approx(np.pi if turned else 1.0, rel=1e-8)
 

@@ -17,7 +17,7 @@ E = 1000.0
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 
 # k h/E: springs no stiffer than a few layers of cells.
-SOFT = fc.Scaled(10.0)
+SOFT = fc.RelativeStiffness(10.0)
 AUGMENTED = {"enforcement": "augmented"}
 
 
@@ -26,7 +26,7 @@ def test_failure_leaves_no_trace(what: str, monkeypatch: pytest.MonkeyPatch) -> 
     """Too few iterations or rounds: `NotConverged`; u, history and multipliers bit for bit."""
     scene = block("quadrilateral", 1, n=4, up=-10.0)
     problem, contact = scene.problem(
-        fc.Coulomb(0.3, k_n=1e4, k_t=1e4), [], contact={"support": bulge(scene)} | AUGMENTED
+        fc.Coulomb(0.3, k_n=1e4, k_t=1e4), [], contact={"obstacle": bulge(scene)} | AUGMENTED
     )
     problem.solve()
     problem.commit()
@@ -55,7 +55,7 @@ BAD = {
     "nan": ({"tolerance": float("nan")}, fc.Frictionless(), ("tolerance", "nan")),
     "one": ({"tolerance": 1.0}, fc.Frictionless(), ("tolerance",)),
     "foundation": ({}, fc.Foundation(k_n=1e3), ("Foundation", "penalty")),
-    "springs": ({}, fc.Coulomb(0.3, fc.Springs(1e3), 1e3), ("Springs", "penalty")),
+    "springs": ({}, fc.Coulomb(0.3, fc.NodalSprings(1e3), 1e3), ("NodalSprings", "penalty")),
 }
 
 
@@ -85,9 +85,9 @@ def test_a_contact_that_only_the_first_round_touches() -> None:
     scene = block("quadrilateral", up=-1.0)
     floor = scene.contact(fc.Frictionless(100.0), name="floor", **AUGMENTED)
     top = fc.ContactSurface(scene.mesh, scene.tags, TOP)
-    support = fc.Obstacle(5e-3, (0.0, -1.0))
+    obstacle = fc.PrescribedGap(5e-3, (0.0, -1.0))
     ledge = fc.Contact(
-        scene.u, top, support, fc.Frictionless(100.0), name="ledge", enforcement="augmented"
+        scene.u, top, obstacle, fc.Frictionless(100.0), name="ledge", enforcement="augmented"
     )
     errors = []
     kept = ledge.enforcement_error
@@ -107,7 +107,7 @@ def test_a_contact_that_only_the_first_round_touches() -> None:
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("method", ["newton", "lbfgs"])
-def test_a_node_held_inside_of_the_support_is_refused(kinematics, method):
+def test_a_node_held_inside_of_the_obstacle_is_refused(kinematics, method):
     """A side of a block whose lower node a condition moves into a wall: nothing undoes that.
 
     Multipliers grew there from round to round, until what the springs bore was small beside them:
@@ -121,11 +121,16 @@ def test_a_node_held_inside_of_the_support_is_refused(kinematics, method):
         options = {"kinematics": kinematics, "enforcement": enforcement}
         contact = fc.Contact(scene.u, surface, wall, fc.Coulomb(0.3), **options)
         problem = fc.ContactProblem(
-            scene.F, scene.u, bcs=scene.bcs, contacts=[contact], method=method, kinematics=np.inf
+            scene.F,
+            scene.u,
+            bcs=scene.bcs,
+            contacts=[contact],
+            method=method,
+            small_displacement_tolerance=np.inf,
         )
         scene.place(lambda x, way=way: x + np.array([[way], [0.0]]))
         if enforcement == "augmented" and way > 0:
-            with pytest.raises(fc.NotConverged, match="holds a node of Γc inside of the support"):
+            with pytest.raises(fc.NotConverged, match="holds a node of Γc inside of the obstacle"):
                 problem.solve()
         else:
             problem.solve()

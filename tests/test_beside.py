@@ -81,7 +81,7 @@ def pops_out(busy):
         )
     ]
     increments = setting(press, -10.0, 0.0)
-    return Play(scene, increments, *walls, kinematics=np.inf, method="newton")
+    return Play(scene, increments, *walls, small_displacement_tolerance=np.inf, method="newton")
 
 
 def too_soft(busy):
@@ -106,7 +106,7 @@ def slides_far(busy):
 
 
 def held_inside(busy):
-    """Multipliers of a node that a condition holds inside of its support."""
+    """Multipliers of a node that a condition holds inside of its obstacle."""
     scene = Beside({"block": Box()}, busy)
     depth = scene.bodies.constant()
     scene.hold("block", LEFT, 0, 1, value=depth)
@@ -160,7 +160,7 @@ def half_as_steep(busy):
     """A distance that changes by 2 per length."""
     scene = Beside({"block": Box()}, busy)
     scene.hold("block", TOP, 0, 1, value=-1e-3)
-    floor = fc.Obstacle(distance=lambda x: 2 * x[1])
+    floor = fc.SignedDistance(lambda x: 2 * x[1])
     contact = scene.contact("block", BOTTOM, floor, fc.Frictionless(), name="floor")
     return Play(scene, [lambda: None], contact)
 
@@ -170,7 +170,7 @@ def through_a_plate(busy):
     scene = Beside({"block": Box()}, busy)
     down = scene.bodies.constant()
     scene.hold("block", TOP, 0, 1, value=down)
-    plate = fc.Obstacle(distance=lambda x: abs(x[1] + 0.1) - 0.01)
+    plate = fc.SignedDistance(lambda x: abs(x[1] + 0.1) - 0.01)
     contact = scene.contact("block", BOTTOM, plate, fc.Frictionless(), name="plate")
     return Play(scene, setting(down, -0.5), contact)
 

@@ -39,7 +39,9 @@ def wedge(**options):
             ("leaning", RIGHT, (1, 0), (-1, 0.2)),
         )
     ]
-    problem = fc.ContactProblem(scene.F, scene.u, contacts=contacts, kinematics=np.inf, **options)
+    problem = fc.ContactProblem(
+        scene.F, scene.u, contacts=contacts, small_displacement_tolerance=np.inf, **options
+    )
     return scene, problem, contacts
 
 

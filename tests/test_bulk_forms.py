@@ -30,12 +30,12 @@ TIGHT = {"snes_rtol": 1e-13}
 
 
 def test_nothing_in_reach():
-    """A support out of reach: the problem is linear elasticity, and the contact force is zero."""
+    """An obstacle out of reach: the problem is linear elasticity, and the contact force is zero."""
     scene = block("triangle", 2)
     push = fem.Constant(scene.mesh, -0.01)
     bcs = [*scene.rollers(), scene.hold(TOP, 1, push)]
     far = fc.HalfSpace((0, -1.0), (0, 1))
-    problem, _ = scene.problem(fc.Coulomb(0.3), bcs, contact={"support": far})
+    problem, _ = scene.problem(fc.Coulomb(0.3), bcs, contact={"obstacle": far})
     step = problem.solve()
     r = step.contacts["contact"]
     assert r.normal_force == 0.0 and r.area == 0.0 and r.stick == r.slip == 0
@@ -135,7 +135,7 @@ def test_plane_stress_with_thickness():
     )
     # E/h comes from the form, its thickness taken out: within the 10 % that the docstring of
     # `cell_modulus` allows for plane stress; without the weight it would be a fifth.
-    law = fc.Frictionless(k_n=fc.Scaled(5.0))
+    law = fc.Frictionless(k_n=fc.RelativeStiffness(5.0))
     scene.problem(law, scene.rollers(), contact={"weight": t})
     _, scaled = scene.problem(law, scene.rollers(), contact={"weight": t})
     k = gathered(COMM, scaled.values.parameters["k_n"])
@@ -198,7 +198,7 @@ def test_a_mass_in_the_form_is_no_stiffness(way):
     v = ufl.TestFunction(u.function_space)
     F = LinearElastic(u, 1000.0, 0.3, "plane strain").residual(v)
     F += fem.Constant(mesh, 5.0) * ufl.dot(u, v) * ufl.dx
-    law = fc.Frictionless(k_n=fc.Scaled(5.0))
+    law = fc.Frictionless(k_n=fc.RelativeStiffness(5.0))
     surface = fc.ContactSurface(mesh, tags, BOTTOM)
     contact = fc.Contact(u, surface, fc.HalfSpace(way, (0.0, 1.0)), law)
     fc.ContactProblem(F, u, bcs=[hold(u, tags, LEFT, 0)], contacts=[contact]).solve()
@@ -208,7 +208,7 @@ def test_a_mass_in_the_form_is_no_stiffness(way):
 
 @pytest.mark.parametrize("kind", ["function", "ufl"])
 def test_variable_modulus(kind):
-    """Two layers of moduli 1000 and 4000: u piecewise linear; `Scaled` takes E of the lower one.
+    """Layers of moduli 1000 and 4000: u piecewise linear; `RelativeStiffness` takes the lower E.
 
     Reference: ν = 0, u_y(y) = -p/k_n - p ∫ dy/E; k_n = 5 · 1000 / (1/4). Tolerance 1e-9.
     """
@@ -225,7 +225,7 @@ def test_variable_modulus(kind):
     ds = ufl.ds(scene.mesh, subdomain_data=scene.tags)
     scene.F -= ufl.dot(scene.traction, v) * ds(TOP)
     problem, contact = scene.problem(
-        fc.Frictionless(k_n=fc.Scaled(5.0)), scene.rollers(), petsc_options=TIGHT
+        fc.Frictionless(k_n=fc.RelativeStiffness(5.0)), scene.rollers(), petsc_options=TIGHT
     )
     problem.solve()
     k_n = gathered(COMM, contact.values.parameters["k_n"])
@@ -373,6 +373,6 @@ def test_a_load_that_steps_with_the_displacement():
     )
     problem, _ = scene.problem(fc.Frictionless(k_n=k_n), scene.rollers())
     assert not problem.bulk.linear
-    step = problem.solve(field=False)
+    step = problem.solve(recover_interior=False)
     assert step.complete
     assert step.contacts["contact"].normal_force == pytest.approx(2.0, rel=1e-8)

@@ -102,7 +102,7 @@ def test_multipliers():
     made = [Pressed(condensation=c, **options) for c in (None, False)]
     (steps, found), (_, full) = (run(m, 1.5, 3) for m in made)
     assert kept(made[0]) <= FEW
-    assert max(step.rounds for step in steps) > 1
+    assert max(step.augmentations for step in steps) > 1
     assert_same(found, full, tolerance)
 
 
@@ -128,7 +128,7 @@ def test_a_body_that_contact_alone_holds(pressure):
 def test_two_bodies(update):
     """A round shoe, a body of its own, pressed on and dragged; pairs as they were or found anew."""
     end, steps = (1.0, 2) if update == "never" else (1.5, 6)
-    made = [Shod(update=update, condensation=c, **TIGHT) for c in (None, False)]
+    made = [Shod(update_pairs=update, condensation=c, **TIGHT) for c in (None, False)]
     (_, found), (_, full) = (run(m, end, steps) for m in made)
     assert kept(made[0]) <= FEW
     assert_same(found, full)
@@ -153,7 +153,10 @@ def test_dragged_away(cell, wanted):
 @ON_ONE_RANK
 def test_two_bodies_pressed_deep():
     """The shoe, until contact is wider than what was kept at first."""
-    made = [Shod(deep=0.05, condensation=c, kinematics=np.inf, **TIGHT) for c in (True, False)]
+    made = [
+        Shod(deep=0.05, condensation=c, small_displacement_tolerance=np.inf, **TIGHT)
+        for c in (True, False)
+    ]
     (steps, found), (_, full) = (run(m, 1.0, 5) for m in made)
     assert n_grown(steps) >= 1
     assert_same(found, full)
@@ -162,7 +165,10 @@ def test_two_bodies_pressed_deep():
 @pytest.mark.parametrize("wanted", [None, True])
 def test_pressed_deep(wanted):
     """Until most of the top touches: on all unknowns from then on, or on all that are touched."""
-    made = [Pressed(deep=0.12, condensation=c, kinematics=np.inf, **TIGHT) for c in (wanted, False)]
+    made = [
+        Pressed(deep=0.12, condensation=c, small_displacement_tolerance=np.inf, **TIGHT)
+        for c in (wanted, False)
+    ]
     (steps, found), (_, full) = (run(m, 1.0, 10) for m in made)
     assert steps[0].attempts[-1].outcome == "converged"
     assert n_grown(steps) >= 1
@@ -177,7 +183,8 @@ def test_field_last():
     """Without every field nothing closes unseen, and nothing changes: bit for bit serially."""
     made = [Pressed(condensation=True) for _ in range(2)]
     (steps, found), (others, every) = (
-        run(m, 3.0, 6, field=field) for m, field in zip(made, ("last", "every"), strict=True)
+        run(m, 3.0, 6, recover_interior=field)
+        for m, field in zip(made, ("last", "every"), strict=True)
     )
     assert n_grown(steps) == n_grown(others) >= 1
     assert all(step.complete for step in steps)
@@ -198,7 +205,7 @@ def test_restart(wanted, tmp_path):
 
 def test_restart_on_all_unknowns(tmp_path):
     """The same where contact has spread too far to be condensed."""
-    make = lambda: Pressed(deep=0.12, kinematics=np.inf)  # noqa: E731
+    make = lambda: Pressed(deep=0.12, small_displacement_tolerance=np.inf)  # noqa: E731
     goes_on(make, shared_folder(tmp_path), stop=4, end=1.0, steps=5)
 
 

@@ -19,7 +19,7 @@ EXACT = 0.0 if COMM.size == 1 else 1e-10
 pytestmark = pytest.mark.mpi
 
 
-def slid(between, *, enforcement="penalty", field=True):
+def slid(between, *, enforcement="penalty", recover_interior=True):
     """A block pressed on a floor that is drawn along, three increments; forces and field."""
     scene = block("quadrilateral", n=4, up=-10.0)
     contact = {"displacement": np.zeros(2), "enforcement": enforcement}
@@ -28,7 +28,7 @@ def slid(between, *, enforcement="penalty", field=True):
     forces = []
     for way in (0.0, 1e-3, 2e-3):
         motion.value[:] = way, 0.0
-        problem.solve(field=field)
+        problem.solve(recover_interior=recover_interior)
         between(problem, contact)
         problem.commit()
         problem.complete()
@@ -41,7 +41,7 @@ def nothing(problem, contact):
 
 
 def changed(problem, contact):
-    """Parameters of law and support, which the next solve is to see and this commit is not."""
+    """Parameters of law and obstacle, which the next solve is to see and this commit is not."""
     kept = {name: c.value.copy() for name, c in contact.parameters.items()}
     contact.parameters["friction"].value = 0.01
     contact.parameters["displacement"].value[:] = 0.5, 0.1
@@ -70,11 +70,11 @@ def failed(problem, contact):
     contact.parameters["displacement"].value[:] = kept
 
 
-@pytest.mark.parametrize("field", [True, False])
+@pytest.mark.parametrize("recover_interior", [True, False])
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("between", [changed, moved, twice, failed])
-def test_commit_keeps_what_solve_found(between, enforcement, field):
-    options = {"enforcement": enforcement, "field": field}
+def test_commit_keeps_what_solve_found(between, enforcement, recover_interior):
+    options = {"enforcement": enforcement, "recover_interior": recover_interior}
     expected, found = slid(nothing, **options), slid(between, **options)
     for a, b in zip(found, expected, strict=True):
         assert close(a, b, EXACT)
@@ -88,8 +88,8 @@ def test_a_second_commit_finds_no_other_pairs():
     slide = body.constant()
     body.hold(ROOF, 0, value=slide)
     body.F += 1e4 * body.v[1] * body.ds(ROOF)
-    support = fc.DeformableBody(body.tags, 10 + LOWER, update="increment")
-    contact = body.contact(10 + UPPER, support, fc.Coulomb(0.3))
+    obstacle = fc.DeformableBody(body.tags, 10 + LOWER, update_pairs="increment")
+    contact = body.contact(10 + UPPER, obstacle, fc.Coulomb(0.3))
     problem = body.problem(contact)
     for way in (0.0, 0.1):
         slide.value = way

@@ -180,7 +180,7 @@ def test_every_cell(cell, degree):
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_deformable_support(cell):
+def test_deformable_obstacle(cell):
     """A block slid over another, pairs found anew: the same, whatever was touched before."""
     n = (7, 2)
     results = []
@@ -202,7 +202,7 @@ def test_deformable_support(cell):
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_driven_support(cell, method):
+def test_driven_obstacle(cell, method):
     """A ball driven by a force, dragged by a displacement: its motion is one of those kept."""
     results = []
     for condensed in (True, False):
@@ -215,7 +215,7 @@ def test_driven_support(cell, method):
         problem, contact = scene.problem(
             fc.Coulomb(0.3, k_n=2e4, k_t=1e4),
             [scene.hold(TOP, i) for i in range(d)],
-            contact={"support": cushion(d, motion)},
+            contact={"obstacle": cushion(d, motion)},
             method=method,
             condensation=condensed,
         )

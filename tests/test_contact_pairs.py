@@ -137,7 +137,9 @@ def facets_of(contact: fc.Contact) -> int:
 def test_a_stack_bears_its_load_through_every_joint(cell: str) -> None:
     """Uniform stress, exactly: each joint bears the load, each block shortens by p h / E."""
     scene = three_blocks(cell)
-    contacts = fc.contact_pairs(scene.u, fc.Frictionless(fc.Scaled(1e3)), 0.1, bodies=scene.joined)
+    contacts = fc.find_contact_pairs(
+        scene.u, fc.Frictionless(fc.RelativeStiffness(1e3)), 0.1, bodies=scene.joined
+    )
     assert [contact.name for contact in contacts] == ["low-mid", "mid-top"]
     scene.solve(contacts)
     bound = 0.0
@@ -169,7 +171,7 @@ def test_the_same_as_sides_named_by_hand() -> None:
                 for body, here, there in (("low", FLOOR, ROOF), ("top", ROOF, FLOOR))
             ]
         else:
-            contacts = fc.contact_pairs(scene.u, law, 0.1, bodies=joined)
+            contacts = fc.find_contact_pairs(scene.u, law, 0.1, bodies=joined)
         scene.solve(contacts)
         found.append([scene.shortened("top"), *(np.array([up(c)]) for c in contacts)])
     for one, other in zip(*found, strict=True):
@@ -186,7 +188,7 @@ def test_two_blocks_on_one(fine: str) -> None:
         "right": box("quadrilateral", (1.02, 1), (2, 2), (n[1], 2)),
     }
     scene = Pressed(parts, {"left": 3.0, "right": 5.0}, ["base"])
-    contacts = fc.contact_pairs(scene.u, fc.Frictionless(), 0.1, bodies=scene.joined)
+    contacts = fc.find_contact_pairs(scene.u, fc.Frictionless(), 0.1, bodies=scene.joined)
     names = [contact.name for contact in contacts]
     # The blocks face each other across the gap, which stays open.
     assert names == ["base-left", "base-right", "left-right"]
@@ -240,8 +242,8 @@ def rubber_between_plates(by_hand: bool) -> list[fc.Contact]:
             for plate, side in (("below", ROOF), ("above", FLOOR))
         ]
     else:
-        options = {"bodies": joined, "surface_on": ("disc",), "kinematics": "finite"}
-        contacts = fc.contact_pairs(u, law, 0.3, **options)
+        options = {"bodies": joined, "slave_bodies": ("disc",), "kinematics": "finite"}
+        contacts = fc.find_contact_pairs(u, law, 0.3, **options)
     residual = body.residual(ufl.TestFunction(space))
     fc.ContactProblem(residual, u, bcs=bcs, contacts=contacts).solve()
     return contacts
@@ -302,9 +304,9 @@ def test_a_body_that_touches_itself() -> None:
             surface, other = fc.ContactSurface(mesh, tags, WEST), fc.DeformableBody(tags, SOUTH)
             contacts = [fc.Contact(u, surface, other, fc.Frictionless(), kinematics="finite")]
         else:
-            assert fc.contact_pairs(u, fc.Frictionless(), 0.12) == []
-            contacts = fc.contact_pairs(
-                u, fc.Frictionless(), 0.12, itself=True, kinematics="finite"
+            assert fc.find_contact_pairs(u, fc.Frictionless(), 0.12) == []
+            contacts = fc.find_contact_pairs(
+                u, fc.Frictionless(), 0.12, self_contact=True, kinematics="finite"
             )
         (contact,) = contacts
         problem = fc.ContactProblem(F, u, bcs=bcs, contacts=contacts)
@@ -323,7 +325,7 @@ def test_the_side_of_a_body_that_touches_itself_is_told_by_its_place() -> None:
     for seed in range(5):
         mesh, _ = fork(seed)
         u = fem.Function(displacement_space(mesh, 1))
-        (contact,) = fc.contact_pairs(u, fc.Frictionless(), 0.12, itself=True)
+        (contact,) = fc.find_contact_pairs(u, fc.Frictionless(), 0.12, self_contact=True)
         assert np.allclose(gathered(mesh.comm, contact.points)[:, 0], 0.45)
 
 
@@ -335,8 +337,10 @@ def test_a_hole_faces_itself_all_around(caplog: pytest.LogCaptureFixture) -> Non
     mesh = mesh_of("quadrilateral", np.concatenate(rings), np.column_stack([i, j, i + 16, j + 16]))
     u = fem.Function(displacement_space(mesh, 1))
     with caplog.at_level(logging.INFO, "fenics_contact"):
-        assert fc.contact_pairs(u, fc.Frictionless(), 1.2, itself=True) == []
-        (contact,) = fc.contact_pairs(u, fc.Frictionless(), 2.0, itself=True, kinematics="finite")
+        assert fc.find_contact_pairs(u, fc.Frictionless(), 1.2, self_contact=True) == []
+        (contact,) = fc.find_contact_pairs(
+            u, fc.Frictionless(), 2.0, self_contact=True, kinematics="finite"
+        )
     assert facets_of(contact) == 16
     points = gathered(COMM, contact.gap)
     # Across the hole, from facet to facet: the diameter of the inscribed circle, at the middle.
@@ -353,13 +357,13 @@ def test_bodies_far_apart_are_not_paired(caplog: pytest.LogCaptureFixture) -> No
     joined = fc.join_meshes([disc((0, 0), 1, 4), disc((3, 0), 1, 5)])
     u = fem.Function(displacement_space(joined.mesh, 1))
     with pytest.warns(UserWarning, match=r"no two of the bodies \[1, 2\] are within 0.9"):
-        assert fc.contact_pairs(u, fc.Frictionless(), 0.9) == []
+        assert fc.find_contact_pairs(u, fc.Frictionless(), 0.9) == []
     caplog.clear()
     with (
         caplog.at_level(logging.INFO, "fenics_contact"),
         pytest.warns(UserWarning, match="10 of the 16 points of Γc have no opposite"),
     ):
-        (contact,) = fc.contact_pairs(u, fc.Frictionless(), 1.3)
+        (contact,) = fc.find_contact_pairs(u, fc.Frictionless(), 1.3)
     assert contact.name == "1-2"
     if COMM.rank == 0:
         # Γc on the finer one, from its corner at distance 1 from the other's.
@@ -373,14 +377,14 @@ def test_back_sides_are_not_paired() -> None:
     parts = [box("quadrilateral", (0, 0.1 * i), (1, 0.1 * (i + 1)), (8 + i, 1)) for i in range(3)]
     joined = fc.join_meshes(parts)
     u = fem.Function(displacement_space(joined.mesh, 1))
-    contacts = fc.contact_pairs(u, fc.Frictionless(), 0.15, bodies=joined, itself=True)
+    contacts = fc.find_contact_pairs(u, fc.Frictionless(), 0.15, bodies=joined, self_contact=True)
     names = [contact.name for contact in contacts]
     # Across the plate between them the outer two face each other, too: open while it is there.
     assert names == ["0-1", "0-2", "1-2"]
     for contact, y in zip(contacts, (0.1, 0.2, 0.2), strict=True):
         x = gathered(COMM, contact.points)
         assert x[:, 1] == pytest.approx(np.full(len(x), y))
-    close = fc.contact_pairs(u, fc.Frictionless(), 0.09, bodies=joined)
+    close = fc.find_contact_pairs(u, fc.Frictionless(), 0.09, bodies=joined)
     assert [contact.name for contact in close] == ["0-1", "1-2"]
 
 
@@ -393,7 +397,7 @@ def test_bodies_that_overlap_from_the_start() -> None:
         ]
         joined = fc.join_meshes(parts)
         u = fem.Function(displacement_space(joined.mesh, 1))
-        contacts = fc.contact_pairs(u, fc.Frictionless(), 0.3, bodies=joined)
+        contacts = fc.find_contact_pairs(u, fc.Frictionless(), 0.3, bodies=joined)
         assert len(contacts) == n_contacts
         for contact in contacts:
             gap = gathered(COMM, contact.gap)
@@ -410,11 +414,11 @@ def test_which_side_is_the_surface() -> None:
         ]
         joined = fc.join_meshes(parts)
         u = fem.Function(displacement_space(joined.mesh, 1))
-        (contact,) = fc.contact_pairs(u, law, 0.3, bodies=joined)
+        (contact,) = fc.find_contact_pairs(u, law, 0.3, bodies=joined)
         on_upper = facets_of(contact) == n
         assert on_upper == bool(expected), (n, width)
         for order, chosen in (((0,), 0), ((1,), 1), ((1, 0), 1), ((0, 1), 0)):
-            (contact,) = fc.contact_pairs(u, law, 0.3, bodies=joined, surface_on=order)
+            (contact,) = fc.find_contact_pairs(u, law, 0.3, bodies=joined, slave_bodies=order)
             looks = COMM.allreduce(contact.values.normal[:, 1].sum()) > 0
             assert looks == (chosen == 0)
 
@@ -431,13 +435,13 @@ def test_cell_tags_and_connected_parts_name_bodies() -> None:
         joined.mesh, 2, joined.cells.indices, 10 * joined.cells.values.astype(np.int32)
     )
     for bodies, name in ((None, "1-2"), (joined, "a-b"), (tags, "10-20")):
-        (contact,) = fc.contact_pairs(u, fc.Frictionless(), 0.1, bodies=bodies)
+        (contact,) = fc.find_contact_pairs(u, fc.Frictionless(), 0.1, bodies=bodies)
         assert contact.name == name and facets_of(contact) == 4
     floors = [joined.facet(body, FLOOR) for body in "ab"]
     only = {"facet_tags": joined.facets, "tags": floors}
-    assert fc.contact_pairs(u, fc.Frictionless(), 0.1, **only) == []
+    assert fc.find_contact_pairs(u, fc.Frictionless(), 0.1, **only) == []
     only["tags"] = [*floors, joined.facet("a", ROOF)]
-    assert len(fc.contact_pairs(u, fc.Frictionless(), 0.1, **only)) == 1
+    assert len(fc.find_contact_pairs(u, fc.Frictionless(), 0.1, **only)) == 1
 
 
 def test_a_law_for_each_pair() -> None:
@@ -449,7 +453,9 @@ def test_a_law_for_each_pair() -> None:
         asked.append((a, b))
         return fc.Coulomb(0.3) if a == "low" else fc.Frictionless()
 
-    contacts = fc.contact_pairs(scene.u, law, 0.1, bodies=scene.joined, enforcement="augmented")
+    contacts = fc.find_contact_pairs(
+        scene.u, law, 0.1, bodies=scene.joined, enforcement="augmented"
+    )
     assert asked == [("low", "mid"), ("mid", "top")]
     assert [contact.law.has_friction for contact in contacts] == [True, False]
     assert all(contact.multipliers is not None for contact in contacts)
@@ -465,7 +471,7 @@ def test_bad_arguments() -> None:
     some = dolfinx.mesh.meshtags(joined.mesh, 2, half, np.ones(len(half), dtype=np.int32))
     ready: dict[str, Any] = {"u": u, "law": law, "distance": 0.1}
     for given, words in (
-        ({"u": 3}, ["contact_pairs: u is"]),
+        ({"u": 3}, ["find_contact_pairs: u is"]),
         ({"distance": 0.0}, ["distance is 0.0", "greater than zero"]),
         ({"distance": "near"}, ["'near'"]),
         ({"law": 3}, ["law is a int", "Law"]),
@@ -475,17 +481,17 @@ def test_bad_arguments() -> None:
         ({"bodies": fc.join_meshes([mesh])}, ["another mesh"]),
         ({"bodies": joined.facets}, ["dimension 1", "dimension 2"]),
         ({"bodies": some}, ["8 cells have no tag"]),
-        ({"surface_on": ["ball"]}, ["'ball'", "[1, 2]"]),
-        ({"surface_on": "ball"}, ["surface_on is 'ball'", "list", "[1, 2]"]),
-        ({"surface_on": 2}, ["surface_on is 2", "list"]),
+        ({"slave_bodies": ["ball"]}, ["'ball'", "[1, 2]"]),
+        ({"slave_bodies": "ball"}, ["slave_bodies is 'ball'", "list", "[1, 2]"]),
+        ({"slave_bodies": 2}, ["slave_bodies is 2", "list"]),
         ({"facet_tags": joined.facets}, ["together"]),
         ({"name": "joint"}, ["name is given"]),
-        ({"itself": "yes"}, ["itself is 'yes'", "True"]),
-        ({"itself": 1}, ["itself is 1", "True"]),
-        ({"support": fc.HalfSpace((0, 0), (0, 1))}, ["support given", "make a Contact"]),
+        ({"self_contact": "yes"}, ["self_contact is 'yes'", "True"]),
+        ({"self_contact": 1}, ["self_contact is 1", "True"]),
+        ({"obstacle": fc.HalfSpace((0, 0), (0, 1))}, ["obstacle given", "make a Contact"]),
         ({"surface": None, "opposite": 2}, ["surface and opposite given"]),
         ({"kinematics": "large"}, ["'large'"]),
-        ({"update": "often"}, ["'often'"]),
+        ({"update_pairs": "often"}, ["'often'"]),
     ):
         arguments = ready | given
-        raised_everywhere(lambda a=arguments: fc.contact_pairs(**a), ValueError, *words)
+        raised_everywhere(lambda a=arguments: fc.find_contact_pairs(**a), ValueError, *words)

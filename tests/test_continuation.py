@@ -35,7 +35,7 @@ def test_the_same_solution(cell, degree):
 def test_a_start_that_is_a_solution(cell):
     """The same increment once more: there is nothing to iterate on. Reference: the state, to 1e-9.
 
-    It was led away from by soft contact, and where a support had carried a body, not back.
+    It was led away from by soft contact, and where an obstacle had carried a body, not back.
     """
     scene, problem, _ = pressed(cell, fc.Coulomb(0.3, k_n=2e4, k_t=1e4), "continuation", n=3)
     problem.solve()
@@ -55,7 +55,7 @@ def test_stiff_contact_from_a_cold_start(method, factor, friction):
     for the primal-dual method, beyond and without for continuation.
     """
     forces = []
-    for scaled in (fc.Scaled(1e3), fc.Scaled(factor)):
+    for scaled in (fc.RelativeStiffness(1e3), fc.RelativeStiffness(factor)):
         law = fc.Coulomb(friction, scaled, scaled) if friction else fc.Frictionless(scaled)
         _, problem, _ = pressed("quadrilateral", law, method, n=8)
         step = problem.solve()
@@ -74,7 +74,7 @@ def test_without_a_fallback_it_fails_and_says_why(caplog):
 
     That they sit under the middle of the ball, where contact is, is told from the geometry.
     """
-    stiff = fc.Scaled(1e4)
+    stiff = fc.RelativeStiffness(1e4)
     law = fc.Coulomb(0.3, stiff, stiff)
     options = {"snes_linesearch_type": "basic"}
     _, problem, contact = pressed(
@@ -93,7 +93,7 @@ def test_without_a_fallback_it_fails_and_says_why(caplog):
 
 def test_every_rung_is_logged(caplog):
     """What failed is in the log and in the step, in its order."""
-    stiff = fc.Scaled(1e4)
+    stiff = fc.RelativeStiffness(1e4)
     law = fc.Coulomb(0.3, stiff, stiff)
     few = {"primal_dual_snes_max_it": 5}
     _, problem, _ = pressed("quadrilateral", law, "newton", n=8, petsc_options=few)
@@ -127,7 +127,7 @@ def test_history_is_led_through():
     """
     ends = []
     for method in ("continuation", "lbfgs"):
-        law = fc.Coulomb(0.3, fc.Scaled(100), fc.Scaled(100))
+        law = fc.Coulomb(0.3, fc.RelativeStiffness(100), fc.RelativeStiffness(100))
         made = Rub(law, mesh={"n": 8}, reach=0.05, method=method)
         steps = list(fc.increments(made.problem, made.load, 0.0, 4.0, steps=8))
         assert all(step.energy.dissipation >= 0 for step in steps)

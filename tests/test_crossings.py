@@ -23,7 +23,7 @@ def test_a_law_with_its_own_normal_part_where_points_have_no_opposite():
     """A wide block on a narrow one: half of the points of Γc are unpaired, and bear nothing."""
     body = stack("quadrilateral", (3, 6), (0.5, 0.5), widths=[0.5, 1.0])
     surface = fc.ContactSurface(body.mesh, body.tags, 10 + UPPER)
-    law = Asperities(0.3, 0.5, 2e-3, fc.Scaled())
+    law = Asperities(0.3, 0.5, 2e-3, fc.RelativeStiffness())
     contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, 10 + LOWER), law)
     body.hold(FLOOR, 0, 1)
     body.hold(ROOF, 0)
@@ -49,7 +49,7 @@ def test_pairs_found_anew_in_bodies_that_penetrate(release, tmp_path):
 
     def make():
         law = fc.Coulomb(0.2, K_N / 50, K_N / 50)
-        return Slider("quadrilateral", law, start=0.4, release=release)
+        return Slider("quadrilateral", law, start=0.4, max_initial_penetration=release)
 
     whole = make()
     list(fc.increments(whole.problem, load(whole), 0.0, 3.0, steps=3))
@@ -95,13 +95,13 @@ def test_a_commit_that_fails_while_pairs_are_found(monkeypatch):
     assert close(made.contact.resultants().force, twin.contact.resultants().force, 1e-9)
 
 
-def test_a_foundation_without_tangential_stiffness_on_a_curved_support():
+def test_a_foundation_without_tangential_stiffness_on_a_curved_obstacle():
     """What small displacements change is told there, too, where k_t is zero."""
     scene = block("quadrilateral", n=4)
     law = fc.Foundation(1e3, fem.Constant(scene.mesh, 0.0))
     push = [scene.hold(TOP, i, fem.Constant(scene.mesh, v)) for i, v in enumerate((0.01, -0.05))]
-    contact = {"support": fc.Ball((0.5, -2.0), 2.0)}
-    problem, _ = scene.problem(law, push, contact=contact, kinematics=np.inf)
+    contact = {"obstacle": fc.Ball((0.5, -2.0), 2.0)}
+    problem, _ = scene.problem(law, push, contact=contact, small_displacement_tolerance=np.inf)
     verdict = problem.solve().verdict
     assert verdict.failures == [] and np.isfinite(verdict.kinematics["contact"].worst)
 

@@ -1,4 +1,4 @@
-"""Contact on rigid supports from data, and on supports of one's own: as by formulas."""
+"""Contact on rigid obstacles from data, and on obstacles of one's own: as by formulas."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ COMM = MPI.COMM_WORLD
 HISTORY = [(0.0, -0.06, 0.0), (0.04, -0.12, 0.1), (-0.02, -0.1, 0.3)]
 
 
-def pressed(cell, support, *, law=None, unit=1.0, degree=1, second_route=False, **contact):
+def pressed(cell, obstacle, *, law=None, unit=1.0, degree=1, cross_check=False, **contact):
     """The forces on the body when a tool presses, is dragged and turned, (n, gdim)."""
     scene = rubber(cell, degree, n=(8, 4) if cell == "triangle" else (4, 2), E=1000.0)
     scene.mesh.geometry.x[:] *= unit
     d = scene.dim
     shift, angle = fem.Constant(scene.mesh, np.zeros(d)), fem.Constant(scene.mesh, 0.0)
-    tool = support(shift, angle)
+    tool = obstacle(shift, angle)
     law = law or fc.Coulomb(0.3, 1e4 / unit, 1e4 / unit)
-    options = {"petsc_options": TIGHT, "second_route": second_route}
+    options = {"petsc_options": TIGHT, "cross_check": cross_check}
     problem, made = scene.problem(tool, law, contact=contact, **options)
     forces = []
     for side, up, turn in HISTORY:
@@ -100,7 +100,7 @@ def test_units_do_not_matter(shape):
 
     And at every solution what is assembled from the boundary form is what the points bear.
     """
-    one = pressed("triangle", tool(2, shape), second_route=True)
+    one = pressed("triangle", tool(2, shape), cross_check=True)
     for unit in (1e-6, 1e6):
         assert close(pressed("triangle", tool(2, shape, unit), unit=unit), one, 1e-7)
 
@@ -114,16 +114,16 @@ def test_a_spline_driven_by_a_force(kinematics):
         down, side = (fem.Constant(scene.mesh, 0.0) for _ in range(2))
         motion = fc.Motion(force=(None, down), displacement=(side, None))
         centre = (0.05, 1.8)
-        support = fc.Cylinder(centre, 0.8, displacement=motion)
+        obstacle = fc.Cylinder(centre, 0.8, displacement=motion)
         if shape == "spline":
             points = circle(240, 0.8, centre)
-            support = fc.RigidProfile(points, closed=True, displacement=motion)
+            obstacle = fc.RigidProfile(points, closed=True, displacement=motion)
         problem, contact = scene.problem(
-            support,
+            obstacle,
             fc.Coulomb(0.3, 1e4, 1e4),
             contact={"kinematics": kinematics},
             petsc_options=TIGHT,
-            kinematics=np.inf,
+            small_displacement_tolerance=np.inf,
         )
         for side.value, down.value in ((0.0, -5.0), (0.0, -20.0), (0.02, -30.0)):
             problem.solve()
@@ -134,8 +134,8 @@ def test_a_spline_driven_by_a_force(kinematics):
     assert went[2] < went[0] < 0
 
 
-class Bubble(fc.SampledSupport):
-    """A ball as one's own support in numbers: a class with three members."""
+class Bubble(fc.SampledObstacle):
+    """A ball as one's own obstacle in numbers: a class with three members."""
 
     gdim, fingerprint = 2, "bubble"
 
@@ -145,7 +145,7 @@ class Bubble(fc.SampledSupport):
         self.displacement, self.rotation = displacement, rotation
 
     def sample(self, x):
-        """See `SampledSupport.sample`."""
+        """See `SampledObstacle.sample`."""
         arm = x - self.centre
         length = np.linalg.norm(arm, axis=1)
         out = arm / length[:, None]
@@ -153,7 +153,7 @@ class Bubble(fc.SampledSupport):
         return fc.Sample(length - self.radius, -out, bend)
 
 
-def test_a_support_of_ones_own_in_numbers():
+def test_an_obstacle_of_ones_own_in_numbers():
     """A ball by numpy alone: the forces of the `Ball` to round-off and what Newton leaves, 1e-9."""
 
     def bubble(shift, angle):
@@ -162,7 +162,7 @@ def test_a_support_of_ones_own_in_numbers():
     assert close(pressed("triangle", bubble), pressed("triangle", tool(2, "ball")), 1e-9)
 
 
-class Faulty(fc.SampledSupport):
+class Faulty(fc.SampledObstacle):
     """A floor that says something wrong of places below it at the right."""
 
     gdim, fingerprint, displacement, rotation = 2, "faulty", None, None
@@ -172,7 +172,7 @@ class Faulty(fc.SampledSupport):
         self.fault = fault
 
     def sample(self, x):
-        """See `SampledSupport.sample`."""
+        """See `SampledObstacle.sample`."""
         distance, normal = x[:, 1].copy(), np.tile([0.0, -1.0], (len(x), 1))
         wrong = (distance < -1e-6) & (x[:, 0] > 0.9)
         if wrong.any() and self.fault == "error":
@@ -191,12 +191,12 @@ class Faulty(fc.SampledSupport):
         ("error", RuntimeError, "beyond my data"),
     ],
 )
-def test_a_support_in_numbers_that_fails_on_the_way(fault, error, text):
-    """A NaN is no open gap, and the error of one rank is that of all; before, the support works."""
+def test_an_obstacle_in_numbers_that_fails_on_the_way(fault, error, text):
+    """A NaN is no open gap, and the error of one rank is raised on all of them."""
     scene = block("triangle", 1, n=4)
     down = fem.Constant(scene.mesh, 0.0)
     bcs = [scene.hold(TOP, 0), scene.hold(TOP, 1, down)]
-    given = {"support": Faulty(fault), "kinematics": "finite"}
+    given = {"obstacle": Faulty(fault), "kinematics": "finite"}
     problem, contact = scene.problem(fc.Coulomb(0.3), bcs, contact=given)
     problem.solve()
     problem.commit()
@@ -208,35 +208,35 @@ def test_a_support_in_numbers_that_fails_on_the_way(fault, error, text):
 
 
 @pytest.mark.parametrize("missing", ["gdim", "fingerprint", "sample"])
-def test_a_support_in_numbers_that_says_too_little(missing):
+def test_an_obstacle_in_numbers_that_says_too_little(missing):
     """What a subclass leaves out is named where the contact is made."""
     said = {"gdim": 2, "fingerprint": "flat", "sample": Faulty.sample}
     del said[missing]
-    support = type("Floor", (fc.SampledSupport,), said)()
+    obstacle = type("Floor", (fc.SampledObstacle,), said)()
     scene = block("triangle", 1)
-    words = "Floor is no support", f"must say its {missing}"
+    words = "Floor is no obstacle", f"must say its {missing}"
     raised_everywhere(
-        lambda: scene.contact(fc.Frictionless(), support=support, kinematics="finite"),
+        lambda: scene.contact(fc.Frictionless(), obstacle=obstacle, kinematics="finite"),
         ValueError,
         *words,
     )
 
 
-def test_a_support_that_says_nothing():
-    """A subclass of `Support` without a place is refused by name."""
-    support = type("Nowhere", (fc.Support,), {})()
+def test_an_obstacle_that_says_nothing():
+    """A subclass of `Obstacle` without a place is refused by name."""
+    obstacle = type("Nowhere", (fc.Obstacle,), {})()
     scene = block("triangle", 1)
     raised_everywhere(
-        lambda: scene.contact(fc.Frictionless(), support=support),
+        lambda: scene.contact(fc.Frictionless(), obstacle=obstacle),
         ValueError,
-        "Nowhere is no support",
+        "Nowhere is no obstacle",
         "must say its place",
     )
 
 
-def test_a_support_in_numbers_of_wrong_shape():
+def test_an_obstacle_in_numbers_of_wrong_shape():
     """It is told what is expected, where the contact is first evaluated."""
-    given = {"support": Faulty("shape"), "kinematics": "finite"}
+    given = {"obstacle": Faulty("shape"), "kinematics": "finite"}
     scene = block("triangle", 1)
     words = "Faulty: distance of its sample has shape", "need"
     raised_everywhere(scene.contact(fc.Frictionless(), **given).evaluate, ValueError, *words)
@@ -268,8 +268,8 @@ def test_a_scene_that_moves_and_turns_as_a_whole(cell, shape):
     for moved in (False, True):
         scene = rubber(cell, 1, n=(6, 3) if d == 2 else (4, 2))
         shift, angle = fem.Constant(scene.mesh, np.zeros(d)), fem.Constant(scene.mesh, 0.0)
-        support = disc(scene, 0.8, displacement=shift, angle=angle, axis=(0, 0, 1), shape=shape)
-        contact = scene.contact(support, fc.Coulomb(0.3, 1e3, 1e3))
+        obstacle = disc(scene, 0.8, displacement=shift, angle=angle, axis=(0, 0, 1), shape=shape)
+        contact = scene.contact(obstacle, fc.Coulomb(0.3, 1e3, 1e3))
         centre = np.array((0.0,) * (d - 1) + (1.8,))
         for number in range(3):
             own = 0.04 * np.cos(number + np.arange(d))
@@ -303,7 +303,7 @@ def test_small_and_finite_agree_where_displacements_are_small(law):
     of the spline are those of its cavity, to the 1e-6 of its normals, as is what the verdict says.
     """
     t = np.linspace(0.2, np.pi - 0.2, 121)
-    arc = np.column_stack([2 * np.cos(t), 2 * np.sin(t) - 1])[::-1]  # the support is outside
+    arc = np.column_stack([2 * np.cos(t), 2 * np.sin(t) - 1])[::-1]  # the obstacle is outside
     share, told = [], []
     for size in (4e-3, 1e-3):
         found = []
@@ -317,7 +317,7 @@ def test_small_and_finite_agree_where_displacements_are_small(law):
                 law,
                 contact={"kinematics": kinematics},
                 petsc_options=TIGHT,
-                kinematics=np.inf,
+                small_displacement_tolerance=np.inf,
             )
             for side, up in ((0.0, -1.0), (0.5, -1.5)):
                 shift.value[:] = size * side, size * up

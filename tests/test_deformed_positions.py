@@ -34,7 +34,7 @@ def fails(problem, *words):
 
 def plate(half):
     """A plate about y = 0, of twice that thickness."""
-    return fc.Obstacle(distance=lambda x: abs(x[1]) - half)
+    return fc.SignedDistance(lambda x: abs(x[1]) - half)
 
 
 @pytest.mark.parametrize("half", [0.01, 1e-4])
@@ -58,7 +58,7 @@ def test_a_thin_plate_is_not_crossed_slowly():
     body = block()
     up = body.constant(np.zeros(2))
     body.hold(TOP, 0, 1)
-    obstacle = fc.Obstacle(distance=lambda x: abs(x[1] + 0.01) - 0.01, displacement=up)
+    obstacle = fc.SignedDistance(lambda x: abs(x[1] + 0.01) - 0.01, displacement=up)
     contact = body.contact(BOTTOM, obstacle, fc.Frictionless(k_n=E), kinematics="finite")
     problem = body.problem(contact)
     forces = []
@@ -77,7 +77,7 @@ def test_a_plate_is_not_crossed_after_a_cut(kinematics):
     body = block()
     up = body.constant(np.zeros(2))
     body.hold(TOP, 0, 1)
-    obstacle = fc.Obstacle(distance=lambda x: abs(x[1] + 0.05) - 0.01, displacement=up)
+    obstacle = fc.SignedDistance(lambda x: abs(x[1] + 0.05) - 0.01, displacement=up)
     contact = body.contact(BOTTOM, obstacle, fc.Frictionless(), kinematics=kinematics)
     problem = body.problem(contact)
     up.value[1] = 0.7
@@ -122,7 +122,7 @@ def test_a_blade_does_not_pierce_a_facet(steps, at, kinematics):
         along = ufl.max_value(-0.65, ufl.min_value(-0.05, x[1]))
         return ufl.sqrt((x[0] - at) ** 2 + (x[1] - along) ** 2) - 0.01
 
-    obstacle = fc.Obstacle(distance=blade, displacement=up)
+    obstacle = fc.SignedDistance(blade, displacement=up)
     contact = body.contact(BOTTOM, obstacle, fc.Frictionless(), kinematics=kinematics)
     problem = body.problem(contact)
     reached = 0.0
@@ -150,7 +150,7 @@ def test_a_blade_is_not_turned_through_a_body(steps):
     body = block()
     body.hold(TOP, 0, 1)
     angle = body.constant()
-    obstacle = fc.Obstacle(distance=blade, rotation=fc.Rotation(angle, (-1.0, -0.3)))
+    obstacle = fc.SignedDistance(blade, rotation=fc.Rotation(angle, (-1.0, -0.3)))
     problem = body.problem(body.contact(BOTTOM, obstacle, fc.Frictionless(), kinematics="finite"))
     with pytest.raises(fc.NotConverged, match=r"has crossed|penetrates"):
         for angle.value in np.linspace(0.0, 1.0, steps + 1)[1:]:

@@ -1,4 +1,4 @@
-"""The rolling demo, run as its user runs it, against GetFEM and by a second route."""
+"""The rolling demo, run as its user runs it, against GetFEM and by a cross-check."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ def scene(symmetric, seed=1):
         fixed = fixed + fixed.T
     fixed += 2 * np.eye(N)
     places = np.column_stack([np.arange(N) / N, np.zeros(N)])
-    places[-1] = np.nan  # such as the motion of a support
+    places[-1] = np.nan  # such as the motion of an obstacle
     operator = Sum()
     matrix = PETSc.Mat().createPython((N, N), operator, comm=PETSc.COMM_SELF)
     matrix.setUp()

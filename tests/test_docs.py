@@ -18,7 +18,6 @@ from scenes.processes import ROOT, command, environment
 
 sys.path.insert(0, str(ROOT / "docs"))
 
-import meanings
 import messages
 
 pytestmark = pytest.mark.whole
@@ -225,18 +224,6 @@ def test_texts_are_found_wherever_they_stand(tmp_path: Path) -> None:
         (8, "warning", "… of …"),
         (9, "TypeError", "it is …"),
     ]
-
-
-def test_every_text_has_its_meaning() -> None:
-    """Errors a group, all else what to do, once; and no group and no meaning is left over."""
-    found = messages.read()
-    modules = [module for _, names, _ in meanings.GROUPS for module in names]
-    assert sorted(modules) == sorted({m.module for m in found if m.kind not in meanings.MEANINGS})
-    others = [m for m in found if m.kind in meanings.MEANINGS]
-    assert [m for m in others if len(messages.meant(m)) != 1] == []
-    for kind, pieces in meanings.MEANINGS.items():
-        texts = [m.text for m in others if m.kind == kind]
-        assert [piece for piece in pieces if not any(piece in text for text in texts)] == []
 
 
 def test_the_tables_have_every_text(tmp_path: Path) -> None:

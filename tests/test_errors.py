@@ -78,7 +78,7 @@ def test_discretisation_of_sliding():
     """Where all that is closed slips, friction's error is μ times that of the normal force."""
     made = press(friction=0.3)
     made.push[-1].value, made.push[0].value = -0.03, 0.2
-    made.problem.kinematics = np.inf  # so far over the ball
+    made.problem.small_displacement_tolerance = np.inf  # so far over the ball
     made.problem.solve()
     assert made.contact.resultants().stick == 0
     found = budget(made.scene, made.problem).parts["discretisation"]
@@ -201,10 +201,10 @@ def test_units_do_not_matter():
     found = []
     for length, pressure in ((1.0, 1.0), (1e-3, 1e6)):
         scene = block("triangle", 2, n=3, size=[length] * 2, E=1e3 * pressure)
-        law = fc.Coulomb(0.3, fc.Scaled(10.0), fc.Scaled(10.0))
+        law = fc.Coulomb(0.3, fc.RelativeStiffness(10.0), fc.RelativeStiffness(10.0))
         bcs = [scene.hold(TOP, 0, 0.01 * length), scene.hold(TOP, 1, -0.03 * length)]
         problem, _ = scene.problem(
-            law, bcs, contact={"support": cushion(2, length=length)}, method="newton"
+            law, bcs, contact={"obstacle": cushion(2, length=length)}, method="newton"
         )
         problem.solve()
         made = budget(scene, problem)
@@ -226,14 +226,14 @@ def test_shapes_are_checked():
 
 
 @pytest.mark.parametrize("bulk", ["linear", "nonlinear"])
-def test_a_state_that_holds_no_support_is_refused_and_solved_from(bulk):
+def test_a_state_that_holds_no_obstacle_is_refused_and_solved_from(bulk):
     """MUMPS' failure of the singular matrix was kept: the next solution ended in PETSc's error 76.
 
     That one is the solution of a problem whose errors nobody asked for, to the solver's tolerance.
     """
-    asked, twin = (Press(support="force", wall=True, bulk=bulk) for _ in range(2))
+    asked, twin = (Press(obstacle="force", wall=True, bulk=bulk) for _ in range(2))
     raised_everywhere(
-        lambda: budget(asked.scene, asked.problem), ValueError, "nothing holds", "support"
+        lambda: budget(asked.scene, asked.problem), ValueError, "nothing holds", "obstacle"
     )
     for made in (asked, twin):
         made.load(1.0)
@@ -266,7 +266,7 @@ def test_multipliers_leave_no_error_of_enforcement():
     for enforcement in ("penalty", "augmented"):
         scene = block("quadrilateral", 1, n=8)
         bcs = [scene.hold(TOP, 0, 0.015), scene.hold(TOP, 1, -0.03)]
-        contact = {"support": cushion(2), "enforcement": enforcement}
+        contact = {"obstacle": cushion(2), "enforcement": enforcement}
         problem, _ = scene.problem(fc.Coulomb(0.3, 1e4, 1e4), bcs, contact=contact)
         problem.solve()
         left[enforcement] = budget(scene, problem).relative("enforcement")["normal force"]
@@ -320,7 +320,9 @@ def test_stresses_of_the_package(kind, bulk):
     surface = fc.ContactSurface(mesh, tags, BOTTOM)
     ball = fc.Ball((0.0, -2.0), 2.0)
     contact = fc.Contact(u, surface, ball, fc.Frictionless(1e4), weight=weight)
-    problem = fc.ContactProblem(F, whole, bcs=bcs, contacts=[contact], kinematics=np.inf)
+    problem = fc.ContactProblem(
+        F, whole, bcs=bcs, contacts=[contact], small_displacement_tolerance=np.inf
+    )
     problem.solve()
     gradient = body.strain(u) if bulk == "linear" else ufl.sym(body.gradient(u))
     found = fc.estimate_errors(problem, body.stress)

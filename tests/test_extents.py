@@ -51,7 +51,7 @@ def test_they_are_those_of_the_points(cell):
     And on any number of ranks, some of them without points of a state.
     """
     made, d = Rub(cell=cell), dimension(cell)
-    made.problem.kinematics = np.inf
+    made.problem.small_displacement_tolerance = np.inf
     seen = set()
     for step in walk(made, path=[(0.0, -0.01), *PATH]):
         found, points = step.contacts["contact"], made.contact.gather()
@@ -79,7 +79,7 @@ def test_they_are_those_of_the_points(cell):
 def test_the_moment_is_that_about_the_origin():
     """Of a step, as `Contact.moment` has it, on any number of ranks."""
     made = Rub()
-    made.problem.kinematics = np.inf
+    made.problem.small_displacement_tolerance = np.inf
     *_, step = fc.increments(made.problem, made.load, 0, 1.5, steps=3)
     assert close(step.contacts["contact"].moment, made.contact.moment([0, 0]), 1e-12)
     assert MPI.COMM_WORLD.allreduce(abs(float(step.contacts["contact"].moment[0]))) > 0

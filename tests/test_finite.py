@@ -32,7 +32,7 @@ IN_SPACE = {
 }
 
 
-def supports(scene, shift, angle):
+def obstacles(scene, shift, angle):
     """Shapes that cut into the top of the block, by name."""
     d, top = scene.dim, scene.height
     turn = fc.Rotation(angle, (0.2,) * d, None if d == 2 else (1.0, 2.0, 3.0))
@@ -43,7 +43,7 @@ def supports(scene, shift, angle):
         "ball": fc.Ball(middle, 0.8, **move),
         "cavity": fc.Ball((*side, top - 1.5), 1.6, inside=True, **move),
         "cylinder": fc.Cylinder(middle, 0.8, None if d == 2 else (0.2, 1, 0.1), **move),
-        "ellipsoid": fc.Obstacle(distance=lambda x: _ellipsoid(x, middle), **move),
+        "ellipsoid": fc.SignedDistance(lambda x: _ellipsoid(x, middle), **move),
         "profile": _lens(middle, move),
         "facets": _gem(middle, move),
     }
@@ -126,7 +126,7 @@ def test_derivatives(cell, shape):
     for law in laws.values():
         scene = rubber(cell, 2 if cell == "triangle" else 1, n=(4, 2), shuffled=True)
         shift, angle = (fem.Constant(scene.mesh, v) for v in (np.zeros(scene.dim), 0.0))
-        contact = scene.contact(supports(scene, shift, angle)[shape], law)
+        contact = scene.contact(obstacles(scene, shift, angle)[shape], law)
         for seed in states(scene, contact, shift, angle):
             error, size = derivative_error(contact, scene, seed)
             assert size > 1.0 and error < 1e-6
@@ -142,16 +142,16 @@ def test_derivatives(cell, shape):
     [("ball", "penalty"), ("ball", "augmented"), ("profile", "penalty"), ("facets", "augmented")],
 )
 def test_the_boundary_form_is_the_same(cell, shape, enforcement):
-    """`Contact.form` and its tangent have the expressions of the support, and not samples of them.
+    """`Contact.form` and its tangent have the expressions of the obstacle, and not samples of them.
 
-    Of a support from data they have its expansion about where it was sampled last. Nodal forces
+    Of an obstacle from data they have its expansion about where it was sampled last. Nodal forces
     and products with the tangent agree to round-off, 1e-11.
     """
     scene = rubber(cell, 1, n=(4, 2))
     v, du = (f(scene.u.function_space) for f in (ufl.TestFunction, ufl.TrialFunction))
     shift, angle = (fem.Constant(scene.mesh, x) for x in (np.zeros(scene.dim), 0.0))
-    support = supports(scene, shift, angle)[shape]
-    contact = scene.contact(support, fc.Coulomb(0.3, K, K), enforcement=enforcement)
+    obstacle = obstacles(scene, shift, angle)[shape]
+    contact = scene.contact(obstacle, fc.Coulomb(0.3, K, K), enforcement=enforcement)
     comm, operator = scene.mesh.comm, fc.ContactOperator(contact)
     maps = contact.entity_maps
     form, tangent = (compile_form(f, maps) for f in (contact.form(v), contact.tangent(v, du)))
@@ -206,8 +206,8 @@ def _refused(arguments, law=None, **options):
     scene = rubber("triangle", 1, n=(2, 1))
 
     def make():
-        support = arguments(scene) if callable(arguments) else arguments
-        scene.contact(support, law or fc.Frictionless(K), **options)
+        obstacle = arguments(scene) if callable(arguments) else arguments
+        scene.contact(obstacle, law or fc.Frictionless(K), **options)
 
     return make
 
@@ -221,9 +221,9 @@ FLOOR = fc.HalfSpace((0, 1), (0, -1))
         (_refused(FLOOR, kinematics="large"), ValueError, "'small', 'finite'"),
         (_refused(FLOOR, gap=0.1), ValueError, "gap is prescribed"),
         (_refused(FLOOR, law=fc.Foundation(K, K)), ValueError, "Foundation bonds"),
-        (_refused(fc.Obstacle(0.1, (0, 1))), ValueError, "distance=lambda"),
+        (_refused(fc.PrescribedGap(0.1, (0, 1))), ValueError, "distance=lambda"),
         (
-            _refused(lambda s: fc.Obstacle(distance=lambda x: ufl.SpatialCoordinate(s.mesh)[1])),
+            _refused(lambda s: fc.SignedDistance(lambda x: ufl.SpatialCoordinate(s.mesh)[1])),
             ValueError,
             "distance=lambda",
         ),
@@ -264,17 +264,3 @@ FLOOR = fc.HalfSpace((0, 1), (0, -1))
 def test_refused(make, error, text):
     """Before any work, on all ranks, with what to give instead."""
     raised_everywhere(make, error, text)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        ({}, "has nothing"),
-        ({"gap": 1.0}, "has gap; give gap and normal"),
-        ({"gap": 1.0, "normal": (0, 1), "distance": abs}, "give gap and normal, or distance"),
-    ],
-)
-def test_an_obstacle_is_given_in_one_way(arguments, text):
-    """By gap and normal, or by its distance."""
-    with pytest.raises(ValueError, match=text):
-        fc.Obstacle(**arguments)

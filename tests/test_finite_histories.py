@@ -78,11 +78,11 @@ def test_turning_the_whole_scene_only_turns_the_answer(cell, shape, enforcement)
     allowed = 1e-9 if enforcement == "penalty" else 1e-7
     still, tool = (Tool(cell, contact=contact, shape=shape) for _ in range(2))
     if d == 3:
-        support = disc(
+        obstacle = disc(
             tool.scene, 0.8, displacement=tool.shift, angle=tool.angle, axis=axis, shape=shape
         )
         tool.problem, tool.contact = tool.scene.problem(
-            support, fc.Coulomb(0.3, 1e4, 1e4), contact=contact, petsc_options=TIGHT
+            obstacle, fc.Coulomb(0.3, 1e4, 1e4), contact=contact, petsc_options=TIGHT
         )
     for side, up in PATH[:4]:
         still.go(side, up)
@@ -123,7 +123,7 @@ def test_small_and_finite_agree_to_first_order(law):
                 law,
                 contact={"kinematics": kinematics},
                 petsc_options=TIGHT,
-                kinematics=np.inf,
+                small_displacement_tolerance=np.inf,
             )
             for side, up in ((0.0, -1.0), (0.5, -1.5)):
                 shift.value[:] = size * side, size * up

@@ -1,4 +1,4 @@
-"""Finite kinematics where they meet histories, files, cuts, free supports and error budgets."""
+"""Finite kinematics where they meet histories, files, cuts, free obstacles and error budgets."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HOW = {
     "penalty": {},
     "augmented": {"contact": {"enforcement": "augmented"}},
     "by force": {"force": True},
-    "linear": {"linear": True, "solver": {"kinematics": np.inf}},
+    "linear": {"linear": True, "solver": {"small_displacement_tolerance": np.inf}},
     "frictionless": {"law": fc.Frictionless(1e4)},
     "profile": {"shape": "profile"},
     "facets": {"shape": "facets", "force": True},
@@ -75,7 +75,7 @@ def test_first_touch_from_afar_in_increments_that_are_cut(shape):
     assert close(ends[0], ends[1], 1e-7)
 
 
-def test_a_support_that_a_force_presses_bears_it():
+def test_an_obstacle_that_a_force_presses_bears_it():
     """N is the force, whatever the tool's angle, and the body follows the tool: 1e-8."""
     for cell in ("triangle", "tetrahedron"):
         tool = Tool(cell, force=True, **({"n": (8, 4)} if cell == "triangle" else {}))
@@ -108,7 +108,7 @@ def test_the_budget_of_small_displacements_predicts_the_difference():
             fc.Ball((0, 1.8), 0.8, displacement=shift),
             fc.Coulomb(0.3, 1e4, 1e4),
             contact={"kinematics": kinematics},
-            kinematics=np.inf,
+            small_displacement_tolerance=np.inf,
         )
         shift.value[:] = 0.0, -0.05
         for shift.value[0] in (0.0, 0.02, 0.04):
@@ -128,7 +128,7 @@ def test_the_form_in_a_problem_of_ones_own(shape):
     """`Contact.form` and `tangent` in a Newton iteration written with DOLFINx alone: same u, 1e-9.
 
     A hyperelastic body with friction, two increments; what is solved is F + contact.form(v). A
-    support from data is sampled by `Contact.evaluate` wherever u has changed.
+    obstacle from data is sampled by `Contact.evaluate` wherever u has changed.
     """
     own, reference = (Tool("triangle", n=(8, 4), shape=shape) for _ in range(2))
     scene, contact = own.scene, own.contact

@@ -135,8 +135,8 @@ class Blocks:
         else:
             for i, value in enumerate(self.way):
                 bodies.hold(2, i, value=value)
-        support = 3 if opposite == "body" else fc.HalfSpace((0, -gap), (0, 1), displacement=floor)
-        self.contact = bodies.contact(1, support, fc.Coulomb(friction=0.3), **options)
+        obstacle = 3 if opposite == "body" else fc.HalfSpace((0, -gap), (0, 1), displacement=floor)
+        self.contact = bodies.contact(1, obstacle, fc.Coulomb(friction=0.3), **options)
         self.problem = bodies.problem(self.contact)
 
     def go(self, along, up):

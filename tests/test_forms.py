@@ -388,7 +388,9 @@ def test_inertia_is_no_stiffness(kind):
     found = []
     for exponent in range(-8, 8, 3):
         dt.value = 10.0**exponent
-        contact = fc.Contact(u, surface, floor, fc.Coulomb(0.3, fc.Scaled(5.0)), weight=weight)
+        contact = fc.Contact(
+            u, surface, floor, fc.Coulomb(0.3, fc.RelativeStiffness(5.0)), weight=weight
+        )
         fc.ContactProblem(F, u, contacts=[contact])
         found.append(at_points(contact, contact.values.parameters["k_n"]))
     # A cell is half of the block high.

@@ -124,7 +124,7 @@ def test_a_yield_surface_of_ones_own_denies_no_balance():
             along = ufl.dot(traction, t)
             return along - more, -along - less
 
-        def slide(self, kinematics, bound, parameters):
+        def return_map(self, kinematics, bound, parameters):
             t, more, less = self._sided(kinematics, bound)
             trial = kinematics.traction - parameters["k_t"] * kinematics.tangential_increment
             along = ufl.dot(trial, t)

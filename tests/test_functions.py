@@ -31,7 +31,7 @@ pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 def test_integrals_are_those_of_the_points(cell):
     """In forms over the body's mesh, on facets of all orientations; nothing leaves its range."""
     made = Rub(cell=cell, degree=2, mesh={"n": 4, "shuffled": True})
-    made.problem.kinematics = np.inf
+    made.problem.small_displacement_tolerance = np.inf
     list(fc.increments(made.problem, made.load, 0, 2, steps=2))
     contact, d = made.contact, made.scene.dim
     ds = ufl.ds(made.scene.mesh, subdomain_data=made.scene.tags)(BOTTOM)
@@ -63,7 +63,7 @@ def test_integrals_are_those_of_the_points(cell):
 def test_a_form_that_is_compiled_once():
     """The same function takes the values of the next state."""
     made = Rub(mesh={"n": 4})
-    made.problem.kinematics = np.inf
+    made.problem.small_displacement_tolerance = np.inf
     contact = made.contact
     ds = ufl.ds(made.scene.mesh, subdomain_data=made.scene.tags)(BOTTOM)
     pressure, slip = contact.function("pressure"), contact.function("slip")
@@ -79,8 +79,8 @@ def test_a_form_that_is_compiled_once():
 def test_files(tmp_path):
     """A gap that is the same everywhere, at every node; and DOLFINx writes such functions."""
     scene = block("tetrahedron", n=3)
-    support = fc.Obstacle(0.1, scene.vector(up=-1.0))
-    gap = scene.contact(fc.Frictionless(1e3), support=support).function("gap")
+    obstacle = fc.PrescribedGap(0.1, scene.vector(up=-1.0))
+    gap = scene.contact(fc.Frictionless(1e3), obstacle=obstacle).function("gap")
     off = COMM.allreduce(np.abs(gap.x.array - 0.1).max(initial=0.0), op=MPI.MAX)
     assert off <= 1e-12
     path = shared_folder(tmp_path) / "gap.pvd"

@@ -70,7 +70,7 @@ FINITE = [*SCENES["finite"], *SCENES["bodies"]]
 @pytest.mark.mpi
 @pytest.mark.parametrize("number", range(len(FINITE)))
 def test_scenes_of_finite_kinematics_are_right(number):
-    """Supports that move and turn, linear bodies and rubber, two bodies; on several ranks some.
+    """Obstacles that move and turn, linear bodies and rubber, two bodies; on several ranks some.
 
     On one rank they are solved, too, and most are the solution found apart.
     """
@@ -116,11 +116,11 @@ def test_a_refusal_that_another_method_contradicts_is_counted(monkeypatch):
 
 @serial
 def test_a_step_across_the_residual_is_no_solution():
-    """A support held by a prescribed pressure alone: PETSc's line search ends all where F·y = 0.
+    """An obstacle held by a prescribed pressure alone: PETSc's line search ends all where F·y = 0.
 
     An attempt that it ends so has a residual as large as the forces.
     """
-    name = "a support that a prescribed pressure alone holds"
+    name = "an obstacle that a prescribed pressure alone holds"
     scene = next(e["scene"] for e in SCENES["regressions"] if e["name"] == name)
     outcome = played(scene | {"method": "newton"})
     assert outcome.outcome == "refused"
@@ -180,7 +180,7 @@ ONE = {
         {
             "body": 0,
             "side": "bottom",
-            "support": {"kind": "halfspace", "clearance": 0.0},
+            "obstacle": {"kind": "halfspace", "clearance": 0.0},
             "law": {
                 "kind": "coulomb",
                 "friction": 0.3,
@@ -278,7 +278,7 @@ def test_another_friction_is_found():
 TURNING = copy.deepcopy(ONE) | {
     "kinematics": "finite",
     "bulk": "linear",
-    "drive": "support",
+    "drive": "obstacle",
     "holds": [[0, "top", [0, 1], "still"]],
     "strain": 0.05,
     "stages": [
@@ -286,7 +286,7 @@ TURNING = copy.deepcopy(ONE) | {
         {"steps": 2, "normal": 1.0, "side": 0.01, "across": 0.0, "turn": 0.02},
     ],
 }
-TURNING["contacts"][0]["support"] = {
+TURNING["contacts"][0]["obstacle"] = {
     "kind": "ball",
     "clearance": 0.0,
     "radius": 1.0,
@@ -314,9 +314,9 @@ TWO = copy.deepcopy(TURNING) | {
 }
 TWO["contacts"][0] |= {
     "body": 1,
-    "support": {"kind": "body", "update": "never", "body": 0, "side": "top"},
+    "obstacle": {"kind": "body", "update": "never", "body": 0, "side": "top"},
 }
-FAR = pytest.mark.parametrize("scene", [TURNING, TWO], ids=["support", "bodies"])
+FAR = pytest.mark.parametrize("scene", [TURNING, TWO], ids=["obstacle", "bodies"])
 
 
 @serial
@@ -354,7 +354,7 @@ LOOSE = copy.deepcopy(TURNING) | {
         {"steps": 1, "normal": 1.0, "side": 0.01, "across": 0.0, "turn": 0.0},
     ],
 }
-LOOSE["contacts"][0]["support"]["kind"] = "cylinder inside"
+LOOSE["contacts"][0]["obstacle"]["kind"] = "cylinder inside"
 LOOSE["contacts"][0]["quadrature"] = 1
 
 
@@ -406,7 +406,7 @@ def test_slip_of_bodies_that_is_not_turned_is_found():
 
 @serial
 @pytest.mark.parametrize("what", ["angle", "shift"])
-def test_a_support_that_is_elsewhere_is_found(what):
+def test_an_obstacle_that_is_elsewhere_is_found(what):
     """It turns or moves by a thousandth more than the scene says."""
 
     def changed(made, problem):
@@ -426,15 +426,15 @@ def test_a_support_that_is_elsewhere_is_found(what):
 def test_shapes_of_the_second_solution(kind):
     """Distances have slope 1, along their normals: by differences, 1e-6; in the plane and in space.
 
-    At places around the lowest corner of the body, near the support and not at its edges.
+    At places around the lowest corner of the body, near the obstacle and not at its edges.
     """
     for d in (2, 3):
         if d == 2 and kind in ("torus", "turned profile"):
             continue
-        support = {"kind": kind, "clearance": 0.01, "radius": 1.3, "points": 24, "flat": 0.8}
+        obstacle = {"kind": kind, "clearance": 0.01, "radius": 1.3, "points": 24, "flat": 0.8}
         body = {"origin": [0.0] * d, "size": [1.0, 1.1, 0.9][:d], "n": [1] * d}
         scene = {"bodies": [body], "units": [1.0, 1.0]}
-        contact = {"side": "bottom", "support": support}
+        contact = {"side": "bottom", "obstacle": obstacle}
         shape = finite_reference.shape_of(scene, contact)
         x = np.random.default_rng(2).uniform(-0.05, 0.05, (40, d)) + 0.4 * (np.arange(d) < d - 1)
         distance, normal = shape(x)
@@ -467,12 +467,12 @@ def test_a_raw_error_counts_as_a_crash_and_a_refusal_as_a_refusal():
 
 # A block with its top held, and a thin plate below it that is led up.
 PLATE = copy.deepcopy(ONE) | {
-    "drive": "support",
+    "drive": "obstacle",
     "holds": [[0, "top", [0, 1], "still"]],
     "stages": [{"steps": 1, "normal": 2.0, "side": 0.0, "across": 0.0}],
     "cuts": 0,
 }
-PLATE["contacts"][0]["support"] = {
+PLATE["contacts"][0]["obstacle"] = {
     **{"kind": "rod", "shape": "plate", "radius": 0.01, "half": 0.4, "tilt": 0.0},
     **{"at": 0.5, "clearance": 0.001, "moving": "displacement"},
 }
@@ -492,11 +492,11 @@ def test_a_scene_beside_an_unrelated_body_is_right(busy):
 
 
 @serial
-@pytest.mark.parametrize("scene", [ONE, TURNING, TWO], ids=["small", "support", "bodies"])
+@pytest.mark.parametrize("scene", [ONE, TURNING, TWO], ids=["small", "obstacle", "bodies"])
 def test_a_scene_that_is_carried_far_is_right(scene):
     carried = copy.deepcopy(scene) | {"carry": [20.0, 5.0]}
     if scene is not TWO:
-        carried["contacts"][0]["support"].setdefault("moving", "carried")
+        carried["contacts"][0]["obstacle"].setdefault("moving", "carried")
     assert played(carried).outcome == "right"
 
 
@@ -524,7 +524,7 @@ def test_a_body_that_is_passed_through_unseen_is_found(monkeypatch):
     """The block goes 0.3 deep into the slab, between the two points of its top."""
     monkeypatch.setattr(TunnellingCheck, "evaluate", lambda self, before: {})
     scene = copy.deepcopy(TWO)
-    scene["contacts"][0]["support"] |= {"body": 1, "side": "bottom"}
+    scene["contacts"][0]["obstacle"] |= {"body": 1, "side": "bottom"}
     scene["contacts"][0] |= {"body": 0, "side": "top"}
     scene["bodies"][0]["n"], scene["contacts"][0]["quadrature"] = [2, 2], 1
     scene["stages"] = [dict(scene["stages"][0], normal=5.0)]
@@ -537,11 +537,11 @@ def test_a_body_that_is_passed_through_unseen_is_found(monkeypatch):
 def test_motion_that_is_not_small_is_found():
     """A disc pressed against the block is led aside by its radius together with it."""
     scene = copy.deepcopy(ONE) | {"carry": [0.5, 0.0]}
-    support = {"kind": "ball", "clearance": 0.0, "radius": 1.0, "moving": "carried"}
-    scene["contacts"][0]["support"] = support
+    obstacle = {"kind": "ball", "clearance": 0.0, "radius": 1.0, "moving": "carried"}
+    scene["contacts"][0]["obstacle"] = obstacle
 
     def changed(made, problem):
-        problem.kinematics = np.inf
+        problem.small_displacement_tolerance = np.inf
 
     assert played(scene).outcome == "refused"
     outcome = played(scene, changed=changed)
@@ -682,11 +682,11 @@ def test_reference_passes_the_patch_test(cell, degree):
     scene = copy.deepcopy(ONE) | {"layout": "pair", "cell": cell, "degree": degree, "nu": 0.0}
     lower = {"origin": [0.0] * d, "size": [*across, 0.4], "n": [1] * d, "E": 1000.0, "jitter": 0}
     upper = lower | {"origin": [0.0] * (d - 1) + [0.4], "size": [*across, 0.6], "n": [2] * d}
-    support = {"kind": "body", "update": "never", "body": 1, "side": "bottom"}
+    obstacle = {"kind": "body", "update": "never", "body": 1, "side": "bottom"}
     law = {"kind": "frictionless", "k_n": ["number", 3.0]}
     scene |= {
         "bodies": [lower, upper],
-        "contacts": [{"body": 0, "side": "top", "support": support, "law": law}],
+        "contacts": [{"body": 0, "side": "top", "obstacle": obstacle, "law": law}],
         "holds": [[0, "bottom", list(range(d)), "still"], [1, "left", list(range(d - 1)), "still"]],
         "drive": "force",
         "stages": [{"steps": 1, "normal": 1.0, "side": 0.0, "across": 0.0}],

@@ -117,7 +117,9 @@ class Scene:
         surface = fc.ContactSurface(mesh, tags, [BOTTOM, RIGHT])
         x = ufl.SpatialCoordinate(mesh)
         normal = [0.3 * x[0] - 0.1, *([0.2 * x[1]] if d == 3 else []), -1.5]
-        obstacle = fc.Obstacle(0.08 + 0.03 * x[0] ** 2 - 0.01 * x[d - 1], ufl.as_vector(normal))
+        obstacle = fc.PrescribedGap(
+            0.08 + 0.03 * x[0] ** 2 - 0.01 * x[d - 1], ufl.as_vector(normal)
+        )
         law = fc.Coulomb(FRICTION, k_n=K_N, k_t=K_T)
         self.contact = fc.Contact(self.u, surface, obstacle, law)
         self.x = gathered(COMM, self.contact.points)
@@ -301,8 +303,8 @@ def test_reopened_points_forget(cell):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
-def test_history_of_a_moving_support(cell):
-    """It is the jump that counts: moving the support by -a is moving the body by +a. Round-off."""
+def test_history_of_a_moving_obstacle(cell):
+    """It is the jump that counts: moving the obstacle by -a is moving the body by +a. Round-off."""
     d = dimension(cell)
     mesh, tags = block_mesh(cell, shuffled=True)
     surface = fc.ContactSurface(mesh, tags, BOTTOM)

@@ -46,7 +46,7 @@ def test_a_row_is_a_step(cell, tmp_path):
     made = Press(cell=cell, wall=True)
     steps, moments = [], []
     for start, end in ((0.0, 2.0), (2.0, 3.0)):
-        for step in made.increments(end, start, history=path):
+        for step in made.increments(end, start, csv=path):
             steps.append(step)
             contacts = made.problem.contacts
             moments.append({c.name: c.moment([0.0] * made.scene.dim) for c in contacts})
@@ -99,8 +99,8 @@ def test_a_resumed_history(tmp_path):
     """Rows behind the checkpoint are replaced, those before it are as they were."""
     folder = shared_folder(tmp_path)
     whole, made, again = Press(), Press(), Press()
-    list(whole.increments(3.0, history=folder / "whole.csv"))
-    files = {"checkpoint": folder / "state.npz", "history": folder / "parts.csv"}
+    list(whole.increments(3.0, csv=folder / "whole.csv"))
+    files = {"checkpoint": folder / "state.npz", "csv": folder / "parts.csv"}
     for step in made.increments(3.0, checkpoint_every=2, **files):
         if step.increment == 5:
             break
@@ -126,7 +126,7 @@ def test_a_resumed_history(tmp_path):
     assert list(done.increments(3.0, **files)) == []
     assert table(folder / "parts.csv") == rows
     # A history that starts anew has a table of its own.
-    next(iter(Press().increments(3.0, history=files["history"])))
+    next(iter(Press().increments(3.0, csv=files["csv"])))
     assert [row["increment"] for row in table(folder / "parts.csv")] == ["1"]
 
 
@@ -139,20 +139,20 @@ def test_cuts_errors_and_failures(tmp_path, monkeypatch):
     def failing(**options):
         calls.append(options)
         if len(calls) == 2:  # the second increment as a whole
-            made.problem.kinematics = 1e-12
+            made.problem.small_displacement_tolerance = 1e-12
         try:
             return solve(**options)
         finally:
-            made.problem.kinematics = 0.2
+            made.problem.small_displacement_tolerance = 0.2
 
     with monkeypatch.context() as patch:
         patch.setattr(made.problem, "solve", failing)
-        list(made.increments(1.5, steps=2, max_cuts=3, history=folder / "cut.csv"))
+        list(made.increments(1.5, steps=2, max_cuts=3, csv=folder / "cut.csv"))
     cuts = numbers(table(folder / "cut.csv"), "cuts")
     assert cuts == [0.0, 1.0, 0.0]
 
     made = Press()
-    steps = list(made.increments(1.0, steps=2, estimate=True, history=folder / "errors.csv"))
+    steps = list(made.increments(1.0, steps=2, estimate=True, csv=folder / "errors.csv"))
     rows = table(folder / "errors.csv")
     for name, unit in (("normal force", "force"), ("peak pressure", "stress")):
         found = [row[f"error of {name} by the increments ({unit})"] for row in rows]
@@ -162,9 +162,9 @@ def test_cuts_errors_and_failures(tmp_path, monkeypatch):
 
     made = Press()
     path = folder / "failed.csv"
-    history = made.increments(1.5, steps=2, max_cuts=0, history=path)
+    history = made.increments(1.5, steps=2, max_cuts=0, csv=path)
     next(history)
-    made.problem.kinematics = 1e-12
+    made.problem.small_displacement_tolerance = 1e-12
     with pytest.raises(fc.NotConverged):
         next(history)
     assert [row["increment"] for row in table(path)] == ["1"]
@@ -180,10 +180,10 @@ def test_wrong_input(tmp_path):
 
     def call(history, problem=made, **options):
         return lambda: next(
-            iter(fc.increments(problem.problem, problem.load, history=history, **options))
+            iter(fc.increments(problem.problem, problem.load, csv=history, **options))
         )
 
-    raised_everywhere(call(3), ValueError, "history", "name of a file")
+    raised_everywhere(call(3), ValueError, "csv", "name of a file")
     raised_everywhere(call(folder / "no" / "h.csv"), ValueError, "no folder", "make it")
     raised_everywhere(call(folder / "letter.txt"), ValueError, "letter.txt", "overwritten")
     raised_everywhere(call(folder), OSError, str(folder.name))
@@ -196,7 +196,7 @@ def test_wrong_input(tmp_path):
     call(folder / "other.csv", other, steps=2)()
     before = path.read_bytes()
     again = lambda: next(  # noqa: E731
-        iter(fc.increments(other.problem, other.load, 0.5, 1.0, history=path))
+        iter(fc.increments(other.problem, other.load, 0.5, 1.0, csv=path))
     )
     raised_everywhere(again, ValueError, "columns differ")
     assert path.read_bytes() == before
@@ -205,7 +205,7 @@ def test_wrong_input(tmp_path):
         path.write_bytes(before + before.splitlines(keepends=True)[1][:20] + b"\n")
     COMM.barrier()
     again = lambda: next(  # noqa: E731
-        iter(fc.increments(made.problem, made.load, 0.5, 1.0, history=path))
+        iter(fc.increments(made.problem, made.load, 0.5, 1.0, csv=path))
     )
     raised_everywhere(again, ValueError, "damaged in line 3")
 
@@ -225,7 +225,7 @@ def test_what_is_no_file_is_refused_and_stays(tmp_path):
     def call(**options):
         return lambda: next(iter(fc.increments(made.problem, made.load, **options)))
 
-    for options in ({"history": pipe}, {"checkpoint": pipe}):
+    for options in ({"csv": pipe}, {"checkpoint": pipe}):
         raised_everywhere(call(**options), ValueError, "pipe", "give the name of a file")
     with pytest.raises(ValueError, match="would take its place"), files.replacing(pipe) as path:
         path.write_bytes(b"")
@@ -237,7 +237,7 @@ def test_a_row_that_cannot_be_written(tmp_path, monkeypatch):
     """The error is everywhere, no half of a row is left, and the committed state stays."""
     path = shared_folder(tmp_path) / "h.csv"
     made = Rub()
-    history = fc.increments(made.problem, made.load, steps=3, history=path)
+    history = fc.increments(made.problem, made.load, steps=3, csv=path)
     next(history)
     before = path.read_bytes()
     COMM.barrier()
@@ -257,7 +257,7 @@ def test_finite_kinematics(tmp_path):
     """Moments act where Γc has moved to; the number of the row's points is that of all ranks."""
     path = shared_folder(tmp_path) / "h.csv"
     made = Tool(law=fc.Frictionless(1e4))
-    (step,) = made.increments(1.0, steps=1, history=path)
+    (step,) = made.increments(1.0, steps=1, csv=path)
     (row,) = table(path)
     moment = float(row["contact: moment z about the origin (force length per thickness)"])
     assert close([moment], made.contact.moment((0.0, 0.0)), 1e-12)
@@ -288,7 +288,7 @@ def test_units_with_a_thickness(tmp_path):
         contact = scene.contact(fc.Frictionless(1e4), weight=weight and t)
         problem = fc.ContactProblem(F, scene.u, bcs=scene.rollers(), contacts=[contact])
         path = folder / f"{weight}.csv"
-        (step,) = fc.increments(problem, lambda load: None, 0, 1, history=path)
+        (step,) = fc.increments(problem, lambda load: None, 0, 1, csv=path)
         found.append((step, table(path)[0]))
         told = "forces and areas per unit thickness"
         assert (told in step.summary()) == (weight is None)

@@ -94,8 +94,8 @@ def test_a_mesh_far_from_the_origin(way):
     v = ufl.TestFunction(u.function_space)
     F = ufl.inner(stress(u, 1000.0, 0.3), strain(v)) * ufl.dx
     F += v[1] * ufl.ds(mesh, subdomain_data=tags)(TOP)
-    support = fc.HalfSpace((way, way), (0, 1))
-    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, BOTTOM), support, coulomb())
+    obstacle = fc.HalfSpace((way, way), (0, 1))
+    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, BOTTOM), obstacle, coulomb())
 
     def call():
         return fc.ContactProblem(F, u, contacts=[contact]).solve()
@@ -150,8 +150,8 @@ def test_start_not_finite_on_one_rank():
     raised_everywhere(build_and_solve(scene), ValueError, "'u'", "finite")
 
 
-def test_displacement_of_the_support_not_finite():
-    """A support moved to NaN between two increments."""
+def test_displacement_of_the_obstacle_not_finite():
+    """An obstacle moved to NaN between two increments."""
     scene = pressed()
     motion = fem.Constant(scene.mesh, np.zeros(2))
     problem, _ = scene.problem(coulomb(), scene.rollers(), contact={"displacement": motion})
@@ -160,8 +160,8 @@ def test_displacement_of_the_support_not_finite():
     raised_everywhere(problem.solve, ValueError, "gap", "finite")
 
 
-def test_tangential_displacement_of_the_support_not_finite():
-    """A support moved to NaN along itself only: the gap does not show it in every arrangement."""
+def test_tangential_displacement_of_the_obstacle_not_finite():
+    """An obstacle moved to NaN along itself only: the gap does not show it in every arrangement."""
     scene = pressed()
     motion = fem.Constant(scene.mesh, np.zeros(2))
     problem, _ = scene.problem(coulomb(), scene.rollers(), contact={"displacement": motion})
@@ -217,7 +217,7 @@ def test_contact_surface_held_in_one_component():
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_load_that_pulls_the_body_off(cell):
-    """A load away from the support, nothing else holding: no contact force can balance it."""
+    """A load away from the obstacle, nothing else holding: no contact force can balance it."""
     scene = block(cell, up=1.0)
     raised_everywhere(build_and_solve(scene), ValueError, "balance", "translation along")
     scene = block(cell, up=1.0)
@@ -248,7 +248,7 @@ def test_a_motion_along_a_cavity():
     # The cavity's axis is the middle of the block: turning about it is felt by no point.
     cavity = fc.Ball((0.5, 0.5), 2.0, inside=True)
     raised_everywhere(
-        lambda: scene.problem(fc.Frictionless(k_n=1e4), [], contact={"support": cavity}),
+        lambda: scene.problem(fc.Frictionless(k_n=1e4), [], contact={"obstacle": cavity}),
         ValueError,
         "rotation about z",
     )
@@ -359,11 +359,11 @@ def test_nodes_that_are_moved(field):
     """Points, gaps and the stiffness are of where nodes were: moved ones are refused, not mixed."""
     scene = pressed()
     problem, contact = scene.problem(coulomb(), scene.rollers())
-    problem.solve(field=field)
+    problem.solve(recover_interior=field)
     problem.commit()
     before = contact.history.rows()
     scene.mesh.geometry.x[:, 0] *= 1.3
-    raised_everywhere(lambda: problem.solve(field=field), ValueError, "moved", "0.3")
+    raised_everywhere(lambda: problem.solve(recover_interior=field), ValueError, "moved", "0.3")
     assert np.array_equal(contact.history.rows(), before) and problem.increment == 1
     scene.mesh.geometry.x[:, 0] /= 1.3
     fc.ContactSurface(scene.mesh, scene.tags, BOTTOM)  # of the mesh as it is now

@@ -178,13 +178,16 @@ def test_arguments_of_a_contact():
     scene = pressed()
     u, surface, floor, law = scene.u, scene.surface, scene.floor(), coulomb()
     for arguments, words in (
-        ((u, surface, law, floor), ("support is a Coulomb", "must be a Support", "(u, surface,")),
+        (
+            (u, surface, law, floor),
+            ("obstacle is a Coulomb", "must be an Obstacle", "(u, surface,"),
+        ),
         ((surface, u, floor, law), ("u is a ContactSurface", "must be a Function")),
         ((u, scene.mesh, floor, law), ("surface is a Mesh", "must be a ContactSurface")),
-        ((u, surface, None, law), ("support is a NoneType",)),
+        ((u, surface, None, law), ("obstacle is a NoneType",)),
         ((u, surface, floor, 0.3), ("law is a float", "must be a Law")),
         ((u, surface, floor, fc.Frictionless), ("law is the class Frictionless", "(...)")),
-        ((u, surface, fc.HalfSpace, law), ("support is the class HalfSpace",)),
+        ((u, surface, fc.HalfSpace, law), ("obstacle is the class HalfSpace",)),
     ):
         raised_everywhere(lambda a=arguments: fc.Contact(*a), ValueError, "contact: ", *words)
     raised_everywhere(lambda: scene.contact(law, name=3), ValueError, "name is a int")
@@ -226,8 +229,8 @@ def test_arguments_of_a_surface():
     ):
         raised_everywhere(lambda a=arguments: fc.ContactSurface(*a), ValueError, word)
     for body, word in (((TOP, tags), "facet_tags is a int"), ((tags, "top"), "tags is 'top'")):
-        support = fc.DeformableBody(*body)
-        raised_everywhere(lambda s=support: scene.contact(coulomb(), support=s), ValueError, word)
+        obstacle = fc.DeformableBody(*body)
+        raised_everywhere(lambda s=obstacle: scene.contact(coulomb(), obstacle=s), ValueError, word)
     raised_everywhere(
         lambda: fc.DeformableBody(tags, TOP, search_distance="far"),
         ValueError,
@@ -247,10 +250,10 @@ def test_quadrature_degree(degree):
     )
 
 
-def test_numbers_of_supports():
+def test_numbers_of_obstacles():
     """Texts for numbers in points, radii and forces; no list where one is wanted."""
     scene = pressed()
-    for support, word in (
+    for obstacle, word in (
         (fc.HalfSpace("origin", (0, 1)), "point of the HalfSpace is 'origin'"),
         (fc.HalfSpace((0, "0"), (0, 1)), "point of the HalfSpace is (0, '0')"),
         (fc.Ball((0, -1), "1"), "radius of the Ball is '1'"),
@@ -258,7 +261,7 @@ def test_numbers_of_supports():
         (scene.floor(displacement=fc.Motion((None, "5"))), "force 1 of the Motion is '5'"),
     ):
         raised_everywhere(
-            lambda s=support: scene.contact(coulomb(), support=s), (ValueError, TypeError), word
+            lambda s=obstacle: scene.contact(coulomb(), obstacle=s), (ValueError, TypeError), word
         )
     raised_everywhere(
         lambda: fc.elasticity.LinearElastic(scene.u, "E", 0.3, "plane strain"),
@@ -268,25 +271,25 @@ def test_numbers_of_supports():
 
 
 @pytest.mark.parametrize("held", [True, False])
-def test_a_support_turned_round(held, caplog):
+def test_an_obstacle_turned_round(held, caplog):
     """The normal of a floor points down, a ball is outside of what it should surround.
 
     The body is inside: refused. A floor that just touches is one that the body leaves: warned.
     """
     scene = pressed()
     bcs = [*scene.rollers(), scene.hold(TOP, 1)] if held else scene.rollers()
-    for support in (fc.HalfSpace((0, -0.5), (0, -1)), fc.Ball((0.5, 0.5), 2.0)):
+    for obstacle in (fc.HalfSpace((0, -0.5), (0, -1)), fc.Ball((0.5, 0.5), 2.0)):
         raised_everywhere(
-            lambda s=support: scene.problem(coulomb(), bcs, contact={"support": s}),
+            lambda s=obstacle: scene.problem(coulomb(), bcs, contact={"obstacle": s}),
             ValueError,
-            "contact: the normal from the body to the support points into the body",
-            "inside of the support",
+            "contact: the normal from the body to the obstacle points into the body",
+            "inside of the obstacle",
         )
     with caplog.at_level("WARNING", logger="fenics_contact"):
-        scene.problem(coulomb(), bcs, contact={"support": fc.HalfSpace((0, 0), (0, -1))})
+        scene.problem(coulomb(), bcs, contact={"obstacle": fc.HalfSpace((0, 0), (0, -1))})
     assert ("points into the body" in caplog.text) == (COMM.rank == 0)
     caplog.clear()
-    scene.problem(coulomb(), bcs, contact={"support": fc.Ball((0.5, 0.5), 2.0, inside=True)})
+    scene.problem(coulomb(), bcs, contact={"obstacle": fc.Ball((0.5, 0.5), 2.0, inside=True)})
     assert "points into the body" not in caplog.text
 
 

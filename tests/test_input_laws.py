@@ -262,7 +262,7 @@ def test_parameter_of_a_wrong_shape():
 @pytest.mark.parametrize("factor", [0.0, -1.0, np.nan, np.inf, "10"])
 def test_scaled_factor_out_of_range(factor):
     """A factor of E/h is a positive number."""
-    raised_everywhere(lambda: fc.Scaled(factor), ValueError, "factor")
+    raised_everywhere(lambda: fc.RelativeStiffness(factor), ValueError, "factor")
 
 
 # ---- gap, normal, weight, modulus ----------------------------------------------------------------
@@ -311,15 +311,15 @@ def test_weight_of_zero(kind):
     )
 
 
-@pytest.mark.parametrize("support", ["obstacle", "half-space"])
-def test_normal_of_length_zero_at_a_point(support):
+@pytest.mark.parametrize("obstacle", ["obstacle", "half-space"])
+def test_normal_of_length_zero_at_a_point(obstacle):
     """A normal by UFL that vanishes over one half of Γc: refused, as a normal of length zero."""
     scene = pressed()
     x = ufl.SpatialCoordinate(scene.mesh)
     normal = ufl.as_vector([0, ufl.conditional(ufl.gt(x[0], 0.5), -1.0, 0.0)])
-    made = {"obstacle": fc.Obstacle(0.0, normal), "half-space": fc.HalfSpace((0, 0), -normal)}
+    made = {"obstacle": fc.PrescribedGap(0.0, normal), "half-space": fc.HalfSpace((0, 0), -normal)}
     raised_everywhere(
-        lambda: scene.problem(coulomb(), scene.rollers(), contact={"support": made[support]}),
+        lambda: scene.problem(coulomb(), scene.rollers(), contact={"obstacle": made[obstacle]}),
         ValueError,
         "normal",
         "length",
@@ -330,9 +330,9 @@ def test_normal_not_finite():
     """A normal by UFL that is NaN somewhere."""
     scene = pressed()
     x = ufl.SpatialCoordinate(scene.mesh)
-    obstacle = fc.Obstacle(0.0, ufl.as_vector([ufl.sqrt(x[0] - 0.5), -1.0]))
+    obstacle = fc.PrescribedGap(0.0, ufl.as_vector([ufl.sqrt(x[0] - 0.5), -1.0]))
     raised_everywhere(
-        lambda: scene.problem(coulomb(), scene.rollers(), contact={"support": obstacle}),
+        lambda: scene.problem(coulomb(), scene.rollers(), contact={"obstacle": obstacle}),
         ValueError,
         "normal",
     )
@@ -395,7 +395,7 @@ def test_data_that_depend_on_the_displacement(what):
         "gap": {"gap": abs(part)},
         "weight": {"weight": 1 + grows},
         "displacement": {"displacement": ufl.as_vector([0.0, 0.1 * scene.u[1]])},
-        "normal": {"support": fc.Obstacle(0.0, ufl.as_vector([scene.u[0], -1.0]))},
+        "normal": {"obstacle": fc.PrescribedGap(0.0, ufl.as_vector([scene.u[0], -1.0]))},
     }[what]
     law = coulomb(friction=grows if what == "friction" else 0.3)
     raised_everywhere(lambda: scene.contact(law, **contact), ValueError, what, "solved for", "u")

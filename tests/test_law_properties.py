@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact.laws.base import Kinematics, Law
+from fenics_contact.laws.base import Law, PointKinematics
 from fenics_contact.laws.friction import FrictionLaw
 from fenics_contact.surface.surface import PointEvaluator
 from scenes.blocks import BOTTOM, block_mesh
@@ -82,9 +82,12 @@ class Point:
             entries = [self.arguments[i] for i in range(size)[self.slices[name]]]
             return ufl.as_vector(entries) if shapes[name] else entries[0]
 
-        kinematics = Kinematics(*(argument(n) for n in ("gap", "u_n", "n", "u_t", "moved", "old")))
+        kinematics = PointKinematics(
+            argument("gap") - argument("u_n"),
+            *(argument(n) for n in ("n", "u_t", "moved", "old")),
+        )
         parameters = {name: argument(name) for name in law.parameters()}
-        response = law.response(kinematics, parameters)
+        response = law.contact_traction(kinematics, parameters)
         expressions = {"r_n": response.normal_traction}
         expressions |= {"opening": response.opening, "penetration": response.penetration}
         expressions["stored"] = law.stored(kinematics, response, parameters)
@@ -286,7 +289,7 @@ def test_complementarity(name, d, data):
 @properties
 @given(data=st.data())
 def test_normal_law_is_monotone(name, d, data):
-    """The farther the body moves to the support, the more it is pushed back: exactly."""
+    """The farther the body moves to the obstacle, the more it is pushed back: exactly."""
     a = data.draw(arguments(name, d))
     b = a | {"u_n": data.draw(signed)}
     low, high = sorted((a, b), key=lambda x: x["u_n"])

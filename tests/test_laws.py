@@ -87,7 +87,7 @@ class Scene:
         self.u = fem.Function(self.space)
         surface = fc.ContactSurface(mesh, tags, [BOTTOM, RIGHT])
         x = ufl.SpatialCoordinate(mesh)
-        obstacle = fc.Obstacle(0.1 + 0.04 * x[0], NORMAL[self.d])
+        obstacle = fc.PrescribedGap(0.1 + 0.04 * x[0], NORMAL[self.d])
         self.contact = fc.Contact(self.u, surface, obstacle, law)
 
     def displace(self, normal: float, tangential: float, seed: int) -> None:
@@ -262,8 +262,8 @@ def test_parameters_vary_over_the_surface(cell):
     mesh = scene.space.mesh
     x = ufl.SpatialCoordinate(mesh)
     law = fc.Coulomb(0.2 + 0.3 * x[0] ** 2, k_n=80 + 40 * x[1], k_t=ufl.exp(4 + x[0] * x[1]))
-    surface, support = scene.contact.surface, scene.contact.support
-    scene.contact = fc.Contact(scene.u, surface, support, law)
+    surface, obstacle = scene.contact.surface, scene.contact.obstacle
+    scene.contact = fc.Contact(scene.u, surface, obstacle, law)
     scene.displace(0.2, 0.03, seed=2)
     scene.contact.evaluate()
     expected = traction_by_hand(
@@ -330,7 +330,7 @@ def test_weight_multiplies_the_form_and_the_resultants(cell):
     contacts = [plain.contact]
     contacts.append(
         fc.Contact(
-            plain.u, plain.contact.surface, plain.contact.support, LAWS["tresca"], weight=2.5
+            plain.u, plain.contact.surface, plain.contact.obstacle, LAWS["tresca"], weight=2.5
         )
     )
     plain.displace(0.2, 0.3, seed=2)
@@ -354,7 +354,7 @@ def test_weight_multiplies_the_form_and_the_resultants(cell):
 
 @pytest.mark.parametrize("cell", CELLS)
 def test_scaled_stiffness_is_a_multiple_of_modulus_over_height(cell):
-    """`Scaled` with a given modulus: k_n = factor E/h, h the height of the cells; here 1/3.
+    """`RelativeStiffness` with a given modulus: k_n = factor E/h, cell height h = 1/3.
 
     Tolerance 1e-9: the E/h field is smoothed by an iterative solve (1e-14) of its logarithm.
     """
@@ -362,7 +362,7 @@ def test_scaled_stiffness_is_a_multiple_of_modulus_over_height(cell):
     mesh, tags = block_mesh(cell, n=3)
     u = fem.Function(displacement_space(mesh, 1))
     surface = fc.ContactSurface(mesh, tags, BOTTOM)
-    law = fc.Frictionless(k_n=fc.Scaled(3.0))
+    law = fc.Frictionless(k_n=fc.RelativeStiffness(3.0))
     up = np.eye(d)[-1]
     contact = fc.Contact(u, surface, fc.HalfSpace(0 * up, up), law, modulus=210.0)
     u.interpolate(lambda x: np.outer(-0.01 * up, np.ones(x.shape[1])))

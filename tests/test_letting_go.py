@@ -1,6 +1,6 @@
 """Bodies that nothing but contact holds stay where their load leaves them, and where all slips.
 
-The tangent along friction is none: a body all of whose points slip is loose along its support, and
+The tangent along friction is none: a body all of whose points slip is loose along its obstacle, and
 one without a load has an equilibrium wherever it is.
 """
 
@@ -175,7 +175,7 @@ def test_a_block_in_a_bowl_slips_on_both_edges(kinematics, bulk):
     bowl = fc.Cylinder((0.0, np.sqrt(radius**2 - 0.25)), radius, inside=True)
     law = fc.Coulomb(friction)
     contact = body.contact(BOTTOM, bowl, law, kinematics=kinematics)
-    problem = body.problem(contact, kinematics=np.inf)
+    problem = body.problem(contact, small_displacement_tolerance=np.inf)
 
     def press(value):
         down.value = value

@@ -146,41 +146,41 @@ def test_tags_of_another_mesh():
         lambda: fc.ContactSurface(scene.mesh, other, BOTTOM), ValueError, "of another mesh"
     )
     raised_everywhere(
-        lambda: scene.contact(coulomb(), support=fc.DeformableBody(other, TOP)),
+        lambda: scene.contact(coulomb(), obstacle=fc.DeformableBody(other, TOP)),
         ValueError,
         "of another mesh",
     )
 
 
 def told_of_doubles(make):
-    """What is warned of supports that are one."""
+    """What is warned of obstacles that are one."""
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         make()
-    return [str(one.message) for one in told if "same support" in str(one.message)]
+    return [str(one.message) for one in told if "same obstacle" in str(one.message)]
 
 
-def doubled(scene, support, **options):
+def doubled(scene, obstacle, **options):
     """A contact of the bottom beside that with the floor, and what is warned of."""
     contacts = [
         scene.contact(coulomb(), name="floor"),
-        scene.contact(coulomb(), name="other", support=support, **options),
+        scene.contact(coulomb(), name="other", obstacle=obstacle, **options),
     ]
     return told_of_doubles(
         lambda: fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=contacts)
     )
 
 
-def test_one_support_twice():
+def test_one_obstacle_twice():
     """Each would bear half of the force: warned of once, with names and facets, two of them."""
     scene = pressed()
     plane = fc.HalfSpace(point=(0.3, 0.0), normal=(0.0, 2.0))
-    for support in (scene.floor(), plane):
-        (told,) = doubled(scene, support)
-        assert told.startswith("floor and other press on one and the same support at 2 facets")
+    for obstacle in (scene.floor(), plane):
+        (told,) = doubled(scene, obstacle)
+        assert told.startswith("floor and other press on one and the same obstacle at 2 facets")
 
 
-def test_two_supports_of_one_surface():
+def test_two_obstacles_of_one_surface():
     """Another place, another way to move, a gap of its own: none of them is the floor."""
     scene = pressed()
     moved = fem.Constant(scene.mesh, np.zeros(2))
@@ -205,8 +205,8 @@ def test_two_bodies_over_one_surface(kinematics):
 
 
 @pytest.mark.parametrize("force", [(None, 1.0), np.array([None, 1.0])])
-def test_two_supports_each_pressed_by_a_force(force):
-    """Each moves by its own force and bears all of that: not one support, however it is given."""
+def test_two_obstacles_each_pressed_by_a_force(force):
+    """Each moves by its own force and bears all of that: not one obstacle, however it is given."""
     scene = pressed()
     contacts = [
         scene.contact(coulomb(), name=name, displacement=fc.Motion(force=force))
@@ -227,7 +227,7 @@ def test_a_load_that_nothing_reads():
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize("where", ["form", "condition", "support", "force", "friction", "gap"])
+@pytest.mark.parametrize("where", ["form", "condition", "obstacle", "force", "friction", "gap"])
 def test_a_load_that_something_reads(where):
     """No warning, wherever it stands, and its value is as before."""
     scene = pressed()
@@ -239,11 +239,11 @@ def test_a_load_that_something_reads(where):
         V = scene.u.function_space
         dofs = fem.locate_dofs_topological(V.sub(1), 1, scene.tags.find(TOP))
         bcs = [*bcs, fem.dirichletbc(load, dofs, V.sub(1))]
-    elif where == "support":
-        options["support"] = fc.HalfSpace((0, 0), (0, 1), displacement=ufl.as_vector([load, 0.0]))
+    elif where == "obstacle":
+        options["obstacle"] = fc.HalfSpace((0, 0), (0, 1), displacement=ufl.as_vector([load, 0.0]))
     elif where == "force":
         motion = fc.Motion(force=(None, load), displacement=(0.0, None))
-        options["support"] = fc.HalfSpace((0, 0), (0, 1), displacement=motion)
+        options["obstacle"] = fc.HalfSpace((0, 0), (0, 1), displacement=motion)
         bcs = [*bcs, scene.hold(TOP, 1)]
     elif where == "friction":
         law = coulomb(load)
@@ -260,9 +260,9 @@ def test_components_in_a_tuple():
     """A constant among numbers: it is said how to write it."""
     scene = pressed()
     way = fem.Constant(scene.mesh, 0.0)
-    support = fc.HalfSpace((0, 0), (0, 1), displacement=(way, 0.0))
+    obstacle = fc.HalfSpace((0, 0), (0, 1), displacement=(way, 0.0))
     raised_everywhere(
-        lambda: scene.contact(coulomb(), support=support), TypeError, "ufl.as_vector([way, 0.0])"
+        lambda: scene.contact(coulomb(), obstacle=obstacle), TypeError, "ufl.as_vector([way, 0.0])"
     )
 
 

@@ -40,7 +40,7 @@ HOW = {
         "mixed": "Taylor-Hood",
         "nu": 0.5,
         "linear": True,
-        "solver": {"kinematics": np.inf},
+        "solver": {"small_displacement_tolerance": np.inf},
     },
 }
 
@@ -56,17 +56,17 @@ def tool(how: str, cell: str = "triangle", **options) -> Tool:
 
 @pytest.mark.parametrize("how", HOW)
 def test_history(how):
-    """Down, along, back and turned: all verdicts pass, which compare forces by a second route.
+    """Down, along, back and turned: all verdicts pass, which compare forces by a cross-check.
 
     The reactions of the bottom, by assembly here, balance the contact force: 1e-10.
     """
-    solver = {"second_route": True} | HOW[how].get("solver", {})
+    solver = {"cross_check": True} | HOW[how].get("solver", {})
     made = Tool("triangle", n=(8, 4), **{**HOW[how], "solver": {"petsc_options": TIGHT, **solver}})
     scene, problem = made.scene, made.problem
     form, part = compiled(scene.F), problem.displacement
     held = fem.Function(part.u.function_space)
     for step in made.increments():
-        assert not step.verdict.failures and step.verdict.routes
+        assert not step.verdict.failures and step.verdict.cross_check
         assert step.method == "lbfgs" if problem.bulk.linear else step.method != "lbfgs"
         forces = assemble_owned(form, scene.u.function_space)
         forces[~problem.constrained[: forces.size]] = 0.0
@@ -198,8 +198,8 @@ def test_tangent_and_boundary_form(name, kinematics):
     """
     scene = rubber("triangle", n=(8, 4), mixed=name, nu=0.5)
     W, comm = scene.u.function_space, scene.mesh.comm
-    support = disc(scene, 0.8, displacement=(0.03, -0.1))
-    contact = scene.contact(support, fc.Coulomb(0.3, 1e3, 1e3), kinematics=kinematics)
+    obstacle = disc(scene, 0.8, displacement=(0.03, -0.1))
+    contact = scene.contact(obstacle, fc.Coulomb(0.3, 1e3, 1e3), kinematics=kinematics)
     operator = fc.ContactOperator(contact)
     start, direction = (fem.Function(W) for _ in range(2))
     for function, seed, size in ((start, 0, 0.03), (direction, 1, 1.0)):
@@ -246,7 +246,7 @@ def test_units(how):
         shift = fem.Constant(scene.mesh, np.zeros(2))
         law = fc.Coulomb(0.3, 1e4 * stress / length, 1e4 * stress / length)
         problem, contact = scene.problem(
-            disc(scene, 0.8 * length, displacement=shift), law, kinematics=np.inf
+            disc(scene, 0.8 * length, displacement=shift), law, small_displacement_tolerance=np.inf
         )
         iterations = []
         for way in ((0.0, -0.05), (0.02, -0.1), (0.05, -0.1)):

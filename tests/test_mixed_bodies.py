@@ -79,7 +79,7 @@ class Blocks:
         self.contact = fc.Contact(
             u,
             fc.ContactSurface(mesh, tags, UPPER),
-            fc.DeformableBody(tags, LOWER, update="never"),
+            fc.DeformableBody(tags, LOWER, update_pairs="never"),
             law,
             kinematics=kinematics,
             **(contact or {}),

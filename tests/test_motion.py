@@ -1,4 +1,4 @@
-"""Supports that move as the force on them says: their translation is unknown, the force given."""
+"""Obstacles that move as the force on them says: their translation is unknown, the force given."""
 
 import dolfinx
 import numpy as np
@@ -19,8 +19,8 @@ def pressed(cell, law, motion, method="lbfgs"):
     scene = block(cell, 1, n=4)
     d = scene.dim
     bcs = [scene.hold(TOP, i) for i in range(d)]
-    support = cushion(d, motion)
-    problem, contact = scene.problem(law, bcs, contact={"support": support}, method=method)
+    obstacle = cushion(d, motion)
+    problem, contact = scene.problem(law, bcs, contact={"obstacle": obstacle}, method=method)
     return scene, problem, contact
 
 
@@ -73,7 +73,7 @@ def test_two_forces_and_their_history():
     motion = fc.Motion(force=(pull, 5.0))
     bcs = [scene.hold(TOP, i) for i in range(2)]
     problem, contact = scene.problem(
-        fc.Coulomb(0.3, k_n=2e4, k_t=1e4), bcs, contact={"support": cushion(2, motion)}
+        fc.Coulomb(0.3, k_n=2e4, k_t=1e4), bcs, contact={"obstacle": cushion(2, motion)}
     )
     problem.solve()
     problem.commit()
@@ -88,7 +88,7 @@ def test_two_forces_and_their_history():
 
 
 def test_a_block_between_the_floor_and_a_weight():
-    """A free body on a floor, pressed by a free support: p = P everywhere, whatever E is."""
+    """A free body on a floor, pressed by a free obstacle: p = P everywhere, whatever E is."""
     scene = block("triangle", 1, n=3, nu=0.0)
     floor = scene.contact(fc.Frictionless(k_n=1e4), name="floor")
     lid = fc.ContactSurface(scene.mesh, scene.tags, TOP)
@@ -102,12 +102,12 @@ def test_a_block_between_the_floor_and_a_weight():
     assert close(top.free_motion[1].value, -7.0 * (2 / 1e4 + 1 / 1000), 1e-8)
 
 
-def test_a_support_on_its_way_meets_the_body():
-    """A support far away is led to first touch by its force."""
+def test_an_obstacle_on_its_way_meets_the_body():
+    """An obstacle far away is led to first touch by its force."""
     scene = block("quadrilateral", 1, n=4, nu=0.0)
     away = fc.HalfSpace((0, -30.0), (0, 1), displacement=fc.Motion(force=(None, 4.0)))
     bcs = [scene.hold(TOP, i) for i in range(2)]
-    problem, contact = scene.problem(fc.Frictionless(k_n=1e4), bcs, contact={"support": away})
+    problem, contact = scene.problem(fc.Frictionless(k_n=1e4), bcs, contact={"obstacle": away})
     problem.solve()
     assert close(contact.resultants().force[1], 4.0, 1e-8)
     assert close(contact.free_motion[1].value, 30.0 + 4.0 * (1 / 1e4 + 1 / 1000), 1e-8)
@@ -168,7 +168,7 @@ def test_one_motion_of_two_contacts_is_refused(turned):
 
 
 def test_the_form_alone_refuses_an_unknown_motion():
-    """The boundary form by itself has no place for the support's unknowns."""
+    """The boundary form by itself has no place for the obstacle's unknowns."""
     scene = block("triangle", 1)
     contact = scene.contact(fc.Frictionless(k_n=1.0), displacement=fc.Motion(force=(None, 1.0)))
     raised_everywhere(

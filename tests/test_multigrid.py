@@ -262,15 +262,15 @@ def test_chosen_by_the_number_of_increments(monkeypatch):
     monkeypatch.setattr(linear, "_MANY", 0)
     monkeypatch.setattr(linear, "_MANY_PER_INCREMENT", problem.unknowns.n_global / 2.5)
     assert problem.solver.condensed
-    problem.expect(2)
+    problem.expected_increments = 2
     assert not problem.solver.condensed and problem.full.linear_kind == "multigrid"
     with pytest.raises(ValueError, match="at least 1"):
-        problem.expect(0)
+        problem.expected_increments = 0
     few = problem.solve().contacts["contact"].normal_force
-    problem.expect(40)
+    problem.expected_increments = 40
     assert not problem.solver.condensed
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers(), condensation=True)
-    problem.expect(2)
+    problem.expected_increments = 2
     assert problem.solver.condensed
     assert problem.solve().contacts["contact"].normal_force == pytest.approx(few, rel=1e-8)
     # `increments` knows the number.
@@ -280,7 +280,7 @@ def test_chosen_by_the_number_of_increments(monkeypatch):
         assert problem.solver.condensed == condensed
 
 
-def test_a_support_that_moves_freely(caplog):
+def test_an_obstacle_that_moves_freely(caplog):
     """Its motions are no nodes: factors, and the log says why."""
     scene = block("triangle", n=4)
     motion = fc.Motion(force=(None, 5.0))
@@ -288,7 +288,7 @@ def test_a_support_that_moves_freely(caplog):
         problem, contact = scene.problem(
             fc.Frictionless(k_n=2e4),
             [scene.hold(TOP, i) for i in range(2)],
-            contact={"support": cushion(2, motion)},
+            contact={"obstacle": cushion(2, motion)},
             linear_solver="multigrid",
         )
     assert problem.full.linear_kind == "direct"

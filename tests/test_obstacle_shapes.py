@@ -29,7 +29,7 @@ def circle(centre, radius):
     return lambda x: np.linalg.norm(x - centre, axis=1) - radius
 
 
-def supports(mesh):
+def obstacles(mesh):
     """By name an obstacle, and the equation of its surface where it has moved to."""
     way, angle = fem.Constant(mesh, (0.1, 0.2)), fem.Constant(mesh, 0.0)
     points = np.array([[0.2, 0.2], [0.8, 0.2], [0.5, 0.7]])
@@ -50,7 +50,7 @@ def supports(mesh):
         "moved": (fc.Ball((0.4, 0.3), 0.3, displacement=way), circle((0.5, 0.5), 0.3)),
         "hole": (fc.Cylinder((0.5, 0.5), 0.3, inside=True), circle((0.5, 0.5), 0.3)),
         "distance": (
-            fc.Obstacle(distance=lambda x: ufl.sqrt(ufl.dot(x, x)) - way[1] * 3),
+            fc.SignedDistance(lambda x: ufl.sqrt(ufl.dot(x, x)) - way[1] * 3),
             circle((0, 0), 0.6),
         ),
         "spline": (fc.RigidProfile(round_, closed=True), circle((0.5, 0.5), 0.3)),
@@ -69,10 +69,10 @@ def supports(mesh):
 def test_the_surface_in_the_plane(name):
     """All that is drawn is on the surface, whose length in the box is known from a finer grid."""
     scene = block("triangle")
-    given = supports(scene.mesh)
-    support, equation = given[name]
+    given = obstacles(scene.mesh)
+    obstacle, equation = given[name]
     kinematics = "finite" if name == "turned" else "small"
-    contact = scene.contact(fc.Frictionless(1e3), support=support, kinematics=kinematics)
+    contact = scene.contact(fc.Frictionless(1e3), obstacle=obstacle, kinematics=kinematics)
     if name == "turned":
         given["_angle"][0].value = -np.pi / 2
 
@@ -117,8 +117,8 @@ def test_what_has_no_place_is_not_drawn():
     """A gap that is given on Γc, with and without a function of it."""
     scene = block("triangle")
     for options in (
-        {"support": bulge(scene)},
-        {"support": fc.Obstacle(0.1, (0.0, -1.0))},
+        {"obstacle": bulge(scene)},
+        {"obstacle": fc.PrescribedGap(0.1, (0.0, -1.0))},
         {"gap": 0.1},
     ):
         assert not ObstacleShape.is_known(scene.contact(fc.Frictionless(1e3), **options))

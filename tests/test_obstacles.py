@@ -1,4 +1,4 @@
-"""What the verdict says of rigid supports: no distance, too deep, on the other side.
+"""What the verdict says of rigid obstacles: no distance, too deep, on the other side.
 
 And how they meet what was given late: E, a start, a motion by force beside a turn.
 """
@@ -36,7 +36,7 @@ def level_set(scene, radius, *, true, shift):
         value = square - radius**2
         return value / (2 * ufl.sqrt(square)) if true else value
 
-    return fc.Obstacle(distance=distance, displacement=shift)
+    return fc.SignedDistance(distance, displacement=shift)
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
@@ -46,11 +46,11 @@ def test_what_is_no_distance_is_refused(kinematics):
     for true in (True, False, None):
         scene = rubber(n=(12, 4), linear=True)
         shift = fem.Constant(scene.mesh, (0.0, -0.01))
-        support = roller(scene, radius, shift)
+        obstacle = roller(scene, radius, shift)
         if true is not None:
-            support = level_set(scene, radius, true=true, shift=shift)
+            obstacle = level_set(scene, radius, true=true, shift=shift)
         options = {"kinematics": kinematics}
-        problem, contact = scene.problem(support, fc.Coulomb(0.2), contact=options)
+        problem, contact = scene.problem(obstacle, fc.Coulomb(0.2), contact=options)
         if true is False:
             with pytest.raises(fc.NotConverged, match=r"by (3\.9|4)\d* per length .*it is none"):
                 problem.solve()
@@ -60,7 +60,7 @@ def test_what_is_no_distance_is_refused(kinematics):
     assert forces[0] == pytest.approx(forces[1], rel=1e-2)
 
 
-def test_a_support_that_sinks_in_is_refused():
+def test_an_obstacle_that_sinks_in_is_refused():
     """Soft springs, a small roller: refused before it comes out on its other side.
 
     Every increment that passes has more force than the one before, and no point is deeper than
@@ -83,7 +83,7 @@ def test_a_support_that_sinks_in_is_refused():
     assert np.all(np.diff(forces) > 0)
 
 
-def test_a_support_that_goes_through_in_one_increment_is_refused():
+def test_an_obstacle_that_goes_through_in_one_increment_is_refused():
     """A roller as thick as half of what it goes down by: nothing of Γc touches it there."""
     radius = 0.15
     scene = rubber(n=(16, 4), E=10.0)
@@ -98,7 +98,7 @@ def test_a_support_that_goes_through_in_one_increment_is_refused():
         problem.solve()
 
 
-def test_sliding_round_a_support_is_no_passage():
+def test_sliding_round_an_obstacle_is_no_passage():
     """Points that go a quarter of the way round a roller, outside of it or on it."""
     scene = rubber(n=(16, 4), E=10.0)
     shift = fem.Constant(scene.mesh, np.zeros(2))
@@ -147,9 +147,9 @@ def test_a_turn_that_differs_from_point_to_point_is_refused():
     x = ufl.SpatialCoordinate(scene.mesh)
     for angle in (0.1 * x[0], scene.u[0]):
         turn = fc.Rotation(angle, about=(0.0, 2.0))
-        support = roller(scene, 1.0, (0.0, 0.0), rotation=turn)
+        obstacle = roller(scene, 1.0, (0.0, 0.0), rotation=turn)
         with pytest.raises(ValueError, match="Rotation differs from point to point"):
-            scene.contact(support, fc.Coulomb(0.2))
+            scene.contact(obstacle, fc.Coulomb(0.2))
 
 
 def test_work_of_a_force_beside_a_turn():
@@ -236,7 +236,7 @@ def test_rubber_on_rubber_with_pairs_found_anew():
         move = [fem.Constant(mesh, 0.0) for _ in range(2)]
         bcs = [hold(u, tags, BOTTOM, i) for i in range(2)]
         bcs += [hold(u, tags, TOP, i, value) for i, value in enumerate(move)]
-        base = fc.DeformableBody(tags, LOWER, update="increment")
+        base = fc.DeformableBody(tags, LOWER, update_pairs="increment")
         contact = fc.Contact(u, fc.ContactSurface(mesh, tags, UPPER), base, fc.Frictionless())
         problem = fc.ContactProblem(body.residual(v), u, bcs=bcs, contacts=[contact])
         for number in range(1, steps + 1):

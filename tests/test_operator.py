@@ -81,7 +81,7 @@ def test_operators_over_several_unknowns_do_not_know_of_each_other():
 
 
 def test_pairs_found_anew_take_another_operator_for_their_contact_alone():
-    """The support on the other side is rigid: its operator is the one that was."""
+    """The obstacle on the other side is rigid: its operator is the one that was."""
     mesh, tags = two_blocks("triangle", (4, 3))
     u = fem.Function(displacement_space(mesh, 1))
     pair = fc.Contact(

@@ -31,7 +31,7 @@ def twisted(law, n=6, **options):
     v = ufl.TestFunction(scene.u.function_space)
     around = ufl.as_vector([0.5 - x[1], x[0] - 0.5, 0.0])
     scene.F -= twist * ufl.dot(around, v) * ufl.ds(scene.mesh, subdomain_data=scene.tags)(TOP)
-    problem, contact = scene.problem(law, [], kinematics=np.inf, **options)
+    problem, contact = scene.problem(law, [], small_displacement_tolerance=np.inf, **options)
     return problem, contact, twist
 
 
@@ -92,7 +92,7 @@ def test_loads_that_grow_together_are_none(cell, method):
     """What pressed before says nothing: both forces grow by a hundred at once."""
     scene = block(cell, n=4, up=-0.1)
     law = fc.Coulomb(MU, k_n=1e5, k_t=1e5)
-    problem, contact = scene.problem(law, [], kinematics=np.inf, method=method)
+    problem, contact = scene.problem(law, [], small_displacement_tolerance=np.inf, method=method)
     problem.solve()
     problem.commit()
     scene.load(up=-10.0, side=0.9 * MU * 10.0)
@@ -118,7 +118,7 @@ def test_a_tight_fit_is_none(by, cell, method):
     if by == "gap":
         contact["gap"] = -depth
     problem, contact = scene.problem(
-        law, [pressed], contact=contact, kinematics=np.inf, method=method
+        law, [pressed], contact=contact, small_displacement_tolerance=np.inf, method=method
     )
     force = depth / (1 / modulus + 1 / stiffness)
     scene.load(side=0.8 * MU * force)
@@ -148,7 +148,7 @@ def test_a_tight_fit_held_by_soft_multipliers_is_none(by, share, stiffness, meth
         fc.Coulomb(MU, k_n=stiffness, k_t=stiffness),
         [pressed],
         contact=contact,
-        kinematics=np.inf,
+        small_displacement_tolerance=np.inf,
         method=method,
     )
     force = depth * modulus
@@ -182,7 +182,9 @@ def test_rubber_that_nothing_holds_any_more(what, kinematics):
     scene.bcs.clear()
     ceiling = fc.HalfSpace((0.0, 1.0), (0.0, -1.0))
     contact = {"kinematics": kinematics}
-    problem, _ = scene.problem(ceiling, fc.Coulomb(MU), contact=contact, kinematics=np.inf)
+    problem, _ = scene.problem(
+        ceiling, fc.Coulomb(MU), contact=contact, small_displacement_tolerance=np.inf
+    )
     problem.solve()
     problem.commit()
     made: list[int] = []
@@ -207,7 +209,7 @@ def test_soft_multipliers_that_hardly_grow_are_not_at_their_end(method):
         fc.Coulomb(MU, k_n=stiffness, k_t=stiffness),
         [scene.hold(TOP, 1, depth)],
         contact={"enforcement": "augmented", "tolerance": 0.04},
-        kinematics=np.inf,
+        small_displacement_tolerance=np.inf,
         method=method,
     )
     for force, share in ((1000.0, 0.5), (100.0, -0.25), (100.0, 0.625)):
@@ -246,11 +248,11 @@ def test_blocks_on_both_sides_do_not_hide_an_overload():
     bcs = [hold(u, joined.facets, tag, 0) for tag in (floor, roof)]
     bcs += [hold(u, joined.facets, floor, 1), hold(u, joined.facets, roof, 1, depth)]
     law = fc.Coulomb(MU, 100 * modulus, 100 * modulus)
-    contacts = fc.contact_pairs(
+    contacts = fc.find_contact_pairs(
         u, law, distance=0.05, bodies=joined, enforcement="augmented", tolerance=1e-4
     )
     problem = fc.ContactProblem(
-        F, u, bcs=bcs, contacts=contacts, kinematics=np.inf, method="newton"
+        F, u, bcs=bcs, contacts=contacts, small_displacement_tolerance=np.inf, method="newton"
     )
     for force, share in ((10.0, 0.13), (1.0, 1.02)):
         depth.value, push.value = -force * 3 * height / modulus, 2 * share * MU * force
@@ -267,7 +269,7 @@ def test_the_larger_friction_of_two():
     """An ellipse bears across its direction what the limit along it would not."""
     scene = block("hexahedron", n=3, size=(1.0, 1.0, 0.25), up=-10.0)
     law = fc.Coulomb(MU, 1e5, 1e5, transverse_friction=2 * MU, direction=(0.0, 1.0, 0.0))
-    problem, contact = scene.problem(law, [], kinematics=np.inf)
+    problem, contact = scene.problem(law, [], small_displacement_tolerance=np.inf)
     problem.solve()
     problem.commit()
     scene.load(up=-10.0, side=1.8 * MU * 10.0)
@@ -277,7 +279,7 @@ def test_the_larger_friction_of_two():
 
 
 def test_polygons_and_where_nothing_is_told():
-    """A polygon's corners count; forces without limit, and supports that turn, are left alone."""
+    """A polygon's corners count; forces without limit, and obstacles that turn, are left alone."""
     for modes, most in ((None, 1.0), (4, np.sqrt(2.0))):
         scene = block("hexahedron", n=2, size=(1.0, 1.0, 0.25), up=-10.0)
         law = fc.Tresca(MU, 10.0, 1e5, 1e5, modes=modes, direction=modes and (1.0, 0.0, 0.0))
@@ -292,7 +294,7 @@ def test_polygons_and_where_nothing_is_told():
         (fc.Foundation(1e5, 1e5), False, {}),
         (fc.Foundation(1e5, 1e5, tension=True), False, {}),
         (tresca, False, {"kinematics": "finite"}),
-        (tresca, True, {"support": turns, "kinematics": "finite"}),
+        (tresca, True, {"obstacle": turns, "kinematics": "finite"}),
     ):
         scene = block("hexahedron", n=2, size=(1.0, 1.0, 0.25), up=-10.0, side=4.0)
         bcs = [scene.hold(TOP, i) for i in range(3)] if held else []

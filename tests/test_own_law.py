@@ -12,7 +12,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact.laws.base import Law, Response
+from fenics_contact.laws.base import ContactTraction, Law
 from fenics_contact.laws.friction import FrictionLaw
 from fenics_contact.laws.return_maps import positive_part
 from scenes.blocks import TOP, block
@@ -105,7 +105,7 @@ def test_overclosure_with_friction(cell, method, condensation):
     push, press = (scene.hold(TOP, i) for i in (0, d - 1))
     held = [scene.hold(TOP, 1)] if d == 3 else []
     problem, contact = scene.problem(
-        Asperities(mu, P0, H, fc.Scaled()),
+        Asperities(mu, P0, H, fc.RelativeStiffness()),
         [push, press, *held],
         method=method,
         condensation=condensation,
@@ -143,7 +143,7 @@ def dragged(law, cell="quadrilateral", **options):
 def test_friction_that_does_not_grow_as_the_pressure(cell, method, condensation):
     """All slips: |τ| is the limit under the pressure at every point, to the solver's 1e-9."""
     mu, strength = 0.5, 4.0
-    law = Saturating(mu, strength, fc.Scaled(), fc.Scaled())
+    law = Saturating(mu, strength, fc.RelativeStiffness(), fc.RelativeStiffness())
     _, problem, contact = dragged(law, cell, method=method, condensation=condensation)
     step = problem.solve()
     assert step.verdict.failures == [] and step.contacts["contact"].stick == 0
@@ -159,7 +159,7 @@ def test_its_error_is_estimated_by_its_derivative():
     """
     found = []
     for factor in (3.0, 3e3):
-        law = Saturating(0.5, 4.0, fc.Scaled(factor), fc.Scaled(factor))
+        law = Saturating(0.5, 4.0, fc.RelativeStiffness(factor), fc.RelativeStiffness(factor))
         scene, problem, _ = dragged(law)
         problem.solve()
         budget = fc.estimate_errors(problem, stress(scene.u, E, NU))
@@ -192,23 +192,25 @@ def test_a_law_that_does_not_say_enough():
     class Silent(Law):
         p0: Any
 
-        def response(self, kinematics, parameters):
-            closing = kinematics.normal_displacement - kinematics.gap
+        def contact_traction(self, kinematics, parameters):
+            closing = -kinematics.gap
             r_n = -parameters["p0"] * positive_part(closing) ** 2
-            return Response(r_n, positive_part(-closing), positive_part(closing))
+            return ContactTraction(r_n, positive_part(-closing), positive_part(closing))
 
     scene = block()
     raised_everywhere(
         lambda: scene.contact(Silent(1.0)), ValueError, "contact", "Silent", "normal_potential"
     )
-    raised_everywhere(lambda: scene.contact(Law()), ValueError, "contact", "Law", "response")
+    raised_everywhere(
+        lambda: scene.contact(Law()), ValueError, "contact", "Law", "contact_traction"
+    )
 
     @dataclass(frozen=True)
     class Slippery(FrictionLaw):
         friction: Any
         k_n: Any
 
-        def response(self, kinematics, parameters):
+        def contact_traction(self, kinematics, parameters):
             return None
 
     raised_everywhere(
@@ -238,12 +240,12 @@ def test_a_limit_of_another_law():
     class Wrong(Saturating):
         """It slides at the limit of another strength than the one that it tells."""
 
-        def response(self, kinematics, parameters):
+        def contact_traction(self, kinematics, parameters):
             """That of a layer as strong again."""
             more = {**parameters, "strength": 2 * parameters["strength"]}
-            return super().response(kinematics, more)
+            return super().contact_traction(kinematics, more)
 
-    _, problem, _ = dragged(Wrong(0.5, 4.0, fc.Scaled(), fc.Scaled()))
+    _, problem, _ = dragged(Wrong(0.5, 4.0, fc.RelativeStiffness(), fc.RelativeStiffness()))
     with pytest.raises(fc.NotConverged, match="friction bound violated by") as caught:
         problem.solve()
     # Smaller increments would not mend it.
@@ -254,7 +256,10 @@ def test_a_limit_of_another_law():
 def test_what_to_try_is_what_the_law_has():
     """No lower k_n of a law that has none; of the package's own there are both."""
     for law, words in (
-        (Asperities(0.3, P0, H, fc.Scaled()), "Try smaller increments, then a lower k_t;"),
+        (
+            Asperities(0.3, P0, H, fc.RelativeStiffness()),
+            "Try smaller increments, then a lower k_t;",
+        ),
         (Overclosure(P0, H), "Try smaller increments;"),
         (fc.Coulomb(0.3), "Try smaller increments, a lower k_t, then a lower k_n;"),
     ):
@@ -294,9 +299,9 @@ class Beside(fc.Frictionless):
         """The stiffness alone."""
         return {"k_n": self.k_n}
 
-    def response(self, kinematics, parameters):
+    def contact_traction(self, kinematics, parameters):
         """More pressure than the parameters say."""
-        told = super().response(kinematics, parameters)
+        told = super().contact_traction(kinematics, parameters)
         return replace(told, normal_traction=(1 + self.hidden) * told.normal_traction)
 
 

@@ -96,8 +96,8 @@ def test_lifted_plates_bear_nothing(cell):
     body.hold(FLOOR, *range(d))
     body.hold(ROOF, *range(d - 1))
     body.hold(ROOF, d - 1, value=up)
-    support = fc.DeformableBody(body.tags, [LOWER, ROOF], update="increment")
-    contact = body.contact(UPPER, support, fc.Frictionless(k_n))
+    obstacle = fc.DeformableBody(body.tags, [LOWER, ROOF], update_pairs="increment")
+    contact = body.contact(UPPER, obstacle, fc.Frictionless(k_n))
     problem = body.problem(contact)
     for height in (0.2, -sunk, 0.2, -sunk):
         up.value = height
@@ -201,12 +201,14 @@ def test_release():
     body = stack("quadrilateral", (10, 10), (0.5, 0.5), apart=-0.2)
     law = fc.Frictionless(1e6)
     for release, unpaired in ((0.25, False), (0.15, True)):
-        support = fc.DeformableBody(body.tags, 10 + LOWER, release=release)
+        obstacle = fc.DeformableBody(body.tags, 10 + LOWER, max_initial_penetration=release)
         with _told(unpaired, "behind"):
-            contact = body.contact(10 + UPPER, support, law)
+            contact = body.contact(10 + UPPER, obstacle, law)
         assert (contact.n_unpaired > 0) == unpaired
     raised_everywhere(
-        lambda: fc.DeformableBody(body.tags, 10 + LOWER, release=-1.0), ValueError, "release"
+        lambda: fc.DeformableBody(body.tags, 10 + LOWER, max_initial_penetration=-1.0),
+        ValueError,
+        "max_initial_penetration",
     )
 
 
@@ -217,8 +219,8 @@ def test_soft_contact_keeps_its_pairs():
     down = body.constant(0.0)
     body.hold(ROOF, 0)
     body.hold(ROOF, 1, value=down)
-    support = fc.DeformableBody(body.tags, 10 + LOWER, update="increment")
-    contact = body.contact(10 + UPPER, support, fc.Frictionless(1.0))
+    obstacle = fc.DeformableBody(body.tags, 10 + LOWER, update_pairs="increment")
+    contact = body.contact(10 + UPPER, obstacle, fc.Frictionless(1.0))
     problem = body.problem(contact)
     for depth in (0.02, 0.04, 0.08, 0.15, 0.25):
         down.value = -depth
@@ -245,7 +247,7 @@ def overhang(cell, law, *, tags=(LOWER,), gap=-0.01, **options):
 
 
 def reaction(body, tag):
-    """Force that the support on a side exerts on the bodies, by assembly of the bulk alone."""
+    """Force that the obstacle on a side exerts on the bodies, by assembly of the bulk alone."""
     space = body.u.function_space
     residual = fem.Function(space)
     fem.assemble_vector(residual.x.array, fem.form(body.F))
@@ -269,7 +271,7 @@ LAWS = {
 @pytest.mark.parametrize("name", LAWS)
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_a_prescribed_gap_over_an_edge(cell, name, enforcement):
-    """What is reported is what the supports feel, whatever the law; what overhangs is open."""
+    """What is reported is what the obstacles feel, whatever the law; what overhangs is open."""
     law = LAWS[name]
     if enforcement == "augmented" and (law.is_physical or cell == "hexahedron"):
         pytest.skip("no multipliers for a physical layer; once is enough")
@@ -279,10 +281,10 @@ def test_a_prescribed_gap_over_an_edge(cell, name, enforcement):
         body.lift.value = lift
         step = problem.solve()
         r = step.contacts["joint 1"]
-        support = reaction(body, ROOF)
-        assert np.abs(support).max() > 1.0
-        assert close(r.force, -support, 1e-7)
-        assert close(reaction(body, FLOOR), -support, 1e-7)
+        obstacle = reaction(body, ROOF)
+        assert np.abs(obstacle).max() > 1.0
+        assert close(r.force, -obstacle, 1e-7)
+        assert close(reaction(body, FLOOR), -obstacle, 1e-7)
         points = contact.gather()
         assert close(points["measure"] @ points["pressure"], r.normal_force, 1e-12)
         assert np.all(points["pressure"][outside] == 0.0)
@@ -421,7 +423,7 @@ def test_a_narrow_indenter_does_not_pass(cell):
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("cells", [6, 12])
-def test_a_support_may_be_that_of_several_contacts(kinematics, cells):
+def test_an_obstacle_may_be_that_of_several_contacts(kinematics, cells):
     """Two slabs under a block that reaches over the edge of the second by 0.03.
 
     With facets of 0.2 no point is over the second slab, which then enters the block: refused, by a

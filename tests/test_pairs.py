@@ -122,8 +122,8 @@ def test_floor_and_wall(cell):
     assert close(gathered(COMM, body.u.x.array[:n]), gathered(COMM, reference.x.array[:n]), 1e-8)
 
 
-def test_one_surface_on_a_body_and_on_a_rigid_support():
-    """The same Γc against two supports: springs in parallel, one of them with a block in series."""
+def test_one_surface_on_a_body_and_on_a_rigid_obstacle():
+    """The same Γc against two obstacles: springs in parallel, one with a block in series."""
     q, k_1, k_2 = 5e3, 1e7, 4e5
     body = stack("quadrilateral", (3, 5), (0.5, 0.5))
     body.hold(FLOOR, 1)
@@ -240,8 +240,8 @@ def test_one_joint_slides_far_and_another_holds():
     body.hold(ROOF, 0, value=drag)
     body.F += q * body.v[1] * body.ds(ROOF)
     glued = joint(body, 1, fc.Coulomb(0.5, k_n=1e7, k_t=1e7))
-    support = fc.DeformableBody(body.tags, 20 + LOWER, update="increment")
-    slides = body.contact(20 + UPPER, support, fc.Coulomb(0.2, k_n=1e7, k_t=1e7), name="slides")
+    obstacle = fc.DeformableBody(body.tags, 20 + LOWER, update_pairs="increment")
+    slides = body.contact(20 + UPPER, obstacle, fc.Coulomb(0.2, k_n=1e7, k_t=1e7), name="slides")
     problem = body.problem(glued, slides)
     n = 0.4 * q
     for step in fc.increments(problem, drag, 0.0, 0.2, steps=10):

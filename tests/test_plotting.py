@@ -39,7 +39,7 @@ def test_pictures_of_any_body(cell, tmp_path, drawn):
     """Whole on any number of ranks: every facet once, its colour and place; axes with units."""
     folder, d = shared_folder(tmp_path), dimension(cell)
     made = Rub(cell=cell, mesh={"n": 4})
-    made.problem.kinematics = np.inf
+    made.problem.small_displacement_tolerance = np.inf
     (step,) = fc.increments(made.problem, made.load, 0, 2, steps=1)
     plotting.plot_pressure(folder / "p.png", made.contact, length="m", stress="Pa", title="Title")
     plotting.plot_status(folder / "s.png", made.contact, length="m")
@@ -92,7 +92,7 @@ def test_fields_and_stress(cell, tmp_path, drawn):
     """
     folder, d = shared_folder(tmp_path), dimension(cell)
     made = Rub(cell=cell, mesh={"n": 4})
-    made.problem.kinematics = np.inf
+    made.problem.small_displacement_tolerance = np.inf
     list(fc.increments(made.problem, made.load, 0, 2, steps=2))
     fields = ("pressure", "friction", "gap", "slip")
     for field in fields:
@@ -197,7 +197,7 @@ def test_only_what_is_near_the_contact(cell, tmp_path, drawn):
     """All facets that bear are drawn, and none farther from them than asked for; or all of them."""
     folder, d = shared_folder(tmp_path), dimension(cell)
     made = Rub(cell=cell, mesh={"n": 8 if d == 2 else 4})
-    made.problem.kinematics = np.inf
+    made.problem.small_displacement_tolerance = np.inf
     list(fc.increments(made.problem, made.load, 0, 1, steps=1))
     points = made.contact.gather()
     reach, count = 0.05, np.count_nonzero(per_facet(points, cell) > 0)

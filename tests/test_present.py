@@ -497,7 +497,7 @@ def test_a_body_touches_itself():
             u,
             fc.ContactSurface(mesh, tags, own),
             fc.DeformableBody(tags, opposite),
-            fc.Coulomb(0.2, fc.Scaled(share), fc.Scaled(share)),
+            fc.Coulomb(0.2, fc.RelativeStiffness(share), fc.RelativeStiffness(share)),
             kinematics="finite",
         )
         body = NeoHookean(u, 100.0, 0.3, "plane strain")
@@ -593,7 +593,7 @@ def test_condensed_as_on_all_unknowns(cell, degree):
         history = []
         for number, place in enumerate([(0, -1), (0, -2), (10, -2), (20, -3), (10, -2)]):
             side.value, down.value = 0.01 * np.array(place)
-            step = problem.solve(field=False)
+            step = problem.solve(recover_interior=False)
             problem.commit()
             assert step.complete  # all of u is looked at, whatever was asked for
             assert not condensation or step.factorisations == (number == 0)

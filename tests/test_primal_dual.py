@@ -23,7 +23,7 @@ SERIAL = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="the same on several
 
 
 def coulomb(k, friction=0.3, **others):
-    return fc.Coulomb(friction, fc.Scaled(k), fc.Scaled(k), **others)
+    return fc.Coulomb(friction, fc.RelativeStiffness(k), fc.RelativeStiffness(k), **others)
 
 
 @pytest.mark.parametrize("k", [1.0, 100.0, 1e4])
@@ -48,8 +48,8 @@ def test_the_same_solution(cell, degree, k):
     [
         coulomb(300.0, modes=6),
         coulomb(300.0, transverse_friction=0.1, direction=(1.0, 1.0, 0.0)),
-        fc.Tresca(0.3, 30.0, fc.Scaled(300.0), fc.Scaled(300.0)),
-        fc.Coulomb(0.3, fc.Scaled(1000.0), fc.Scaled(30.0)),
+        fc.Tresca(0.3, 30.0, fc.RelativeStiffness(300.0), fc.RelativeStiffness(300.0)),
+        fc.Coulomb(0.3, fc.RelativeStiffness(1000.0), fc.RelativeStiffness(30.0)),
     ],
     ids=["polygon", "ellipse", "Tresca", "soft along Γc"],
 )
@@ -204,19 +204,19 @@ def test_in_other_units():
 
 
 @pytest.mark.parametrize(
-    "case", ["no friction", "a support that is moved by a force", "a nonlinear bulk"]
+    "case", ["no friction", "an obstacle that is moved by a force", "a nonlinear bulk"]
 )
 def test_what_it_is_not_for_is_refused(case):
     """By the method's name, before any work."""
     scene = block("triangle", n=2)
-    law, support, form = coulomb(10.0), cushion(2), scene.F
+    law, obstacle, form = coulomb(10.0), cushion(2), scene.F
     if case == "no friction":
         law = fc.Frictionless()
     elif case == "a nonlinear bulk":
         form = kirchhoff(scene)
     else:
-        support = fc.HalfSpace((0, 0), (0, 1), displacement=fc.Motion(force=(None, 1.0)))
-    contact = scene.contact(law, support=support)
+        obstacle = fc.HalfSpace((0, 0), (0, 1), displacement=fc.Motion(force=(None, 1.0)))
+    contact = scene.contact(law, obstacle=obstacle)
     bcs = [scene.hold(TOP, i) for i in range(2)]
     with pytest.raises(ValueError, match="method is 'primal_dual', which is for friction by"):
         fc.ContactProblem(form, scene.u, bcs=bcs, contacts=[contact], method="primal_dual")

@@ -94,11 +94,11 @@ class Page(HTMLParser):
         for contact in problem.contacts:
             chosen = dict(self.tables[f"Contact: {contact.name}"])
             assert chosen["law"] == type(contact.law).__name__
-            assert chosen["support"] == type(contact.support).__name__
+            assert chosen["obstacle"] == type(contact.obstacle).__name__
             assert chosen["kinematics"] == ("finite" if contact.finite else "small")
             for name, constant in contact.parameters.items():
                 told = ", ".join(f"{x:g}" for x in np.ravel(constant.value))
-                scaled = isinstance(getattr(contact.law, name, None), fc.Scaled)
+                scaled = isinstance(getattr(contact.law, name, None), fc.RelativeStiffness)
                 assert chosen[name] == told + (" E/h" if scaled else "")
         extents = self.tables["Extents on the undeformed surface"]  # of the first contact
         found = steps[-1].contacts[problem.contacts[0].name].extents
@@ -135,7 +135,7 @@ def test_a_resumed_history(tmp_path, curves):
     References: the steps of both runs.
     """
     folder = shared_folder(tmp_path)
-    kept = {"checkpoint": folder / "state.npz", "history": folder / "history.csv"}
+    kept = {"checkpoint": folder / "state.npz", "csv": folder / "history.csv"}
 
     def press():
         return Press(wall=True, contact={"enforcement": "augmented"})
@@ -154,7 +154,7 @@ def test_a_resumed_history(tmp_path, curves):
         made.problem,
         steps[-1],
         folder / "new" / "folder",
-        history=kept["history"],
+        csv=kept["csv"],
         stress=body.stress,
         budget=budget,
         title="<b>one & two</b>",
@@ -190,7 +190,7 @@ def test_a_resumed_history(tmp_path, curves):
 def space():
     """A block in space, and its stress."""
     made = Rub(cell="tetrahedron")
-    made.problem.kinematics = np.inf
+    made.problem.small_displacement_tolerance = np.inf
     steps = list(fc.increments(made.problem, made.load, 0, 2, steps=2))
     return made.problem, steps, stress(made.scene.u, made.scene.E, made.scene.nu)
 
@@ -210,7 +210,7 @@ def finite():
 def alone():
     """One increment without a load parameter, not committed."""
     made = Rub(fc.Coulomb(0.3))
-    made.problem.kinematics = np.inf
+    made.problem.small_displacement_tolerance = np.inf
     made.move(0.01, 0.03)
     return made.problem, made.problem.solve(), None
 
@@ -242,7 +242,7 @@ def test_an_unloaded_body(tmp_path):
     steps = []
     for start, end in ((0.0, -3.0), (-3.0, 0.0)):
         load = fc.increments(
-            problem, lambda p: scene.load(up=p), start, end, steps=2, history=folder / "h.csv"
+            problem, lambda p: scene.load(up=p), start, end, steps=2, csv=folder / "h.csv"
         )
         steps += list(load)
     for step in steps:
@@ -254,7 +254,7 @@ def test_an_unloaded_body(tmp_path):
     assert "; contact: no contact force" in steps[-1].summary()
     assert "stick" not in steps[-1].summary() and "stick" in steps[0].summary()
     assert steps[-1].verdict.relative_residual == 0.0
-    page = Page(fc.report(problem, steps, folder, history=folder / "h.csv"))
+    page = Page(fc.report(problem, steps, folder, csv=folder / "h.csv"))
     assert "There are no forces." in page.text and "of the forces." not in page.text
     assert "There is no contact force" in page.text and "e+" not in " ".join(page.pictures)
     rows = (folder / "h.csv").read_text().splitlines()
@@ -266,10 +266,8 @@ def test_bad_input(tmp_path):
     """On all ranks, before any work; there is no page."""
     folder = shared_folder(tmp_path)
     made = Rub()
-    made.problem.kinematics = np.inf
-    first, step = fc.increments(
-        made.problem, made.load, 0, 1, steps=2, history=folder / "history.csv"
-    )
+    made.problem.small_displacement_tolerance = np.inf
+    first, step = fc.increments(made.problem, made.load, 0, 1, steps=2, csv=folder / "history.csv")
     problem, page = made.problem, folder / "page"
     if COMM.rank == 0:
         lines = (folder / "history.csv").read_text().splitlines(keepends=True)
@@ -289,10 +287,10 @@ def test_bad_input(tmp_path):
         (("increments [1]", "at increment 2"), (problem, first, page), {}),
         (("increments [2, 2]",), (problem, [step, step], page), {}),
         (("folder is 3",), (problem, step, 3), {}),
-        (("history is 3",), (problem, step, page), {"history": 3}),
-        (("last increment is 1",), (problem, step, page), {"history": folder / "short.csv"}),
-        (("no column 'increment'",), (problem, step, page), {"history": folder / "other.csv"}),
-        (("has no row",), (problem, step, page), {"history": folder / "empty.csv"}),
+        (("csv is 3",), (problem, step, page), {"csv": 3}),
+        (("last increment is 1",), (problem, step, page), {"csv": folder / "short.csv"}),
+        (("no column 'increment'",), (problem, step, page), {"csv": folder / "other.csv"}),
+        (("has no row",), (problem, step, page), {"csv": folder / "empty.csv"}),
         (("shape ()", "(3, 3)"), (problem, step, page), {"stress": made.scene.E}),
         (("budget is a float",), (problem, step, page), {"budget": 0.1}),
         (("title",), (problem, step, page), {"title": 1}),
@@ -302,9 +300,7 @@ def test_bad_input(tmp_path):
     ):
         raised_everywhere(lambda a=arguments, o=options: fc.report(*a, **o), ValueError, *words)
     missing = folder / "missing.csv"
-    raised_everywhere(
-        lambda: fc.report(problem, step, page, history=missing), OSError, "missing.csv"
-    )
+    raised_everywhere(lambda: fc.report(problem, step, page, csv=missing), OSError, "missing.csv")
     raised_everywhere(lambda: fc.report(problem, step, folder / "other.csv"), OSError, "other.csv")
     COMM.barrier()
     assert not (page / "report.html").exists()
@@ -314,7 +310,7 @@ def test_a_failure_leaves_the_page_before(tmp_path, monkeypatch):
     """A picture that cannot be drawn: the error on all ranks, the page as it was."""
     folder = shared_folder(tmp_path)
     made = Rub()
-    made.problem.kinematics = np.inf
+    made.problem.small_displacement_tolerance = np.inf
     (step,) = fc.increments(made.problem, made.load, 0, 1)
     path = fc.report(made.problem, step, folder)
     COMM.barrier()

@@ -46,7 +46,7 @@ def test_pairs_found_anew(cell, condensation, update, stop, tmp_path):
     make = lambda: Ramp(  # noqa: E731
         cell=cell,
         condensation=condensation,
-        update=update,
+        update_pairs=update,
         n=(10, 4) if cell == "quadrilateral" else (6, 2),
     )
     goes_on(make, shared_folder(tmp_path), stop=stop)
@@ -58,7 +58,7 @@ LAWS = {
     "tresca": lambda: fc.Tresca(0.3, 20.0),
     "frictionless": lambda: fc.Frictionless(),
     "foundation": lambda: fc.Foundation(k_n=2e4, k_t=1e4, tension=False),
-    "springs": lambda: fc.Coulomb(0.3, fc.Springs(2e3), fc.Springs(1e3)),
+    "springs": lambda: fc.Coulomb(0.3, fc.NodalSprings(2e3), fc.NodalSprings(1e3)),
 }
 HOW = {
     "penalty": {},
@@ -78,38 +78,38 @@ def products() -> list[tuple]:
         ["plain", "estimate", "last", "every 3", "wall", "nonlinear"],
     )
     sensible = [
-        (support, law, how, method, extra)
-        for support, law, how, method, extra in choices
+        (obstacle, law, how, method, extra)
+        for obstacle, law, how, method, extra in choices
         if not (law in ("foundation", "springs") and how != "penalty")
-        and not (law == "springs" and support == "ramp")
-        and not (law == "polygon" and support != "fixed")
-        and not (support in ("ramp", "force") and extra in ("wall", "nonlinear"))
+        and not (law == "springs" and obstacle == "ramp")
+        and not (law == "polygon" and obstacle != "fixed")
+        and not (obstacle in ("ramp", "force") and extra in ("wall", "nonlinear"))
     ]
     picked = np.random.default_rng(3).choice(len(sensible), 26, replace=False)
     chosen = [sensible[i] for i in sorted(picked)]
     return chosen if COMM.size == 1 else chosen[::4]
 
 
-@pytest.mark.parametrize(("support", "law", "how", "method", "extra"), products())
-def test_products(support, law, how, method, extra, tmp_path):
-    """Supports, laws, enforcement, methods and ways to lead a history, in combination."""
+@pytest.mark.parametrize(("obstacle", "law", "how", "method", "extra"), products())
+def test_products(obstacle, law, how, method, extra, tmp_path):
+    """Obstacles, laws, enforcement, methods and ways to lead a history, in combination."""
     options = {}
     if extra == "estimate":
         options["estimate"] = True
     elif extra == "last":
-        options |= {"field": "last", "checkpoint_every": 2}
+        options |= {"recover_interior": "last", "checkpoint_every": 2}
     elif extra == "every 3":
         options |= {"checkpoint_every": 3}
 
     def make():
         contact = dict(HOW[how])
-        if support == "ramp":
+        if obstacle == "ramp":
             return Ramp(LAWS[law](), contact=contact, method=method)
         return Press(
             LAWS[law](),
             cell="hexahedron" if law == "polygon" else "triangle",
             n=2 if law == "polygon" else 4,
-            support=support,
+            obstacle=obstacle,
             surface={"quadrature_scheme": "vertex"} if law == "springs" else None,
             contact=contact,
             wall=extra == "wall",
@@ -140,7 +140,7 @@ def test_cut_increments(make, tmp_path):
 
         def choosy(**options):
             if now[0] - at[0] > 0.3:
-                balance = {"the body": fc.Balance(1.0, 1.0, 0.0)}
+                balance = {"the body": fc.ForceBalance(1.0, 1.0, 0.0)}
                 verdict = fc.Verdict(balance, balance)
                 raise fc.NotConverged(problem.increment + 1, -1, verdict)
             return solve(**options)
@@ -211,8 +211,8 @@ def run_script(ranks: int, **values) -> dict[str, np.ndarray]:
     [
         ("Ramp(n=(6, 2))", (1, 2)),
         pytest.param("Ramp(n=(6, 2))", (2, 3), marks=pytest.mark.slow),
-        ("Press(support='force', contact={'enforcement': 'augmented'})", (2, 1)),
-        ("Press(cell='tetrahedron', n=2, wall=True, support='moving')", (2, 1)),
+        ("Press(obstacle='force', contact={'enforcement': 'augmented'})", (2, 1)),
+        ("Press(cell='tetrahedron', n=2, wall=True, obstacle='moving')", (2, 1)),
     ],
 )
 def test_on_another_number_of_ranks(scene, ranks, tmp_path):
@@ -320,8 +320,8 @@ def test_a_loop_that_was_left_goes_on(tmp_path):
 
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
-@pytest.mark.parametrize("support", ["rigid", "body", "body, pairs found anew"])
-def test_results_of_a_finished_history(support, enforcement, tmp_path):
+@pytest.mark.parametrize("obstacle", ["rigid", "body", "body, pairs found anew"])
+def test_results_of_a_finished_history(obstacle, enforcement, tmp_path):
     """Counts of open, sticking and slipping points are those of the last increment.
 
     At its end they all stick: to be told how they came there takes what was evaluated before the
@@ -330,9 +330,9 @@ def test_results_of_a_finished_history(support, enforcement, tmp_path):
 
     def make():
         given = {"contact": {"enforcement": enforcement}}
-        if support == "rigid":
+        if obstacle == "rigid":
             return Press(**given)
-        return Ramp(update="increment" if "anew" in support else "never", **given)
+        return Ramp(update_pairs="increment" if "anew" in obstacle else "never", **given)
 
     path = shared_folder(tmp_path) / "state.npz"
     one, called, loaded = make(), make(), make()

@@ -65,14 +65,14 @@ def test_fields_of_every_kind(cell, tmp_path):
     path = shared_folder(tmp_path) / "state.npz"
     made, after = Press(cell=cell, n=2), Press(cell=cell, n=2)
     fields = more_fields(made)
-    for step in made.increments(checkpoint=path, fields=fields):
+    for step in made.increments(checkpoint=path, state_fields=fields):
         fill(fields, step.increment)
         if step.increment == 3:
             break
     fields, expected = more_fields(after), more_fields(after)
     # The third was left in the middle of the loop: the file has the second.
     fill(expected, 2)
-    steps = after.increments(checkpoint=path, fields=fields)
+    steps = after.increments(checkpoint=path, state_fields=fields)
     assert next(steps).increment == 3
     for field, reference in zip(fields, expected, strict=True):
         found, wanted = field.x.array, reference.x.array
@@ -81,7 +81,7 @@ def test_fields_of_every_kind(cell, tmp_path):
     fields = more_fields(other)
     for wrong in (fields[:-1], [], fields[::-1], [*fields, other.plastic]):
         call = lambda wrong=wrong: next(  # noqa: E731
-            other.increments(checkpoint=path, fields=wrong, changed="continue")
+            other.increments(checkpoint=path, state_fields=wrong, on_mismatch="continue")
         )
         raised_everywhere(call, ValueError, str(path))
 
@@ -96,7 +96,7 @@ def test_plastic_strains_go_on(bulk, tmp_path):
             made.plastic + 0.1 * ufl.tr(strain(made.scene.u)),
             compat.interpolation_points(made.plastic.function_space.element),
         )
-        for step in made.increments(2.0, checkpoint=path, fields=[made.plastic]):
+        for step in made.increments(2.0, checkpoint=path, state_fields=[made.plastic]):
             held = fem.Function(made.plastic.function_space)
             held.interpolate(grown)
             made.plastic.x.array[:] = held.x.array
@@ -151,6 +151,8 @@ def test_fields_that_cannot_be_saved(tmp_path):
         (made.scene.u, "displacement"),
         (made.scene.E, "Constant"),
     ):
-        call = lambda field=field: made.increments(checkpoint=path, fields=[field])  # noqa: E731
+        call = lambda field=field: made.increments(checkpoint=path, state_fields=[field])  # noqa: E731
         raised_everywhere(call, ValueError, word)
-    raised_everywhere(lambda: made.increments(fields=[made.plastic]), ValueError, "checkpoint")
+    raised_everywhere(
+        lambda: made.increments(state_fields=[made.plastic]), ValueError, "checkpoint"
+    )

@@ -56,8 +56,8 @@ OTHER = {
     "radius": ({"radius": 2.0001}, ["gap of floor"]),
     "tilt": ({"tilt": 0.001}, ["normal of floor"]),
     "weight": ({"contact": {"weight": 2.0}}, ["weight of floor", "1 in", "2 here"]),
-    "support": (
-        {"support": "moving"},
+    "obstacle": (
+        {"obstacle": "moving"},
         ["prescribed by a Dirichlet condition", "shift of floor"],
     ),
 }
@@ -81,7 +81,7 @@ def test_changed_data_are_refused(other, saved):
         each.problem.commit()
     assert differences(made, fresh, 0.0 if COMM.size == 1 else 1e-7) == []
     told = Press(wall=True, **options)
-    step = next(told.increments(checkpoint=saved, changed="continue"))
+    step = next(told.increments(checkpoint=saved, on_mismatch="continue"))
     assert step.increment == 4 and step.load == 2.0
 
 
@@ -109,7 +109,7 @@ FIXED = {
     "name": ({"names": ("ground", "wall")}, ["contacts", "floor, wall", "ground, wall"]),
     "contacts": ({"wall": False}, ["contacts", "floor, wall"]),
     "rule": ({"surface": {"quadrature_degree": 5}}, ["quadrature of floor", "points"]),
-    "motion": ({"support": "force"}, ["free motion of floor"]),
+    "motion": ({"obstacle": "force"}, ["free motion of floor"]),
 }
 
 
@@ -132,12 +132,12 @@ def test_nodes_elsewhere_are_another_mesh(saved):
     made = Press(wall=True)
     x = made.scene.mesh.geometry.x
     x[np.all(np.abs(x[:, :2] - 0.5) < 1e-9, axis=1), 0] += 1e-6
-    call = lambda: next(made.increments(checkpoint=saved, changed="continue"))  # noqa: E731
+    call = lambda: next(made.increments(checkpoint=saved, on_mismatch="continue"))  # noqa: E731
     raised_everywhere(call, ValueError, "nodes", "places")
 
 
 def test_data_that_the_load_changes_are_no_change(tmp_path):
-    """A friction coefficient and a support as loads: compared where the history stands."""
+    """A friction coefficient and an obstacle as loads: compared where the history stands."""
     path = shared_folder(tmp_path) / "state.npz"
 
     class Both(Press):
@@ -145,7 +145,7 @@ def test_data_that_the_load_changes_are_no_change(tmp_path):
             super().load(t)
             self.problem.contacts[0].parameters["friction"].value = 0.1 + 0.1 * t
 
-    made, after = Both(support="moving"), Both(support="moving")
+    made, after = Both(obstacle="moving"), Both(obstacle="moving")
     next(made.increments(checkpoint=path))
     assert [s.increment for s in after.increments(checkpoint=path)] == list(range(2, 9))
 
@@ -168,7 +168,7 @@ def test_a_state_that_is_not_committed_is_not_saved(tmp_path):
         made = Press()
         next(made.increments())
         made.load(1.0)
-        made.problem.solve(field=False)
+        made.problem.solve(recover_interior=False)
         raised_everywhere(lambda m=made: checkpoint.save(m.problem, path), ValueError, "commit()")
         assert not checkpoint.exists(made.problem, path)
         getattr(made.problem, end)()
@@ -387,12 +387,12 @@ def test_increments_that_are_never_asked_for(caplog):
         ({"end": float("nan")}, ["end is nan"]),
         ({"start": None}, ["start is None"]),
         ({"start": 1.0, "end": 1.0}, ["start", "end"]),
-        ({"field": "never"}, ["field", "never"]),
+        ({"recover_interior": "never"}, ["recover_interior", "never"]),
         ({"max_cuts": -1}, ["max_cuts is -1"]),
         ({"checkpoint_every": 0}, ["checkpoint_every is 0"]),
-        ({"changed": "yes"}, ["changed", "refuse", "continue"]),
+        ({"on_mismatch": "yes"}, ["on_mismatch", "refuse", "continue"]),
         ({"checkpoint": 3}, ["checkpoint is 3"]),
-        ({"fields": 3, "checkpoint": "x.npz"}, ["fields"]),
+        ({"state_fields": 3, "checkpoint": "x.npz"}, ["state_fields"]),
         ({"load": 3}, ["load is a int"]),
     ],
 )

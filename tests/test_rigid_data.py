@@ -1,4 +1,4 @@
-"""Rigid supports from data: their distance and its derivatives."""
+"""Rigid obstacles from data: their distance and its derivatives."""
 
 from __future__ import annotations
 
@@ -139,16 +139,16 @@ def test_normal_and_curvature_are_derivatives(name):
     """
     if name in SURFACES:
         points, facets = SURFACES[name]()
-        support, x = fc.RigidSurface(points, facets), places(points)
+        obstacle, x = fc.RigidSurface(points, facets), places(points)
     else:
-        support, x = _wavy(name)
+        obstacle, x = _wavy(name)
     d, step = x.shape[1], 1e-6
-    here = support.sample(x)
+    here = obstacle.sample(x)
     slope, bend = np.empty((len(x), d)), np.empty((len(x), d, d))
     size = 1 + np.abs(here.curvature).max(axis=(1, 2))
     same = np.abs(here.distance) > 1e-3
     for i, e in enumerate(np.eye(d)):
-        ahead, behind = support.sample(x + step * e), support.sample(x - step * e)
+        ahead, behind = obstacle.sample(x + step * e), obstacle.sample(x - step * e)
         slope[:, i] = (ahead.distance - behind.distance) / (2 * step)
         bend[:, i] = -(ahead.normal - behind.normal) / (2 * step)
         for side in (ahead, behind):
@@ -180,17 +180,17 @@ def _wavy(name):
 def test_at_edges_and_corners():
     """On a box: the normal is the pseudo-normal, the sign that of the side from which one comes."""
     points, facets = box((-1, -1, -1), (1, 1, 1))
-    support = fc.RigidSurface(points, facets)
-    found = support.sample(points)
+    obstacle = fc.RigidSurface(points, facets)
+    found = obstacle.sample(points)
     assert np.abs(found.distance).max() == 0.0
     assert close(found.normal, -points / np.sqrt(3), 1e-12)
     middle = np.array([[1.0, 1.0, 0.2], [-1.0, 0.1, 1.0]])
     expected = -middle * [[1, 1, 0], [1, 0, 1]] / np.sqrt(2)
-    assert close(support.sample(middle).normal, expected, 1e-12)
+    assert close(obstacle.sample(middle).normal, expected, 1e-12)
     for side in (1.0, -1.0):
         x = points * (1 + side * 1e-4)
-        assert np.all(np.sign(support.sample(x).distance) == side)
-    off = support.sample(np.array([[1.3, 1.4, 0.2], [2.0, 3.0, 3.0]]))
+        assert np.all(np.sign(obstacle.sample(x).distance) == side)
+    off = obstacle.sample(np.array([[1.3, 1.4, 0.2], [2.0, 3.0, 3.0]]))
     assert close(off.distance, [0.5, 3.0], 1e-12)
     # About the edge a circle of radius 0.5, about the corner a ball of radius 3.
     t = np.array([-0.8, 0.6, 0.0])
@@ -200,12 +200,12 @@ def test_at_edges_and_corners():
 
 
 def test_beside_an_open_surface_everything_is_outside():
-    """Above or below, where the border is closest the support is not; behind the middle one is."""
-    floor = fc.RigidSurface([[1.0, 0.0], [-1.0, 0.0]], [[0, 1]])  # the support is below
+    """Above or below, where the border is closest the obstacle is not; behind the middle one is."""
+    floor = fc.RigidSurface([[1.0, 0.0], [-1.0, 0.0]], [[0, 1]])  # the obstacle is below
     x = np.array([[0.2, 0.3], [0.2, -0.3], [1.3, 0.4], [1.3, -0.4], [-1.0 - 1e-6, -0.5]])
     assert not floor.facets.closed
-    for support in (floor, fc.RigidProfile([[1.0, 0.0], [0.3, 0.0], [-1.0, 0.0]])):
-        found = support.sample(x)
+    for obstacle in (floor, fc.RigidProfile([[1.0, 0.0], [0.3, 0.0], [-1.0, 0.0]])):
+        found = obstacle.sample(x)
         assert close(found.distance, [0.3, -0.3, 0.5, 0.5, 0.5], 1e-9)
         assert close(found.normal[:2], [[0, -1], [0, -1]], 1e-9)
         assert close(found.normal[3], np.array([-0.6, 0.8]), 1e-9)
@@ -276,10 +276,10 @@ def test_from_afar_and_from_nowhere():
 
 def test_many_points_and_facets():
     """10,000 points against 131,072 triangles: distances of a ball to the height of its facets."""
-    support = fc.RigidSurface(*ball(7))
+    obstacle = fc.RigidSurface(*ball(7))
     x = RNG.normal(size=(10_000, 3))
     x *= (RNG.uniform(0.95, 1.1, size=10_000) / np.linalg.norm(x, axis=1))[:, None]
-    found = support.sample(x)
+    found = obstacle.sample(x)
     assert np.abs(found.distance - np.linalg.norm(x, axis=1) + 1).max() < 1.1e-4
 
 
@@ -296,15 +296,15 @@ def test_a_spline_through_points_of_a_circle():
     half = radius * (np.outer(np.cos(t), one) + np.outer(np.sin(t), axis)) + 1
     x = RNG.uniform(-2, 2, (500, 3))
     x = np.concatenate([x, np.outer([-1.3, 0.5, 0.9, 1.2], axis)])
-    for support, place, matrix in (
+    for obstacle, place, matrix in (
         (fc.RigidProfile(points, closed=True), x @ plane.T, np.eye(2)),
         (fc.RigidProfile(points @ plane, closed=True, extruded=3 * axis), x, plane.T @ plane),
         (fc.RigidProfile(half, turned=((1, 1, 1), axis)), x + 1, np.eye(3)),
     ):
-        arm = (place - (1 if support.gdim == 3 and np.trace(matrix) > 2.5 else 0)) @ matrix
+        arm = (place - (1 if obstacle.gdim == 3 and np.trace(matrix) > 2.5 else 0)) @ matrix
         length = np.linalg.norm(arm, axis=1)
         kept = length > 0.25
-        found, n = support.sample(place[kept]), arm[kept] / length[kept, None]
+        found, n = obstacle.sample(place[kept]), arm[kept] / length[kept, None]
         assert close(found.distance, length[kept] - radius, 1e-8, scale=1.0)
         assert close(found.normal, -n, 1e-5)
         bend = (matrix - np.einsum("ni,nj->nij", n, n)) / length[kept, None, None]

@@ -1,4 +1,4 @@
-"""Facets as long as a rigid support is round have points enough to see its shape."""
+"""Facets as long as a rigid obstacle is round have points enough to see its shape."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RADIUS = 1.0
 
 
 def profile(middle):
-    """A circle as a spline, the support on the left of its way."""
+    """A circle as a spline, the obstacle on the left of its way."""
     angle = np.linspace(0.0, 2 * np.pi, 40, endpoint=False)
     return fc.RigidProfile(
         middle + RADIUS * np.column_stack([np.cos(angle), np.sin(angle)]), closed=True
@@ -31,7 +31,7 @@ def distance(middle):
     def to(x):
         return ufl.sqrt((x[0] - middle[0]) ** 2 + (x[1] - middle[1]) ** 2) - RADIUS
 
-    return fc.Obstacle(distance=to)
+    return fc.SignedDistance(to)
 
 
 SHAPES = {
@@ -81,18 +81,18 @@ def test_points_stay_as_they_are_on_shorter_facets():
     References: p + 1 points on a facet, or its nodes with multipliers.
     """
 
-    def points(support, length=0.25, **options):
+    def points(obstacle, length=0.25, **options):
         axes = [length * np.arange(5.0), np.linspace(-1.0, 0.0, 2)]
         block = Bodies(boxes([axes], {2: near(1, 0.0)}), 1.0, 0.3, degree=options.pop("degree", 1))
-        return block.contact(2, support, fc.Frictionless(), **options).quadrature
+        return block.contact(2, obstacle, fc.Frictionless(), **options).quadrature
 
     tool = fc.Cylinder((0.0, RADIUS), RADIUS)
     assert points(tool).degree == 2 and points(tool, degree=2).degree == 4
     assert points(tool, enforcement="augmented").at_vertices
     assert points(tool, 1.0, quadrature=2).degree == 2
-    for support in (fc.Ball((0.0, -5.0), 6.0, inside=True), fc.HalfSpace((0, 0), (0, -1))):
-        assert points(support, 1.0).degree == 2
-        assert points(support, 1.0, enforcement="augmented").at_vertices
+    for obstacle in (fc.Ball((0.0, -5.0), 6.0, inside=True), fc.HalfSpace((0, 0), (0, -1))):
+        assert points(obstacle, 1.0).degree == 2
+        assert points(obstacle, 1.0, enforcement="augmented").at_vertices
     assert points(tool, 100.0).degree == 78
 
 
@@ -102,7 +102,7 @@ def test_few_points_are_told_of(enforcement):
 
     Reference: with the degree that is told the force is that of 40 points, to 4 %.
     """
-    with pytest.warns(UserWarning, match="as long as the radius of the support") as told:
+    with pytest.warns(UserWarning, match="as long as the radius of the obstacle") as told:
         forces("distance", 2.0, enforcement=enforcement)
     degree = int(str(told[0].message).split("quadrature_degree=")[1].split(")")[0])
     with warnings.catch_warnings():

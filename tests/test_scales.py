@@ -164,7 +164,7 @@ def test_a_body_out_of_balance_is_named():
     verdict = step.verdict
     light = verdict.equations["body 2"]  # they are numbered along x
     assert light.force < 1e-6
-    broken = fc.Balance(1e-3 * light.force, light.force, light.tolerance)
+    broken = fc.ForceBalance(1e-3 * light.force, light.force, light.tolerance)
     equations = verdict.equations | {"body 2": broken}
     failures = fc.Verdict(equations, verdict.sums, verdict.laws).failures
     assert len(failures) == 1 and "body 2" in failures[0]
@@ -207,8 +207,8 @@ def test_what_is_not_finite_does_not_pass(place, value):
     """Not even an infinite residual below an infinite tolerance."""
     numbers = {"residual": np.inf if value == np.inf else 0.0, "force": 1.0, "tolerance": np.inf}
     numbers[place] = value
-    broken = fc.Balance(**numbers)
-    sound = fc.Balance(0.0, 1.0, 1e-9)
+    broken = fc.ForceBalance(**numbers)
+    sound = fc.ForceBalance(0.0, 1.0, 1e-9)
     assert fc.Verdict({"the body": broken}, {"the body": sound}).failures
     assert fc.Verdict({"the body": sound}, {"the body": broken}).failures
     assert not fc.Verdict({"the body": sound}, {"the body": sound}).failures

@@ -47,11 +47,11 @@ class Hovering:
         value[0], value[-1] = side, up
         return value
 
-    def contact(self, support, friction=0.3, tag=BOTTOM, **options):
+    def contact(self, obstacle, friction=0.3, tag=BOTTOM, **options):
         """Of a side, by finite kinematics."""
         surface = fc.ContactSurface(self.u.function_space.mesh, self.tags, tag)
         options = FINITE | {"weight": self.body.weight} | options
-        return fc.Contact(self.u, surface, support, fc.Coulomb(friction=friction), **options)
+        return fc.Contact(self.u, surface, obstacle, fc.Coulomb(friction=friction), **options)
 
     def problem(self, *contacts, **options):
         """The problem."""
@@ -70,7 +70,7 @@ def around(x, centre, radius):
     return ufl.sqrt(ufl.dot(arm, arm)) - radius
 
 
-def support(scene, shape, gap):
+def obstacle(scene, shape, gap):
     """Shapes under the middle of the bottom."""
     centre = np.full(scene.d, 0.5)
     centre[-1] = -gap - 3.0
@@ -79,7 +79,7 @@ def support(scene, shape, gap):
     if shape == "cylinder":
         return fc.Cylinder(centre, 3.0, None if scene.d == 2 else (0.0, 1.0, 0.0))
     if shape == "distance":
-        return fc.Obstacle(distance=lambda x: around(x, centre, 3.0))
+        return fc.SignedDistance(lambda x: around(x, centre, 3.0))
     centre[-1] = 4.94 - gap
     return fc.Ball(centre, 5.0, inside=True)
 
@@ -99,7 +99,7 @@ def test_the_gap_is_not_felt(cell, shape, bulk):
     found = []
     for gap in (1e-4, 0.05, 1.0):
         scene = Hovering(cell, bulk, (0.02, -1.0))
-        contact = scene.contact(support(scene, shape, gap))
+        contact = scene.contact(obstacle(scene, shape, gap))
         step = scene.problem(contact).solve()
         assert step.iterations <= 60
         resultants = contact.resultants()
@@ -283,10 +283,10 @@ def test_a_block_goes_on_from_where_it_was_let_go(gap, bulk):
 @pytest.mark.parametrize("bulk", BULKS)
 @pytest.mark.parametrize("shape", ["plane", "cylinder"])
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
-def test_supports_take_bodies_along(cell, shape, bulk):
+def test_obstacles_take_bodies_along(cell, shape, bulk):
     """That nothing else holds, down and along by more than they are pressed in.
 
-    Reference: the same forces, to 1e-7, and the displacement of the support. Linear bodies were
+    Reference: the same forces, to 1e-7, and the displacement of the obstacle. Linear bodies were
     refused, and on a cylinder all of them.
     """
     scene = Hovering(cell, bulk, (0.02, -1.0))
@@ -312,11 +312,11 @@ def test_supports_take_bodies_along(cell, shape, bulk):
 
 
 @pytest.mark.parametrize("bulk", BULKS)
-def test_a_support_moves_into_a_block_that_was_let_go(bulk):
+def test_an_obstacle_moves_into_a_block_that_was_let_go(bulk):
     """Up by a fifth of its height, as the block is pressed again: it goes out as a rigid body.
 
-    Reference: the load, and the way of the support, to 1e-2 for the place where a round support is
-    met. It took 4 iterations; pressed from inside the linear one was refused.
+    Reference: the load, and the way of the obstacle, to 1e-2 for the place where a round obstacle
+    is met. It took 4 iterations; pressed from inside the linear one was refused.
     """
     scene = Hovering("quadrilateral", bulk, (0.0, 0.0))
     shift = fem.Constant(scene.u.function_space.mesh, np.zeros(2))

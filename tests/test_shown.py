@@ -20,7 +20,7 @@ NAME = "<b>one & two</b>"
 def solved():
     """A block slipped to and fro, under a name that would be markup, and its last step."""
     made = Rub(contact={"name": NAME}, degree=2)
-    made.problem.kinematics = np.inf
+    made.problem.small_displacement_tolerance = np.inf
     *_, step = fc.increments(made.problem, made.load, 0, 2, steps=4, estimate=True)
     return made, step
 
@@ -88,11 +88,11 @@ def test_a_verdict(solved):
     )
     for _, left, passes in rows[1:]:
         assert float(left) <= 2 * float(passes)
-    made.problem.kinematics = 1e-12
+    made.problem.small_displacement_tolerance = 1e-12
     made.load(2.5)
     with pytest.raises(fc.NotConverged) as error:
         made.problem.solve()
-    made.problem.kinematics = np.inf
+    made.problem.small_displacement_tolerance = np.inf
     title, _, remarks = table(error.value.verdict)
     assert title == "Verdict: does not hold" and remarks == error.value.verdict.failures
 

@@ -23,7 +23,7 @@ def test_found_where_the_body_has_gone(cell, update):
     """
     n = (14, 4) if cell in ("triangle", "quadrilateral") else (7, 2)
     law = fc.Frictionless(k_n=K_N)
-    carried, standing = (Slider(cell, law, start=s, n=n, update=update) for s in (0.4, 1.73))
+    carried, standing = (Slider(cell, law, start=s, n=n, update_pairs=update) for s in (0.4, 1.73))
     carried.step(-0.01, 1.33)  # lifted, so that nothing touches
     assert carried.contact.resultants().normal_force == 0.0
     carried.step(0.002, 1.33)
@@ -32,11 +32,11 @@ def test_found_where_the_body_has_gone(cell, update):
     a, b = carried.contact.gather(), standing.contact.gather()
     assert close(a["pressure"], b["pressure"], 1e-7)
     # Without the update the pairs would still be those of the start: that is refused, or said.
-    held = Slider(cell, law, start=0.4, n=n, update="never")
+    held = Slider(cell, law, start=0.4, n=n, update_pairs="never")
     held.step(-0.01, 1.33)
     with pytest.raises(fc.NotConverged, match="taken as small"):
         held.step(0.002, 1.33)
-    held.problem.kinematics = np.inf
+    held.problem.small_displacement_tolerance = np.inf
     with pytest.warns(UserWarning, match="taken as small"):
         held.step(0.002, 1.33)
     assert not close(held.contact.gather()["pressure"], b["pressure"], 1e-3)
@@ -102,13 +102,18 @@ def test_by_default_found_anew_once_points_slid_by_a_facet(condensation):
     ways = [0.0, 0.2, 0.3, 0.4, 0.5]
     made = {
         update: Slider(
-            "quadrilateral", law, start=0.8, update=update, condensation=condensation, n=(14, 4)
+            "quadrilateral",
+            law,
+            start=0.8,
+            update_pairs=update,
+            condensation=condensation,
+            n=(14, 4),
         )
         for update in ("never", "auto", "increment")
     }
     numbers, forces = {}, {}
     for update, slider in made.items():
-        slider.problem.kinematics = np.inf
+        slider.problem.small_displacement_tolerance = np.inf
         first = slider.contact.pairs.number
         numbers[update], forces[update] = [], []
         for way in ways:
@@ -126,11 +131,11 @@ def test_found_anew_where_the_field_lags():
     law = fc.Coulomb(0.3, k_n=K_N, k_t=K_N)
     forces = []
     for field in (True, False):
-        made = Slider("quadrilateral", law, start=0.8, update="auto", condensation=True)
+        made = Slider("quadrilateral", law, start=0.8, update_pairs="auto", condensation=True)
         steps = []
         for way in [0.0, 0.2, 0.3, 0.4]:
             made.move[-1].value, made.move[0].value = -0.002, way
-            steps.append(made.problem.solve(field=field))
+            steps.append(made.problem.solve(recover_interior=field))
             made.problem.commit()
         assert [step.complete for step in steps] == [True] * 4 if field else [False] * 3 + [True]
         assert made.contact.pairs.number > 1
@@ -142,4 +147,6 @@ def test_update_has_three_values():
     """Anything else is refused."""
     mesh, tags = two_blocks("triangle", (3, 4))
     assert mesh is not None
-    raised_everywhere(lambda: fc.DeformableBody(tags, LOWER, update="step"), ValueError, "update")
+    raised_everywhere(
+        lambda: fc.DeformableBody(tags, LOWER, update_pairs="step"), ValueError, "update_pairs"
+    )

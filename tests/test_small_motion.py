@@ -1,6 +1,6 @@
 """Displacements are taken as small: what that leaves out is told, warned of, and refused.
 
-The reference is the same scene with the other one moved: to drag the support is exact, since its
+The reference is the same scene with the other one moved: to drag the obstacle is exact, since its
 gap and normals are those of where it is; to drag the body as far the other way is not.
 """
 
@@ -24,20 +24,26 @@ RADIUS, DEPTH = 4.0, 0.05
 pytestmark = pytest.mark.mpi
 
 
-def pressed(cell="quadrilateral", *, body=0.0, support=0.0, kinematics=np.inf, **options):
+def pressed(
+    cell="quadrilateral", *, body=0.0, obstacle=0.0, small_displacement_tolerance=np.inf, **options
+):
     """A block on a cylinder or ball, pressed down by a prescribed way, one of them moved."""
     scene = block(cell, n=8 if cell == "quadrilateral" else 3, size=(2.0,) * options.pop("d", 2))
     d = scene.dim
     center = np.full(d, 1.0)
     center[-1] = -RADIUS
     motion = np.zeros(d)
-    motion[0] = support
+    motion[0] = obstacle
     ball = fc.Ball(center, RADIUS, displacement=motion)
     bcs = [scene.hold(TOP, d - 1, -DEPTH), scene.hold(TOP, 0, body)]
     if d == 3:
         bcs.append(scene.hold(TOP, 1))
     problem, contact = scene.problem(
-        fc.Frictionless(), bcs, contact={"support": ball}, kinematics=kinematics, **options
+        fc.Frictionless(),
+        bcs,
+        contact={"obstacle": ball},
+        small_displacement_tolerance=small_displacement_tolerance,
+        **options,
     )
     return problem, contact
 
@@ -53,16 +59,16 @@ def solved(**scene):
 @pytest.mark.parametrize("options", [{}, {"condensation": False, "method": "lbfgs"}])
 @pytest.mark.parametrize("way", [0.05, 0.2])
 def test_what_dragging_the_body_leaves_out_is_told(way, options):
-    """The estimate is of the size of the difference to the support dragged, within a half of it."""
+    """The estimate is the difference to the dragged obstacle, within a half of it."""
     told, dragged = solved(body=-way, **options)
-    nearly, exact = solved(support=way, **options)
+    nearly, exact = solved(obstacle=way, **options)
     missing = np.abs(dragged - exact).max() / np.linalg.norm(dragged)
     small = max(nearly.worst, told.force / 5)
     assert 0.5 * (missing - small) <= told.force <= 2 * (missing + small)
     assert missing > 0.005
 
 
-def test_a_flat_support_leaves_nothing_out():
+def test_a_flat_obstacle_leaves_nothing_out():
     """However far the body slides along it."""
     scene = block("quadrilateral", n=4, up=-10.0)
     problem, contact = scene.problem(fc.Coulomb(0.1), [scene.hold(TOP, 0, 30.0)])
@@ -90,7 +96,7 @@ def test_the_true_gap(cell):
 
 
 def test_motion_that_is_not_small_fails():
-    problem, contact = pressed(body=-1.0, kinematics=0.2)
+    problem, contact = pressed(body=-1.0, small_displacement_tolerance=0.2)
     with pytest.raises(fc.NotConverged, match="too large to be taken as small"):
         problem.solve()
     assert close(contact.history.rows(), 0 * contact.history.rows(), 0.0, scale=1.0)
@@ -111,13 +117,13 @@ def test_a_stiffness_in_other_units_fails(condensation):
 
     with pytest.raises(fc.NotConverged, match="times its size"):
         pushed(0.02)
-    assert pushed(0.02, kinematics=np.inf).verdict.deformation["the body"] > 10
+    assert pushed(0.02, small_displacement_tolerance=np.inf).verdict.deformation["the body"] > 10
     assert pushed(1e6, top=50.0).verdict.deformation["the body"] < 0.1
 
 
 def test_motion_that_is_hardly_small_is_warned_of_as_it_grows():
     """Once for each doubling; every summary has it."""
-    problem, _ = pressed(body=-0.2, kinematics=0.5)
+    problem, _ = pressed(body=-0.2, small_displacement_tolerance=0.5)
     with pytest.warns(UserWarning, match="taken as small") as caught:
         step = problem.solve()
     problem.commit()
@@ -129,7 +135,7 @@ def test_motion_that_is_hardly_small_is_warned_of_as_it_grows():
         problem.solve()
     first = step.verdict.kinematics["contact"].worst
     moved, said, shares = fem.Constant(problem.u.function_space.mesh, 0.0), [], []
-    problem, _ = pressed(body=moved, kinematics=np.inf)
+    problem, _ = pressed(body=moved, small_displacement_tolerance=np.inf)
     for way in np.linspace(0.0, -0.4, 9):
         moved.value = way
         with warnings.catch_warnings(record=True) as caught:
@@ -176,7 +182,7 @@ def test_the_verdict_is_that_of_the_turned_scene(angle):
         top.x.array[:] = np.tile(q @ [-0.05, -0.02], top.x.array.size // 2)
         nodes = fem.locate_dofs_topological(scene.u.function_space, 1, tags.find(TOP))
         problem, _ = scene.problem(
-            fc.Coulomb(0.2), [fem.dirichletbc(top, nodes)], contact={"support": ball}
+            fc.Coulomb(0.2), [fem.dirichletbc(top, nodes)], contact={"obstacle": ball}
         )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
@@ -189,7 +195,7 @@ def test_the_verdict_is_that_of_the_turned_scene(angle):
     assert found[1] == pytest.approx(found[0], rel=1e-5)
 
 
-# ---- a support whose displacement varies along Γc ------------------------------------------------
+# ---- an obstacle whose displacement varies along Γc ----------------------------------------------
 
 
 def tilted(angle, how):
@@ -212,7 +218,7 @@ def tilted(angle, how):
             floor = fc.RigidProfile(points[::-1], displacement=motion)
     bcs = [scene.hold(TOP, 0), scene.hold(TOP, 1)]
     problem, contact = scene.problem(
-        fc.Frictionless(), bcs, contact={"support": floor}, kinematics=np.inf
+        fc.Frictionless(), bcs, contact={"obstacle": floor}, small_displacement_tolerance=np.inf
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
@@ -249,9 +255,9 @@ def test_small_motion_is_no_matter():
 def test_an_obstacle_that_tells_no_distance():
     """A gap given as a number of its own is not looked at elsewhere; its normal is."""
     scene = block("quadrilateral", n=4, up=-10.0)
-    support = fc.Obstacle(0.0, (0.0, -1.0))
+    obstacle = fc.PrescribedGap(0.0, (0.0, -1.0))
     problem, contact = scene.problem(
-        fc.Frictionless(), scene.rollers(), contact={"support": support}
+        fc.Frictionless(), scene.rollers(), contact={"obstacle": obstacle}
     )
     assert problem.solve().verdict.kinematics["contact"].worst == 0.0
     gap, _ = contact.true_placement()
@@ -259,7 +265,7 @@ def test_an_obstacle_that_tells_no_distance():
 
 
 def test_the_error_budget_has_it():
-    """Its line for the normal force is the difference to the support dragged, within a third."""
+    """Its line for the normal force is the difference to the obstacle dragged, within a third."""
 
     def solved(**scene):
         problem, contact = pressed(**scene)
@@ -269,7 +275,7 @@ def test_the_error_budget_has_it():
         return problem, contact.resultants().normal_force
 
     problem, dragged = solved(body=-0.1)
-    _, exact = solved(support=0.1)
+    _, exact = solved(obstacle=0.1)
     plane = stress(problem.u, 1000.0, 0.3)
     told = fc.estimate_errors(problem, plane).parts["kinematics"]["normal force"]
     assert close(told, dragged - exact, 1 / 3)

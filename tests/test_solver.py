@@ -83,8 +83,8 @@ def test_a_block_far_above_its_floor(cell, condensation):
     found = []
     for gap in (0.0, 0.05, 0.5):
         scene = block(cell, 1, side=0.05, up=-1.0, n=4 if cell == "triangle" else 2)
-        support = fc.HalfSpace(scene.vector(up=-gap), scene.vector(up=1.0))
-        contact = scene.contact(fc.Coulomb(friction=0.3), support=support)
+        obstacle = fc.HalfSpace(scene.vector(up=-gap), scene.vector(up=1.0))
+        contact = scene.contact(fc.Coulomb(friction=0.3), obstacle=obstacle)
         problem = fc.ContactProblem(scene.F, scene.u, contacts=[contact], condensation=condensation)
         step = problem.solve()
         assert step.iterations <= 25
@@ -122,7 +122,7 @@ def test_a_block_above_a_floor_that_is_tilted(tilt):
     scene = block("triangle", 1, side=0.02, up=-1.0, n=4)
     normal = np.array([-np.sin(tilt), np.cos(tilt)])
     floor = fc.HalfSpace(np.array([float(tilt > 0), 0.0]) - 0.1 * normal, normal)
-    problem, contact = scene.problem(fc.Coulomb(friction=0.2), [], contact={"support": floor})
+    problem, contact = scene.problem(fc.Coulomb(friction=0.2), [], contact={"obstacle": floor})
     step = problem.solve()
     assert step.iterations <= 100
     assert close(contact.resultants().force, [-0.02, 1.0], 1e-8)
@@ -411,8 +411,8 @@ def test_methods_agree(cell, degree):
 def test_units_do_not_matter(method, law):
     """The same scene in N-mm, in SI and by factors of 1e-9: same iterations, same digits.
 
-    Stiffnesses by `Scaled`, so that the measured E/h is in it too. Tolerance 1e-9 of the fields:
-    the same iterations, with the round-off of other numbers.
+    Stiffnesses by `RelativeStiffness`, so that the measured E/h is in it too. Tolerance 1e-9 of
+    the fields: the same iterations, with the round-off of other numbers.
     """
     make = {"coulomb": fc.Coulomb(0.3), "frictionless": fc.Frictionless()}[law]
     path = PATH[:4] if law == "coulomb" else PATH[:1]

@@ -77,8 +77,8 @@ def test_springs_of_an_inclined_surface(cell, n, weight):
     contact = fc.Contact(
         u,
         fc.ContactSurface(mesh, tags, BOTTOM, **VERTEX),
-        fc.Obstacle(0.1, normal),
-        fc.Coulomb(0.3, k_n=fc.Springs(K_N), k_t=fc.Springs(K_T)),
+        fc.PrescribedGap(0.1, normal),
+        fc.Coulomb(0.3, k_n=fc.NodalSprings(K_N), k_t=fc.NodalSprings(K_T)),
         weight=None if weight == "none" else 3.0 + x[0] * x[1],
     )
     for shares, block_of_node in (((1, 0), K_N * along), ((0, 1), K_T * (np.eye(d) - along))):
@@ -115,7 +115,7 @@ def test_springs_between_two_bodies(cell):
         fem.Function(space),
         fc.ContactSurface(mesh, tags, LOWER, **VERTEX),
         fc.DeformableBody(tags, UPPER),
-        fc.Coulomb(0.3, k_n=fc.Springs(K_N), k_t=fc.Springs(K_T)),
+        fc.Coulomb(0.3, k_n=fc.NodalSprings(K_N), k_t=fc.NodalSprings(K_T)),
     )
     assert contact.n_unpaired == 0
     along = np.outer(q[:, -1], q[:, -1])
@@ -135,7 +135,7 @@ def test_springs_follow_their_parameters():
     mesh, tags = block_mesh("quadrilateral")
     u = fem.Function(displacement_space(mesh, 1))
     surface = fc.ContactSurface(mesh, tags, BOTTOM, **VERTEX)
-    law = fc.Frictionless(fc.Springs(K_N))
+    law = fc.Frictionless(fc.NodalSprings(K_N))
     contact = fc.Contact(u, surface, fc.HalfSpace((0, 0), (0, 1)), law, weight=2.0)
     contact.parameters["k_n"].value = 5.0
     contact.parameters["weight"].value = 11.0
@@ -150,13 +150,13 @@ def test_springs_follow_their_parameters():
 def test_springs_want_vertices():
     """Springs on a surface whose points are no vertices; springs of no stiffness."""
     scene = block()
-    for law in (fc.Frictionless(fc.Springs(1.0)), fc.Coulomb(0.3, k_t=fc.Springs(1.0))):
+    for law in (fc.Frictionless(fc.NodalSprings(1.0)), fc.Coulomb(0.3, k_t=fc.NodalSprings(1.0))):
         raised_everywhere(
             lambda law=law: scene.contact(law), ValueError, "contact", "'default'", "vertex"
         )
     for value in (0.0, -1.0, np.nan, np.inf, "stiff", None):
         raised_everywhere(
-            lambda value=value: fc.Springs(value), ValueError, repr(value), "greater than zero"
+            lambda value=value: fc.NodalSprings(value), ValueError, repr(value), "greater than zero"
         )
 
 
@@ -310,13 +310,13 @@ def test_a_foundation_that_lies_is_caught(what):
             """Those of the foundation."""
             return {"k_n": 50.0, "k_t": 20.0}
 
-        def response(self, kinematics, parameters):
+        def contact_traction(self, kinematics, parameters):
             """The foundation's, changed."""
-            r = super().response(kinematics, parameters)
+            r = super().contact_traction(kinematics, parameters)
             r_n, tau = r.normal_traction, r.traction
             if what == "pull":
                 r_n = ufl.min_value(r_n, 0.0)
-            return fc.Response(
+            return fc.ContactTraction(
                 1.01 * r_n if what == "normal" else r_n,
                 r.opening,
                 r.penetration,

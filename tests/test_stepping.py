@@ -81,7 +81,7 @@ def test_increments_that_numbers_cannot_tell_apart(start, end):
 def test_one_file_for_checkpoint_and_table(tmp_path):
     """Each would overwrite the other; nothing is written."""
     made, path = Rub(), shared_folder(tmp_path) / "state"
-    names = {"checkpoint": path, "history": path.parent / ".." / path.parent.name / "state"}
+    names = {"checkpoint": path, "csv": path.parent / ".." / path.parent.name / "state"}
     call = lambda: fc.increments(made.problem, made.load, **names)  # noqa: E731
     raised_everywhere(call, ValueError, "checkpoint and history are both")
     assert not path.exists()
@@ -146,15 +146,15 @@ def test_what_energy_leaves_out_vanishes_with_the_increments():
 
 
 @pytest.mark.parametrize("field", [True, False])
-def test_energy_of_a_driven_support(field):
+def test_energy_of_a_driven_obstacle(field):
     """A weight's work goes into the block and the springs: P²/2 (1/k_n + 1/E), all of it."""
     scene = block("quadrilateral", 1, n=2, nu=0.0)
     force = fem.Constant(scene.mesh, 0.0)
     floor = scene.floor(displacement=fc.Motion(force=(None, force)))
     bcs = [scene.hold(TOP, i) for i in range(2)]
-    problem, _ = scene.problem(fc.Frictionless(k_n=1e4), bcs, contact={"support": floor})
+    problem, _ = scene.problem(fc.Frictionless(k_n=1e4), bcs, contact={"obstacle": floor})
     force.value = 6.0
-    step = problem.solve(field=field)
+    step = problem.solve(recover_interior=field)
     assert close(step.energy.work, 18.0 * (1 / 1e4 + 1 / 1000), 1e-7)
     assert close(step.energy.springs, 18.0 / 1e4, 1e-7)
     assert close(step.energy.elastic, 18.0 / 1000, 1e-7)

@@ -14,7 +14,7 @@ COMM = MPI.COMM_WORLD
 def lagging(field, tmp_path=None, *, law=None, steps=8, **kwargs):
     """The history with the field found when ``field`` says."""
     made = Rub(law, cell="hexahedron", condensation=True)
-    options = {"steps": steps, "field": field} | kwargs
+    options = {"steps": steps, "recover_interior": field} | kwargs
     return made, list(fc.increments(made.problem, made.load, 0.0, 4.0, **options))
 
 
@@ -49,7 +49,7 @@ def test_field_on_request():
     for step in fc.increments(every.problem, every.load, 0.0, 4.0, steps=8):
         made = lazy.problem
         lazy.load(step.load)
-        assert not made.solve(field=False).complete
+        assert not made.solve(recover_interior=False).complete
         made.commit()
         status = lazy.contact.status.copy()
         assert np.array_equal(status, every.contact.status)
@@ -73,7 +73,7 @@ def stiffening(field: str) -> tuple[Rub, list[fc.Step]]:
         made.scene.E.value = 1000.0 * (1 + 0.2 * t)
         made.contact.parameters["k_n"].value = 2e4 * (1 + 0.2 * t)
 
-    return made, list(fc.increments(made.problem, load, 0.0, 2.0, steps=4, field=field))
+    return made, list(fc.increments(made.problem, load, 0.0, 2.0, steps=4, recover_interior=field))
 
 
 def test_field_left_behind_while_bulk_and_law_change():
@@ -98,13 +98,13 @@ def test_solution_dropped_with_the_bulk_it_was_found_with(last):
     for first, second in ((True, True), (False, last)):
         made = Rub(cell="triangle", condensation=True)
         made.load(1.0)
-        made.problem.solve(field=first)
+        made.problem.solve(recover_interior=first)
         made.problem.commit()
         made.load(1.5)
-        made.problem.solve(field=second)
+        made.problem.solve(recover_interior=second)
         made.scene.E.value *= 1.5
         made.load(2.0)
-        step = made.problem.solve(field=first)
+        step = made.problem.solve(recover_interior=first)
         made.problem.commit()
         made.problem.complete()
         states.append([made, step.energy])
@@ -125,7 +125,7 @@ def test_checkpoint_of_a_field_left_behind(tmp_path):
     folder = shared_folder(tmp_path)
     whole, _ = lagging("last", checkpoint=folder / "whole.npz", checkpoint_every=3)
     made = Rub(cell="hexahedron", condensation=True)
-    options = {"steps": 8, "field": "last", "checkpoint": folder / "part.npz"}
+    options = {"steps": 8, "recover_interior": "last", "checkpoint": folder / "part.npz"}
     options["checkpoint_every"] = 3
     for step in fc.increments(made.problem, made.load, 0.0, 4.0, **options):
         if step.increment == 5:
@@ -141,7 +141,11 @@ def test_a_failure_leaves_the_field_to_be_completed():
     every, lazy = Rub(cell="triangle", condensation=True), Rub(cell="triangle", condensation=True)
     limited(lazy, 0.6)
     for made in (every, lazy):
-        options = {"steps": [0.5, 4.0] if made is lazy else [0.5], "max_cuts": 0, "field": "last"}
+        options = {
+            "steps": [0.5, 4.0] if made is lazy else [0.5],
+            "max_cuts": 0,
+            "recover_interior": "last",
+        }
         history = fc.increments(made.problem, made.load, 0.0, options["steps"][-1], **options)
         if made is every:
             list(history)
@@ -159,13 +163,13 @@ def test_a_failure_leaves_what_was_solved_and_not_committed():
     for made in (every, lazy):
         for t in (0.5, 1.5):
             made.load(t)
-            made.problem.solve(field=made is every)
+            made.problem.solve(recover_interior=made is every)
             if t == 0.5:
                 made.problem.commit()
     pressure = lazy.contact.pressure.copy()
     lazy.push[-1].value = np.nan
     with pytest.raises(ValueError, match="finite"):
-        lazy.problem.solve(field=False)
+        lazy.problem.solve(recover_interior=False)
     assert np.array_equal(lazy.contact.pressure, pressure)
     lazy.load(1.5)
     lazy.problem.complete()
@@ -176,7 +180,7 @@ def test_a_field_that_is_wrong_is_refused(monkeypatch):
     """What is recovered is checked by the product with K, not by what recovered it."""
     made = Rub(cell="triangle", condensation=True)
     made.load(1.0)
-    made.problem.solve(field=False)
+    made.problem.solve(recover_interior=False)
     made.problem.commit()
     field = made.problem.solver.system.pending_field
     field[field != 0.0] *= 1.001
@@ -189,6 +193,6 @@ def test_wrong_field():
     made = Rub()
     for field in ("never", 0, 1.5):
         call = lambda field=field: list(  # noqa: E731
-            fc.increments(made.problem, made.load, field=field)
+            fc.increments(made.problem, made.load, recover_interior=field)
         )
         raised_everywhere(call, ValueError, "every")

@@ -19,7 +19,7 @@ from scenes.elasticity import displacement_space, hold
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
 INNER, MIDDLE, OUTER = 1.0, 1.5, 2.0
-TIE = fc.Foundation(fc.Scaled(10.0), fc.Scaled(10.0))
+TIE = fc.Foundation(fc.RelativeStiffness(10.0), fc.RelativeStiffness(10.0))
 
 
 def ring(n, inside, outside):

@@ -1,4 +1,4 @@
-"""Supports turned by a moment: the angle is unknown, the moment about the axis given."""
+"""Obstacles turned by a moment: the angle is unknown, the moment about the axis given."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PATH = [(0.0, -0.1, 0.0), (0.06, -0.1, 0.0), (0.1, -0.1, -8.0), (0.02, -0.1, 2.0
 
 
 def turned_by(contact, axis):
-    """Moment of the contact forces on the body about the axis of the support, as it is now."""
+    """Moment of the contact forces on the body about the axis of the obstacle, as it is now."""
     d = len(axis)
     motion = np.array(contact.values.shift[:1].sum(axis=0))
     motion = np.array([COMM.allreduce(float(v), op=MPI.SUM) for v in motion])
@@ -33,7 +33,7 @@ def turned_by(contact, axis):
     for i, constant in contact.free_motion.items():
         motion[i] += float(constant.value)
     found = contact.moment(np.asarray(axis) + motion)
-    return float(found @ contact.support.rotation.unit_axis(d)[-len(found) :])
+    return float(found @ contact.obstacle.rotation.unit_axis(d)[-len(found) :])
 
 
 def moment_of(tool):
@@ -51,7 +51,7 @@ def roll(tool, side, up, moment):
 
 
 def scene_of(cell, law, shape):
-    """A support that cuts into a block, pressed and turned by forces; all unknowns there are."""
+    """An obstacle that cuts into a block, pressed and turned by forces; all unknowns there are."""
     scene = rubber(cell, 2 if cell == "triangle" else 1, n=(4, 2), shuffled=True)
     d = scene.dim
     side, middle = (0.0,) * (d - 1), (0.0,) * (d - 1) + (scene.height + 0.7,)
@@ -59,12 +59,12 @@ def scene_of(cell, law, shape):
         "displacement": fc.Motion(force=(1.0,) + (None,) * (d - 1)),
         "rotation": fc.Rotation(None, (0.2,) * d, None if d == 2 else (1.0, 2.0, 3.0), moment=0.5),
     }
-    supports = {
+    obstacles = {
         "plane": fc.HalfSpace((*side, scene.height), (*((0.3,) * (d - 1)), -1.0), **move),
         "ball": fc.Ball(middle, 0.8, **move),
         "cylinder": fc.Cylinder(middle, 0.8, None if d == 2 else (0.2, 1, 0.1), **move),
     }
-    problem, contact = scene.problem(supports[shape], law, kinematics=np.inf)
+    problem, contact = scene.problem(obstacles[shape], law, small_displacement_tolerance=np.inf)
     return problem, contact
 
 
@@ -72,7 +72,7 @@ def difference(problem, contact, state, way):
     """Largest error of the tangent times a way, against central differences of forces; shares.
 
     Returns:
-        Of all rows, and of those of the support's unknowns, relative to the largest of each.
+        Of all rows, and of those of the obstacle's unknowns, relative to the largest of each.
     """
     operator, unknowns, step = problem.operators[0], problem.unknowns, 1e-6
 
@@ -334,7 +334,7 @@ def test_condensed_and_not():
     """A linear body, condensed onto what contact touches and the angle: the same, 1e-8."""
     found = []
     for condensation in (True, False):
-        solver = {"kinematics": np.inf, "condensation": condensation}
+        solver = {"small_displacement_tolerance": np.inf, "condensation": condensation}
         solver |= {} if condensation else {"method": "newton"}
         tool = Tool("hexahedron", driven=True, force=True, linear=True, solver=solver)
         for step in tool.increments(3.0):
@@ -351,7 +351,7 @@ HOW = {
         "force": True,
         "linear": True,
         "shape": "profile",
-        "solver": {"kinematics": np.inf},
+        "solver": {"small_displacement_tolerance": np.inf},
     },
 }
 
@@ -370,8 +370,8 @@ def test_a_file_of_another_axis_or_moment_is_refused(tmp_path):
     def make(about=(0.0, 1.8), angle=None, moment=None):
         scene = rubber("triangle", 1, n=(8, 4))
         turn = fc.Rotation(angle, about, moment=moment)
-        support = fc.Ball((0, 1.8), 0.8, displacement=(0, -0.05), rotation=turn)
-        return scene.problem(support, fc.Coulomb(0.3, 1e4, 1e4))[0]
+        obstacle = fc.Ball((0, 1.8), 0.8, displacement=(0, -0.05), rotation=turn)
+        return scene.problem(obstacle, fc.Coulomb(0.3, 1e4, 1e4))[0]
 
     for given, other in (({"angle": 0.0}, {"moment": 0.0}), ({"moment": 0.0}, {"angle": 0.0})):
         problem = make(**given)
@@ -382,7 +382,7 @@ def test_a_file_of_another_axis_or_moment_is_refused(tmp_path):
         changed = dict.fromkeys(given, 0.1)
         for again, word in (
             (make(**given, about=(0.1, 1.8)), "about"),
-            (make(**changed), "turn of" if "angle" in given else "free supports"),
+            (make(**changed), "turn of" if "angle" in given else "free obstacles"),
             (make(**other), "free motion"),
         ):
             raised_everywhere(lambda p=again: checkpoint.load(p, path), ValueError, word)
@@ -395,8 +395,8 @@ def test_a_file_of_another_direction_of_the_axis_is_refused(tmp_path):
     for axis in ((0, 1, 0), (0, 2, 0), (0, 1, 0.1)):
         scene = rubber("tetrahedron", 1, n=(1, 1))
         turn = fc.Rotation(0.0, (0, 0, 1.8), axis)
-        support = fc.Ball((0, 0, 1.8), 0.8, rotation=turn)
-        problems.append(scene.problem(support, fc.Frictionless(1e4))[0])
+        obstacle = fc.Ball((0, 0, 1.8), 0.8, rotation=turn)
+        problems.append(scene.problem(obstacle, fc.Frictionless(1e4))[0])
     checkpoint.save(problems[0], path)
     checkpoint.load(problems[1], path)
     raised_everywhere(lambda: checkpoint.load(problems[2], path), ValueError, "axis")
@@ -440,9 +440,9 @@ def test_a_turn_of_more_than_a_right_angle_is_no_trial():
 def test_nothing_holds_a_smooth_roller():
     """Without friction no force on a disc has a moment about its middle."""
     scene = rubber(n=(4, 2))
-    support = disc(scene, RADIUS, displacement=(0, -0.1), moment=0.0)
+    obstacle = disc(scene, RADIUS, displacement=(0, -0.1), moment=0.0)
     raised_everywhere(
-        lambda: scene.problem(support, fc.Frictionless(1e4)), ValueError, "rotation about its axis"
+        lambda: scene.problem(obstacle, fc.Frictionless(1e4)), ValueError, "rotation about its axis"
     )
 
 

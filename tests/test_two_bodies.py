@@ -209,7 +209,7 @@ def test_shrink_fit() -> None:
         u,
         fc.ContactSurface(mesh, tags, 1),
         fc.DeformableBody(tags, 2),
-        fc.Frictionless(k_n=fc.Scaled(30)),
+        fc.Frictionless(k_n=fc.RelativeStiffness(30)),
         gap=-0.02,
     )
     problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
@@ -240,8 +240,8 @@ def test_a_coarse_surface_presses_on_all_of_a_fine_one(kinematics, fine) -> None
         bcs = [hold(u, tags, BOTTOM, i) for i in range(2)]
         bcs += [hold(u, tags, TOP, i, value) for i, value in enumerate((side, down))]
         law = fc.Coulomb(0.3, k_n=10 * E, k_t=10 * E)
-        surface, support = fc.ContactSurface(mesh, tags, own), fc.DeformableBody(tags, other)
-        contact = fc.Contact(u, surface, support, law, kinematics=kinematics)
+        surface, obstacle = fc.ContactSurface(mesh, tags, own), fc.DeformableBody(tags, other)
+        contact = fc.Contact(u, surface, obstacle, law, kinematics=kinematics)
         F = residual(u, ufl.TestFunction(u.function_space), E, 0.3)
         problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
         for depth in (0.05, 0.1):
@@ -363,9 +363,9 @@ def _pressed_by(cell, times, *, degree=1, own=LOWER, kinematics="finite", given=
     bcs = [hold(u, tags, tag, i) for tag in (BOTTOM, TOP) for i in range(d - 1)]
     bcs += [hold(u, tags, BOTTOM, d - 1), hold(u, tags, TOP, d - 1, down)]
     surface = fc.ContactSurface(mesh, tags, own, quadrature_degree=given)
-    support = fc.DeformableBody(tags, {LOWER: UPPER, UPPER: LOWER}.get(own, own))
+    obstacle = fc.DeformableBody(tags, {LOWER: UPPER, UPPER: LOWER}.get(own, own))
     law = fc.Frictionless(k_n=10 * E)
-    contact = fc.Contact(u, surface, support, law, kinematics=kinematics)
+    contact = fc.Contact(u, surface, obstacle, law, kinematics=kinematics)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         F = residual(u, ufl.TestFunction(u.function_space), E, 0.3)
@@ -424,8 +424,8 @@ def test_facets_over_which_the_opposite_ends_are_warned_of(cell, n, width) -> No
         down = fem.Constant(mesh, -0.02)
         bcs += [hold(u, tags, BOTTOM, d - 1), hold(u, tags, TOP, d - 1, down)]
         surface = fc.ContactSurface(mesh, tags, own, quadrature_degree=degree)
-        support, law = fc.DeformableBody(tags, other), fc.Frictionless(k_n=10 * E)
-        contact = fc.Contact(u, surface, support, law, kinematics="finite")
+        obstacle, law = fc.DeformableBody(tags, other), fc.Frictionless(k_n=10 * E)
+        contact = fc.Contact(u, surface, obstacle, law, kinematics="finite")
         F = residual(u, ufl.TestFunction(u.function_space), E, 0.3)
         problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
         with warnings.catch_warnings(record=True) as caught:
@@ -554,7 +554,7 @@ def test_scaled_stiffness_is_by_the_softer_body(cell, contrast, swap) -> None:
     modulus.interpolate(lambda x: np.where(x[d - 1] > 0.5, E, contrast * E))
     v = ufl.TestFunction(u.function_space)
     own, other = (LOWER, UPPER) if swap else (UPPER, LOWER)
-    law = fc.Frictionless(k_n=fc.Scaled(3.0))
+    law = fc.Frictionless(k_n=fc.RelativeStiffness(3.0))
     contact = fc.Contact(u, fc.ContactSurface(mesh, tags, own), fc.DeformableBody(tags, other), law)
     bcs = [hold(u, tags, tag, i) for tag in (BOTTOM, TOP) for i in range(d)]
     fc.ContactProblem(residual(u, v, modulus, 0.3), u, bcs=bcs, contacts=[contact])

@@ -25,9 +25,9 @@ class Changed(fc.Coulomb):
         """Those of Coulomb's law."""
         return {"friction": self.friction, "k_n": self.k_n, "k_t": self.k_t}
 
-    def response(self, kinematics, parameters):
+    def contact_traction(self, kinematics, parameters):
         """Coulomb's, with one entry changed."""
-        r = super().response(kinematics, parameters)
+        r = super().contact_traction(kinematics, parameters)
         parts = {name: getattr(r, name) for name in r.__dataclass_fields__}
         if self.what == "cone":
             parts["traction"] = 1.01 * r.traction
@@ -43,7 +43,7 @@ class Changed(fc.Coulomb):
             parts["slip"] = tuple(2 * s for s in r.slip)
         elif self.what == "direction":
             parts["traction"] = -r.traction
-        return fc.Response(**parts)
+        return fc.ContactTraction(**parts)
 
 
 def test_the_changed_law_is_sound_when_nothing_is_changed():
@@ -114,13 +114,13 @@ def test_forces_by_a_second_route(factor, condensation):
 
     What the solver, the laws and the sums of forces make of it agrees, within their tolerances.
     """
-    made = Rub(second_route=True, condensation=condensation)
+    made = Rub(cross_check=True, condensation=condensation)
     made.contact.pairs.own_map.scale(factor)
     made.move(*PATH[1])
     if factor == 1.0:
         steps = walk(made)
-        assert all(step.verdict.routes["contact"].holds() for step in steps)
-        assert all(step.verdict.routes["contact"].force > 0 for step in steps)
+        assert all(step.verdict.cross_check["contact"].holds() for step in steps)
+        assert all(step.verdict.cross_check["contact"].force > 0 for step in steps)
         return
     with pytest.raises(fc.NotConverged) as caught:
         made.problem.solve()

@@ -140,7 +140,7 @@ def test_values_of_the_points(cell, tmp_path):
     """At the points what the contact has; in facets nothing beyond their points, and the force."""
     folder, d = shared_folder(tmp_path), dimension(cell)
     made = Rub(cell=cell, degree=2, mesh={"n": 3})
-    made.problem.kinematics = np.inf
+    made.problem.small_displacement_tolerance = np.inf
     writer = fc.Writer(folder, made.problem)
     for step in fc.increments(made.problem, made.load, 0, 2, steps=2):
         writer.write(step)
@@ -337,9 +337,9 @@ def test_a_field_that_is_behind(tmp_path):
     grids = []
     for name, field in (("every", "every"), ("last", "last")):
         made = Rub(condensation=True)
-        made.problem.kinematics = np.inf
+        made.problem.small_displacement_tolerance = np.inf
         writer = fc.Writer(folder / name, made.problem)
-        for step in fc.increments(made.problem, made.load, 0, 1, steps=2, field=field):
+        for step in fc.increments(made.problem, made.load, 0, 1, steps=2, recover_interior=field):
             if step.increment == 1:
                 assert step.complete == (field == "every")
                 writer.write(step)

@@ -284,13 +284,13 @@ def rubbed(
     law |= {"k_t": ["number", 4 * kappa * soft], "friction": mu} if mu else {}
     upper, lower = {"body": 1, "side": "bottom"}, {"body": 0, "side": "top"}
     here, there = (upper, lower) if own == UPPER else (lower, upper)
-    support = {"kind": "body", "update": "never"} | there
+    obstacle = {"kind": "body", "update": "never"} | there
     slab = {"origin": [0.0, 0.0], "size": [2.0, 1.0], "n": [n[0], 2], "E": moduli[0], "jitter": 0}
     block = {"origin": [0.6, 1.0], "size": [0.8, 0.5], "n": [n[1], 2], "E": moduli[1], "jitter": 0}
     still = {"normal": 1.0, "across": 0.0, "spin": 0.0, "steps": steps}
     scene = {"kinematics": "present", "bulk": bulk, "layout": "two", "cell": "quadrilateral"}
     scene |= {"degree": 1, "nu": NU, "bodies": [slab, block], "units": [1.0, 1.0]}
-    scene |= {"drive": "prescribed", "contacts": [here | {"support": support, "law": law}]}
+    scene |= {"drive": "prescribed", "contacts": [here | {"obstacle": obstacle, "law": law}]}
     scene |= {"holds": [[0, "bottom", [0, 1], "still"], [1, "top", [0, 1], "moved"]]}
     scene |= {"strain": 0.1, "share": 1.0, "bend": [0.0, 0.1]}
     scene |= {"stages": [still | {"side": 0.0, "turn": 0.0}, still | {"side": 0.1, "turn": 0.05}]}

@@ -99,11 +99,11 @@ def turned_with_all(steps: int, angle: float = 2 * np.pi) -> Solve:
 def over_facets(n: int, steps: int, way: float) -> Solve:
     """A block dragged under a plane of n facets, by a way: the plane in one piece."""
 
-    def force(method: str, support: Any) -> tuple[list[fc.Step], Array]:
+    def force(method: str, obstacle: Any) -> tuple[list[fc.Step], Array]:
         scene = rubber(n=(8, 4))
         shift = fem.Constant(scene.mesh, np.zeros(2))
         options = {"method": method, "petsc_options": TIGHT}
-        problem, contact = scene.problem(support(shift), fc.Coulomb(0.3, 1e4, 1e4), **options)
+        problem, contact = scene.problem(obstacle(shift), fc.Coulomb(0.3, 1e4, 1e4), **options)
 
         def press(t: float) -> None:
             shift.value[:] = 0.0, -0.05 * t
@@ -134,14 +134,14 @@ def over_facets(n: int, steps: int, way: float) -> Solve:
 def over_drum(n: int, steps: int, angle: float) -> Solve:
     """A drum of n facets turned under pressure: the force of one that is round."""
 
-    def force(method: str, support: Any) -> tuple[list[fc.Step], Array]:
+    def force(method: str, obstacle: Any) -> tuple[list[fc.Step], Array]:
         scene = rubber(n=(12, 6))
         shift, turn = fem.Constant(scene.mesh, np.zeros(2)), fem.Constant(scene.mesh, 0.0)
         centre = (0.0, scene.height + RADIUS)
         move = {"displacement": shift, "rotation": fc.Rotation(turn, centre)}
         options = {"method": method, "petsc_options": TIGHT}
         law = fc.Coulomb(0.3, 1e4, 1e4)
-        problem, contact = scene.problem(support(centre, move), law, **options)
+        problem, contact = scene.problem(obstacle(centre, move), law, **options)
 
         def press(t: float) -> None:
             shift.value[1] = -DEPTH * t
@@ -270,16 +270,16 @@ def rubbed(kappa: float, mu: float, bulk: str = "rubber", steps: int = 2, **chan
     law: dict[str, Any] = {"kind": "coulomb" if mu else "frictionless"}
     law |= {"k_n": ["number", 4 * kappa]} | ({"k_t": ["number", 4 * kappa]} if mu else {})
     law |= {"friction": mu} if mu else {}
-    support = {"kind": "ball", "clearance": 0.0, "radius": 1.0, "moving": "displacement"}
-    support |= {"turn": "middle"}
+    obstacle = {"kind": "ball", "clearance": 0.0, "radius": 1.0, "moving": "displacement"}
+    obstacle |= {"turn": "middle"}
     body = {"origin": [0.0, 0.0], "size": [1.0, 1.0], "n": [6, 4], "E": E, "jitter": 0}
     stages = [
         {"steps": steps, "normal": 1.0, "side": 0.0, "across": 0.0, "turn": 0.0},
         {"steps": steps, "normal": 1.0, "side": 0.05, "across": 0.0, "turn": 0.3},
     ]
     scene = {"kinematics": "finite", "bulk": bulk, "layout": "floor", "cell": "quadrilateral"}
-    scene |= {"degree": 1, "nu": NU, "bodies": [body], "units": [1.0, 1.0], "drive": "support"}
-    scene |= {"contacts": [{"body": 0, "side": "bottom", "support": support, "law": law}]}
+    scene |= {"degree": 1, "nu": NU, "bodies": [body], "units": [1.0, 1.0], "drive": "obstacle"}
+    scene |= {"contacts": [{"body": 0, "side": "bottom", "obstacle": obstacle, "law": law}]}
     scene |= {"holds": [[0, "top", [0, 1], "still"]], "strain": 0.1, "share": 1.0}
     scene |= {"stages": stages} | change
 

@@ -96,10 +96,10 @@ class Block:
         return [self.hold(TOP, 0, aside), *across, self.hold(TOP, self.d - 1, -down)]
 
     def problem(
-        self, law: Any, support: Any, bcs: list[fem.DirichletBC], **options: Any
+        self, law: Any, obstacle: Any, bcs: list[fem.DirichletBC], **options: Any
     ) -> fc.ContactProblem:
         """The problem with one contact."""
-        self.contact = fc.Contact(self.u, self.surface, support, law)
+        self.contact = fc.Contact(self.u, self.surface, obstacle, law)
         return fc.ContactProblem(self.F, self.u, bcs=bcs, contacts=[self.contact], **options)
 
     def floor(self, gap: float = 0.0) -> fc.HalfSpace:
@@ -142,7 +142,7 @@ def difference(f: fem.Function, g: fem.Function) -> float:
     return error / size if size else error
 
 
-# ---- a block on a rigid support ------------------------------------------------------------------
+# ---- a block on a rigid obstacle -----------------------------------------------------------------
 
 
 def friction_law(mu: float, k_n: Any, k_t: Any = None) -> Any:
@@ -223,7 +223,7 @@ def dragged(
         body = Block(**block)
         length = body.size[0]
         bcs = body.moved(aside * length, down * length)
-        law = friction_law(mu, fc.Scaled(kappa), fc.Scaled(kappa * ratio))
+        law = friction_law(mu, fc.RelativeStiffness(kappa), fc.RelativeStiffness(kappa * ratio))
         problem = body.problem(law, body.cushion(), bcs, method=method, **options)
         return [problem.solve()], body
 
@@ -305,7 +305,9 @@ def cycle(path: list[tuple[float, float]], mu: float = 0.3) -> Solve:
         body = Block()
         move = [fem.Constant(body.mesh, 0.0) for _ in range(2)]
         bcs = [body.hold(TOP, i, c) for i, c in enumerate(move)]
-        problem = body.problem(friction_law(mu, fc.Scaled(10)), body.floor(), bcs, method=method)
+        problem = body.problem(
+            friction_law(mu, fc.RelativeStiffness(10)), body.floor(), bcs, method=method
+        )
         steps = []
         for aside, down in [path[0], *path, path[0]]:
             move[0].value, move[1].value = aside, -down
@@ -326,7 +328,9 @@ def loaded(side: float, up: float, mu: float, bcs: str, n: Sequence[int] = (8, 8
     def solve(method: str) -> tuple[list[fc.Step], float]:
         body = Block(n=n)
         held = {"free": [], "sides": body.rollers()}[bcs]
-        problem = body.problem(friction_law(mu, fc.Scaled(10)), body.floor(), held, method=method)
+        problem = body.problem(
+            friction_law(mu, fc.RelativeStiffness(10)), body.floor(), held, method=method
+        )
         body.traction.value[0], body.traction.value[-1] = side, up
         step = problem.solve()
         wanted = -body.traction.value
@@ -418,9 +422,9 @@ class Pair:
             options: Of the problem.
         """
         a, x = self.length, self.body.x
-        support = fc.DeformableBody(self.body.tags, OPPOSITE)
+        obstacle = fc.DeformableBody(self.body.tags, OPPOSITE)
         gap = (x[0] - 0.5 * a) ** 2 / (4.0 * a) if curved else None
-        contact = fc.Contact(self.u, self.surface, support, law, gap=gap)
+        contact = fc.Contact(self.u, self.surface, obstacle, law, gap=gap)
         return fc.ContactProblem(
             self.body.F, self.u, bcs=self.body.bcs, contacts=[contact], **options
         )
@@ -524,9 +528,9 @@ def hertz(kappa: float, *, enforcement: str = "penalty") -> tuple[Solve, float]:
         body.hold(LEFT, 0)
         roller = fc.Motion(force=(None, -force / 2))
         gap = body.x[0] ** 2 / (2 * radius)
-        support = fc.Obstacle(gap, (0.0, 1.0), displacement=roller)
+        obstacle = fc.PrescribedGap(gap, (0.0, 1.0), displacement=roller)
         law = fc.Frictionless(k_n)
-        contact = body.contact(FRONT, support, law, enforcement=enforcement)
+        contact = body.contact(FRONT, obstacle, law, enforcement=enforcement)
         problem = body.problem(contact, method=method)
         step = problem.solve()
         return [step], abs(step.contacts["contact"].max_pressure / peak - 1)
@@ -568,8 +572,8 @@ def ranked(
         both.body.hold(OPPOSITE, 0, 1)
         both.body.hold(BOTTOM, 0, value=0.02)
         both.body.hold(BOTTOM, 1, value=0.03)
-        support = fc.Ball((0.5, 2.5), 2.0)
-        contact = fc.Contact(both.u, both.surface, support, law)
+        obstacle = fc.Ball((0.5, 2.5), 2.0)
+        contact = fc.Contact(both.u, both.surface, obstacle, law)
         problem = fc.ContactProblem(
             both.body.F, both.u, bcs=both.body.bcs, contacts=[contact], method=method
         )

@@ -293,7 +293,7 @@ def against_hertz() -> Iterator[Trial]:
 
 
 def finite_kinematics() -> Iterator[Trial]:
-    """Supports that move and turn by any amount, linear bodies and rubber."""
+    """Obstacles that move and turn by any amount, linear bodies and rubber."""
     alone = ("newton",)  # of rubber
     moment, again = "moment of friction at all points, exact", "the tractions before"
     name = "finite kinematics, a disc turned, in increments"

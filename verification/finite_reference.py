@@ -56,8 +56,8 @@ _ROUNDS = 400
 
 
 def shape_of(scene: dict[str, Any], contact: dict[str, Any]) -> Shape:
-    """The shape of a support by closed formulas, or by brute force over its data."""
-    given, where = contact["support"], finite_scenes.place_of(scene, contact)
+    """The shape of an obstacle by closed formulas, or by brute force over its data."""
+    given, where = contact["obstacle"], finite_scenes.place_of(scene, contact)
     kind, d = given["kind"], len(scene["bodies"][0]["size"])
     if contact["side"] == "right" or kind == "halfspace":
         normal = where["normal"]
@@ -189,14 +189,14 @@ def _convex(corners: Array) -> Shape:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a support is: x = R (z - about) + about + shift, from places z where it began."""
+    """Where an obstacle is: x = R (z - about) + about + shift, from places z where it began."""
 
     turn: Array
     about: Array
     shift: Array
 
     def into(self, x: Array) -> Array:
-        """Places in the frame of the support."""
+        """Places in the frame of the obstacle."""
         return (x - self.about - self.shift) @ self.turn + self.about
 
     def out(self, z: Array) -> Array:
@@ -206,10 +206,10 @@ class Pose:
 
 @dataclass(eq=False)
 class FiniteState(reference.State):
-    """History of points; places and vectors in the frame of the support.
+    """History of points; places and vectors in the frame of the obstacle.
 
     Attributes:
-        jump: The closest point of the support, (n, d) (length).
+        jump: The closest point of the obstacle, (n, d) (length).
         traction: τ, or with multipliers λ_t.
         normal: n that it is across.
     """
@@ -219,10 +219,10 @@ class FiniteState(reference.State):
 
 @dataclass(eq=False)
 class FiniteContact(reference.ContactModel):
-    """Γc on a rigid support, at places X + u.
+    """Γc on a rigid obstacle, at places X + u.
 
     Attributes:
-        shape: Of the support where it began.
+        shape: Of the obstacle where it began.
         about: A point of the axis of its turn.
         axis: Direction of that in space; None in the plane.
         turns: Whether it turns.
@@ -234,7 +234,7 @@ class FiniteContact(reference.ContactModel):
     turns: bool = False
 
     def pose(self, shift: Array, angle: float) -> Pose:
-        """Where the support is."""
+        """Where the obstacle is."""
         if not self.turns:
             return Pose(np.eye(self.d), np.zeros(self.d), shift)
         if self.d == 2:
@@ -249,7 +249,7 @@ class FiniteContact(reference.ContactModel):
         return shift.out(self.spine)
 
     def start(self) -> FiniteState:
-        """No traction, on the support where it began."""
+        """No traction, on the obstacle where it began."""
         distance, normal = self.shape(self.x)
         zero = np.zeros_like(self.x)
         pressure = None if self.project is None else np.zeros(len(zero))
@@ -278,7 +278,7 @@ class FiniteContact(reference.ContactModel):
         return found | {"turn": pose.turn}
 
     def seen_from(self, x: Array, pose: Pose) -> tuple[Array, Array]:
-        """Distance of places from the support, and its normal there."""
+        """Distance of places from the obstacle, and its normal there."""
         distance, inward = self.shape(pose.into(x))
         return distance, inward @ pose.turn.T
 
@@ -325,7 +325,7 @@ def _turned(vector: Array, before: Array, now: Array) -> Array:
 
 @dataclass(eq=False)
 class FiniteLoad(reference.Load):
-    """What drives an increment, the turn of the supports too.
+    """What drives an increment, the turn of the obstacles too.
 
     Attributes:
         angle: Radians.
@@ -337,7 +337,7 @@ class FiniteLoad(reference.Load):
 
 @dataclass(eq=False)
 class FiniteProblem(reference.Problem):
-    """A body that may be nonlinear, and contacts on supports that move and turn.
+    """A body that may be nonlinear, and contacts on obstacles that move and turn.
 
     Attributes:
         bulk: Function of u: internal forces (N,), their derivative (N, N), and whether no cell is
@@ -355,12 +355,12 @@ class FiniteProblem(reference.Problem):
         return self.bulk(u)[1]
 
     def shifts(self, load: Any, motion: Array) -> list[Any]:
-        """Places of the supports."""
+        """Places of the obstacles."""
         moved = super().shifts(load, motion)
         return [c.pose(s, load.angle) for c, s in zip(self.contacts, moved, strict=True)]
 
     def residual(self, u: Array, load: Any, found: list[dict]) -> tuple[Array, Array]:
-        """Internal forces - f - contact, and force on supports not balanced."""
+        """Internal forces - f - contact, and force on obstacles not balanced."""
         total = self.bulk(u)[0] - load.force - sum(self.contact_force(found))
         motion = [
             (self.contacts[c].weights @ found[c]["traction"])[i] - load.pushes[c][i]
@@ -550,7 +550,7 @@ class FiniteProblem(reference.Problem):
             blocks *= model.weights[:, None, None]
             felt = np.einsum("qij,qjn->qin", blocks, left.reshape(len(jump), d, -1))
             matrix -= left.T @ felt.reshape(left.shape)
-            for k, (o, i) in enumerate(free):  # the history moves along with the support
+            for k, (o, i) in enumerate(free):  # the history moves along with the obstacle
                 if o == c and not closed:
                     ends = []
                     for s in (1, -1):
@@ -634,7 +634,7 @@ def loads_of(made: Any) -> Callable[[int, float], FiniteLoad]:
         dofs = np.unique(np.concatenate([bc.dof_indices()[0] for bc in made.bcs]))
         shifts, pushes = [], []
         for contact in scene["contacts"]:
-            moving, free = contact["support"].get("moving"), contact["support"].get("free", ())
+            moving, free = contact["obstacle"].get("moving"), contact["obstacle"].get("free", ())
             shift, push = np.zeros(d), np.zeros(d)
             if moving == "displacement":
                 shift = made.shift.value.copy()
@@ -659,7 +659,7 @@ def loads_of(made: Any) -> Callable[[int, float], FiniteLoad]:
 class FiniteJudge(fuzz_judge.Judge):
     """Takes the package's increments one by one; see `fuzz_judge.Judge`.
 
-    Energies are not made anew. With friction, rubber or curved supports an increment may have
+    Energies are not made anew. With friction, rubber or curved obstacles an increment may have
     several solutions: one that differs from that found apart is "another".
     """
 
@@ -686,9 +686,9 @@ class FiniteJudge(fuzz_judge.Judge):
         return FiniteState(old.jump, traction, record["lambda_n"][row], None, normal)
 
     def _bulges(self, given: dict[str, Any]) -> float:
-        """A round support rises into a facet by L² / 8 R."""
+        """A round obstacle rises into a facet by L² / 8 R."""
         bulges = super()._bulges(given)
-        if given["support"]["kind"] in ("body", "rod"):
+        if given["obstacle"]["kind"] in ("body", "rod"):
             return bulges
         body = self.scene["bodies"][given["body"]]
         radius = finite_scenes.place_of(self.scene, given).get("radius", np.inf)
@@ -704,7 +704,7 @@ class FiniteJudge(fuzz_judge.Judge):
 
     def _unique(self) -> bool:
         plain = all(c.law.unique and not c.free for c in self.problem.contacts)
-        flat = all(c["support"]["kind"] == "halfspace" for c in self.scene["contacts"])
+        flat = all(c["obstacle"]["kind"] == "halfspace" for c in self.scene["contacts"])
         return plain and flat and self.scene["bulk"] == "linear" and not self._slips()
 
     def _slips(self) -> bool:

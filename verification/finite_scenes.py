@@ -1,8 +1,8 @@
-"""Random scenes with finite kinematics: one body on rigid supports that move and turn.
+"""Random scenes with finite kinematics: one body on rigid obstacles that move and turn.
 
 As in `fuzz_scenes`, whose mesh, loads and history they share, a scene is a dictionary of numbers
 that is played again as it is. It says ``"kinematics": "finite"``, its contacts lie below the body
-(and at its right), and its stages turn the support below as well.
+(and at its right), and its stages turn the obstacle below as well.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ KINDS = (
 )
 # Of the quadrature of the nonlinear bulk, the same for both solutions.
 DEGREE = 4
-# Supports that turn about their middle without pressing more.
+# Obstacles that turn about their middle without pressing more.
 _ROUND = ("ball", "cylinder", "ball inside", "cylinder inside")
 
 
@@ -64,7 +64,7 @@ def draw(
     body = {"origin": [0.0] * d, "size": [within(0.7, 1.6) for _ in range(d)], "n": n}
     body |= {"E": log(2, 4), "jitter": jitter}
     bulk = "rubber" if chance(0.5, "rubber") else "linear"
-    drive = pick("prescribed", "prescribed", "support", "support", "force")
+    drive = pick("prescribed", "prescribed", "obstacle", "obstacle", "force")
     law_kind = pick("frictionless", "frictionless", *["coulomb"] * 5, "tresca", "tension")
     if space and chance(0.3):
         law_kind = pick("polygon", "ellipse")
@@ -83,8 +83,8 @@ def draw(
             made |= {"transverse": pick(0.1, 0.3, 0.7, of=rng), "direction": [1.0, 0.4, 0.1]}
         return made
 
-    def contact(side: str, support: Scene) -> Scene:
-        made: Scene = {"body": 0, "side": side, "support": support, "law": law()}
+    def contact(side: str, obstacle: Scene) -> Scene:
+        made: Scene = {"body": 0, "side": side, "obstacle": obstacle, "law": law()}
         if chance(0.15):
             made["scheme"] = "vertex"
         elif chance(0.15):
@@ -95,38 +95,38 @@ def draw(
             made["accuracy"] = pick("draft", "standard", 1e-4)
         return made
 
-    support: Scene = {"kind": kind, "clearance": 0.0, "radius": log(-0.3, 0.7)}
+    obstacle: Scene = {"kind": kind, "clearance": 0.0, "radius": log(-0.3, 0.7)}
     if chance(0.3, of=rng):
-        support["clearance"] = float(f"{rng.uniform(-0.3, 2) * strain:.3g}")
+        obstacle["clearance"] = float(f"{rng.uniform(-0.3, 2) * strain:.3g}")
     if kind == "halfspace" and chance(0.3, of=rng):
-        support["slope"] = pick(0.1, -0.2, of=rng)
+        obstacle["slope"] = pick(0.1, -0.2, of=rng)
     if "cylinder" in kind and space and chance(0.5, of=rng):
-        support["axis"] = [0.2, 1.0, 0.1]
+        obstacle["axis"] = [0.2, 1.0, 0.1]
     if kind in ("profile", "turned profile"):
-        support["points"] = pick(24, 40, 90, of=rng)
-        support["flat"] = within(0.6, 1.0)
+        obstacle["points"] = pick(24, 40, 90, of=rng)
+        obstacle["flat"] = within(0.6, 1.0)
     if kind == "facets":
-        support["points"] = pick(12, 24, 60, of=rng)
+        obstacle["points"] = pick(12, 24, 60, of=rng)
     turns = chance(0.6, "turn")
     if turns:
-        support["turn"] = "middle" if kind in _ROUND and chance(0.6, of=rng) else "aside"
+        obstacle["turn"] = "middle" if kind in _ROUND and chance(0.6, of=rng) else "aside"
         if space:
-            support["about"] = pick([0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.3, 1.0, 0.2], of=rng)
+            obstacle["about"] = pick([0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.3, 1.0, 0.2], of=rng)
             if drive != "force" and chance(0.2, of=rng):
-                support["about"] = [0.0, 0.0, 1.0]
-    if drive == "support":
-        support["moving"] = "displacement"
+                obstacle["about"] = [0.0, 0.0, 1.0]
+    if drive == "obstacle":
+        obstacle["moving"] = "displacement"
         if chance(0.35, "motion"):
-            support["moving"], support["free"] = "force", [d - 1]
+            obstacle["moving"], obstacle["free"] = "force", [d - 1]
     elif chance(0.3):
-        support["moving"] = "displacement"  # aside, while the body is pressed
-    contacts = [contact("bottom", support)]
+        obstacle["moving"] = "displacement"  # aside, while the body is pressed
+    contacts = [contact("bottom", obstacle)]
     if chance(0.1, "corner") and drive != "force":
         contacts.append(contact("right", {"kind": "halfspace", "clearance": 0.3 * strain}))
     for wall in contacts[1:]:
-        wall["support"]["moving"] = support.get("moving") and "displacement"
-        if not wall["support"]["moving"]:
-            wall["support"].pop("moving")
+        wall["obstacle"]["moving"] = obstacle.get("moving") and "displacement"
+        if not wall["obstacle"]["moving"]:
+            wall["obstacle"].pop("moving")
 
     whole = list(range(d))
     holds: list[list[Any]] = [[0, "top", whole, "moved" if drive == "prescribed" else "still"]]
@@ -136,9 +136,9 @@ def draw(
     # Stages: strain at their end, ways aside in widths of the body, angle in radians.
     far = pick(strain, strain, 0.1, 0.4, of=rng)
     most_turned = 0.5 * strain
-    if turns and support["turn"] == "middle":
+    if turns and obstacle["turn"] == "middle":
         most_turned = pick(0.3, 1.5, 6.3, of=rng)
-    elif turns and support.get("about") == [0.0, 0.0, 1.0]:
+    elif turns and obstacle.get("about") == [0.0, 0.0, 1.0]:
         most_turned = pick(0.3, 1.0, of=rng)
     stages, angle = [], 0.0
     for name in pick(
@@ -217,12 +217,12 @@ def draw(
     return scene | draw_form(seed, family, without)
 
 
-# ---- supports ------------------------------------------------------------------------------------
+# ---- obstacles -----------------------------------------------------------------------------------
 
 
 def place_of(scene: Scene, contact: Scene) -> dict[str, Any]:
-    """Numbers of a support where it begins, in units of length."""
-    body, given = scene["bodies"][contact.get("body", 0)], contact["support"]
+    """Numbers of an obstacle where it begins, in units of length."""
+    body, given = scene["bodies"][contact.get("body", 0)], contact["obstacle"]
     length, d = scene["units"][0], len(body["size"])
     if given["kind"] == "rod":
         return geometry(scene, contact)
@@ -272,8 +272,8 @@ def place_of(scene: Scene, contact: Scene) -> dict[str, Any]:
 
 
 def pieces(scene: Scene, contact: Scene) -> tuple[Array, Array]:
-    """Points of a support from data, and of facets their numbers, outwards."""
-    given, where = contact["support"], place_of(scene, contact)
+    """Points of an obstacle from data, and of facets their numbers, outwards."""
+    given, where = contact["obstacle"], place_of(scene, contact)
     kind, d = given["kind"], len(scene["bodies"][0]["size"])
     if kind == "box":
         low, high = where["low"], where["high"]
@@ -303,7 +303,7 @@ class FiniteMade(Made):
     """A scene as mesh, forms and constants.
 
     Attributes:
-        angle: Of the support below (radians).
+        angle: Of the obstacle below (radians).
     """
 
     def __init__(self, scene: Scene, comm: MPI.Comm, *, bulk: Any = None) -> None:
@@ -355,34 +355,34 @@ class FiniteMade(Made):
         down = now["normal"] * scene["strain"] * size[-1]
         up = np.eye(d)[-1]
         self.angle.value = now["turn"]
-        by_body, by_support = np.zeros(d), np.zeros(d)
+        by_body, by_obstacle = np.zeros(d), np.zeros(d)
         if scene["drive"] == "prescribed":
             by_body = -down * up
-            moving = {c["support"].get("moving") for c in scene["contacts"]}
+            moving = {c["obstacle"].get("moving") for c in scene["contacts"]}
             if not moving & {"displacement", "force"}:
                 by_body = by_body + way
             else:
-                by_support = -way
-        elif scene["drive"] == "support":
-            by_support = down * up - way
+                by_obstacle = -way
+        elif scene["drive"] == "obstacle":
+            by_obstacle = down * up - way
         else:
             pull = -now["normal"] * scene["strain"] * up
             rows = self.traction.x.array.reshape(-1, d)
             rows[self._cells] = pull * self.moduli[0]
-            by_support = -way
+            by_obstacle = -way
         for _, i, value in self.moved:
             value.value = by_body[i] * self.length
-        self.shift.value[:] = by_support * self.length
+        self.shift.value[:] = by_obstacle * self.length
         area = np.prod(size[:-1]) * self.length ** (d - 1) * self.thickness.value
         force = now["normal"] * scene["strain"] * self.moduli[0] * area
         for i in range(d):
             self.push[i].value = max(force, 0.02 * scene["strain"] * self.moduli[0] * area)
-            self.pull[i].value = by_support[i] * self.length
+            self.pull[i].value = by_obstacle[i] * self.length
         self.apply_features(stage, t)
 
     def turn(self, contact: Scene) -> tuple[Array, Array | None] | None:
         """A point of the axis, and its direction in space; None: it does not turn."""
-        given = contact["support"]
+        given = contact["obstacle"]
         if "turn" not in given:
             return None
         where = place_of(self.scene, contact)
@@ -396,9 +396,9 @@ class FiniteMade(Made):
             axis = np.array(given.get("axis", (0.0, 1.0, 0.0)))
         return about, axis
 
-    def support(self, contact: Scene) -> Any:
-        """The package's support."""
-        given, where, d = contact["support"], place_of(self.scene, contact), self.d
+    def obstacle(self, contact: Scene) -> Any:
+        """The package's obstacle."""
+        given, where, d = contact["obstacle"], place_of(self.scene, contact), self.d
         move: dict[str, Any] = {}
         if given.get("moving") == "displacement":
             move["displacement"] = self.shift
@@ -427,7 +427,7 @@ class FiniteMade(Made):
             return fc.Cylinder(where["center"], where["radius"], axis, inside=inside, **move)
         if kind in ("capsule", "rod", "torus"):
             shape = _torus if kind == "torus" else capsule
-            return fc.Obstacle(distance=lambda x: shape(self.mesh, where, x), **move)
+            return fc.SignedDistance(lambda x: shape(self.mesh, where, x), **move)
         points, numbers = pieces(self.scene, contact)
         if kind in ("facets", "box"):
             return fc.RigidSurface(points, numbers, **move)
@@ -473,6 +473,6 @@ def simpler(scene: Scene) -> list[Scene]:
     for i in range(len(scene["stages"])):
         add(lambda s, i=i: s["stages"][i].update(turn=0.0))
     for i, contact in enumerate(scene["contacts"]):
-        if "turn" in contact["support"]:
-            add(lambda s, i=i: s["contacts"][i]["support"].pop("turn"))
+        if "turn" in contact["obstacle"]:
+            add(lambda s, i=i: s["contacts"][i]["obstacle"].pop("turn"))
     return found

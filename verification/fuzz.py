@@ -273,11 +273,11 @@ def features(scene: Scene) -> list[str]:
     found = [scene["layout"], scene["cell"], f"degree {scene['degree']}", f"drive {scene['drive']}"]
     found += [f"{n} {scene[n]}" for n in ("bulk", "form") if n in scene]
     for contact in scene["contacts"]:
-        support = contact["support"]
-        found += [f"law {contact['law']['kind']}", f"support {support['kind']}"]
-        found += [f"pairs {support['update']}"] if "update" in support else []
-        found += [f"moving by {support['moving']}"] if "moving" in support else []
-        found += [f"turning about {support['turn']}"] if "turn" in support else []
+        obstacle = contact["obstacle"]
+        found += [f"law {contact['law']['kind']}", f"obstacle {obstacle['kind']}"]
+        found += [f"pairs {obstacle['update']}"] if "update" in obstacle else []
+        found += [f"moving by {obstacle['moving']}"] if "moving" in obstacle else []
+        found += [f"turning about {obstacle['turn']}"] if "turn" in obstacle else []
         found += [f"prescribed {n}" for n in ("gap",) if n in contact]
         found += [
             f"{n} {contact[n]}" for n in ("scheme", "enforcement", "accuracy") if n in contact
@@ -286,7 +286,7 @@ def features(scene: Scene) -> list[str]:
     found += [n for n in ("restart", "ration", "weight", "thickness", "bend") if n in scene]
     found += ["friction changes"] if any("friction" in s for s in scene["stages"]) else []
     sides = {(c["body"], c["side"]) for c in scene["contacts"]}
-    opposite = {(c["support"].get("body"), c["support"].get("side")) for c in scene["contacts"]}
+    opposite = {(c["obstacle"].get("body"), c["obstacle"].get("side")) for c in scene["contacts"]}
     found += ["both sides"] if sides & opposite else []
     found += [f"method {scene['method']}"] if "method" in scene else []
     found += ["units"] if scene["units"] != [1.0, 1.0] else []
@@ -303,7 +303,7 @@ def _unlikeness(scene: Scene) -> list[str]:
     """Of two bodies: which has facets at least four times as wide, or is 1000 times as stiff."""
     own, other = (
         scene["bodies"][side["body"]]
-        for side in (scene["contacts"][0], scene["contacts"][0]["support"])
+        for side in (scene["contacts"][0], scene["contacts"][0]["obstacle"])
     )
     wide, stiff = (own["size"][0] / own["n"][0]) / (other["size"][0] / other["n"][0]), own["E"]
     found = [f"Γc {'coarse' if wide > 1 else 'fine'}"] * (not 0.25 < wide < 4)
@@ -546,7 +546,7 @@ def _simpler(scene: Scene) -> Iterator[Scene]:
         for name in ("gap", "scheme", "quadrature", "enforcement", "accuracy"):
             if name in contact:
                 yield from changed(lambda s, i=i, n=name: s["contacts"][i].pop(n))
-        law, support = contact["law"], contact["support"]
+        law, obstacle = contact["law"], contact["obstacle"]
         yield from changed(
             lambda s, i=i: s["contacts"][i].update(
                 law={"kind": "frictionless", "k_n": ["number", 10.0]}
@@ -566,15 +566,17 @@ def _simpler(scene: Scene) -> Iterator[Scene]:
                     lambda s, i=i, k=k: s["contacts"][i]["law"].update({k: ["number", 10.0]})
                 )
         for name in ("slope", "moving"):
-            if name in support:
-                yield from changed(lambda s, i=i, n=name: s["contacts"][i]["support"].pop(n))
-        if support["kind"] != "body":
-            plain = {n: v for n, v in support.items() if n in ("moving", "free")}
+            if name in obstacle:
+                yield from changed(lambda s, i=i, n=name: s["contacts"][i]["obstacle"].pop(n))
+        if obstacle["kind"] != "body":
+            plain = {n: v for n, v in obstacle.items() if n in ("moving", "free")}
             plain |= {"kind": "halfspace", "clearance": 0.0}
-            yield from changed(lambda s, i=i, p=plain: s["contacts"][i].update(support=p))
-            yield from changed(lambda s, i=i: s["contacts"][i]["support"].update(clearance=0.0))
+            yield from changed(lambda s, i=i, p=plain: s["contacts"][i].update(obstacle=p))
+            yield from changed(lambda s, i=i: s["contacts"][i]["obstacle"].update(clearance=0.0))
         else:
-            yield from changed(lambda s, i=i: s["contacts"][i]["support"].update(update="never"))
+            yield from changed(
+                lambda s, i=i: s["contacts"][i]["obstacle"].update(update_pairs="never")
+            )
     for b, body in enumerate(scene["bodies"]):
         yield from changed(lambda s, b=b: s["bodies"][b].update(jitter=0))
         yield from changed(lambda s, b=b: s["bodies"][b].update(E=1000.0))

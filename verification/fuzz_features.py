@@ -2,9 +2,9 @@
 
 - ``"busy"``: an unrelated body in the same mesh, with loads, motions and a floor of its own. The
   second solution is that of the scene without it.
-- a support of kind ``"rod"``: a thin plate, a blade or a pin, all of them capsules, which is
+- an obstacle of kind ``"rod"``: a thin plate, a blade or a pin, all of them capsules, which is
   pressed against the body, dragged past an end, or led through it.
-- ``"carry"``: a translation of all bodies and supports by many lengths.
+- ``"carry"``: a translation of all bodies and obstacles by many lengths.
 - longer ways along the surface, past the end of what lies opposite.
 """
 
@@ -56,26 +56,26 @@ def add_features(scene: Scene, seed: int, without: tuple[str, ...] = ()) -> Scen
         angle = within(-np.pi, np.pi) if scene["drive"] != "force" else pick(0.0, np.pi)
         scene["carry"] = [float(f"{far * f(angle):.3g}") for f in (np.cos, np.sin)]
         for contact in scene["contacts"]:
-            if contact["support"]["kind"] != "body":
-                contact["support"].setdefault("moving", "carried")
+            if contact["obstacle"]["kind"] != "body":
+                contact["obstacle"].setdefault("moving", "carried")
     if chance(0.35, "busy"):
         scene["busy"] = pick(*BUSY)
     return scene
 
 
 def _can_be_carried(scene: Scene) -> bool:
-    """Whether conditions and supports can lead all bodies along."""
-    supports = [c["support"] for c in scene["contacts"]]
-    moving = [s.get("moving") for s in supports]
-    if "kinematics" not in scene and {s["kind"] for s in supports} - {"halfspace", "body"}:
-        return False  # where a curved support has gone its normals are others
+    """Whether conditions and obstacles can lead all bodies along."""
+    obstacles = [c["obstacle"] for c in scene["contacts"]]
+    moving = [s.get("moving") for s in obstacles]
+    if "kinematics" not in scene and {s["kind"] for s in obstacles} - {"halfspace", "body"}:
+        return False  # where a curved obstacle has gone its normals are others
     kept = {h[0] for h in scene["holds"] if 0 in h[2]}
     return "force" not in moving and len(kept) == len(scene["bodies"])
 
 
 def _drag_farther(scene: Scene, within: Any) -> None:
-    """Ways aside up to two and a half times the width of the body, where supports have ends."""
-    ends = {c["support"]["kind"] for c in scene["contacts"]} & {"body", "box", "facets", "capsule"}
+    """Ways aside up to two and a half times the width of the body, where obstacles have ends."""
+    ends = {c["obstacle"]["kind"] for c in scene["contacts"]} & {"body", "box", "facets", "capsule"}
     sides = [abs(s["side"]) for s in scene["stages"]]
     if "kinematics" not in scene or not ends or not max(sides):
         return
@@ -85,7 +85,7 @@ def _drag_farther(scene: Scene, within: Any) -> None:
 
 
 def _add_rod(scene: Scene, chance: Any, pick: Any, log: Any, within: Any) -> None:
-    """Put a rod in the place of the supports, and let it be led along."""
+    """Put a rod in the place of the obstacles, and let it be led along."""
     finite = "kinematics" in scene
     body = scene["bodies"][0]
     d, width, height = len(body["size"]), body["size"][0], body["size"][-1]
@@ -103,8 +103,8 @@ def _add_rod(scene: Scene, chance: Any, pick: Any, log: Any, within: Any) -> Non
     half = {"pin": 0.0, "blade": 0.3}.get(shape, within(0.2, 1.5) * width)
     tilt = {"plate": 0.0, "blade": 0.5 * np.pi, "pin": 0.0, "slanted": within(-1, 1)}[shape]
     clearance = within(0.0, 0.05) if chance(0.6) else 0.0
-    support = {"kind": "rod", "shape": shape, "radius": radius, "half": half, "tilt": tilt}
-    support |= {"clearance": clearance, "at": within(-0.1, 1.1), "moving": "displacement"}
+    obstacle = {"kind": "rod", "shape": shape, "radius": radius, "half": half, "tilt": tilt}
+    obstacle |= {"clearance": clearance, "at": within(-0.1, 1.1), "moving": "displacement"}
     depth = (log(-4, -1.3) if finite else log(-5, -2.3)) * height
     whole = 2 * (radius + half * abs(np.sin(tilt)))
     reach = width + 2 * half * abs(np.cos(tilt))
@@ -123,13 +123,13 @@ def _add_rod(scene: Scene, chance: Any, pick: Any, log: Any, within: Any) -> Non
     )
     if chance(0.2):  # it comes from beside the body
         sign = pick(-1.0, 1.0)
-        support["at"] = float(f"{0.5 - sign * (0.55 + 0.5 * (reach - width) / width):.4g}")
-        support["clearance"] = -depth
+        obstacle["at"] = float(f"{0.5 - sign * (0.55 + 0.5 * (reach - width) / width):.4g}")
+        obstacle["clearance"] = -depth
         ways = [(0.0, -sign * within(0.1, 1.5) * reach)]
     turns = finite and chance(0.3)
     if turns:
-        support |= {"turn": "middle"} | ({"about": [0.0, 1.0, 0.0]} if d == 3 else {})
-    contact["support"] = support
+        obstacle |= {"turn": "middle"} | ({"about": [0.0, 1.0, 0.0]} if d == 3 else {})
+    contact["obstacle"] = obstacle
     strain = scene["strain"]
     stages = []
     for up, side in ways:
@@ -139,7 +139,7 @@ def _add_rod(scene: Scene, chance: Any, pick: Any, log: Any, within: Any) -> Non
         if finite:
             stage["turn"] = within(-1.0, 1.0) if turns else 0.0
         stages.append({n: v if n == "steps" else float(f"{v:.4g}") for n, v in stage.items()})
-    scene |= {"bodies": [body], "contacts": [contact], "layout": "floor", "drive": "support"}
+    scene |= {"bodies": [body], "contacts": [contact], "layout": "floor", "drive": "obstacle"}
     scene |= {"stages": stages, "holds": [[0, "top", list(range(d)), "still"]], "share": 1.0}
     scene["cuts"] = pick(1, 3, 5)
     for name in ("restart", "thickness", "ration"):
@@ -167,7 +167,7 @@ def with_busy_body(scene: Scene) -> Scene:
     if busy["floor"]:
         law = {"kind": "coulomb", "friction": 0.3, "k_n": ["scaled", 10.0], "k_t": ["scaled", 10.0]}
         floor = {"body": number, "side": "bottom", "law": law}
-        floor["support"] = {"kind": "halfspace", "clearance": 0.0}
+        floor["obstacle"] = {"kind": "halfspace", "clearance": 0.0}
         found["contacts"] = [*scene["contacts"], floor]
     if "bend" in scene:
         found["bend"] = [*scene["bend"], 0.0]
@@ -178,5 +178,5 @@ def feature_names(scene: Scene) -> list[str]:
     """What of this a scene has, for tables."""
     found = [f"{n} {scene[n]}" for n in ("busy",) if n in scene] + ["busy"] * ("busy" in scene)
     found += ["carried"] * ("carry" in scene)
-    shapes = [c["support"]["shape"] for c in scene["contacts"] if "shape" in c["support"]]
+    shapes = [c["obstacle"]["shape"] for c in scene["contacts"] if "shape" in c["obstacle"]]
     return found + [f"rod {shape}" for shape in shapes]

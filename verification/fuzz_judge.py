@@ -90,7 +90,7 @@ class Judge:
         self.worst: dict[str, float] = {}
         # Between curved facets integrals are exact to some times the square of the slope of one
         # against the other only, in both.
-        paired = any(c["support"]["kind"] == "body" for c in scene["contacts"])
+        paired = any(c["obstacle"]["kind"] == "body" for c in scene["contacts"])
         slope = 4 * sum(map(abs, scene.get("bend", [0.0])))
         self._curved = _CURVED * slope**2 if paired else 0.0
         scaled = any(
@@ -264,7 +264,7 @@ class Judge:
             self._own_old[i] = own.counted_from(apart, own_old, idle)
 
     def _touching(self, model: Any, record: dict[str, Any], u: Array, old: Any) -> dict[str, Any]:
-        """What follows from the state of first touch, in which a support is on its way."""
+        """What follows from the state of first touch, in which an obstacle is on its way."""
         if hasattr(model, "respond_at"):
             return model.respond_at(u, old)
         jump = record["set_down"]["jump"][self._rows(model, record)]
@@ -390,7 +390,7 @@ class Judge:
             size = max(self._size(now, "contacts", i) for i in range(len(now["contacts"])))
             rest = float(np.abs(now["motion rest"]).max())
             rounding = max(b["rounding"] for b in now["bodies"])
-            self._check(name, "support", rest, _RESIDUAL * rtol * size + rounding)
+            self._check(name, "obstacle", rest, _RESIDUAL * rtol * size + rounding)
 
     def _check_results(self, name: str, contact: Any, found: dict, record: dict[str, Any]) -> None:
         """Reported forces, area and fields against those made anew from u."""
@@ -471,7 +471,7 @@ class Judge:
         if contact.law.has_normal:
             left = np.abs(contact.project @ -found["r_n"] - record["lambda_n"][row]).max()
         if contact.law.slips:
-            tau = found.get("framed", found["tau"])  # in the frame of a support that turns
+            tau = found.get("framed", found["tau"])  # in the frame of an obstacle that turns
             change = contact.project @ tau - record["lambda_t"][row]
             if self.scene["degree"] == 1:
                 change = self._answered(contact, found["normal"], change, fixed)
@@ -480,7 +480,7 @@ class Judge:
         self._check(name, "multipliers", left, allowed)
         # However large the tractions are: what is inside is not by as much as anyone can see.
         if contact.law.has_normal:
-            # Of a facet that reaches past the support the points beside it lead the plane astray.
+            # Of a facet that reaches past the obstacle the points beside it lead the plane astray.
             deep = np.minimum(contact.project @ found["closing"], found["closing"])
             deep = np.where(found["r_n"] < 0, deep, 0.0).max()
             # Γc may be one point.
@@ -523,7 +523,7 @@ class Judge:
     def _check_geometry(
         self, name: str, u: Array, load: Any, motion: Array, found: list[dict]
     ) -> None:
-        """Depth of Γc in rigid supports where it has moved to, beyond what points resist."""
+        """Depth of Γc in rigid obstacles where it has moved to, beyond what points resist."""
         shifts = self.problem.shifts(load, motion)
         for i, (c, f, shift) in enumerate(zip(self.problem.contacts, found, shifts, strict=True)):
             if c.near is None or not c.law.has_normal or c.law.tension:
@@ -629,8 +629,8 @@ class Judge:
     def _between(self, i: int) -> set[tuple[Any, Any]]:
         """The two surfaces of a contact, as body and side."""
         given = self.scene["contacts"][i]
-        support = given["support"]
-        return {(given["body"], given["side"]), (support.get("body"), support.get("side"))}
+        obstacle = given["obstacle"]
+        return {(given["body"], given["side"]), (obstacle.get("body"), obstacle.get("side"))}
 
     def _check_energy(
         self,

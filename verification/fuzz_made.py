@@ -85,8 +85,8 @@ def tag_of(scene: Scene, body: int, side: str) -> int:
         if (contact["body"], contact["side"]) == (body, side):
             return 11 + i
     for i, contact in enumerate(scene["contacts"]):
-        support = contact["support"]
-        if support["kind"] == "body" and (support["body"], support["side"]) == (body, side):
+        obstacle = contact["obstacle"]
+        if obstacle["kind"] == "body" and (obstacle["body"], obstacle["side"]) == (body, side):
             return 21 + i
     return TOP if side == "top" else 100 + 10 * body + list(_SIDES).index(side)
 
@@ -96,12 +96,12 @@ class Made:
 
     Attributes:
         n_own: Number of bodies of the scene; an unrelated one comes after them.
-        carried: Translation of all bodies and supports of the scene.
+        carried: Translation of all bodies and obstacles of the scene.
         F: The residual with coefficients by cell and plain measures; the package gets it as the
             scene says that it is written (`fuzz_forms.written`).
         set_down: Where slip is counted from anew in this increment, by the names of contacts:
             "rigid", whether bodies were set down, "u" (see `_displacement`), and "jump", the
-            displacement relative to the support at the points, (n_points, d).
+            displacement relative to the obstacle at the points, (n_points, d).
     """
 
     def __init__(self, scene: Scene, comm: MPI.Comm) -> None:
@@ -271,7 +271,7 @@ class Made:
             share = scene["share"] if driven.index(body) else 1.0
             size = scene["bodies"][body]["size"][-1] * self.length
             value.value = way[i] * strain * size * share
-        if scene["drive"] == "support":
+        if scene["drive"] == "obstacle":
             size = scene["bodies"][0]["size"][-1] * self.length
             self.shift.value[:] = -way * strain * size
             area = np.prod(scene["bodies"][0]["size"][:-1]) * self.length ** (d - 1)
@@ -281,7 +281,7 @@ class Made:
         self.apply_features(stage, t)
 
     def apply_features(self, stage: int, t: float) -> None:
-        """Carry all bodies and supports along, and keep the unrelated body busy."""
+        """Carry all bodies and obstacles along, and keep the unrelated body busy."""
         d, scene = self.d, self.scene
         self.carried.value[:] = 0.0
         if "carry" in scene:
@@ -331,9 +331,11 @@ class Made:
         def stiffness(given: Any) -> Any:
             kind, value = given
             if kind == "scaled":
-                return fc.Scaled(value)
+                return fc.RelativeStiffness(value)
             if kind == "springs":
-                return fc.Springs(value * body["E"] * self.stress * self.length ** (self.d - 2))
+                return fc.NodalSprings(
+                    value * body["E"] * self.stress * self.length ** (self.d - 2)
+                )
             return value * body["E"] * unit
 
         k = {n: stiffness(law[n]) for n in ("k_n", "k_t") if law.get(n)}
@@ -348,12 +350,12 @@ class Made:
             return fc.Tresca(law["friction"], pressure, **k, unilateral=kind == "tresca")
         return fc.Coulomb(law["friction"], **k, **shape)
 
-    def support(self, contact: Scene) -> Any:
-        """The package's support."""
-        given = contact["support"]
+    def obstacle(self, contact: Scene) -> Any:
+        """The package's obstacle."""
+        given = contact["obstacle"]
         if given["kind"] == "body":
             tag = tag_of(self.scene, given["body"], given["side"])
-            return fc.DeformableBody(self.tags, tag, update=given["update"])
+            return fc.DeformableBody(self.tags, tag, update_pairs=given["update"])
         where = geometry(self.scene, contact)
         shift = None
         if given.get("moving") == "displacement":
@@ -374,9 +376,11 @@ class Made:
             numbers = (fem.Constant(self.mesh, float(where[n])) for n in ("gap", "curve", "middle"))
             gap, curve, middle = numbers
             direction = fem.Constant(self.mesh, -np.asarray(where["normal"]))
-            return fc.Obstacle(gap + curve * (x[0] - middle) ** 2, direction, displacement=shift)
+            return fc.PrescribedGap(
+                gap + curve * (x[0] - middle) ** 2, direction, displacement=shift
+            )
         if kind == "rod":
-            return fc.Obstacle(distance=lambda x: capsule(self.mesh, where, x), displacement=shift)
+            return fc.SignedDistance(lambda x: capsule(self.mesh, where, x), displacement=shift)
         inside = given["kind"].endswith("inside")
         if kind == "ball":
             return fc.Ball(where["center"], where["radius"], inside=inside, displacement=shift)
@@ -398,7 +402,7 @@ class Made:
                 fc.Contact(
                     self.u,
                     surface,
-                    self.support(c),
+                    self.obstacle(c),
                     self.law(c),
                     gap=None if gap is None else gap * self.length,
                     enforcement=c.get("enforcement"),
@@ -442,8 +446,8 @@ _SHAPE = {"modes": "modes", "transverse_friction": "transverse", "direction": "d
 
 
 def geometry(scene: Scene, contact: Scene) -> dict[str, Any]:
-    """Numbers of a rigid support, in units of length."""
-    body, given = scene["bodies"][contact["body"]], contact["support"]
+    """Numbers of a rigid obstacle, in units of length."""
+    body, given = scene["bodies"][contact["body"]], contact["obstacle"]
     length, d = scene["units"][0], len(body["size"])
     low = np.array(body["origin"], dtype=float)
     size = np.array(body["size"], dtype=float)

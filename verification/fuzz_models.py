@@ -79,7 +79,7 @@ def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float],
             made,
             contact,
             surface(11 + i),
-            lambda c=contact["support"]: surface(tag_of(scene, c["body"], c["side"])),
+            lambda c=contact["obstacle"]: surface(tag_of(scene, c["body"], c["side"])),
         )
         for i, contact in enumerate(scene["contacts"])
     ]
@@ -93,7 +93,7 @@ def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float],
         dofs = np.unique(np.concatenate([np.zeros(0, dtype=np.int32), *fixed]))
         shifts, pushes = [], []
         for contact in scene["contacts"]:
-            moving = contact["support"].get("moving")
+            moving = contact["obstacle"].get("moving")
             shift, push = np.zeros(d), np.zeros(d)
             if moving == "displacement":
                 shift = made.shift.value.copy()
@@ -101,7 +101,7 @@ def model(scene: Scene) -> tuple[reference.Problem, Made, Callable[[int, float],
                 shift = made.carried.value.copy()
             elif moving == "force":
                 for i in range(d):
-                    if i in contact["support"]["free"]:
+                    if i in contact["obstacle"]["free"]:
                         push[i] = float(made.push[i].value)
                     else:
                         shift[i] = float(made.pull[i].value)
@@ -159,10 +159,10 @@ def contact_of(
     kind_of: Any = reference.ContactModel,
     there: Surface | None = None,
 ) -> tuple[Any, tuple[Array, Array]]:
-    """Points, stiffness and law of a contact without its support; facet and place of points."""
+    """Points, stiffness and law of a contact without its obstacle; facet and place of points."""
     scene, law = made.scene, contact["law"]
     d, degree = made.d, scene["degree"]
-    rigid = contact["support"]["kind"] != "body"
+    rigid = contact["obstacle"]["kind"] != "body"
     wanted = contact.get("accuracy")
     augmented = contact.get("enforcement") == "augmented"
     physical = law["kind"] in ("foundation", "tension") or any(
@@ -172,8 +172,8 @@ def contact_of(
         augmented = fc.Accuracy.of(wanted).enforcement == "augmented"
     scheme, rule = contact.get("scheme"), contact.get("quadrature")
     per_node = 1
-    if rule is None and rigid:  # 4 along a round support, by its radius
-        around = made.support(contact).smallest_radius
+    if rule is None and rigid:  # 4 along a round obstacle, by its radius
+        around = made.obstacle(contact).smallest_radius
         per_node = int(np.ceil(4 * float(np.median(here.lengths())) / around - 1e-9))
     if scheme is None and rule is None and augmented and rigid and degree == 1 and per_node <= 1:
         scheme = "vertex" if scene["cell"] != "hexahedron" else None
@@ -226,8 +226,8 @@ def contact_of(
         unilateral=law["kind"] != "prescribed",
     )
     free = (
-        tuple(contact["support"].get("free", ()))
-        if contact["support"].get("moving") == "force"
+        tuple(contact["obstacle"].get("free", ()))
+        if contact["obstacle"].get("moving") == "force"
         else ()
     )
     made_model = kind_of(
@@ -244,7 +244,7 @@ def contact_of(
         free=free,
         project=_projection(here, facet, xi, weights, max(1, degree - 1)) if augmented else None,
     )
-    if contact["support"]["kind"] == "rod":
+    if contact["obstacle"]["kind"] == "rod":
         low, high = geometry(scene, contact)["ends"]
         made_model.spine = low + np.linspace(0, 1, 21)[:, None] * (high - low)
     return made_model, (facet, xi)
@@ -263,11 +263,11 @@ def capsule_at(x: Array, where: dict[str, Any]) -> tuple[Array, Array]:
 
 def _contact(made: Made, contact: Scene, here: Surface, opposite: Any) -> Any:
     """A contact as the reference has it."""
-    there = opposite() if contact["support"]["kind"] == "body" else None
+    there = opposite() if contact["obstacle"]["kind"] == "body" else None
     made_model, (facet, xi) = contact_of(made, contact, here, there=there)
     scene, given, x = made.scene, contact.get("gap"), made_model.x
     if there is None:
-        kind, where = contact["support"]["kind"], geometry(scene, contact)
+        kind, where = contact["obstacle"]["kind"], geometry(scene, contact)
         place = _placement(kind, where, x)
         made_model.radius = float(where.get("radius", 0.0))
         if given is None and kind != "obstacle":
@@ -296,7 +296,7 @@ def _contact(made: Made, contact: Scene, here: Surface, opposite: Any) -> Any:
     if given is None and not made_model.law.tension:
         thickness = scene.get("thickness", 1.0)
         made_model.back = lambda u: reference_geometry.penetration(there, here, u, thickness)
-    if contact["support"]["update"] == "increment":
+    if contact["obstacle"]["update"] == "increment":
         made_model.repair = repair
     if given is None:
 
@@ -314,7 +314,7 @@ def _contact(made: Made, contact: Scene, here: Surface, opposite: Any) -> Any:
 
 
 def _placement(kind: str, where: dict[str, Any], x: Array) -> Any:
-    """Gap and normal at the points, as functions of the support's shift."""
+    """Gap and normal at the points, as functions of the obstacle's shift."""
     if kind == "halfspace":
         normal = np.asarray(where["normal"])
         return lambda s: ((x - where["point"] - s) @ normal, np.tile(-normal, (len(x), 1)) + 0 * s)

@@ -1,6 +1,6 @@
 """Random scenes of contact as plain dictionaries; `fuzz_made` and `fuzz_models` make them.
 
-A scene is boxes that share no node, contacts between them or with rigid supports, and stages of
+A scene is boxes that share no node, contacts between them or with rigid obstacles, and stages of
 loads. It is JSON all through, so that an old failure can be played again whatever `draw` has become
 since. Lengths and forces are drawn in the scene's own units and scaled by ``units`` when the scene
 is made.
@@ -161,10 +161,10 @@ def draw(
         "units": [1.0, 1.0],
     }
 
-    drive = pick("force", "force", "prescribed", "support")
-    if layout in ("pair", "tower", "apart") and drive == "support":
+    drive = pick("force", "force", "prescribed", "obstacle")
+    if layout in ("pair", "tower", "apart") and drive == "obstacle":
         drive = "force"
-    if "motion" in without and drive == "support":
+    if "motion" in without and drive == "obstacle":
         drive = "prescribed"
     scene["drive"] = drive
 
@@ -195,8 +195,8 @@ def draw(
             made["k_t"] = made["k_t"] or ["number", log(0, 2)]
         return made
 
-    def contact(body: int, side: str, support: Scene) -> Scene:
-        made: Scene = {"body": body, "side": side, "support": support, "law": law()}
+    def contact(body: int, side: str, obstacle: Scene) -> Scene:
+        made: Scene = {"body": body, "side": side, "obstacle": obstacle, "law": law()}
         springs = chance(0.1)
         if springs:
             made["scheme"] = "vertex"
@@ -243,11 +243,11 @@ def draw(
             if degree == 1 and cell != "hexahedron" and chance(0.3, "increment")
             else "never"
         )
-        support: Scene = {"kind": "body", "update": update}
+        obstacle: Scene = {"kind": "body", "update": update}
         if chance(0.6):
-            contacts.append(contact(upper, "bottom", support | {"body": upper - 1, "side": "top"}))
+            contacts.append(contact(upper, "bottom", obstacle | {"body": upper - 1, "side": "top"}))
         else:
-            contacts.append(contact(upper - 1, "top", support | {"body": upper, "side": "bottom"}))
+            contacts.append(contact(upper - 1, "top", obstacle | {"body": upper, "side": "bottom"}))
     standing = layout in ("pair", "tower") and chance(0.4)
     if standing:
         contacts.append(contact(0, "bottom", rigid()))
@@ -261,13 +261,13 @@ def draw(
             c["law"]["k_n"] = c["law"]["k_n"] and ["number", 20.0]
             if "k_t" in c["law"]:
                 c["law"]["k_t"] = ["number", 10.0]
-            if c["support"].get("update") == "increment":
-                c["support"]["update"] = "never"
+            if c["obstacle"].get("update") == "increment":
+                c["obstacle"]["update"] = "never"
     if layout == "pair" and chance(0.12, "both"):
         first = contacts[0]
         other = copy.deepcopy(first)
-        other |= {"body": first["support"]["body"], "side": first["support"]["side"]}
-        other["support"] |= {"body": first["body"], "side": first["side"]}
+        other |= {"body": first["obstacle"]["body"], "side": first["obstacle"]["side"]}
+        other["obstacle"] |= {"body": first["body"], "side": first["side"]}
         contacts.insert(1, other)
     if layout == "pair" and chance(0.08, "narrow", of=rng):
         bodies[1]["size"][0] = float(f"{rng.uniform(0.03, 0.3) * bodies[0]['size'][0]:.3g}")
@@ -285,7 +285,7 @@ def draw(
     for b in driven:
         if drive == "prescribed":
             holds.append([b, "top", list(range(d)), "moved"])
-        elif drive == "support":
+        elif drive == "obstacle":
             holds.append([b, "top", list(range(d)), "still"])
     if drive == "force":
         for b in range(n_bodies):
@@ -296,8 +296,8 @@ def draw(
             if space and chance(0.9):
                 holds.append([b, "front", [1], "still"])
     scene["holds"] = holds
-    if drive == "support":
-        moves = contacts[0]["support"]
+    if drive == "obstacle":
+        moves = contacts[0]["obstacle"]
         if chance(0.5):
             moves["moving"] = "displacement"
         else:

@@ -41,7 +41,7 @@ def flat_punch() -> Outcome:
     body.hold(GROUND, 0, 1)
     body.hold(AXIS, 0)
     punch = fc.HalfSpace((0, 0), (0, -1), displacement=fc.Motion(force=(None, -force / 2)))
-    contact = body.contact(SURFACE, punch, fc.Frictionless(fc.Scaled(100)))
+    contact = body.contact(SURFACE, punch, fc.Frictionless(fc.RelativeStiffness(100)))
     problem = body.problem(contact)
     problem.solve()
     points = contact.gather()
@@ -93,7 +93,7 @@ def wavy(n: int = 256) -> Outcome:
     load = body.constant(0.0)
     body.F += load * body.v[1] * body.ds(LOAD)
     gap = amplitude * (1 - ufl.cos(2 * np.pi / wave * body.x[0]))
-    contact = body.contact(SURFACE, fc.Obstacle(gap, (0, -1)), fc.Frictionless())
+    contact = body.contact(SURFACE, fc.PrescribedGap(gap, (0, -1)), fc.Frictionless())
     problem = body.problem(contact)
     rows = []
     for share, width, peak in (
@@ -201,7 +201,7 @@ def cylinder(h: float = 0.25, stiffness: float = 10.0) -> Outcome:
     width = _integral(body, LOAD)
     load = body.constant(0.0)
     body.F += load / width * body.v[1] * body.ds(LOAD)
-    contact = body.contact(SURFACE, OPPOSITE, fc.Frictionless(fc.Scaled(stiffness)))
+    contact = body.contact(SURFACE, OPPOSITE, fc.Frictionless(fc.RelativeStiffness(stiffness)))
     problem = body.problem(contact)
     list(fc.increments(problem, load, 0.0, total / 2, steps=2))
     r, points = contact.resultants(), contact.gather()

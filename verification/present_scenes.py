@@ -82,7 +82,7 @@ def draw(
     upper = {"body": 1, "side": "bottom"}
     lower = {"body": 0, "side": "top"}
     own, other = (upper, lower) if chance(0.6) else (lower, upper)
-    contact: Scene = own | {"support": {"kind": "body", "update": "never"} | other, "law": law}
+    contact: Scene = own | {"obstacle": {"kind": "body", "update": "never"} | other, "law": law}
     if chance(0.2):
         contact["quadrature"] = pick(1, 3, 5)
     if chance(0.2, "multipliers"):
@@ -252,6 +252,6 @@ class PresentMade(FiniteMade):
             moved = middle + (place - middle) @ whole.T + self.carried.value - x
             value.x.array[:] = moved.ravel()
 
-    def support(self, contact: Scene) -> Any:
-        """The package's support."""
-        return Made.support(self, contact)
+    def obstacle(self, contact: Scene) -> Any:
+        """The package's obstacle."""
+        return Made.obstacle(self, contact)

@@ -65,7 +65,7 @@ class Law:
 
     def frame(self, n: Array) -> tuple[Array, ...]:
         """Unit tangents, (n, d) each: in space along the direction and across it."""
-        if n is not self._frame[0]:  # normals are the same ones until the support moves
+        if n is not self._frame[0]:  # normals are the same ones until the obstacle moves
             self._frame = n, self._tangents(n)
         return self._frame[1]
 

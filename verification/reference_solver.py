@@ -4,7 +4,7 @@ It shares nothing with the package but DOLFINx's stiffness and load vector: poin
 normals of Γc, pairs of surfaces and L2 projection (`reference_geometry`), laws (`reference_laws`),
 history, condensation and solver (here) are made anew, dense and by brute force, for problems of
 some hundred unknowns. What is solved is what the package's docstrings define: laws at quadrature
-points (`laws`), supports (`supports`), pairs (`pairing`), multipliers (`multipliers`).
+points (`laws`), obstacles (`obstacles`), pairs (`pairing`), multipliers (`multipliers`).
 
 Arrays are those of one rank. Numbers of nodes are those of the displacement element.
 """
@@ -40,7 +40,7 @@ class State:
     """What a contact keeps from one increment to the next.
 
     Attributes:
-        jump: Displacement relative to the support that Δu_t counts from, (n, d) (length).
+        jump: Displacement relative to the obstacle that Δu_t counts from, (n, d) (length).
         traction: τ, or with multipliers λ_t, (n, d) (stress).
         pressure: λ_n, (n,) (stress); None without multipliers.
         limit: Of friction, where it is taken for given, (n,) (stress).
@@ -54,29 +54,29 @@ class State:
 
 @dataclass(eq=False)
 class ContactModel:
-    """Γc, its support and its law at points.
+    """Γc, its obstacle and its law at points.
 
     Attributes:
-        place: Function of the shift of the support, (d,): gap (n,) and unit normal (n, d).
+        place: Function of the shift of the obstacle, (d,): gap (n,) and unit normal (n, d).
         interpolation: From node values to the body's displacement, less the opposite one,
             (n_points, n_nodes).
         weights: (n,).
         k_n, k_t: Stiffness at the points, (n,).
         law: The law.
         paired: Points that may carry tractions, (n,).
-        free: Components of the support's motion that follow from the force on it.
+        free: Components of the obstacle's motion that follow from the force on it.
         project: L2 projection of the multipliers, (n, n); None without multipliers.
         repair: Pairs the points anew at a displacement; None where pairs stay.
         back: ∫ of the penetration as the opposite surface sees it at a displacement; None where
-            the support is rigid.
+            the obstacle is rigid.
         here: Γc.
         facet: On it, of every point.
-        near: Function of places (n, d) and where the support is: distance (n,) and minus its
-            gradient (n, d); None where the support is no rigid shape.
-        radius: Of a round support, whose round-off gaps have (length).
-        spine: Middle line of a rod where it began, (n, d); None of other supports.
+        near: Function of places (n, d) and where the obstacle is: distance (n,) and minus its
+            gradient (n, d); None where the obstacle is no rigid shape.
+        radius: Of a round obstacle, whose round-off gaps have (length).
+        spine: Middle line of a rod where it began, (n, d); None of other obstacles.
         anew: Function of u: interpolation, gap and pairs of bodies where they have moved to; None
-            where the support is rigid.
+            where the obstacle is rigid.
     """
 
     x: Array
@@ -114,7 +114,7 @@ class ContactModel:
         return self.interpolation @ u.reshape(-1, self.d)
 
     def placed(self, shift: Array) -> tuple[Array, Array]:
-        """Gap and normal; the same arrays until the support moves or the pairs change."""
+        """Gap and normal; the same arrays until the obstacle moves or the pairs change."""
         if np.iscomplexobj(shift):
             return self.place(shift)
         if self._placed[0] is not self.place or self._placed[1] != shift.tobytes():
@@ -164,7 +164,7 @@ class ContactModel:
         return by_jump, by_shift
 
     def at_rest(self) -> Any:
-        """Where the support began, as `respond` takes it."""
+        """Where the obstacle began, as `respond` takes it."""
         return np.zeros(self.d)
 
     def spine_at(self, shift: Any) -> Array:
@@ -229,8 +229,8 @@ class Load:
         force: Load vector, (N,) (force).
         fixed: Prescribed unknowns.
         values: Theirs (length).
-        shifts: Of every contact the prescribed displacement of its support, (d,); zero where free.
-        pushes: Of every contact the force on its support, (d,).
+        shifts: Of every contact the prescribed displacement of its obstacle, (d,); zero where free.
+        pushes: Of every contact the force on its obstacle, (d,).
     """
 
     force: Array
@@ -397,7 +397,7 @@ class Problem:
         return [(c, i) for c, m in enumerate(self.contacts) for i in m.free]
 
     def shifts(self, load: Load, motion: Array) -> list[Array]:
-        """Displacements of the supports."""
+        """Displacements of the obstacles."""
         shifts = [np.array(s, dtype=motion.dtype) for s in load.shifts]
         for value, (c, i) in zip(motion, self.motions(), strict=False):
             shifts[c][i] = value
@@ -422,7 +422,7 @@ class Problem:
         return self.body.stiffness
 
     def residual(self, u: Array, load: Load, found: list[dict]) -> tuple[Array, Array]:
-        """K u - f - contact on all unknowns, and force on supports not balanced."""
+        """K u - f - contact on all unknowns, and force on obstacles not balanced."""
         total = self.body.stiffness @ u - load.force - sum(self.contact_force(found))
         motion = [
             (self.contacts[c].weights @ found[c]["traction"])[i] - load.pushes[c][i]

@@ -47,7 +47,7 @@ def spheres() -> Outcome:
     body.hold(TOP, 1)
     body.hold(AXIS, 1)
     x = body.x
-    law = fc.Coulomb(friction, k_n=fc.Scaled(20), k_t=fc.Scaled(20))
+    law = fc.Coulomb(friction, k_n=fc.RelativeStiffness(20), k_t=fc.RelativeStiffness(20))
     gap = (x[0] ** 2 + x[1] ** 2) / (2 * radius)
     contact = body.contact(SURFACE, OPPOSITE, law, gap=gap)
     problem = body.problem(contact)

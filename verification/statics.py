@@ -165,7 +165,7 @@ def capstan() -> Outcome:
     budget="forces follow from statics and are met to round-off",
 )
 def incline() -> Outcome:
-    """The steepest slope on which a block stays, on a support that is elastic itself.
+    """The steepest slope on which a block stays, on an obstacle that is elastic itself.
 
     Gravity is turned, not the mesh. Parts of the base slip long before.
     """

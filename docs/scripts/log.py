@@ -38,7 +38,10 @@ steel = fc.elasticity.LinearElastic(u, E=2e5, nu=0.3, kind="plane strain")
 F = steel.residual(v) + 10.0 * v[1] * ds(2)
 top = fem.locate_dofs_topological(V.sub(0), 1, tags.find(2))
 bcs = [fem.dirichletbc(push, top, V.sub(0))]
-floor, law = fc.HalfSpace((0, 0), (0, 1)), fc.Coulomb(0.3, k_n=fc.Scaled(1e4))  # too stiff
+floor, law = (
+    fc.HalfSpace((0, 0), (0, 1)),
+    fc.Coulomb(0.3, k_n=fc.RelativeStiffness(1e4)),
+)  # too stiff
 contact = fc.Contact(u, fc.ContactSurface(msh, tags, 1), floor, law)
 problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method="lbfgs")
 for step in fc.increments(problem, push, 0, 1e-4, steps=2):

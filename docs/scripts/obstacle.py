@@ -53,12 +53,12 @@ if MPI.COMM_WORLD.rank == 0:
     write_stl("output/fine.stl", 0.1)
 MPI.COMM_WORLD.Barrier()
 
-# begin supports
+# begin obstacles
 msh = mesh.create_box(MPI.COMM_WORLD, [(0, 0, -0.5), (1, 1, 0)], (12, 12, 6))
 depth = fem.Constant(msh, 0.0)
 down = {"displacement": ufl.as_vector([0, 0, -depth])}
-supports = {
-    "distance": fc.Obstacle(distance=to_roller, **down),
+obstacles = {
+    "distance": fc.SignedDistance(to_roller, **down),
     "profile": fc.RigidProfile(crown, turned=axle, **down),
     "coarse": fc.RigidSurface.from_stl("output/coarse.stl", **down),
     "halved": fc.RigidSurface.from_stl("output/coarse.stl", halvings=2, **down),
@@ -83,9 +83,9 @@ surface = fc.ContactSurface(msh, tags, TOP)
 
 # begin press
 gaps, forces = {}, {}
-for name, support in supports.items():
+for name, obstacle in obstacles.items():
     u.x.array[:], depth.value = 0, 0
-    contact = fc.Contact(u, surface, support, fc.Frictionless())
+    contact = fc.Contact(u, surface, obstacle, fc.Frictionless())
     gaps[name] = contact.gather()["gap"]  # before any load
     problem = fc.ContactProblem(body.residual(v), u, bcs=bcs, contacts=[contact])
     list(fc.increments(problem, depth, 0, DEPTH))

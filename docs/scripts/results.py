@@ -33,14 +33,14 @@ problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
 # begin results
 writer = fc.Writer("output", problem, stress=steel.stress)
 film = fc.Animation("output/film.gif", problem, stress=steel.stress, magnification=1000)
-for step in fc.increments(problem, push, 0, 1e-4, steps=5, history="output/history.csv"):
+for step in fc.increments(problem, push, 0, 1e-4, steps=5, csv="output/history.csv"):
     print(step.summary())
     writer.write(step)
     film.add(step)
 film.save()
 budget = fc.estimate_errors(problem, steel.stress)
 print(budget)
-fc.report(problem, step, "output", history="output/history.csv", stress=steel.stress, budget=budget)
+fc.report(problem, step, "output", csv="output/history.csv", stress=steel.stress, budget=budget)
 fc.plotting.plot_pressure("output/pressure.png", contact)
 fc.plotting.plot_status("output/status.png", contact)
 fc.plotting.plot_deformation("output/deformation.png", u, magnification=1000, contacts=[contact])

@@ -56,7 +56,7 @@ problem = fc.ContactProblem(rubber.residual(v, dx, q=q), w, bcs=[bonded], contac
 # begin history
 Path("output").mkdir(exist_ok=True)
 force, peak, taken = [0.0], [0.0], 0.0
-kept = {"history": "output/history.csv"}
+kept = {"csv": "output/history.csv"}
 for step in fc.increments(problem, closing, 0, CLOSING, steps=STEPS, **kept):
     found = contact.resultants()
     force.append(found.normal_force)

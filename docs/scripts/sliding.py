@@ -42,8 +42,8 @@ for name, side, i, value in held:
 
 # begin contact
 surface = fc.ContactSurface(joined.mesh, joined.facets, joined.facet("pad", BELOW))
-support = fc.DeformableBody(joined.facets, joined.facet("plate", ABOVE))
-contact = fc.Contact(u, surface, support, fc.Coulomb(FRICTION))
+obstacle = fc.DeformableBody(joined.facets, joined.facet("plate", ABOVE))
+contact = fc.Contact(u, surface, obstacle, fc.Coulomb(FRICTION))
 problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
 
 # begin history

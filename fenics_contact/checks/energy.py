@@ -31,7 +31,7 @@ class Energy:
     elastic energy; their difference, and all other attributes, mean what they say.
 
     Attributes:
-        work: Work of the loads, of Dirichlet values and of moving supports.
+        work: Work of the loads, of Dirichlet values and of moving obstacles.
         elastic: Work of the internal forces: the change of elastic energy, exact for a linear bulk.
         springs: Change of the energy in the contact's springs, r_n²/2k_n + |τ|²/2k_t.
         dissipation: Work of friction on the slip, ≥ 0.
@@ -45,9 +45,10 @@ class Energy:
             at both ends, up to the solver's tolerance. Not between bodies with finite kinematics,
             whose points have other partners at both ends: what they felt of the one before is not
             what the force on it does. It gets less with smaller increments.
-        created: Share of the energy exchanged that friction has given instead of taken, the largest
-            of the groups of bodies between which forces pass; 0 if none. Where a sliding body is
-            turned round in one increment works cancel: then by what friction takes each way.
+        friction_energy_gain: Share of the energy exchanged that friction has given instead of
+            taken, the largest of the groups of bodies between which forces pass; 0 if none. Where
+            a sliding body is turned round in one increment works cancel: then by what friction
+                takes each way.
     """
 
     work: float
@@ -58,7 +59,7 @@ class Energy:
     friction: float
     sliding: float
     imbalance: float
-    created: float
+    friction_energy_gain: float
 
 
 @dataclass(frozen=True)
@@ -68,9 +69,10 @@ class EnergyState:
     Attributes:
         forces: At the unknowns, by the mark of the coordinates they are in.
         contacts: Of each contact the tractions on the body, its displacement relative to the
-            support, and that of the support as far as it is prescribed: (3, n_points, gdim). Where
-            the support turns, the displacement relative to it in its frame, that of the body less
-            the free motion of the support, and the axes of the frame: (3 + gdim, n_points, gdim).
+            obstacle, and that of the obstacle as far as it is prescribed: (3, n_points, gdim).
+            Where the obstacle turns, the displacement relative to it in its frame, that of the
+            body less the free motion of the obstacle, and the axes of the frame: (3 + gdim,
+                n_points, gdim).
             Where a moment turns it two more: `Contact.turning_rate`, and the angle.
         springs: Of each contact the energy in the springs at the points, (n_points,).
     """
@@ -92,7 +94,7 @@ class EnergyState:
         return cls(forces, [_ways(c, c.traction) for c in contacts], springs)
 
     def between(self, jumps: Sequence[Array]) -> EnergyState:
-        """The same state with the displacements relative to supports taken between new pairs."""
+        """The same state with the displacements relative to obstacles taken between new pairs."""
         ways = [
             np.stack([w[0], jump, *w[2:]]) for w, jump in zip(self.contacts, jumps, strict=True)
         ]
@@ -165,7 +167,7 @@ class EnergyState:
             friction=friction,
             sliding=sliding,
             imbalance=work - elastic - tractions,
-            created=float((sums[5, gives] / exchanged[gives]).max(initial=0.0)),
+            friction_energy_gain=float((sums[5, gives] / exchanged[gives]).max(initial=0.0)),
         )
 
 
@@ -176,7 +178,7 @@ def _ways(contact: Contact, traction: Array) -> Array:
         return np.stack([traction, jump, contact.values.shift])
     units = np.eye(jump.shape[1])
     axes = [contact.opposite.turned(np.broadcast_to(unit, jump.shape)) for unit in units]
-    # The work of forces that move the support is that of the loads.
+    # The work of forces that move the obstacle is that of the loads.
     own = contact.own_displacement()
     for component, motion in contact.free_motion.items():
         own[:, component] -= float(motion.value)

@@ -154,17 +154,17 @@ def check_contacts(
 
 
 def _check_shared(one: Contact, other: Contact) -> None:
-    """Refuse one force or moment for the supports of two contacts, which move each on its own."""
-    moved = one.support.displacement, other.support.displacement
-    turned = one.support.rotation, other.support.rotation
+    """Refuse one force or moment for the obstacles of two contacts, which move each on its own."""
+    moved = one.obstacle.displacement, other.obstacle.displacement
+    turned = one.obstacle.rotation, other.obstacle.rotation
     for free, (mine, theirs), what in (
         (bool(one.free_motion), moved, "Motion, whose force"),
         (one.free_angle is not None, turned, "Rotation, whose moment"),
     ):
         if free and mine is theirs:
             raise ValueError(
-                f"{one.name} and {other.name} have one {what} would act twice, on two supports "
-                "that move each on its own; of one support make one Contact, on "
+                f"{one.name} and {other.name} have one {what} would act twice, on two obstacles "
+                "that move each on its own; of one obstacle make one Contact, on "
                 "ContactSurface(mesh, tags, [1, 2]), or give each its own"
             )
 
@@ -179,7 +179,7 @@ def _facets_held(contact: Contact, constrained: Array) -> int:
 def check_start(contacts: Sequence[Contact]) -> float:
     """Refuse input out of range; warn of what makes forces wrong without an error. Collective.
 
-    These are bodies in their supports, points too few for what is opposite, one support twice.
+    These are bodies in their obstacles, points too few for what is opposite, one obstacle twice.
 
     Args:
         contacts: Of a problem.
@@ -199,7 +199,7 @@ def check_start(contacts: Sequence[Contact]) -> float:
         if not extent * np.finfo(np.float64).eps <= _COORDINATE_ROUND_OFF * smallest:
             raise ValueError(
                 f"{contact.name}: facets of Γc of size {smallest:.3g} have coordinates as large as "
-                f"{extent:.3g}, of which double precision keeps 16 digits; move mesh and supports "
+                f"{extent:.3g}, of which double precision keeps 16 digits; move mesh and obstacles "
                 "next to the origin"
             )
         contact.check_input()
@@ -209,7 +209,7 @@ def check_start(contacts: Sequence[Contact]) -> float:
             worst = max(worst, -gap)
             if comm.rank == 0:
                 logger.warning(
-                    "%s: the undeformed body penetrates its support by up to %g",
+                    "%s: the undeformed body penetrates its obstacle by up to %g",
                     contact.name,
                     -gap,
                 )
@@ -233,7 +233,7 @@ def _warn_of_few_points(contact: Contact) -> None:
 
 
 def _warn_of_doubles(contacts: Sequence[Contact]) -> None:
-    """Say which two contacts share the force of what is one support. Collective."""
+    """Say which two contacts share the force of what is one obstacle. Collective."""
     if len(contacts) < 2:
         return
     comm, pairs = contacts[0].surface.mesh.comm, list(combinations(contacts, 2))
@@ -242,7 +242,7 @@ def _warn_of_doubles(contacts: Sequence[Contact]) -> None:
         if n_facets:
             warn(
                 comm,
-                f"{one.name} and {other.name} press on one and the same support at {n_facets} "
+                f"{one.name} and {other.name} press on one and the same obstacle at {n_facets} "
                 "facets of Γc: each bears its share of the force there, as springs side by side "
                 "do; make one Contact of them, or take these facets out of one, unless two laws "
                 "are meant to act together",
@@ -250,8 +250,8 @@ def _warn_of_doubles(contacts: Sequence[Contact]) -> None:
 
 
 def _n_doubled(one: Contact, other: Contact) -> int:
-    """Facets of this rank where two supports of one kind that move as one are at one place."""
-    mine, theirs = one.support, other.support
+    """Facets of this rank where two obstacles of one kind that move as one are at one place."""
+    mine, theirs = one.obstacle, other.obstacle
     if one.free_motion or other.free_motion:  # each moves by its own force
         return 0
     moved = mine.displacement is theirs.displacement or mine.displacement == theirs.displacement

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from dolfinx import fem
 
+from fenics_contact.checks.cross_check import CrossCheck
 from fenics_contact.checks.kinematics import Linearisation, linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.quadrature_resolution import warn_of_divided_facets, warn_of_few_points
-from fenics_contact.checks.second_route import SecondRoute
 from fenics_contact.checks.tunnelling import TunnellingCheck
-from fenics_contact.checks.verdict import Balance, Verdict, check_laws
+from fenics_contact.checks.verdict import ForceBalance, Verdict, check_laws
 from fenics_contact.parallel import global_sum, warn
 from fenics_contact.systems.ejected_bodies import find_ejected_bodies
 from fenics_contact.systems.forces import Forces
@@ -35,23 +35,23 @@ class Judge:
     """Looks at evaluated states of a problem.
 
     Attributes:
-        kinematics: See `ContactProblem`.
+        small_displacement_tolerance: See `ContactProblem`.
     """
 
     def __init__(
-        self, full: FullSystem, motions: RigidBodyModes, *, kinematics: float, second_route: bool
+        self, full: FullSystem, motions: RigidBodyModes, *, tolerance: float, cross_check: bool
     ) -> None:
         """Measure the mesh.
 
         Args:
             full: The system on all unknowns.
             motions: Rigid motions of the bodies.
-            kinematics: See `ContactProblem`.
-            second_route: Likewise.
+            tolerance: ``small_displacement_tolerance`` of `ContactProblem`.
+            cross_check: Likewise.
         """
-        self.kinematics = kinematics
+        self.small_displacement_tolerance = tolerance
         self._full, self._motions = full, motions
-        self._second_route = SecondRoute(full.contacts) if second_route else None
+        self._cross_check = CrossCheck(full.contacts) if cross_check else None
         self._contacts, self._comm = full.contacts, full.unknowns.comm
         self._tunnelling = TunnellingCheck(full.contacts)
         self._warned: dict[str, float] = {}
@@ -109,8 +109,8 @@ class Judge:
         unbalanced = np.max([np.linalg.norm(part, axis=1) for part in parts], axis=0)
         sums = zip(names, unbalanced, sizes[1], allowed, strict=False)
         verdict = Verdict(
-            equations={name: Balance(*map(float, row)) for name, *row in equations},
-            sums={name: Balance(*map(float, row)) for name, *row in sums},
+            equations={name: ForceBalance(*map(float, row)) for name, *row in equations},
+            sums={name: ForceBalance(*map(float, row)) for name, *row in sums},
             laws={c.name: check_laws(c) for c in self._contacts} if laws else {},
             enforcement={c.name: c.enforcement_error() for c in augmented},
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
@@ -118,13 +118,13 @@ class Judge:
             # Of the opposite only what Γc meets is known before u is complete.
             tunnelling=self._tunnelling.evaluate(before) if system is self._full else {},
             kinematics=self._linearisation(respond) if respond else {},
-            kinematics_allowed=self.kinematics,
+            small_displacement_tolerance=self.small_displacement_tolerance,
             deformation=self._deformation(),
             ejected_bodies=find_ejected_bodies(self._full, self._motions, contacts, began)
             if laws and system is self._full
             else {},
             inverted=self._full.bulk.is_inverted(),
-            routes=self._second_route.compare() if self._second_route and laws else {},
+            cross_check=self._cross_check.compare() if self._cross_check and laws else {},
         )
         return verdict, system.forces(bulk, reaction)
 

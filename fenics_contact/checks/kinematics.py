@@ -1,7 +1,7 @@
 """What small displacements leave out: gap and normal where the body has moved to.
 
 The gap is taken as s - u_n with s and n of the undeformed body. Where the body has moved by u both
-are others, by the curvature of the support or because the bodies have turned. What that changes in
+are others, by the curvature of the obstacle or because the bodies have turned. What that changes in
 the forces follows from one linear solve with the tangent at hand.
 """
 

@@ -1,4 +1,4 @@
-"""Whether a support is what contact takes it for, where the body has moved to."""
+"""Whether an obstacle is what contact takes it for, where the body has moved to."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ __all__ = ["ObstacleCheck"]
 
 # By how much the gradient of a distance may differ from 1 where contact is.
 _SLOPE = 0.05
-# Penetration by the radius of curvature that is left there: 1 is half of that of the support.
+# Penetration by the radius of curvature that is left there: 1 is half of that of the obstacle.
 _DEEP = 1.0
-# Of the angle that a support turns by in an increment (radians): a right one and round-off. Beyond
-# two of them the straight way of a point leads backwards.
+# Of the angle that an obstacle turns by in an increment (radians): a right one and round-off.
+# Beyond two of them the straight way of a point leads backwards.
 _TURN = np.pi / 2 + 1e-9
 
 
@@ -29,8 +29,8 @@ class ObstacleCheck:
     Attributes:
         slope: Length of the gradient of the distance at closed points, where it is farthest from 1.
         depth: With finite kinematics the largest penetration, by the distance from there to the
-            centre of curvature of the support.
-        turn: By which the support has turned in this increment where there is friction (radians).
+            centre of curvature of the obstacle.
+        turn: By which the obstacle has turned in this increment where there is friction (radians).
     """
 
     slope: float
@@ -46,7 +46,7 @@ class ObstacleCheck:
         slope = max(ends, key=lambda value: abs(value - 1.0))
         depth = 0.0
         curvature = contact.opposite.largest_curvature()
-        if curvature is not None and not contact.support.is_flat:
+        if curvature is not None and not contact.obstacle.is_flat:
             depth = global_max(comm, (contact.values.penetration * curvature)[closed])
         rubs = contact.law.has_friction and comm.allreduce(int(closed.any())) > 0
         turn = abs(contact.opposite.turned_by(contact.values)) if rubs else 0.0
@@ -57,19 +57,18 @@ class ObstacleCheck:
         found = []
         if not abs(self.slope - 1.0) <= _SLOPE:
             found.append(
-                f"{contact}: the distance of the Obstacle changes by {self.slope:.3g} per length "
-                "where contact is, and not by 1: it is none; divide it by the length of its "
-                "gradient"
+                f"{contact}: the gradient of the SignedDistance has length {self.slope:.3g} where "
+                "contact is; it must be 1: divide the function by the length of its gradient"
             )
         if not self.depth <= _DEEP:
             found.append(
-                f"{contact}: a point is as deep in the support as half of its radius of curvature, "
-                "and about to come out on its other side; take a larger k_n, or "
-                'enforcement="augmented"'
+                f"{contact}: the penetration of a point is half of the radius of curvature of the "
+                "obstacle, so that its closest point may be on the other side; increase k_n, or "
+                'use enforcement="augmented"'
             )
         if not self.turn <= _TURN:
             found.append(
-                f"{contact}: the support turns by {self.turn:.3g} rad in one increment, in which "
+                f"{contact}: the obstacle turns by {self.turn:.3g} rad in one increment, in which "
                 "friction takes the straight way between both ends; turn it by no more than a "
                 "right angle in each"
             )

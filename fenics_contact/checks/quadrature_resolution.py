@@ -45,7 +45,7 @@ def warn_of_few_points(contact: Contact) -> bool:
     warn(
         comm,
         f"{contact.name}: facets of Γc that bear {100 * borne / whole:.2g} % of the normal force "
-        f"are {most:.2g} times as long as the radius of the support there, whose shape passes "
+        f"are {most:.2g} times as long as the radius of the obstacle there, whose shape passes "
         "between their points: the force is wrong. Take smaller facets, or give "
         f"ContactSurface(quadrature_degree={round(POINTS_PER_RADIUS * most) * points - 2}), as "
         "many points as see it",

@@ -27,7 +27,7 @@ class Step:
         increment: Number of the increment, from 1.
         reason: SNES reason of the last solve (positive: converged).
         iterations: SNES iterations in all, those on too few unknowns included.
-        rounds: Solutions one after another, with multipliers between them.
+        augmentations: Updates of the multipliers, the first solution included.
         method: The method that found the solution; see `ContactProblem`.
         factorisations: Sparse matrices factored; dense ones of a condensed problem do not count.
         verdict: The independent check.
@@ -45,7 +45,7 @@ class Step:
     increment: int
     reason: int
     iterations: int
-    rounds: int
+    augmentations: int
     method: str
     factorisations: int
     verdict: Verdict
@@ -63,7 +63,7 @@ class Step:
         Of every contact "force" is ∫ -r_n, "friction ∫|τ|" the sum of the sizes over the points,
         and "resultant" the force on the body, in which tractions of opposite ways cancel. A contact
         whose forces are no more than the residual that passes has "no contact force"
-        (`Balance.is_loaded`): how many of its points stick or slip is round-off. What small
+        (`ForceBalance.is_loaded`): how many of its points stick or slip is round-off. What small
         displacements leave out is said from 1 % of force or pressure on. Where forces and areas are
         per unit thickness (`Resultants.per_thickness`) the line ends with these words.
         """

@@ -16,7 +16,7 @@ from fenics_contact.parallel import global_max, global_min, longest
 from fenics_contact.systems.balance import MOST_EXCUSED
 from fenics_contact.types import Array
 
-__all__ = ["Attempt", "Balance", "NotConverged", "Verdict", "check_laws"]
+__all__ = ["Attempt", "ForceBalance", "NotConverged", "Verdict", "check_laws"]
 
 # The laws hold point by point up to rounding of their few operations.
 _LAW_TOLERANCE = 1e-10
@@ -25,14 +25,14 @@ _ROUND_OFF = 16 * np.finfo(float).eps / _LAW_TOLERANCE
 # Share of the energy exchanged that friction may seem to give: by the mean of the tractions at both
 # ends it does so where slip turns round within a long increment (6 % where a load aside is
 # reversed at once); in a state that smaller increments do not lead to it is half or more.
-_CREATED = 0.25
+_MAX_FRICTION_ENERGY_GAIN = 0.25
 # A displacement by the size of the body, rigid motion apart, that no body with stiffness has: half
 # of what its ends move apart.
 _MOST_DEFORMED = 5.0
 
 
 @dataclass(frozen=True)
-class Balance:
+class ForceBalance:
     """What is left of forces that should balance, and what it is judged by.
 
     Attributes:
@@ -79,7 +79,7 @@ class Verdict:
     """What was checked after a solve, the same on every rank.
 
     Attributes:
-        equations: Norms of the free residual, recomputed by assembly, by body, free support and
+        equations: Norms of the free residual, recomputed by assembly, by body, free obstacle and
             contact: each is judged by the forces that act on it in the present increment.
         sums: Largest component of load + contact + reactions, by body, and of their moments about
             its middle, by its size: contact by its tractions at the points and not by its nodal
@@ -87,37 +87,38 @@ class Verdict:
         laws: Largest violations by contact and by law, relative; see `check_laws`.
         enforcement: `Contact.enforcement_error` of the contacts with multipliers, by name.
         enforcement_tolerance: What passes, by name.
-        obstacles: What is found of supports that are rigid or go far, by contact.
+        obstacles: What is found of obstacles that are rigid or go far, by contact.
         tunnelling: Penetration that the points of a contact do not resist, and places that have
             crossed what lies opposite, by contact; see `Tunnelling`.
         kinematics: What taking displacements as small changes, relative, by contact.
-        kinematics_allowed: What passes; where it is finite no body passes that is deformed by more
-            than five times its size.
+        small_displacement_tolerance: What passes; where it is finite no body passes that is
+            deformed by more than five times its size.
         deformation: Of every body its largest displacement, rigid motion apart, by its size, or by
             how far its Dirichlet values differ, if that is more.
         ejected_bodies: Bodies that nothing touches any more, how far they have gone, and how far
             anything else has (length), by their names; see `find_ejected_bodies`.
-        created: Share of the energy exchanged that friction has given; see `Energy.created`.
+        friction_energy_gain: Share of the energy exchanged that friction has given; see
+            `Energy.friction_energy_gain`.
         inverted: Whether cells of a nonlinear bulk are turned inside out.
-        routes: By contact the largest difference of its nodal forces from those that DOLFINx
-            assembles from the boundary form; empty where it was not asked for, see ``second_route``
+        cross_check: By contact the largest difference of its nodal forces from those that DOLFINx
+            assembles from the boundary form; empty where it was not asked for, see ``cross_check``
             of `ContactProblem`.
     """
 
-    equations: dict[str, Balance]
-    sums: dict[str, Balance]
+    equations: dict[str, ForceBalance]
+    sums: dict[str, ForceBalance]
     laws: dict[str, dict[str, float]] = field(default_factory=dict)
     enforcement: dict[str, float] = field(default_factory=dict)
     enforcement_tolerance: dict[str, float] = field(default_factory=dict)
     obstacles: dict[str, ObstacleCheck] = field(default_factory=dict)
     tunnelling: dict[str, Tunnelling] = field(default_factory=dict)
     kinematics: dict[str, Linearisation] = field(default_factory=dict)
-    kinematics_allowed: float = np.inf
+    small_displacement_tolerance: float = np.inf
     deformation: dict[str, float] = field(default_factory=dict)
     ejected_bodies: dict[str, tuple[float, float]] = field(default_factory=dict)
-    created: float = 0.0
+    friction_energy_gain: float = 0.0
     inverted: bool = False
-    routes: dict[str, Balance] = field(default_factory=dict)
+    cross_check: dict[str, ForceBalance] = field(default_factory=dict)
 
     @property
     def inexact(self) -> dict[str, float]:
@@ -155,7 +156,7 @@ class Verdict:
 
     @property
     def is_loaded(self) -> bool:
-        """Whether forces act on a body, a free support or a contact; see `Balance.is_loaded`."""
+        """Whether forces act on a body, a free obstacle or a contact (`ForceBalance.is_loaded`)."""
         return any(balance.is_loaded for balance in self.equations.values())
 
     @property
@@ -165,14 +166,14 @@ class Verdict:
         return max((balance.residual / balance.force for balance in loaded), default=0.0)
 
     @staticmethod
-    def _worst(balances: dict[str, Balance]) -> Balance:
-        return max(balances.values(), key=Balance.excess)
+    def _worst(balances: dict[str, ForceBalance]) -> ForceBalance:
+        return max(balances.values(), key=ForceBalance.excess)
 
     def _repr_html_(self) -> str:
         """What is left of what must vanish, and what passes, for notebooks."""
         balances = {f"equations, {name}": b for name, b in self.equations.items()}
         balances |= {f"sums of forces, {name}": b for name, b in self.sums.items()}
-        balances |= {f"second route, {name}": b for name, b in self.routes.items()}
+        balances |= {f"cross-check, {name}": b for name, b in self.cross_check.items()}
         rows = [(n, f"{b.residual:.2e}", f"{b.tolerance:.2e}") for n, b in balances.items()]
         for contact, laws in self.laws.items():
             for law, violation in laws.items():
@@ -200,7 +201,7 @@ class Verdict:
         for name, balance in self.sums.items():
             if not balance.holds():
                 found.append(f"forces on {name}, or their moments, do not balance: {balance}")
-        for contact, balance in self.routes.items():
+        for contact, balance in self.cross_check.items():
             if not balance.holds():
                 found.append(
                     f"{contact}: forces differ from those of the boundary form as DOLFINx "
@@ -219,17 +220,18 @@ class Verdict:
                     f"{contact}: penetration or elastic slip left, {error:.3e} of the largest "
                     f"traction in the springs, above {allowed:.3e}; a larger tolerance, or "
                     "k_n and k_t nearer to 10 E/h, take fewer rounds; where a Dirichlet condition "
-                    "holds a node of Γc inside of the support nothing undoes it: take such facets "
+                    "holds a node of Γc inside of the obstacle nothing undoes it: take such facets "
                     "out of Γc"
                 )
-        if not self.created <= _CREATED:
+        if not self.friction_energy_gain <= _MAX_FRICTION_ENERGY_GAIN:
             found.append(
-                f"friction would drive the slip, by {100 * self.created:.2g} % of the energy "
-                "exchanged: another state than smaller increments lead to, where several satisfy "
-                "the equations; use smaller ones (increments() cuts them by itself)"
+                "friction would drive the slip, by "
+                f"{100 * self.friction_energy_gain:.2g} % of the energy exchanged. Several "
+                "states satisfy the equations; smaller increments lead to another one. Use smaller "
+                "increments (increments() halves them where needed)"
             )
         for contact, change in self.kinematics.items():
-            if self.kinematics_allowed == np.inf:
+            if self.small_displacement_tolerance == np.inf:
                 continue
             if not np.isfinite(change.judged):
                 found.append(
@@ -237,24 +239,26 @@ class Verdict:
                     "be told, because the springs of contact at its points hold a body against "
                     "nothing; where friction alone holds it and all points slip, the load is at "
                     "its limit; hold it by a condition or a weak spring, or accept it: "
-                    "ContactProblem(kinematics=inf)"
+                    "ContactProblem(small_displacement_tolerance=inf)"
                 )
-            elif change.judged > self.kinematics_allowed:
+            elif change.judged > self.small_displacement_tolerance:
                 found.append(
                     f"{contact}: displacements are too large to be taken as small: with gap and "
                     "normals where the body has moved to, the contact force would differ by "
                     f"{100 * change.force:.2g} % and the pressure by "
-                    f"{100 * change.pressure:.2g} %, above {100 * self.kinematics_allowed:.2g} %; "
-                    "load in smaller steps, describe the motion as one of the support, find pairs "
-                    'anew (update="increment"), or accept it: ContactProblem(kinematics=inf)'
+                    f"{100 * change.pressure:.2g} %, above "
+                    f"{100 * self.small_displacement_tolerance:.2g} %; "
+                    "load in smaller steps, describe the motion as one of the obstacle, find pairs "
+                    'anew (update_pairs="increment"), or accept it: '
+                    "ContactProblem(small_displacement_tolerance=inf)"
                 )
         for name, deformation in self.deformation.items():
-            if self.kinematics_allowed == np.inf or deformation <= _MOST_DEFORMED:
+            if self.small_displacement_tolerance == np.inf or deformation <= _MOST_DEFORMED:
                 continue
             found.append(
                 f"{name} is deformed by {deformation:.2g} times its size: nothing holds a part of "
                 "it, or stiffness and loads are in other units than lengths; or accept it: "
-                "ContactProblem(kinematics=inf)"
+                "ContactProblem(small_displacement_tolerance=inf)"
             )
         for name, (way, others) in self.ejected_bodies.items():
             found.append(

@@ -1,1 +1,1 @@
-"""Contact: displacement, surface, support and law bound together."""
+"""Contact: displacement, surface, obstacle and law bound together."""

@@ -15,9 +15,9 @@ from fenics_contact.contact.pairs import Pairs
 from fenics_contact.contact.point_law import PointLaw, PointTangent
 from fenics_contact.contact.present import PresentKinematics, PresentPairs
 from fenics_contact.contact.values import PointValues
+from fenics_contact.obstacles.base import Placement
+from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import global_max
-from fenics_contact.supports.base import Placement
-from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.types import Array
 
 __all__ = ["BodyOpposite", "FollowedOpposite"]
@@ -81,9 +81,9 @@ class BodyOpposite(Opposite):
 
     @property
     def _update(self) -> str:
-        support = self._parts.support
-        assert isinstance(support, DeformableBody)
-        return support.update
+        obstacle = self._parts.obstacle
+        assert isinstance(obstacle, DeformableBody)
+        return obstacle.update_pairs
 
     def pairs_due(self, values: PointValues) -> bool:
         """See `Opposite`."""
@@ -136,9 +136,9 @@ class FollowedOpposite(BodyOpposite):
 
     def __init__(self, parts: Parts) -> None:
         """Collect both surfaces. Collective."""
-        support = parts.support
-        assert isinstance(support, DeformableBody)
-        pairs = PresentPairs(parts.name, parts.displacement.u, parts.quadrature, support)
+        obstacle = parts.obstacle
+        assert isinstance(obstacle, DeformableBody)
+        pairs = PresentPairs(parts.name, parts.displacement.u, parts.quadrature, obstacle)
         super().__init__(parts, pairs)
         self._present = pairs
         self.felt = pairs.felt.function
@@ -177,7 +177,7 @@ class FollowedOpposite(BodyOpposite):
 
     @property
     def may_pair_anew(self) -> bool:
-        """See `Opposite`: not at a commit alone, whatever the support says."""
+        """See `Opposite`: not at a commit alone, whatever the obstacle says."""
         return False
 
     @property

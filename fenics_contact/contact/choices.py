@@ -10,9 +10,9 @@ from fenics_contact.contact.body import BodyOpposite, FollowedOpposite
 from fenics_contact.contact.opposite import Opposite, Parts
 from fenics_contact.contact.rigid import MovingOpposite, RigidOpposite
 from fenics_contact.laws.base import Law
-from fenics_contact.laws.stiffness import Springs
-from fenics_contact.supports.base import Support
-from fenics_contact.supports.deformable import DeformableBody
+from fenics_contact.laws.stiffness import NodalSprings
+from fenics_contact.obstacles.base import Obstacle
+from fenics_contact.obstacles.deformable import DeformableBody
 
 __all__ = ["enforcement_of", "is_finite", "is_regularised", "opposite_of"]
 
@@ -23,13 +23,13 @@ _KINEMATICS = ("small", "finite")
 _TOLERANCE = 1e-5
 
 
-def is_finite(name: str, kinematics: str, support: Support, law: Law, gap: Any) -> bool:
+def is_finite(name: str, kinematics: str, obstacle: Obstacle, law: Law, gap: Any) -> bool:
     """Whether displacements may be of any size.
 
     Args:
         name: Of the contact, in messages.
         kinematics: As given to `Contact`.
-        support: Likewise.
+        obstacle: Likewise.
         law: Likewise.
         gap: Likewise.
 
@@ -42,9 +42,9 @@ def is_finite(name: str, kinematics: str, support: Support, law: Law, gap: Any) 
             "passes in a verdict is the kinematics of the ContactProblem)"
         )
     if kinematics == "small":
-        if support.rotation is not None:
+        if obstacle.rotation is not None:
             raise ValueError(
-                f'{name}: a support that turns needs Contact(kinematics="finite"); for turns '
+                f'{name}: an obstacle that turns needs Contact(kinematics="finite"); for turns '
                 "below 0.01 give its displacement as a UFL vector: forces are off by about as much "
                 "as the angle"
             )
@@ -52,11 +52,11 @@ def is_finite(name: str, kinematics: str, support: Support, law: Law, gap: Any) 
     if gap is not None:
         raise ValueError(
             f"{name}: a gap is prescribed, and finite kinematics take it from the places of "
-            "body and support; leave the gap out, and move the support by its displacement"
+            "body and obstacle; leave the gap out, and move the obstacle by its displacement"
         )
     if law.has_tangential and not law.has_friction:
         raise ValueError(
-            f"{name}: {type(law).__name__} bonds points to places of the support, and finite "
+            f"{name}: {type(law).__name__} bonds points to places of the obstacle, and finite "
             "kinematics know no such law; use one with friction, or leave k_t out"
         )
     return True
@@ -64,7 +64,7 @@ def is_finite(name: str, kinematics: str, support: Support, law: Law, gap: Any) 
 
 def is_regularised(law: Law) -> bool:
     """Whether the stiffness stands for none at all, and is not that of physical springs."""
-    springs = (isinstance(v, Springs) for v in law.parameters().values())
+    springs = (isinstance(v, NodalSprings) for v in law.parameters().values())
     return not law.is_physical and not any(springs)
 
 
@@ -94,8 +94,8 @@ def enforcement_of(
     if enforcement == "penalty":
         return False, tolerance
     if not is_regularised(law):
-        springs = [n for n, v in law.parameters().items() if isinstance(v, Springs)]
-        what = f"{springs[0]} by Springs" if springs else type(law).__name__
+        springs = [n for n, v in law.parameters().items() if isinstance(v, NodalSprings)]
+        what = f"{springs[0]} by NodalSprings" if springs else type(law).__name__
         raise ValueError(
             f"{name}: {what} has the stiffness of something that is there; multipliers "
             'would take it away; use enforcement="penalty", or a law and stiffness that stand '
@@ -105,12 +105,12 @@ def enforcement_of(
 
 
 def opposite_of(parts: Parts, *, finite: bool) -> Opposite:
-    """What lies opposite, by support and kinematics. Collective.
+    """What lies opposite, by obstacle and kinematics. Collective.
 
     Args:
         parts: Of the contact.
         finite: Whether displacements may be of any size.
     """
-    if isinstance(parts.support, DeformableBody):
+    if isinstance(parts.obstacle, DeformableBody):
         return FollowedOpposite(parts) if finite else BodyOpposite(parts)
     return MovingOpposite(parts) if finite else RigidOpposite(parts)

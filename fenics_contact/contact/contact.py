@@ -1,4 +1,4 @@
-"""Contact: binds displacement, surface, support and law; the boundary form and its results."""
+"""Contact: binds displacement, surface, obstacle and law; the boundary form and its results."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from fenics_contact.contact.pairs import Pairs
 from fenics_contact.contact.results import PointResults
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law
-from fenics_contact.supports.base import SampledSupport, Support
-from fenics_contact.supports.deformable import DeformableBody
+from fenics_contact.obstacles.base import Obstacle, SampledObstacle
+from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.surface.displacement import Displacement, check_kind
 from fenics_contact.surface.facet_places import FacetPlaces
 from fenics_contact.surface.fields import PointFields
@@ -72,28 +72,28 @@ class Committed:
 
 
 class Contact(PointResults):
-    """Frictional contact of Γc with a support, as a boundary form and a committed history.
+    """Frictional contact of Γc with an obstacle, as a boundary form and a committed history.
 
     Attributes:
         u: The displacement, a vector-valued Lagrange function; of a mixed function one of its own,
             which has the values of the last evaluation.
         displacement: What it is in the function that is solved for.
-        surface, support, law: What was given.
+        surface, obstacle, law: What was given.
         quadrature: The points of Γc.
         history: The committed state.
         multipliers: λ_n and λ_t of augmented enforcement, None under penalty.
         accuracy: What was chosen for the accuracy wanted, None if none was said.
         tolerance: What `enforcement_error` must come below, with multipliers.
-        parameters: Every parameter of law and support given by a number, as a ``fem.Constant``
+        parameters: Every parameter of law and obstacle given by a number, as a ``fem.Constant``
             by name ("friction", "k_n", "displacement" …): set ``.value`` to change it. Of a
-            `Scaled` stiffness that is the multiple of E/h.
+            `RelativeStiffness` stiffness that is the multiple of E/h.
         entity_maps: For compiling `form` in a problem of one's own.
         name: In messages and files.
-        free_motion: Components of the support's displacement that follow from the force on it, as
+        free_motion: Components of the obstacle's displacement that follow from the force on it, as
             scalar constants by number of the component: their values are results (length).
         applied_force: The forces on it, likewise (force).
-        free_angle: Angle of a support that is turned by a moment, a scalar constant whose value is
-            a result (radians); None: there is none.
+        free_angle: Angle of an obstacle that is turned by a moment, a scalar constant whose value
+            is a result (radians); None: there is none.
         applied_moment: The moment, likewise (force times length).
         inputs: All that was given, as UFL.
         gap_prescribed: Whether the gap was given apart from the geometry.
@@ -107,7 +107,7 @@ class Contact(PointResults):
         self,
         u: fem.Function | ufl.core.expr.Expr,
         surface: ContactSurface,
-        support: Support,
+        obstacle: Obstacle,
         law: Law,
         *,
         gap: Any = None,
@@ -126,19 +126,19 @@ class Contact(PointResults):
                 a part of a mixed function w, beside a pressure, that of ``u, p = ufl.split(w)``;
                 parts that are bubbles may be added to it, which Γc does not feel.
             surface: Γc.
-            support: What it presses on.
+            obstacle: What it presses on.
             law: The reactions.
-            gap: Initial gap s (length) prescribed independently of the support's geometry (paper,
-                footnote 1): a number, constant or UFL. The support's motion is added to it, and
-                belongs into ``displacement`` of the support: a constant in the gap that is changed
+            gap: Initial gap s (length) prescribed independently of the obstacle's geometry (paper,
+                footnote 1): a number, constant or UFL. The obstacle's motion is added to it, and
+                belongs into ``displacement`` of the obstacle: a constant in the gap that is changed
                 opens and closes it, as an interference that grows does, and no more. Friction feels
                 nothing of what moves along Γc with it, and does no work on it. 0 is for bodies that
                 touch all over at first, whose facets alone leave gaps.
             weight: Factor of the surface measure where the bulk form carries one: a thickness, or
                 2πr for axisymmetric problems.
             modulus: Young's modulus near Γc (stress), a number or function with one value per
-                cell, for `Scaled` stiffness. By default it is measured from the bulk form, by
-                `ContactProblem`.
+                cell, for `RelativeStiffness`. By default it is measured from the bulk
+                form, by `ContactProblem`.
             accuracy: "draft", "standard", "fine", or the relative error wanted in contact force and
                 pressure: sets enforcement, tolerance and stiffness where they are not given, the
                 solver's tolerance and the number of increments; see `Accuracy`.
@@ -151,56 +151,56 @@ class Contact(PointResults):
                 functions of the multipliers the penetration is that share of the penalty's.
             kinematics: "small": gap and normals are those of the undeformed body, and the verdict
                 looks at what that leaves out. "finite": displacements and rotations may be of any
-                size, on a rigid support whose place is known everywhere or on a `DeformableBody`;
+                size, on a rigid obstacle whose place is known everywhere or on a `DeformableBody`;
                 the bulk form should bear them, too. Tractions and stiffness are per undeformed
                 area.
             name: In messages and files.
 
         Raises:
-            ValueError: ``u`` is no displacement of this mesh, or data of support or law are wrong.
+            ValueError: ``u`` is no displacement of this mesh, or data of obstacle or law are wrong.
             TypeError: A parameter is of a type that cannot be a coefficient.
         """
         check_instance("name", name, str)
-        order = "the order is Contact(u, surface, support, law)"
+        order = "the order is Contact(u, surface, obstacle, law)"
         check_kind(u, name, order)
         for what, value, kind in (
             ("surface", surface, ContactSurface),
-            ("support", support, Support),
+            ("obstacle", obstacle, Obstacle),
             ("law", law, Law),
         ):
             check_instance(f"{name}: {what}", value, kind, order)
         self.name = name
-        self.surface, self.support, self.law = surface, support, law
+        self.surface, self.obstacle, self.law = surface, obstacle, law
         self.entity_maps = surface.entity_maps
         gdim = surface.mesh.geometry.dim
         self.displacement = Displacement(u, surface.mesh, name)
         self.u, degree = self.displacement.u, self.displacement.degree
         try:
-            support.check_complete()
+            obstacle.check_complete()
             law.check_complete()
             law.check_dimension(gdim)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
         self.accuracy = None if accuracy is None else Accuracy.of(accuracy)
-        self.finite = is_finite(name, kinematics, support, law, gap)
+        self.finite = is_finite(name, kinematics, obstacle, law, gap)
         augments, self.tolerance = enforcement_of(name, enforcement, tolerance, law, self.accuracy)
         # Linear elements hold a curved gap at their nodes alone (docs/enforcement.md). But between
         # two meshes, and on quadrilaterals of any shape, nodes carry no uniform pressure over.
-        nodal = augments and degree == 1 and not isinstance(support, DeformableBody)
+        nodal = augments and degree == 1 and not isinstance(obstacle, DeformableBody)
         nodal = nodal and surface.submesh.topology.cell_name() != "quadrilateral"
         # Nor where the area of a vertex is not that of its share of a uniform pressure.
         nodal = nodal and not varies(weight)
         opposite = None
-        if isinstance(support, DeformableBody):
-            opposite = tagged_facets(surface.mesh, support.facet_tags, support.tags)
+        if isinstance(obstacle, DeformableBody):
+            opposite = tagged_facets(surface.mesh, obstacle.facet_tags, obstacle.tags)
         self.quadrature = surface.quadrature(
             degree,
             nodal=nodal,
             opposite=opposite,
             pieces=not self.finite,
-            radius=support.smallest_radius,
+            radius=obstacle.smallest_radius,
         )
-        moving = self.finite and not isinstance(support, DeformableBody)
+        moving = self.finite and not isinstance(obstacle, DeformableBody)
         self.multipliers: Multipliers | None = None
         if augments:
             self.multipliers = Multipliers(self.quadrature, degree, law, turning=moving)
@@ -208,7 +208,7 @@ class Contact(PointResults):
             name,
             self.quadrature,
             law,
-            support,
+            obstacle,
             weight=weight,
             accuracy=self.accuracy,
             opposite=opposite,
@@ -232,7 +232,7 @@ class Contact(PointResults):
             name=name,
             displacement=self.displacement,
             quadrature=self.quadrature,
-            support=support,
+            obstacle=obstacle,
             law=law,
             inputs=self.inputs,
             gap=gap,
@@ -257,12 +257,12 @@ class Contact(PointResults):
         Args:
             v: Test function of ``u``'s space, of a mixed function the part of the test function
                 that ``ufl.split`` gives. Compile with ``entity_maps=contact.entity_maps``.
-                With a `SampledSupport` call `evaluate` before assembling, wherever ``u`` or the
-                support has moved: the form has the expansion about where it was sampled last.
+                With a `SampledObstacle` call `evaluate` before assembling, wherever ``u`` or the
+                obstacle has moved: the form has the expansion about where it was sampled last.
 
         Raises:
-            ValueError: A stiffness is `Scaled` and the modulus is not known; or the support is
-                another body, or moves by an amount that is unknown.
+            ValueError: A stiffness is `RelativeStiffness` and the modulus is not known; or the
+                obstacle is another body, or moves by an amount that is unknown.
         """
         self._check_form()
         return self.form_at(self.displacement.expression, v)
@@ -276,7 +276,7 @@ class Contact(PointResults):
         """Refuse what no form on Γc can hold."""
         if self.motions:
             raise ValueError(
-                f"{self.name}: the form on Γc cannot hold the unknown motion of the support; use "
+                f"{self.name}: the form on Γc cannot hold the unknown motion of the obstacle; use "
                 "ContactProblem, or prescribe the displacement"
             )
         if not self.rigid:
@@ -379,7 +379,7 @@ class Contact(PointResults):
 
     @property
     def free_motion(self) -> dict[int, fem.Constant]:
-        """Unknown components of the support's displacement; see the class."""
+        """Unknown components of the obstacle's displacement; see the class."""
         return self.inputs.free_motion
 
     @property
@@ -389,7 +389,7 @@ class Contact(PointResults):
 
     @property
     def free_angle(self) -> fem.Constant | None:
-        """Unknown angle of the support; see the class."""
+        """Unknown angle of the obstacle; see the class."""
         return self.inputs.free_angle
 
     @property
@@ -399,16 +399,16 @@ class Contact(PointResults):
 
     @property
     def motions(self) -> list[FreeMotion]:
-        """All unknowns of the support, displacements before the angle."""
+        """All unknowns of the obstacle, displacements before the angle."""
         return self.inputs.motions
 
     @property
     def needs_modulus(self) -> bool:
-        """Whether a stiffness is `Scaled` and still waits for `set_modulus`."""
+        """Whether a stiffness is `RelativeStiffness` and still waits for `set_modulus`."""
         return self.inputs.needs_modulus
 
     def set_modulus(self, modulus: Any) -> None:
-        """Fix E for `Scaled` stiffnesses: a number or a function, one value a cell. Collective."""
+        """Set E for `RelativeStiffness`: a number or a function, one value a cell. Collective."""
         self.inputs.set_modulus(modulus)
 
     @property
@@ -429,7 +429,7 @@ class Contact(PointResults):
         self.inputs.check(self.opposite.data.values)
 
     def given(self) -> dict[str, Array]:
-        """The data of law, support and contact at this rank's points, by name. Collective.
+        """The data of law, obstacle and contact at this rank's points, by name. Collective.
 
         What was evaluated before stays.
         """
@@ -443,12 +443,12 @@ class Contact(PointResults):
         return {n: v for n, v in data.items() if n in names or n.startswith("parameter ")}
 
     def reads(self, constant: fem.Constant) -> bool:
-        """Whether law, support, gap or weight were given with it.
+        """Whether law, obstacle, gap or weight were given with it.
 
         True where that cannot be seen: shapes in numbers, and laws from elsewhere, may hold it.
         """
         own = type(self.law).__module__.split(".")[0] == __name__.split(".")[0]
-        seen = own and not isinstance(self.support, SampledSupport)
+        seen = own and not isinstance(self.obstacle, SampledObstacle)
         loads = [motion.load() for motion in self.motions]
         return not seen or self.opposite.data.reads(constant) or any(f is constant for f in loads)
 
@@ -456,7 +456,7 @@ class Contact(PointResults):
 
     @property
     def rigid(self) -> bool:
-        """Whether the support is rigid: its reactions are then external to the mesh."""
+        """Whether the obstacle is rigid: its reactions are then external to the mesh."""
         return self.opposite.is_rigid
 
     @property
@@ -471,7 +471,7 @@ class Contact(PointResults):
 
     @property
     def paired(self) -> Mask:
-        """Which of this rank's points have an opposite, (n_points,); all on a rigid support.
+        """Which of this rank's points have an opposite, (n_points,); all on a rigid obstacle.
 
         The others bear nothing and are open.
         """
@@ -668,7 +668,7 @@ class Contact(PointResults):
     def begin(self) -> None:
         """Let slip be counted from the present ``u``, if nothing has been committed. Collective.
 
-        The support is where it was given, not displaced. `ContactProblem` calls it before its
+        The obstacle is where it was given, not displaced. `ContactProblem` calls it before its
         first increment; the constructor has done so for the ``u`` of then.
         """
         if not self.commits and self.opposite.begins_anew():

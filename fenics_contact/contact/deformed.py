@@ -1,4 +1,4 @@
-"""Where the support of a contact is, seen from where the body has moved to."""
+"""Where the obstacle of a contact is, seen from where the body has moved to."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from fenics_contact.supports.base import Placement
+from fenics_contact.obstacles.base import Placement
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
 from fenics_contact.types import Array
@@ -21,7 +21,7 @@ _FLAT = 1e-6
 
 
 class DeformedPlaces:
-    """Gap and normal of a rigid support at X + u instead of X; compiled when first called."""
+    """Gap and normal of a rigid obstacle at X + u instead of X; compiled when first called."""
 
     def __init__(
         self, quadrature: SurfaceQuadrature, displacement: fem.Function, placement: Placement
@@ -31,7 +31,7 @@ class DeformedPlaces:
         Args:
             quadrature: The points.
             displacement: u at the points.
-            placement: Of the support, seen from X, but displaced as it is where X has moved to.
+            placement: Of the obstacle, seen from X, but displaced as it is where X has moved to.
         """
         self._quadrature, self._displacement, self._placement = quadrature, displacement, placement
         self._evaluate: PointEvaluator | None = None
@@ -56,9 +56,9 @@ class DeformedPlaces:
 
 
 class VaryingMotion:
-    """A prescribed displacement w of a support that varies along Γc.
+    """A prescribed displacement w of an obstacle that varies along Γc.
 
-    It turns and stretches the surface of the support: a tangent t becomes t + ∇w t, so that the
+    It turns and stretches the surface of the obstacle: a tangent t becomes t + ∇w t, so that the
     normal is along n - ∇wᵀ n, to first order, with the derivatives of w along the surface.
 
     Attributes:
@@ -82,7 +82,7 @@ class VaryingMotion:
         Args:
             x: Places of the points, (n_points, gdim) (length).
             shift: w there, likewise.
-            normal: Of the support before it is displaced, (n_points, gdim).
+            normal: Of the obstacle before it is displaced, (n_points, gdim).
             displacement: u there, (n_points, gdim) (length).
         """
         away, change = (v[self._rows] - v[self._rows].mean(axis=1)[:, None] for v in (x, shift))
@@ -94,7 +94,7 @@ class VaryingMotion:
         self._fields.commit({"moved": moved})
 
     def turn(self, gap: Array, normal: Array) -> tuple[Array, Array]:
-        """Distance and normal of the support displaced by w, of those before it is turned by it."""
+        """Distance and normal of the displaced obstacle, from those before the rotation by w."""
         turned = normal - np.einsum("qij,qi->qj", self._slope, normal)
         length = np.linalg.norm(turned, axis=1)
         return gap / length, turned / length[:, None]

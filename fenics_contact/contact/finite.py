@@ -1,13 +1,13 @@
-"""What points of Γc feel of displacements of any size, on a rigid support that may turn.
+"""What points of Γc feel of displacements of any size, on a rigid obstacle that may turn.
 
-Gap and normal are those at X + u, where the support is now. Integrals are over the undeformed Γc:
+Gap and normal are those at X + u, where the obstacle is now. Integrals are over the undeformed Γc:
 tractions are nominal, forces per undeformed area. The map from unknowns to the points stays
 that of small displacements; all that is nonlinear happens at the points.
 
-The history is kept in the frame of the support, which moves and turns with it: a point that rests
-on a turning roller does not slip. Slip is the way of the foot, the point of the support that is
-closest, x + g n; the committed traction turns with the support, and then from the old normal to the
-new one by the smallest rotation.
+The history is kept in the frame of the obstacle, which moves and turns with it: a point that rests
+on a turning roller does not slip. Slip is the way of the foot, the point of the obstacle that is
+closest, x + g n; the committed traction turns with the obstacle, and then from the old normal to
+the new one by the smallest rotation.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from dolfinx import fem
 from ufl.algorithms.analysis import extract_constants, extract_type
 
 from fenics_contact.contact.kinematics import Seen, combined, tangential
-from fenics_contact.laws.base import Kinematics, Law, Response
-from fenics_contact.supports.base import Placement
+from fenics_contact.laws.base import ContactTraction, Law, PointKinematics
+from fenics_contact.obstacles.base import Placement
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
 from fenics_contact.types import Array
@@ -46,7 +46,7 @@ _OPPOSITE = 1e-12
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a rigid support has moved to: coordinates that move with it (UFL).
+    """Where a rigid obstacle has moved to: coordinates that move with it (UFL).
 
     Attributes:
         shift: Its displacement; None: none.
@@ -83,22 +83,22 @@ class Frame:
 
 
 class View(Protocol):
-    """How a support is seen from points that have moved (UFL)."""
+    """How an obstacle is seen from points that have moved (UFL)."""
 
     def gap(self, jump: Any) -> Any:
-        """Distance to the support at X + u (length)."""
+        """Distance to the obstacle at X + u (length)."""
 
     def normal(self, jump: Any) -> Any:
-        """Unit normal from body to support there."""
+        """Unit normal from body to obstacle there."""
 
     def relative(self, jump: Any) -> Any:
-        """Displacement in the frame of the support (length)."""
+        """Displacement in the frame of the obstacle (length)."""
 
     def framed(self, vector: Any) -> Any:
         """A direction as it is in that frame."""
 
     def carried(self, name: str) -> Any:
-        """What was committed, as the support has carried it along.
+        """What was committed, as the obstacle has carried it along.
 
         Args:
             name: "foot", its place minus X (length); "traction" and "normal", of the multipliers
@@ -107,7 +107,7 @@ class View(Protocol):
 
 
 class ExactView:
-    """By the expressions of the support themselves."""
+    """By the expressions of the obstacle themselves."""
 
     def __init__(
         self,
@@ -121,7 +121,7 @@ class ExactView:
 
         Args:
             x: Coordinates of the undeformed Γc.
-            frame: Of the support.
+            frame: Of the obstacle.
             place: Gap and direction at coordinates in the frame.
             history: The committed state, vectors in the frame.
             multipliers: Likewise.
@@ -163,9 +163,9 @@ class ExactView:
 class SampledView:
     """By numbers at the points, and derivatives there: exact at `update`'s displacement.
 
-    Laws are compiled for numbers at points, and serve every support. Gap and normal are linear
+    Laws are compiled for numbers at points, and serve every obstacle. Gap and normal are linear
     about the displacement that they were sampled at, so that the first derivatives of tractions
-    are exact, too, curvature of the support included.
+    are exact, too, curvature of the obstacle included.
     """
 
     def __init__(
@@ -183,7 +183,7 @@ class SampledView:
             exact: What to sample.
             quadrature: The points.
             jump: Displacement of the body there.
-            turns: Whether the support turns.
+            turns: Whether the obstacle turns.
             friction: Whether there is any.
         """
         d = quadrature.surface.mesh.geometry.dim
@@ -216,7 +216,7 @@ class SampledView:
         return self._fields.values(name)
 
     def turned(self, vectors: Array) -> Array:
-        """Directions in the frame of the support, as they are in space: (n_points, gdim)."""
+        """Directions in the frame of the obstacle, as they are in space: (n_points, gdim)."""
         if not self._turns:
             return vectors
         axes = np.stack([self.values(f"axis {i}") for i in range(self._d)], axis=1)
@@ -249,14 +249,14 @@ class SampledView:
 
 
 class FiniteKinematics:
-    """Displacements of any size relative to a rigid support; see the module.
+    """Displacements of any size relative to a rigid obstacle; see the module.
 
     As in small displacements a law sees s - u_n as the gap: u_n is what the gap s that Γc had at
-    first, from where the support is now, has lost.
+    first, from where the obstacle is now, has lost.
     """
 
     def __init__(self, view: View, multipliers: PointFields | None) -> None:
-        """Take how the support is seen.
+        """Take how the obstacle is seen.
 
         Args:
             view: That.
@@ -264,7 +264,7 @@ class FiniteKinematics:
         """
         self._view, self._multipliers = view, multipliers
 
-    def felt(self, jump: Any, law: Law, seen: Seen) -> Kinematics:
+    def felt(self, jump: Any, law: Law, seen: Seen) -> PointKinematics:
         """What a law sees of a displacement of the body (UFL)."""
         view = self._view
         gap, normal = view.gap(jump), view.normal(jump)
@@ -276,19 +276,18 @@ class FiniteKinematics:
             total = tangential(seen.relative(jump), normal)
             increment = tangential(foot - view.carried("foot"), normal)
             traction = _turned(view.carried("traction"), view.carried("normal"), normal)
-        return Kinematics(seen.gap, seen.gap - gap, normal, total, increment, traction, multiplier)
+        return PointKinematics(gap, normal, total, increment, traction, multiplier)
 
     def told(
-        self, jump: Any, law: Law, seen: Seen, felt: Kinematics, response: Response
+        self, jump: Any, law: Law, seen: Seen, felt: PointKinematics, response: ContactTraction
     ) -> dict[str, Any]:
         """What of it is told beside what laws see (UFL), by its name in `PointValues`."""
         view, normal = self._view, felt.normal
-        gap = felt.gap - felt.normal_displacement
         told = {"normal": normal, "jump": view.relative(jump)}
         if law.has_friction:
             old = view.carried("committed traction"), view.carried("committed normal")
             told |= {
-                "foot": view.relative(jump) + view.framed(gap * normal),
+                "foot": view.relative(jump) + view.framed(felt.gap * normal),
                 "framed_normal": view.framed(normal),
                 "framed_traction": view.framed(response.traction),
                 "carried_traction": _turned(*old, normal),
@@ -312,7 +311,7 @@ def _turned(vector: Any, before: Any, normal: Any) -> Any:
 
 
 def check_rigid(name: str, shift: Any, rotation: tuple[Any, Any] | None) -> None:
-    """Refuse a support that is displaced or turned by other amounts at other points.
+    """Refuse an obstacle that is displaced or turned by other amounts at other points.
 
     Raises:
         ValueError: It says what to give.
@@ -320,27 +319,27 @@ def check_rigid(name: str, shift: Any, rotation: tuple[Any, Any] | None) -> None
     varies = (ufl.SpatialCoordinate, ufl.Coefficient)
     if rotation is not None and any(extract_type(ufl.as_ufl(e), varies) for e in rotation):
         raise ValueError(
-            f"{name}: the Rotation differs from point to point, or depends on u; a support is "
+            f"{name}: the Rotation differs from point to point, or depends on u; an obstacle is "
             "rigid: give numbers or constants"
         )
     if shift is not None and extract_type(shift, varies):
         raise ValueError(
-            f"{name}: the displacement of the support differs from point to point, and finite "
-            "kinematics take a rigid support: give numbers or constants, and turn it by a Rotation"
+            f"{name}: the displacement of the obstacle differs from point to point, and finite "
+            "kinematics take a rigid obstacle: give numbers or constants, and turn it by a Rotation"
         )
 
 
 def check_places(name: str, place: Callable[[Any], Placement], mesh: Any) -> None:
-    """Refuse a support that says where it is on the undeformed Γc alone.
+    """Refuse an obstacle that says where it is on the undeformed Γc alone.
 
     Raises:
         ValueError: It says what to give.
     """
     if not is_known_everywhere(place, mesh):
         raise ValueError(
-            f"{name}: the support is given on the undeformed Γc, and finite kinematics need it at "
-            "every place: give an Obstacle(distance=lambda x: ...), with all coordinates taken "
-            "from its argument, or another rigid support by numbers and constants"
+            f"{name}: the obstacle is given on the undeformed Γc, and finite kinematics need it at "
+            "every place: give an SignedDistance(lambda x: ...), with all coordinates taken "
+            "from its argument, or another rigid obstacle by numbers and constants"
         )
 
 

@@ -13,10 +13,10 @@ from dolfinx import fem
 
 from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.contact.contact import Contact
-from fenics_contact.joining import Joined
+from fenics_contact.joining import JoinedMesh
 from fenics_contact.laws.base import Law
+from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import agreed, collective_errors, warn
-from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_cells
@@ -24,7 +24,7 @@ from fenics_contact.surface.proximity import Neighbours, find_neighbours
 from fenics_contact.surface.surface import ContactSurface, tagged_facets
 from fenics_contact.types import Index
 
-__all__ = ["contact_pairs"]
+__all__ = ["find_contact_pairs"]
 
 logger = logging.getLogger("fenics_contact")
 
@@ -34,18 +34,18 @@ LawOf: TypeAlias = Law | Callable[[Hashable, Hashable], Law]
 _AS_FINE = 0.01
 
 
-def contact_pairs(
+def find_contact_pairs(
     u: fem.Function | ufl.core.expr.Expr,
     law: LawOf,
     distance: float,
     *,
-    bodies: Joined | dolfinx.mesh.MeshTags | None = None,
+    bodies: JoinedMesh | dolfinx.mesh.MeshTags | None = None,
     facet_tags: dolfinx.mesh.MeshTags | None = None,
     tags: int | Sequence[int] | None = None,
-    surface_on: Sequence[Hashable] = (),
-    itself: bool = False,
-    update: str = "auto",
-    release: float | None = None,
+    slave_bodies: Sequence[Hashable] = (),
+    self_contact: bool = False,
+    update_pairs: str = "auto",
+    max_initial_penetration: float | None = None,
     **options: Any,
 ) -> list[Contact]:
     """Find which bodies of a mesh may touch, and make a contact of each two. Collective.
@@ -57,7 +57,7 @@ def contact_pairs(
 
     Γc is the side whose facets are smaller on the mean; of sides as fine (to 1 %) that with fewer
     facets, of which no point looks past the other; or else that of the first body. A stiffness
-    cannot be known here: where the softer body is to have Γc, say so by ``surface_on``.
+    cannot be known here: where the softer body is to have Γc, say so by ``slave_bodies``.
 
     Bodies are looked at once, undeformed; where they overlap from the start by more than half the
     height of their cells no contact is found. Facets all of whose displacements are prescribed can
@@ -78,12 +78,12 @@ def contact_pairs(
         facet_tags: With ``tags``: only facets with these tags may touch; by default all of the
             boundary.
         tags: The tag, or tags, meant.
-        surface_on: Names of bodies that are to have Γc, the first before the others.
-        itself: Whether a body may touch itself, too. Its facets are divided into two sides that
-            face each other. Where that cannot be, as in a hole that closes, all of them are Γc and
-            all opposite: every two places are then two pairs, which share what they bear.
-        update: Of the `DeformableBody` opposite.
-        release: Likewise.
+        slave_bodies: Names of bodies that are to have Γc, the first before the others.
+        self_contact: Whether a body may touch itself, too. Its facets are divided into two sides
+            that face each other. Where that cannot be, as in a hole that closes, all of them are
+            Γc and all opposite: every two places are then two pairs, which share what they bear.
+        update_pairs: Of the `DeformableBody` opposite.
+        max_initial_penetration: Of the `DeformableBody` opposite.
         **options: For every `Contact`, such as ``kinematics`` and ``enforcement``.
 
     Returns:
@@ -94,31 +94,31 @@ def contact_pairs(
         ValueError: An argument is none of these, a cell has no tag, or facets are no part of the
             boundary; and what `Contact` refuses.
     """
-    _check(law, distance, bodies, facet_tags, tags, itself, options)
-    space = Displacement(u, None, "contact_pairs").u.function_space
+    _check(law, distance, bodies, facet_tags, tags, self_contact, options)
+    space = Displacement(u, None, "find_contact_pairs").u.function_space
     mesh, comm = space.mesh, space.mesh.comm
     names, of_cell = _bodies(space, bodies)
-    if isinstance(surface_on, str) or not isinstance(surface_on, Sequence):
+    if isinstance(slave_bodies, str) or not isinstance(slave_bodies, Sequence):
         raise ValueError(
-            f"surface_on is {surface_on!r}; give a list of names of bodies, which are {names!r}"
+            f"slave_bodies is {slave_bodies!r}; give a list of names of bodies, which are {names!r}"
         )
-    unknown = [body for body in surface_on if body not in names]
+    unknown = [body for body in slave_bodies if body not in names]
     if unknown:
-        raise ValueError(f"surface_on names {unknown!r}; the bodies are {names!r}")
+        raise ValueError(f"slave_bodies names {unknown!r}; the bodies are {names!r}")
     if facet_tags is None or tags is None:
         facets = _boundary(mesh)
     else:
         facets = tagged_facets(mesh, facet_tags, tags)
     label = of_cell[facet_cells(mesh, facets)]
-    found = find_neighbours(space, facets, label, distance, itself=itself)
+    found = find_neighbours(space, facets, label, distance, self_contact=self_contact)
     if not found:
         warn(
             comm,
-            f"contact_pairs: no two of the bodies {names} are within {distance:g}. Check the "
+            f"find_contact_pairs: no two of the bodies {names} are within {distance:g}. Check the "
             "distance; bodies that overlap by more than half a cell are not found either",
         )
 
-    on = [agreed(comm, _side_of_surface(pair, names, surface_on)) for pair in found]
+    on = [agreed(comm, _side_of_surface(pair, names, slave_bodies)) for pair in found]
     roles = [pair.facets[side] for pair, side in zip(found, on, strict=True)]
     roles += [pair.facets[1 - side] for pair, side in zip(found, on, strict=True)]
     marks, tags_of = _marked(mesh, roles)
@@ -129,8 +129,13 @@ def contact_pairs(
             logger.info("%s", _told(f"{a}-{b}", (a, b), pair, side))
         chosen = law if isinstance(law, Law) else law(a, b)
         surface = ContactSurface(mesh, marks, tags_of[i])
-        support = DeformableBody(marks, tags_of[len(found) + i], update=update, release=release)
-        contacts.append(Contact(u, surface, support, chosen, name=f"{a}-{b}", **options))
+        obstacle = DeformableBody(
+            marks,
+            tags_of[len(found) + i],
+            update_pairs=update_pairs,
+            max_initial_penetration=max_initial_penetration,
+        )
+        contacts.append(Contact(u, surface, obstacle, chosen, name=f"{a}-{b}", **options))
     return contacts
 
 
@@ -140,7 +145,7 @@ def _check(
     bodies: Any,
     facet_tags: Any,
     tags: Any,
-    itself: Any,
+    self_contact: Any,
     options: dict[str, Any],
 ) -> None:
     """Refuse what has no sense."""
@@ -148,29 +153,29 @@ def _check(
         check_instance("law", law, Law, "or a function of the names of two bodies")
     if not (is_number(distance) and 0.0 < distance < np.inf):
         raise ValueError(f"distance is {distance!r}; it must be a length greater than zero")
-    if bodies is not None and not isinstance(bodies, Joined | dolfinx.mesh.MeshTags):
+    if bodies is not None and not isinstance(bodies, JoinedMesh | dolfinx.mesh.MeshTags):
         raise ValueError(
             f"bodies is a {type(bodies).__name__}; give what join_meshes returned, tags of all "
             "cells, or nothing for the connected parts of the mesh"
         )
     if (facet_tags is None) != (tags is None):
         raise ValueError("facet_tags and tags belong together; give both, or none for all facets")
-    if not isinstance(itself, bool | np.bool_):
+    if not isinstance(self_contact, bool | np.bool_):
         raise ValueError(
-            f"itself is {itself!r}; give True where a body may touch itself, else False"
+            f"self_contact is {self_contact!r}; give True where a body may touch itself, else False"
         )
-    own = [name for name in ("surface", "support", "opposite") if name in options]
+    own = [name for name in ("surface", "obstacle", "opposite") if name in options]
     if own:
         raise ValueError(
-            f"{' and '.join(own)} given; contact_pairs finds both sides of every contact itself: "
-            "leave it out, or make a Contact of these sides"
+            f"{' and '.join(own)} given; find_contact_pairs finds both sides of every "
+            "contact: leave it out, or make a Contact of these sides"
         )
     if "name" in options:
         raise ValueError("name is given; contacts have the names of their bodies: leave it out")
 
 
 def _bodies(
-    space: fem.FunctionSpace, bodies: Joined | dolfinx.mesh.MeshTags | None
+    space: fem.FunctionSpace, bodies: JoinedMesh | dolfinx.mesh.MeshTags | None
 ) -> tuple[list[Hashable], Index]:
     """Names of the bodies, and the number of that of every cell of this rank. Collective.
 
@@ -184,7 +189,7 @@ def _bodies(
     if bodies is None:
         n_bodies, of_node = connected_bodies(space)
         return list(range(1, n_bodies + 1)), of_node[space.dofmap.list[:n, 0]]
-    if isinstance(bodies, Joined):
+    if isinstance(bodies, JoinedMesh):
         if bodies.mesh is not mesh:
             raise ValueError("bodies are joined in another mesh than that of u; make u on theirs")
         number = np.zeros(n, dtype=np.int64)
@@ -222,12 +227,12 @@ def _boundary(mesh: dolfinx.mesh.Mesh) -> Index:
 
 
 def _side_of_surface(
-    pair: Neighbours, names: Sequence[Hashable], surface_on: Sequence[Hashable]
+    pair: Neighbours, names: Sequence[Hashable], slave_bodies: Sequence[Hashable]
 ) -> int:
-    """Which of the two sides is Γc, see `contact_pairs`."""
-    wanted = [list(surface_on).index(names[i]) for i in pair.bodies if names[i] in surface_on]
+    """Which of the two sides is Γc, see `find_contact_pairs`."""
+    wanted = [list(slave_bodies).index(names[i]) for i in pair.bodies if names[i] in slave_bodies]
     if wanted:
-        return [names[i] for i in pair.bodies].index(surface_on[min(wanted)])
+        return [names[i] for i in pair.bodies].index(slave_bodies[min(wanted)])
     one, other = pair.sizes
     if abs(one - other) > _AS_FINE * max(one, other):
         return int(other < one)

@@ -18,9 +18,9 @@ from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.contact.accuracy import DEFAULT_FACTOR, Accuracy
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law
-from fenics_contact.laws.stiffness import Scaled, Springs
+from fenics_contact.laws.stiffness import NodalSprings, RelativeStiffness
+from fenics_contact.obstacles.base import Motion, Obstacle, Rotation, as_vector, nonzero_vector
 from fenics_contact.parallel import global_max, global_min
-from fenics_contact.supports.base import Motion, Rotation, Support, as_vector, nonzero_vector
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.modulus import modulus_over_height
 from fenics_contact.surface.surface import SurfaceQuadrature, VertexAreas
@@ -32,8 +32,8 @@ __all__ = ["FreeMotion", "Inputs", "check_given", "varies"]
 logger = logging.getLogger("fenics_contact")
 
 # What a contact itself is given by these names, among which a law's parameters stand.
-_OWN = ("angle", "displacement", "gap", "moment", "support", "weight")
-# Normal times outward normal of the body above minus which Γc faces its support.
+_OWN = ("angle", "displacement", "gap", "moment", "obstacle", "weight")
+# Normal times outward normal of the body above minus which Γc faces its obstacle.
 _FACING = 1e-6
 # The size of the mesh times this is a penetration that no mesh has.
 _DEEP = 0.1
@@ -45,7 +45,7 @@ _NOTHING = 1e-12
 
 @dataclass(frozen=True)
 class FreeMotion:
-    """An unknown of a rigid support, which systems have as a length with a force on it.
+    """An unknown of a rigid obstacle, which systems have as a length with a force on it.
 
     Attributes:
         way: "along x", or "about its axis".
@@ -84,14 +84,14 @@ class FreeMotion:
 
 
 class Inputs:
-    """Weight, parameters of the law and displacement of the support, as UFL.
+    """Weight, parameters of the law and displacement of the obstacle, as UFL.
 
     Attributes:
         constants: Every parameter given by a number, by name; see `Contact.parameters`.
         stiffness_factor: Factor of k_n and k_t.
         weight: Factor of the surface measure.
         law: Parameters of the law, by name.
-        shift: Displacement of the support; None: it has none.
+        shift: Displacement of the obstacle; None: it has none.
         rotation: Matrix of its turn, and a point of the axis; None: it does not turn.
         angle: Of that turn (radians); None likewise.
         axis: Direction of the axis, in space; None: it does not turn, or in the plane.
@@ -100,7 +100,7 @@ class Inputs:
         applied_force: The forces on these.
         free_angle: That of the turn, where it is unknown; else None.
         applied_moment: What turns it then.
-        motions: All unknowns of the support, displacements first.
+        motions: All unknowns of the obstacle, displacements first.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Inputs:
         name: str,
         quadrature: SurfaceQuadrature,
         law: Law,
-        support: Support,
+        obstacle: Obstacle,
         *,
         weight: Any,
         accuracy: Accuracy | None,
@@ -120,10 +120,10 @@ class Inputs:
             name: Of the contact, in messages.
             quadrature: The points.
             law: Whose parameters are wanted.
-            support: Whose displacement is.
+            obstacle: Whose displacement is.
             weight: Factor of the surface measure; None: 1.
             accuracy: Says the stiffness where the user does not.
-            opposite: This rank's facets of the other body; None: the support is rigid.
+            opposite: This rank's facets of the other body; None: the obstacle is rigid.
 
         Raises:
             ValueError: A number is out of range, or a shape is wrong.
@@ -132,10 +132,10 @@ class Inputs:
         self._name, self._law, self._quadrature = name, law, quadrature
         self._surface, self._accuracy = quadrature.surface, accuracy
         self._gdim = self._surface.mesh.geometry.dim
-        self._scale: fem.Function | None = None  # E/h, if a stiffness is Scaled
+        self._scale: fem.Function | None = None  # E/h, if a stiffness is RelativeStiffness
         self._scale_known = False
         self._opposite = opposite
-        self._tributary: VertexAreas | None = None  # if a stiffness is that of Springs
+        self._tributary: VertexAreas | None = None  # if a stiffness is that of NodalSprings
         self.constants: dict[str, fem.Constant] = {}
         self.weight = self.scalar("weight", 1.0 if weight is None else weight)
         for own in [n for n in _OWN if n in law.parameters()]:
@@ -150,7 +150,7 @@ class Inputs:
         self.free_motion: dict[int, fem.Constant] = {}
         self.free_shift: dict[int, ufl.core.expr.Expr] = {}
         self.applied_force: dict[int, Any] = {}
-        self.shift = self._displacement(support.displacement)
+        self.shift = self._displacement(obstacle.displacement)
         self.angle: Any = None
         self.motions = [
             FreeMotion(f"along {'xyz'[i]}", constant, partial(self.applied_force.get, i))
@@ -159,7 +159,7 @@ class Inputs:
         self.axis: Any = None
         self.free_angle: fem.Constant | None = None
         self.applied_moment: fem.Constant | None = None
-        self.rotation = self._rotation(support.rotation)
+        self.rotation = self._rotation(obstacle.rotation)
 
     # ---- as UFL ----------------------------------------------------------------------------------
 
@@ -198,7 +198,7 @@ class Inputs:
                 f"or a UFL expression{of_components}"
             )
         constant = fem.Constant(self._surface.mesh, array.astype(np.float64))
-        if name != "support":
+        if name != "obstacle":
             self.constants[name] = constant
         return constant
 
@@ -207,11 +207,11 @@ class Inputs:
             return self.to_ufl(
                 name, nonzero_vector(f"{self._name}: direction of friction", value, self._gdim)
             )
-        if isinstance(value, Springs):
+        if isinstance(value, NodalSprings):
             if self._tributary is None:
                 self._tributary = VertexAreas(self._quadrature, self.weight, self._name)
             return self.to_ufl(name, value.k) / self._tributary.area
-        if isinstance(value, Scaled):
+        if isinstance(value, RelativeStiffness):
             if self._scale is None:
                 space = fem.functionspace(self._surface.submesh, ("Lagrange", 1))
                 self._scale = fem.Function(space)
@@ -233,7 +233,7 @@ class Inputs:
         shift = self.to_ufl("displacement", displacement)
         if shift.ufl_shape != (self._gdim,):
             raise ValueError(
-                f"{self._name}: displacement of the support has shape {shift.ufl_shape}; the mesh "
+                f"{self._name}: displacement of the obstacle has shape {shift.ufl_shape}; the mesh "
                 f"needs ({self._gdim},)"
             )
         return shift
@@ -253,11 +253,11 @@ class Inputs:
         angle = self._turning(rotation, about) if given[0] is None else given[0]
         self.angle = self.to_ufl("angle", angle)
         matrix = rotation.matrix(self._gdim, self.angle)
-        self.axis = self.to_ufl("support", axis) if self._gdim == 3 else None
-        return matrix, self.to_ufl("support", about)
+        self.axis = self.to_ufl("obstacle", axis) if self._gdim == 3 else None
+        return matrix, self.to_ufl("obstacle", about)
 
     def _turning(self, rotation: Rotation, about: Any) -> fem.Constant:
-        """The angle of a support that is turned by a moment. Collective."""
+        """The angle of an obstacle that is turned by a moment. Collective."""
         moment = rotation.moment
         if not (is_number(moment) or (isinstance(moment, fem.Constant) and not moment.ufl_shape)):
             raise TypeError(
@@ -267,7 +267,7 @@ class Inputs:
         if isinstance(about, ufl.core.expr.Expr):
             raise TypeError(
                 f"{self._name}: about of the Rotation is {about!r}; where the moment is given it "
-                f"must be {self._gdim} numbers: the displacement of the support moves the axis"
+                f"must be {self._gdim} numbers: the displacement of the obstacle moves the axis"
             )
         self.applied_moment = self.to_ufl("moment", moment)
         self.free_angle = fem.Constant(self._surface.mesh, 0.0)
@@ -284,7 +284,7 @@ class Inputs:
         return self.free_angle
 
     def _moving(self, motion: Motion) -> ufl.core.expr.Expr:
-        """The displacement of a support some components of which are unknown."""
+        """The displacement of an obstacle some components of which are unknown."""
         forces, given = motion.components(self._gdim)
         shift: list[Any] = [None] * self._gdim
         for i, value in given.items():
@@ -301,7 +301,7 @@ class Inputs:
         return ufl.as_vector(shift)
 
     def prescribed_shift(self) -> Any:
-        """Displacement of the support without its free components."""
+        """Displacement of the obstacle without its free components."""
         if self.shift is None:
             return ufl.as_vector([0.0] * self._gdim)
         return ufl.replace(self.shift, {c: ufl.as_ufl(0.0) for c in self.free_motion.values()})
@@ -310,7 +310,7 @@ class Inputs:
 
     @property
     def needs_modulus(self) -> bool:
-        """Whether a stiffness is `Scaled` and still waits for `set_modulus`."""
+        """Whether a stiffness is `RelativeStiffness` and still waits for `set_modulus`."""
         return self._scale is not None and not self._scale_known
 
     def set_modulus(self, modulus: Any) -> None:
@@ -352,8 +352,8 @@ class Inputs:
         shortest = global_min(comm, data["direction_length"], empty=1.0)
         if not shortest > 0.0:
             raise ValueError(
-                f"{self._name}: the normal of the support has length {shortest:g} at a point of "
-                "Γc; it must point from the body to the support everywhere"
+                f"{self._name}: the normal of the obstacle has length {shortest:g} at a point of "
+                "Γc; it must point from the body to the obstacle everywhere"
             )
         # Only what was given: what follows from u is checked with u.
         weight = data["weight"]
@@ -388,7 +388,7 @@ class Inputs:
             self._check_direction(parameters["direction"], data["normal"])
 
     def check_side(self, values: PointValues, *, gap_prescribed: bool) -> None:
-        """Refuse, or warn of, a support that all of Γc looks away from. Collective.
+        """Refuse, or warn of, an obstacle that all of Γc looks away from. Collective.
 
         Args:
             values: Evaluated with the data as they are.
@@ -402,13 +402,13 @@ class Inputs:
             return
         x, depth = self._surface.mesh.geometry.x, -global_min(comm, values.initial_gap)
         text = (
-            f"{self._name}: the normal from the body to the support points into the body at every "
+            f"{self._name}: the normal from the body to the obstacle points into the body at every "
             "point of Γc: turn it round (a HalfSpace's points out of it, to the body: up for a "
             "floor; a Ball or Cylinder around the body has inside=True)"
         )
         size = global_max(comm, x) - global_min(comm, x)
         if depth > _DEEP * size and not gap_prescribed:
-            raise ValueError(f"{text}; the body is inside of the support, by up to {depth:g}")
+            raise ValueError(f"{text}; the body is inside of the obstacle, by up to {depth:g}")
         if comm.rank == 0:
             logger.warning(text)
 

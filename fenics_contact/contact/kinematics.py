@@ -1,7 +1,7 @@
 """What points of Γc feel of displacements: kinematics of small displacements.
 
 Gap and normals are those of the undeformed body. The map from displacements to what a point feels
-relative to its support is constant (`ContactOperator`), and a linear bulk stays linear.
+relative to its obstacle is constant (`ContactOperator`), and a linear bulk stays linear.
 `FiniteKinematics` has the same methods.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 
 import ufl
 
-from fenics_contact.laws.base import Kinematics, Law, Response
+from fenics_contact.laws.base import ContactTraction, Law, PointKinematics
 from fenics_contact.surface.fields import PointFields
 
 __all__ = ["Seen", "SmallKinematics", "combined", "tangential"]
@@ -24,9 +24,9 @@ class Seen:
     """What a law sees of a point apart from displacements (UFL).
 
     Attributes:
-        gap: Initial gap, the motion of the support included (length).
-        normal: Unit normal from body to support.
-        shift: Displacement of the support; None: it has none.
+        gap: Initial gap, the motion of the obstacle included (length).
+        normal: Unit normal from body to obstacle.
+        shift: Displacement of the obstacle; None: it has none.
         parameters: Of the law, by name.
     """
 
@@ -36,12 +36,12 @@ class Seen:
     parameters: Mapping[str, Any]
 
     def relative(self, jump: Any) -> Any:
-        """Displacement of the body relative to the support (UFL)."""
+        """Displacement of the body relative to the obstacle (UFL)."""
         return jump if self.shift is None else jump - self.shift
 
 
 class SmallKinematics:
-    """Displacements that change neither the normals nor the place of the support."""
+    """Displacements that change neither the normals nor the place of the obstacle."""
 
     def __init__(self, history: PointFields, multipliers: PointFields | None) -> None:
         """Take the state that increments start from.
@@ -52,7 +52,7 @@ class SmallKinematics:
         """
         self._history, self._multipliers = history, multipliers
 
-    def felt(self, jump: Any, law: Law, seen: Seen) -> Kinematics:
+    def felt(self, jump: Any, law: Law, seen: Seen) -> PointKinematics:
         """What a law sees of a displacement of the body, relative to what lies opposite (UFL)."""
         normal = seen.normal
         total = increment = traction = multiplier = None
@@ -64,15 +64,15 @@ class SmallKinematics:
         if law.has_tangential:
             total = tangential(seen.relative(jump), normal)
         if law.has_friction:
-            # The old traction and displacement are taken along the present normal: the support
+            # The old traction and displacement are taken along the present normal: the obstacle
             # may have moved on since the last commit.
             increment = tangential(seen.relative(jump) - self._history.ufl("jump"), normal)
             traction = tangential(old_traction.ufl("traction"), normal)
-        u_n = ufl.dot(jump, normal)
-        return Kinematics(seen.gap, u_n, normal, total, increment, traction, multiplier)
+        gap = seen.gap - ufl.dot(jump, normal)
+        return PointKinematics(gap, normal, total, increment, traction, multiplier)
 
     def told(
-        self, jump: Any, law: Law, seen: Seen, felt: Kinematics, response: Response
+        self, jump: Any, law: Law, seen: Seen, felt: PointKinematics, response: ContactTraction
     ) -> dict[str, Any]:
         """What of it is told beside what laws see (UFL), by its name in `PointValues`."""
         return {"jump": seen.relative(jump)}

@@ -148,7 +148,7 @@ class Multipliers:
 
     Attributes:
         fields: "pressure" λ_n and, with friction, "traction" λ_t (stress), in the frame of the
-            support; where normals turn, "normal" are those it is across.
+            obstacle; where normals turn, "normal" are those it is across.
         as_displacement: Whether they are functions of the displacement's own degree, which is 1.
     """
 
@@ -196,7 +196,7 @@ class Multipliers:
         """All that the tractions of an evaluated contact change of λ_t. Collective.
 
         Returns:
-            In the frame of the support, (n_points, gdim) (stress).
+            In the frame of the obstacle, (n_points, gdim) (stress).
         """
         self._left_out = None
         return np.asarray(self._next(values)["traction"] - self.fields.values("traction"))

@@ -10,8 +10,8 @@ from dolfinx import fem
 from ufl.algorithms import extract_coefficients
 from ufl.algorithms.analysis import extract_constants
 
+from fenics_contact.obstacles.base import Placement, SampledObstacle
 from fenics_contact.parallel import collective_errors
-from fenics_contact.supports.base import Placement, SampledSupport
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
 from fenics_contact.types import Array
 
@@ -24,7 +24,7 @@ class ObstacleSampler:
     def __init__(
         self,
         quadrature: SurfaceQuadrature,
-        obstacle: Callable[[Any], Placement] | SampledSupport,
+        obstacle: Callable[[Any], Placement] | SampledObstacle,
     ) -> None:
         """Bind the obstacle.
 
@@ -57,7 +57,7 @@ class ObstacleSampler:
         Returns:
             (n,) (length) and (n, gdim).
         """
-        if isinstance(self._obstacle, SampledSupport):
+        if isinstance(self._obstacle, SampledObstacle):
             with collective_errors(self._comm):
                 found = self._obstacle.sample_checked(place)
             return found.distance, found.normal

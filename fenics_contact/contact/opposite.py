@@ -1,6 +1,6 @@
 """What lies opposite Γc: where it is, and what the points feel of it.
 
-|                     | a rigid support (`rigid`) | another body (`body`) |
+|                     | a rigid obstacle (`rigid`) | another body (`body`) |
 |---------------------|---------------------------|-----------------------|
 | small displacements | `RigidOpposite`           | `BodyOpposite`        |
 | finite ones         | `MovingOpposite`          | `FollowedOpposite`    |
@@ -31,8 +31,8 @@ from fenics_contact.contact.point_law import AnyKinematics, PointLaw, PointTange
 from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law
+from fenics_contact.obstacles.base import Obstacle, Placement
 from fenics_contact.parallel import global_max
-from fenics_contact.supports.base import Placement, Support
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import SurfaceQuadrature
@@ -48,7 +48,7 @@ class Parts:
     name: str
     displacement: Displacement
     quadrature: SurfaceQuadrature
-    support: Support
+    obstacle: Obstacle
     law: Law
     inputs: Inputs
     gap: Any
@@ -57,7 +57,7 @@ class Parts:
 
     def new_pairs(self) -> Pairs:
         """Pairs that stay as they are found. Collective."""
-        return Pairs(self.name, self.displacement.u, self.quadrature, self.support)
+        return Pairs(self.name, self.displacement.u, self.quadrature, self.obstacle)
 
     def new_jump(self) -> fem.Function:
         """A function at the points, for the displacement there."""
@@ -80,19 +80,19 @@ class Opposite(ABC):
     Attributes:
         pairs: What lies opposite each of the points.
         data: What was given, sampled at the points.
-        jump: Displacement at the points relative to what lies opposite; that of a rigid support is
+        jump: Displacement at the points relative to what lies opposite; that of a rigid obstacle is
             not in it.
         felt: What laws are functions of there: the jump, or what follows from it.
         given, sampled: What else laws see, as expressions on Γc, and as numbers at the points.
-        in_form, at_points: Kinematics of laws in the form on Γc, and at numbers at the points.
-        committed_jump: The jump at the last commit, that of the support taken away, (n_points,
+        in_form, at_points: PointKinematics of laws in the form on Γc, and at numbers at the points.
+        committed_jump: The jump at the last commit, that of the obstacle taken away, (n_points,
             gdim), between the places that are opposite each other from then on; zero before the
             first.
-        committed_angle: By which the support had turned then (radians).
+        committed_angle: By which the obstacle had turned then (radians).
         is_finite: Whether displacements may be of any size.
-        is_rigid: Whether it is a rigid support, whose reactions are external to the mesh.
+        is_rigid: Whether it is a rigid obstacle, whose reactions are external to the mesh.
         follows: Whether the pairs follow the bodies wherever they go.
-        carries: Whether it is a support that takes along what sticks to it by any amount.
+        carries: Whether it is an obstacle that takes along what sticks to it by any amount.
         pairs_anew: Whether pairs are found anew, on the deformed bodies, at every commit.
         degenerate: Whether Γc has lost its tangent plane somewhere, where pairs follow the bodies.
         sampler: What evaluates a rigid obstacle anywhere; None where it is known on Γc alone, or
@@ -122,7 +122,7 @@ class Opposite(ABC):
             pairs: Of the points.
             jump: A function at the points, for the displacement there.
             placement: Where the opposite is, seen from the undeformed Γc.
-            at_rest: Of a support known in numbers, what has to be sampled for that.
+            at_rest: Of an obstacle known in numbers, what has to be sampled for that.
         """
         self.pairs, self.jump = pairs, jump
         self._parts, self._at_rest = parts, at_rest
@@ -171,15 +171,15 @@ class Opposite(ABC):
                 rows = [matrix[i, j] for i in range(d) for j in range(d)]
                 expressions |= {"angle": inputs.angle, "turn": ufl.as_vector(rows)}
         own = dict(given.parameters) | {"weight": inputs.weight}
-        own |= {"displacement of the support": expressions["shift"]}
+        own |= {"displacement of the obstacle": expressions["shift"]}
         own |= {n: expressions[n] for n in ("angle", "about") if n in expressions}
         own |= {"gap": given.gap, "normal": direction}
         parts = self._parts
         check_given(parts.name, own, parts.quadrature, parts.displacement)
         seen = ["initial_gap", "normal", *(f"parameter {n}" for n in given.parameters)]
         if given.shift is not None:
-            expressions["support"] = given.shift
-            seen.append("support")
+            expressions["obstacle"] = given.shift
+            seen.append("obstacle")
         for i, free in inputs.free_shift.items():
             expressions |= {f"gap by {i}": ufl.diff(given.gap, free)}
             expressions |= {f"normal by {i}": ufl.diff(given.normal, free)}
@@ -187,7 +187,7 @@ class Opposite(ABC):
         sampled = Seen(
             data.ufl("initial_gap"),
             data.ufl("normal"),
-            None if given.shift is None else data.ufl("support"),
+            None if given.shift is None else data.ufl("obstacle"),
             {n: data.ufl(f"parameter {n}") for n in given.parameters},
         )
         return data, sampled
@@ -208,7 +208,7 @@ class Opposite(ABC):
 
     @property
     def _free(self) -> list[int]:
-        """Unknown components of the support's displacement that laws are differentiated by."""
+        """Unknown components of the obstacle's displacement that laws are differentiated by."""
         return list(self._parts.inputs.free_motion)
 
     # ---- the points ------------------------------------------------------------------------------
@@ -285,7 +285,7 @@ class Opposite(ABC):
         Returns:
             Gap, (n_points,) (length): NaN where there is no opposite, and infinite where an
             `Obstacle` says no distance that could be told at other places; and unit normals from
-            body to support, (n_points, gdim).
+            body to obstacle, (n_points, gdim).
         """
 
     def deviation(self, values: PointValues) -> tuple[Array, Array]:
@@ -306,7 +306,7 @@ class Opposite(ABC):
 
     @property
     def turns(self) -> bool:
-        """Whether the support turns."""
+        """Whether the obstacle turns."""
         return self._parts.inputs.rotation is not None
 
     def turned(self, vectors: Array) -> Array:
@@ -314,7 +314,7 @@ class Opposite(ABC):
         return vectors
 
     def angle(self, values: PointValues) -> float:
-        """By which the support has turned since it began, 0 where it cannot (radians). Collective.
+        """By which the obstacle has turned since it began, 0 where it cannot (radians). Collective.
 
         Args:
             values: Of the last evaluation.
@@ -332,11 +332,11 @@ class Opposite(ABC):
         return global_max(self._mesh.comm, arrays["angle"])
 
     def turned_by(self, values: PointValues) -> float:
-        """By which the support has turned since the last commit (radians). Collective."""
+        """By which the obstacle has turned since the last commit (radians). Collective."""
         return self.angle(values) - self.committed_angle
 
     def carried(self, values: PointValues, traction: Array) -> tuple[Array, Array]:
-        """What a support that has moved since a state would do to points that stuck. Collective.
+        """What an obstacle that has moved since a state would do to points that stuck. Collective.
 
         Args:
             values: Of that state, with ``u`` as it is now.
@@ -352,28 +352,28 @@ class Opposite(ABC):
         raise ValueError(f"{self._parts.name}: what lies opposite carries nothing")
 
     def turning_rate(self) -> Array:
-        """Way by a unit angle of the support's points where those of Γc are now. Collective.
+        """Way by a unit angle of the obstacle's points where those of Γc are now. Collective.
 
         Returns:
             ω × r, with r from the axis as it is now, (n_points, gdim) (length).
 
         Raises:
-            ValueError: The support does not turn.
+            ValueError: The obstacle does not turn.
         """
-        rotation = self._parts.support.rotation
+        rotation = self._parts.obstacle.rotation
         if rotation is None:
-            raise ValueError(f"{self._parts.name}: the support does not turn")
+            raise ValueError(f"{self._parts.name}: the obstacle does not turn")
         jump = self.present_jump()
         self.update_data()
         data = self.data.values
-        return rotation.rate(data["x"] + jump - data["about"] - data.get("support", 0.0))
+        return rotation.rate(data["x"] + jump - data["about"] - data.get("obstacle", 0.0))
 
     def slope(self, values: PointValues) -> Array:
         """Length of the gradient of the gap where points are, (n_points,): 1 of a distance.
 
         At X with small displacements, at X + u with finite ones.
         """
-        if self._parts.support.is_distance:
+        if self._parts.obstacle.is_distance:
             return self.data.values["direction_length"].copy()
         return np.ones(len(values.x))
 
@@ -381,10 +381,10 @@ class Opposite(ABC):
         """Second derivatives of the distance at X + u, (n_points, gdim, gdim) (1/length).
 
         Raises:
-            ValueError: Displacements are taken as small, or it is no rigid support.
+            ValueError: Displacements are taken as small, or it is no rigid obstacle.
         """
         raise ValueError(
-            f'{self._parts.name}: there is none without kinematics="finite" and a rigid support'
+            f'{self._parts.name}: there is none without kinematics="finite" and a rigid obstacle'
         )
 
     def rotation_in_increment(self, values: PointValues) -> Callable[[Array, Array | float], Array]:
@@ -441,7 +441,7 @@ class Opposite(ABC):
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
         """Find what lies opposite the points; see `Contact.pair`. Collective.
 
-        On a rigid support there is nothing to find.
+        On a rigid obstacle there is nothing to find.
 
         Args:
             u: Displacement in which to find it; None: the undeformed bodies.

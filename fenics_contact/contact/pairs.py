@@ -9,9 +9,9 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.contact.values import PointValues
+from fenics_contact.obstacles.base import Obstacle
+from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import global_sum, warn
-from fenics_contact.supports.base import Support
-from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.pairing import Pairing
 from fenics_contact.surface.rays import REASONS
 from fenics_contact.surface.surface import SurfaceQuadrature
@@ -34,7 +34,7 @@ class PairsState:
 class Pairs:
     """Opposites of the points, and the sparse map from displacements to jumps at the points.
 
-    On a rigid support there is nothing to find, and every point has its opposite.
+    On a rigid obstacle there is nothing to find, and every point has its opposite.
 
     Attributes:
         own_map: From ``u`` to the displacement of the points, (n_points gdim, n_dofs).
@@ -42,14 +42,14 @@ class Pairs:
         paired: Which of this rank's points have an opposite, (n_points,).
         n_unpaired: Points without, on all ranks.
         number: How often opposites were found.
-        distance: To the opposite, as a function at the points; None on a rigid support.
+        distance: To the opposite, as a function at the points; None on a rigid obstacle.
         acts: 1 at points with an opposite, 0 at others, likewise.
         search: The surface opposite, to search; likewise.
         found_at: Displacement in which the present pairs were found; None: the undeformed bodies.
     """
 
     def __init__(
-        self, name: str, u: fem.Function, quadrature: SurfaceQuadrature, support: Support
+        self, name: str, u: fem.Function, quadrature: SurfaceQuadrature, obstacle: Obstacle
     ) -> None:
         """Collect the surfaces; `find` finds the pairs. Collective."""
         self._name, self._u, self._quadrature = name, u, quadrature
@@ -63,8 +63,8 @@ class Pairs:
         self.distance: fem.Function | None = None
         self.acts: fem.Function | None = None
         self.found_at: fem.Function | None = None
-        if isinstance(support, DeformableBody):
-            self.search = Pairing(support, quadrature, u.function_space)
+        if isinstance(obstacle, DeformableBody):
+            self.search = Pairing(obstacle, quadrature, u.function_space)
             self.distance = fem.Function(quadrature.space(), name="distance")
             self.acts = fem.Function(quadrature.space(), name="paired")
 

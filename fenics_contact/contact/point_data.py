@@ -1,7 +1,7 @@
 """What was given of a contact, sampled at its points.
 
 A law sees numbers at the points and not the expressions they come from, so that what is compiled
-for a law serves every support, gap and body. The numbers follow the constants and functions in the
+for a law serves every obstacle, gap and body. The numbers follow the constants and functions in the
 expressions.
 """
 

@@ -18,7 +18,7 @@ from ufl.domain import extract_unique_domain
 from fenics_contact.contact.finite import FiniteKinematics
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
 from fenics_contact.contact.present import PresentKinematics
-from fenics_contact.laws.base import Kinematics, Law, Response
+from fenics_contact.laws.base import ContactTraction, Law, PointKinematics
 from fenics_contact.parallel import global_max, global_min
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
 from fenics_contact.types import Array
@@ -40,9 +40,9 @@ class PointTangent:
     Attributes:
         by_jump: By the displacement of the body, (n_points, gdim, gdim) (stress/length); where
             `Opposite.local_map` is one, of the forces on the local unknowns by these.
-        by_shift: By that of the support, likewise; None where no component of it is free.
-        spun: By a turn of body and support together, ω × the traction, (n_points, gdim) (stress);
-            None where the support is not turned by a moment. Anisotropic friction, whose direction
+        by_shift: By that of the obstacle, likewise; None where no component of it is free.
+        spun: By a turn of body and obstacle together, ω × the traction, (n_points, gdim) (stress);
+            None where the obstacle is not turned by a moment. Anisotropic friction, whose direction
             stays as it is, has some more.
     """
 
@@ -79,7 +79,7 @@ class PointLaw:
             quadrature: The points.
             jump: Displacement of the body at the points, of that opposite taken away.
             acts: 1 at points at which it acts, 0 at others (UFL); None: it acts at all.
-            free: Components of the support's displacement that are unknown.
+            free: Components of the obstacle's displacement that are unknown.
         """
         self.law, self.seen = law, seen
         self._kinematics, self._quadrature, self._jump = kinematics, quadrature, jump
@@ -104,13 +104,13 @@ class PointLaw:
         """A value at points at which the law acts, 0 at the others."""
         return value if self._acts is None else self._acts * value
 
-    def _felt(self, jump: Any = None, seen: Seen | None = None) -> Kinematics:
+    def _felt(self, jump: Any = None, seen: Seen | None = None) -> PointKinematics:
         jump = self._jump if jump is None else jump
         return self._kinematics.felt(jump, self.law, seen or self.seen)
 
-    def _response(self, felt: Kinematics, seen: Seen | None = None) -> Response:
+    def _response(self, felt: PointKinematics, seen: Seen | None = None) -> ContactTraction:
         """What the law answers, nothing at points at which it does not act."""
-        response = self.law.response(felt, (seen or self.seen).parameters)
+        response = self.law.contact_traction(felt, (seen or self.seen).parameters)
         if self._acts is None:
             return response
         there = self._there
@@ -161,7 +161,7 @@ class PointLaw:
         """Derivatives of the traction. Collective.
 
         Args:
-            turns: Of every free component of the support's displacement the derivatives of gap
+            turns: Of every free component of the obstacle's displacement the derivatives of gap
                 and normal by it, (n_points,) and (n_points, gdim).
         """
         rows, d = self._tangent(), self._gdim
@@ -169,23 +169,23 @@ class PointLaw:
         if not self._free:
             return PointTangent(by_jump)
         by_normal = np.stack([rows[f"normal {i}"] for i in range(d)], axis=1)
-        by_support = np.stack([rows[f"support {i}"] for i in range(d)], axis=1)
+        by_obstacle = np.stack([rows[f"obstacle {i}"] for i in range(d)], axis=1)
         by_shift = np.zeros_like(by_jump)
         for i, (gap, normal) in turns.items():
-            by_shift[:, :, i] = by_support[:, :, i]
+            by_shift[:, :, i] = by_obstacle[:, :, i]
             by_shift[:, :, i] += rows["gap"] * gap[:, None]
             by_shift[:, :, i] += np.einsum("qij,qj->qi", by_normal, normal)
         return PointTangent(by_jump, by_shift)
 
     @cached_property
     def _tangent(self) -> PointEvaluator:
-        """By the jump; where the support moves freely by its displacement, the normal, the gap."""
+        """By the jump; where the obstacle moves freely by its displacement, the normal, the gap."""
         seen, jump = self.seen, ufl.variable(self._jump)
         by = {"jump": jump}
         if self._free:
-            by |= {"normal": ufl.variable(seen.normal), "support": ufl.variable(seen.shift)}
+            by |= {"normal": ufl.variable(seen.normal), "obstacle": ufl.variable(seen.shift)}
             by |= {"gap": ufl.variable(seen.gap)}
-            seen = replace(seen, gap=by["gap"], normal=by["normal"], shift=by["support"])
+            seen = replace(seen, gap=by["gap"], normal=by["normal"], shift=by["obstacle"])
         traction = self.traction(jump, seen)
         rows: dict[str, Any] = {}
         for name, variable in by.items():
@@ -254,8 +254,7 @@ class PointLaw:
     def _bound(self) -> tuple[bool, bool]:
         """What the expression of the friction bound says of itself; see the properties."""
         felt = self._felt()
-        names = ["gap", "normal_displacement", "tangential_displacement"]
-        names += ["tangential_increment", "multiplier"]
+        names = ["gap", "tangential_displacement", "tangential_increment", "multiplier"]
         given = {name: getattr(felt, name) for name in names}
         motion = {n: ufl.variable(v) for n, v in given.items() if v is not None}
         pressure = ufl.variable(self.seen.gap)  # any scalar
@@ -269,7 +268,7 @@ class PointLaw:
         law, parameters, felt = self.law, self.seen.parameters, self._felt()
         response = self._response(felt)
         told = {
-            "normal_displacement": felt.normal_displacement,
+            "normal_displacement": self.seen.gap - felt.gap,
             "opening": response.opening,
             "penetration": response.penetration,
             "normal_traction": response.normal_traction,
@@ -321,17 +320,16 @@ class PointLaw:
         comm, x = surface.mesh.comm, surface.mesh.geometry.x
         return fem.Constant(surface.submesh, _BARELY * (global_max(comm, x) - global_min(comm, x)))
 
-    def _own_normal(self, felt: Kinematics, response: Response) -> dict[str, Any]:
+    def _own_normal(self, felt: PointKinematics, response: ContactTraction) -> dict[str, Any]:
         """What is known of r_n that does not follow from k_n (UFL): stiffness, and another way."""
         law, parameters = self.law, self.seen.parameters
-        u_n = ufl.variable(felt.normal_displacement)
-        at_variable = replace(felt, normal_displacement=u_n)
+        gap = ufl.variable(felt.gap)
+        at_variable = replace(felt, gap=gap)
         # Where nothing acts the stiffness is that of a point that has just closed.
         acts = ufl.ne(response.normal_traction, 0)
-        closed = ufl.conditional(acts, felt.normal_displacement, felt.gap + self._barely)
-        at_closed = replace(felt, normal_displacement=closed)
+        at_closed = replace(felt, gap=ufl.conditional(acts, felt.gap, -self._barely))
         return {
-            "normal_reaction": -ufl.diff(law.normal_potential(at_variable, parameters), u_n),
+            "normal_reaction": ufl.diff(law.normal_potential(at_variable, parameters), gap),
             "normal_stiffness": law.normal_stiffness(at_closed, parameters),
         }
 

@@ -31,9 +31,9 @@ from petsc4py import PETSc
 from fenics_contact.contact.kinematics import Seen, combined, tangential
 from fenics_contact.contact.pairs import Pairs, PairsState
 from fenics_contact.contact.values import PointValues
-from fenics_contact.laws.base import Kinematics, Law, Response
+from fenics_contact.laws.base import ContactTraction, Law, PointKinematics
+from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import global_max
-from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.rays import Hits, interpolation_matrix
 from fenics_contact.surface.surface import SurfaceQuadrature
@@ -100,10 +100,10 @@ class PresentPairs(Pairs):
     """
 
     def __init__(
-        self, name: str, u: fem.Function, quadrature: SurfaceQuadrature, support: DeformableBody
+        self, name: str, u: fem.Function, quadrature: SurfaceQuadrature, obstacle: DeformableBody
     ) -> None:
         """Collect the surfaces; `follow` finds the pairs. Collective."""
-        super().__init__(name, u, quadrature, support)
+        super().__init__(name, u, quadrature, obstacle)
         assert self.search is not None
         self._rays = self.search.rays
         d = self._gdim
@@ -388,7 +388,7 @@ class PresentKinematics:
         """
         self._told, self._multipliers = pairs.told, multipliers
 
-    def felt(self, jump: Any, law: Law, seen: Seen) -> Kinematics:
+    def felt(self, jump: Any, law: Law, seen: Seen) -> PointKinematics:
         """What a law sees of `PresentPairs.felt` (UFL)."""
         d = len(seen.normal)
         gap = jump[0]
@@ -400,11 +400,10 @@ class PresentKinematics:
             multiplier = self._multipliers.ufl("pressure")
         if law.has_friction:
             increment, traction = tangential(slip, normal), tangential(start, normal)
-        nothing = ufl.as_ufl(0.0)
-        return Kinematics(nothing, -gap, normal, increment, increment, traction, multiplier)
+        return PointKinematics(gap, normal, increment, increment, traction, multiplier)
 
     def told(
-        self, jump: Any, law: Law, seen: Seen, felt: Kinematics, response: Response
+        self, jump: Any, law: Law, seen: Seen, felt: PointKinematics, response: ContactTraction
     ) -> dict[str, Any]:
         """What of it is told beside what laws see (UFL), by its name in `PointValues`."""
         told = {"normal": felt.normal, "jump": self._told.ufl("jump")}

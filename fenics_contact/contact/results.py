@@ -14,10 +14,10 @@ from dolfinx import fem
 
 from fenics_contact.arguments import check_instance
 from fenics_contact.contact.inputs import Inputs
-from fenics_contact.contact.values import Extent, PointValues, Resultants, Status
+from fenics_contact.contact.values import PointValues, Resultants, Status, ZoneExtent
 from fenics_contact.laws.base import Law
+from fenics_contact.obstacles.base import as_vector
 from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_sum
-from fenics_contact.supports.base import as_vector
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facet_values import facet_values
 from fenics_contact.surface.fields import PointFields
@@ -155,7 +155,7 @@ class PointResults(ABC):
     def moment(self, about: Sequence[float]) -> Array:
         """Moment of the contact forces on the body about a point. Collective.
 
-        They act on the undeformed Γc, or with finite kinematics at X + u. That on a rigid support
+        They act on the undeformed Γc, or with finite kinematics at X + u. That on a rigid obstacle
         is the opposite.
 
         Args:
@@ -264,7 +264,7 @@ class PointResults(ABC):
             max_penetration=global_max(comm, self.values.penetration),
         )
 
-    def _extents(self) -> dict[str, Extent]:
+    def _extents(self) -> dict[str, ZoneExtent]:
         """Of the points that are closed, that stick and that slip. Collective."""
         comm, x, status = self.surface.mesh.comm, self.points, self.status
         states = {
@@ -281,7 +281,7 @@ class PointResults(ABC):
         low, high = ends[:, :, 0].min(axis=0), ends[:, :, 1].max(axis=0)
         low, high = (np.where(low <= high, end, np.nan) for end in (low, high))
         rows = zip(states, areas, low, high, strict=True)
-        return {name: Extent(float(area), *each) for name, area, *each in rows}
+        return {name: ZoneExtent(float(area), *each) for name, area, *each in rows}
 
     def gather(self) -> dict[str, Array]:
         """All of Γc on every rank, for pictures and tables, ordered by coordinates. Collective.

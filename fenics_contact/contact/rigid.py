@@ -1,4 +1,4 @@
-"""What lies opposite Γc where it is a rigid support."""
+"""What lies opposite Γc where it is a rigid obstacle."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from fenics_contact.contact.opposite import Opposite, Parts
 from fenics_contact.contact.point_law import PointLaw, PointTangent
 from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues
-from fenics_contact.supports.base import Placement, SampledSupport
+from fenics_contact.obstacles.base import Placement, SampledObstacle
 from fenics_contact.types import Array
 
 __all__ = ["MovingOpposite", "RigidOpposite"]
 
 
 class RigidOpposite(Opposite):
-    """A rigid support, seen from the undeformed Γc."""
+    """A rigid obstacle, seen from the undeformed Γc."""
 
     def __init__(self, parts: Parts) -> None:
         """Place it. Collective.
 
         Raises:
-            ValueError: Data of a `SampledSupport` do not fit.
+            ValueError: Data of a `SampledObstacle` do not fit.
         """
         x, jump = ufl.SpatialCoordinate(parts.quadrature.surface.mesh), parts.new_jump()
         shift = parts.inputs.shift
@@ -62,7 +62,7 @@ class RigidOpposite(Opposite):
     @property
     def is_flat(self) -> bool:
         """See `Opposite`."""
-        return self._parts.support.is_flat and self._varying is None
+        return self._parts.obstacle.is_flat and self._varying is None
 
     def true_placement(self, values: PointValues) -> tuple[Array, Array]:
         """See `Opposite`."""
@@ -70,7 +70,7 @@ class RigidOpposite(Opposite):
         if self._varying is not None:
             data = self.data.values
             jump = self.present_jump()
-            self._varying.update(data["x"], data["support"], data["normal"], jump)
+            self._varying.update(data["x"], data["obstacle"], data["normal"], jump)
         if self._moved is not None:
             self._moved.update()
             found = self._moved.values("distance"), self._moved.values("normal")
@@ -80,7 +80,7 @@ class RigidOpposite(Opposite):
 
 
 class MovingOpposite(Opposite):
-    """A rigid support that may move and turn by any amount, seen from where Γc is now."""
+    """A rigid obstacle that may move and turn by any amount, seen from where Γc is now."""
 
     is_finite = True
     carries = True
@@ -121,7 +121,7 @@ class MovingOpposite(Opposite):
 
     @property
     def _free(self) -> list[int]:
-        """None: where all follows from X + u less the motion of the support, so do derivatives."""
+        """None: where all follows from X + u less the motion of the obstacle, so do derivatives."""
         return []
 
     def update(self) -> None:
@@ -134,7 +134,7 @@ class MovingOpposite(Opposite):
     def tangent(self, law: PointLaw) -> PointTangent:
         """See `Opposite`."""
         tangent = super().tangent(law)
-        rotation = self._parts.support.rotation
+        rotation = self._parts.obstacle.rotation
         if self._parts.inputs.free_angle is None or rotation is None:
             return tangent
         return replace(tangent, spun=rotation.rate(law.evaluate_traction()))
@@ -145,14 +145,14 @@ class MovingOpposite(Opposite):
         return self._view.values("gap"), self._view.values("normal")
 
     def turned(self, vectors: Array) -> Array:
-        """See `Opposite`: of the frame of the support."""
+        """See `Opposite`: of the frame of the obstacle."""
         return self._view.turned(vectors)
 
     def carried(self, values: PointValues, traction: Array) -> tuple[Array, Array]:
         """See `Opposite`."""
         self.update()
         way = self.turned(values.jump - self._view.values("relative"))
-        rotation = self._parts.support.rotation
+        rotation = self._parts.obstacle.rotation
         if rotation is not None:
             turn = self._angle(self.data.values) - self.angle(values)
             traction = rotation.turned(traction, turn)
@@ -178,7 +178,7 @@ class MovingOpposite(Opposite):
 
     def rotation_in_increment(self, values: PointValues) -> Callable[[Array, Array | float], Array]:
         """See `Opposite`."""
-        rotation, angle = self._parts.support.rotation, self.turned_by(values)
+        rotation, angle = self._parts.obstacle.rotation, self.turned_by(values)
         if rotation is None:
             return super().rotation_in_increment(values)
         about = values.arrays["about"][:1]  # the same at all points
@@ -197,15 +197,15 @@ class MovingOpposite(Opposite):
 
 
 def _placed(parts: Parts, x: Any, shift: Any) -> Placement:
-    """Where a rigid support is, seen from x (UFL)."""
-    return parts.support.place(x, shift, lambda v: parts.inputs.to_ufl("support", v))
+    """Where a rigid obstacle is, seen from x (UFL)."""
+    return parts.obstacle.place(x, shift, lambda v: parts.inputs.to_ufl("obstacle", v))
 
 
 def _sampler(parts: Parts) -> ObstacleSampler | None:
     """What evaluates the obstacle anywhere; None where gap or normal are given on Γc alone."""
-    support = parts.support
-    if isinstance(support, SampledSupport):
-        return ObstacleSampler(parts.quadrature, support)
+    obstacle = parts.obstacle
+    if isinstance(obstacle, SampledObstacle):
+        return ObstacleSampler(parts.quadrature, obstacle)
     mesh = parts.quadrature.surface.mesh
     if parts.gap is not None or not is_known_everywhere(lambda z: _placed(parts, z, None), mesh):
         return None
@@ -215,27 +215,27 @@ def _sampler(parts: Parts) -> ObstacleSampler | None:
 def _sampled_places(
     parts: Parts, jump: fem.Function, frame: Frame, moved: Frame
 ) -> tuple[SampledPlaces | None, SampledPlaces | None]:
-    """A support known in numbers, from X and from X + u in its frames; else none. Collective.
+    """An obstacle known in numbers, from X and from X + u in its frames; else none. Collective.
 
     Raises:
         ValueError: Its data are of another dimension, or not the same on every rank.
     """
-    support, mesh = parts.support, parts.quadrature.surface.mesh
-    if not isinstance(support, SampledSupport):
+    obstacle, mesh = parts.obstacle, parts.quadrature.surface.mesh
+    if not isinstance(obstacle, SampledObstacle):
         return None, None
-    kind = type(support).__name__
+    kind = type(obstacle).__name__
     d = mesh.geometry.dim
-    if support.gdim != d:
+    if obstacle.gdim != d:
         raise ValueError(
-            f"{parts.name}: the {kind} is given in {support.gdim} dimensions, and the mesh has "
+            f"{parts.name}: the {kind} is given in {obstacle.gdim} dimensions, and the mesh has "
             f"{d}; give it {d} coordinates a point"
         )
-    if len(set(mesh.comm.allgather(support.fingerprint))) > 1:
+    if len(set(mesh.comm.allgather(obstacle.fingerprint))) > 1:
         raise ValueError(
             f"{parts.name}: the data of the {kind} differ from rank to rank; give every rank "
             "the same (read the file on all of them, or broadcast its arrays)"
         )
     x = ufl.SpatialCoordinate(mesh)
     places = (frame.into(x), moved.into(x + jump))
-    rest, deformed = (SampledPlaces(parts.quadrature, support, place) for place in places)
+    rest, deformed = (SampledPlaces(parts.quadrature, obstacle, place) for place in places)
     return rest, deformed

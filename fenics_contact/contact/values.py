@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fenics_contact.types import Array, Mask
 
-__all__ = ["Extent", "PointValues", "Resultants", "Status"]
+__all__ = ["PointValues", "Resultants", "Status", "ZoneExtent"]
 
 
 class Status(IntEnum):
@@ -24,7 +24,7 @@ class Status(IntEnum):
 
 
 @dataclass(frozen=True)
-class Extent:
+class ZoneExtent:
     """Where the quadrature points of one state are on Γc, the same on every rank.
 
     The state ends between the outermost of them and the next point: coordinates and half of a
@@ -61,8 +61,8 @@ class Resultants:
         normal_force: ∫ -r_n, tension counted negative.
         tangential_force: ∫ |τ|.
         moment: Of the force about the origin, as `Contact.moment` gives it, (1,) or (3,).
-        extents: `Extent` of "contact" (the closed part; all that has a support where the law bears
-            tension), and in it of "stick" and of "slip".
+        extents: `ZoneExtent` of "contact" (the closed part; all that has an obstacle where the law
+            bears tension), and in it of "stick" and of "slip".
         open, stick, slip: Numbers of quadrature points.
         max_pressure: Largest -r_n at a point (stress).
         max_penetration: Largest δ₋ (length).
@@ -73,7 +73,7 @@ class Resultants:
     normal_force: float
     tangential_force: float
     moment: Array
-    extents: Mapping[str, Extent]
+    extents: Mapping[str, ZoneExtent]
     open: int
     stick: int
     slip: int
@@ -100,17 +100,17 @@ class PointValues:
 
     Attributes:
         x: Places of the points (length).
-        normal: Unit normal n from body to support.
+        normal: Unit normal n from body to obstacle.
         direction_length: Length of the direction it was given by.
         facing: n by the outward normal of the body.
         weight: Factor of the surface measure.
-        initial_gap: s (length), the motion of the support included.
-        shift: Displacement of the support as far as it is prescribed (length).
+        initial_gap: s (length), the motion of the obstacle included.
+        shift: Displacement of the obstacle as far as it is prescribed (length).
         parameters: Of the law, by name.
         paired: Whether the point has an opposite; 1 or 0.
         depth: How deep it is in the opposite body, whatever gap is prescribed (length).
         slide: Tangential displacement relative to it since the pairs were found (length).
-        jump: Displacement relative to the support (length).
+        jump: Displacement relative to the obstacle (length).
         normal_displacement: u_n (length).
         opening, penetration: δ₊ and δ₋ (length).
         normal_traction: r_n (stress).
@@ -131,10 +131,10 @@ class PointValues:
         slip_increment: Δβ of every mode, (n_points, n_modes) (length).
         multiplier: λ_n (stress).
         elastic_slip: What multipliers leave of K_t⁻¹ τ (length), as the history has it.
-        foot: Displacement of what the history measures slip by, in the frame of the support
-            (length): the jump, or with finite kinematics that of the closest point of the support.
-        framed_traction, framed_normal: τ (stress) and n in the frame of the support.
-        carried_traction: The committed τ as support and normal have turned it since (stress).
+        foot: Displacement of what the history measures slip by, in the frame of the obstacle
+            (length): the jump, or with finite kinematics that of the closest point of the obstacle.
+        framed_traction, framed_normal: τ (stress) and n in the frame of the obstacle.
+        carried_traction: The committed τ as obstacle and normal have turned it since (stress).
         arrays: All that was evaluated, by name, for files.
     """
 

@@ -21,13 +21,13 @@ from fenics_contact.parallel import gather_rows
 from fenics_contact.problem import ContactProblem
 from fenics_contact.types import Array
 
-__all__ = ["Level", "adapt"]
+__all__ = ["AdaptationLevel", "adapt"]
 
 _SIMPLICES = (dolfinx.mesh.CellType.triangle, dolfinx.mesh.CellType.tetrahedron)
 
 
 @dataclass(frozen=True)
-class Level:
+class AdaptationLevel:
     """One solution on the way.
 
     Attributes:
@@ -52,7 +52,7 @@ def adapt(
     levels: int = 8,
     share: float = 0.5,
     snap: Mapping[int, Callable[[Array], Array]] | None = None,
-) -> Iterator[Level]:
+) -> Iterator[AdaptationLevel]:
     """Solve on finer and finer meshes. Collective.
 
     Args:
@@ -67,7 +67,7 @@ def adapt(
         snap: By tag, where new nodes of curved sides belong: a map of coordinates, (n, gdim).
 
     Yields:
-        A `Level` after every solution.
+        A `AdaptationLevel` after every solution.
 
     Raises:
         ValueError: Cells that cannot be split, or arguments without sense.
@@ -97,7 +97,7 @@ def adapt(
         budget = estimate_errors(problem, stress, strain=strain[0] if strain else None)
         dofmap = problem.u.function_space.dofmap
         dofs = dofmap.index_map.size_global * dofmap.index_map_bs
-        yield Level(mesh, facet_tags, problem, budget, dofs)
+        yield AdaptationLevel(mesh, facet_tags, problem, budget, dofs)
 
 
 def _worst(comm: MPI.Comm, squares: Array, share: float) -> npt.NDArray[np.int32]:

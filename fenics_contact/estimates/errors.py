@@ -38,7 +38,7 @@ _REMEDIES = {
     "enforcement": "a higher k_n and k_t",
     "discretisation": "a finer mesh at the contact, or a higher degree",
     "increments": "more increments",
-    "kinematics": 'Contact(kinematics="finite"), or a motion of the support instead of the body,',
+    "kinematics": 'Contact(kinematics="finite"), or a motion of the obstacle instead of the body,',
     "solver": "a smaller snes_rtol",
 }
 
@@ -195,8 +195,8 @@ def estimate_errors(
         increment_error: Errors by the size of the increments, ``Step.increment_error``.
 
     Raises:
-        ValueError: Shapes that do not fit; or a body, or a support that moves freely, that nothing
-            holds at this state.
+        ValueError: Shapes that do not fit; or a body, or an obstacle that moves freely, that
+            nothing holds at this state.
     """
     problem.complete()
     displacement = problem.displacement
@@ -269,7 +269,7 @@ def _displacement(problem: ContactProblem, state: Array) -> float:
     """Displacement of the loads along themselves; without loads the largest one."""
     comm, load = problem.u.function_space.mesh.comm, problem.load
     of_nodes = np.linalg.norm(problem.displacement.vectors(load), axis=1)
-    others = load.copy()  # forces on free supports
+    others = load.copy()  # forces on free obstacles
     others[: problem.unknowns.n_dofs] = 0.0
     size, work = global_sum(comm, [of_nodes.sum() + np.abs(others).sum(), load @ state])
     if size > 0:

@@ -52,8 +52,8 @@ from fenics_contact.systems.committed import CommittedState
 
 __all__ = [
     "Stored",
-    "check_changed",
     "check_fields",
+    "check_mismatch",
     "check_places",
     "exists",
     "load",
@@ -80,7 +80,7 @@ def save(
     path: str | Path,
     numbers: Sequence[float] = (),
     *,
-    fields: Sequence[fem.Function] = (),
+    state_fields: Sequence[fem.Function] = (),
     notes: Any = None,
 ) -> None:
     """Write the committed state, with the loads as they are now. Collective.
@@ -94,7 +94,7 @@ def save(
         problem: At a committed state.
         path: The file (``.npz``).
         numbers: The caller's own, to be found again: the load parameter, for instance.
-        fields: The caller's functions that belong to the state; see `check_fields`.
+        state_fields: The caller's functions that belong to the state; see `check_fields`.
         notes: More of the caller's, of what JSON can hold.
 
     Raises:
@@ -103,7 +103,7 @@ def save(
         OSError: It cannot be written; the problem is as before. On all ranks.
     """
     comm = problem.u.function_space.mesh.comm
-    check_fields(problem, fields)
+    check_fields(problem, state_fields)
     check_places(problem)
     committed = problem.committed_state()
     rows = committed.rows(problem.unknowns, problem.bulk)
@@ -117,14 +117,14 @@ def save(
         nodes = rows[:, part.dofs].reshape(len(rows), -1, part.space.dofmap.bs)
         arrays[part.name] = gather(comm, node_places(part.space), *nodes)
     scene: dict[str, Any] = {"format": FORMAT, "notes": notes, "contacts": {}}
-    scene["fixed"], scene["data"] = fixed_words(problem, fields), data_words(problem)
+    scene["fixed"], scene["data"] = fixed_words(problem, state_fields), data_words(problem)
     for contact in problem.contacts:
         given, values = contact.given(), dict(contact.values.arrays)
         scene["contacts"][contact.name] = layout_of(given), layout_of(values)
         places = point_places(contact)
         arrays[f"contact {contact.name}"] = gather(comm, places, contact.history.rows(), given)
         arrays[f"values {contact.name}"] = gather(comm, places, values)
-    for number, field in enumerate(fields):
+    for number, field in enumerate(state_fields):
         arrays[f"field {number}"] = gather(comm, node_places(field.function_space), rows_of(field))
     with collective_errors(comm):
         if comm.rank == 0:
@@ -138,19 +138,19 @@ def load(
     problem: ContactProblem,
     path: str | Path,
     *,
-    fields: Sequence[fem.Function] = (),
-    changed: str = "refuse",
+    state_fields: Sequence[fem.Function] = (),
+    on_mismatch: str = "refuse",
 ) -> list[float]:
     """Make a saved state the committed one. Collective.
 
-    The loads, conditions and supports must be set as they were: they are compared.
+    The loads, conditions and obstacles must be set as they were: they are compared.
 
     Args:
         problem: That of the file, made anew.
         path: The file.
-        fields: Those that were given to `save`, to be set; in the same order.
-        changed: "refuse" a file whose state is one of other data than the problem's (stiffness,
-            laws and their parameters, supports, conditions, loads), or "continue" from it with the
+        state_fields: Those that were given to `save`, to be set; in the same order.
+        on_mismatch: "refuse" a file whose state is one of other data than the problem's (stiffness,
+            laws and their parameters, obstacles, conditions, loads), or "continue" from it with the
             data of the problem.
 
     Returns:
@@ -161,23 +161,23 @@ def load(
             set of contacts, or of other data; the problem is as before. On all ranks.
         OSError: It cannot be read. On all ranks.
     """
-    check_changed(changed)
+    check_mismatch(on_mismatch)
     stored = read(problem, path)
-    take_up(problem, stored, fields=fields, changed=changed)
+    take_up(problem, stored, state_fields=state_fields, on_mismatch=on_mismatch)
     return stored.numbers
 
 
-def check_changed(changed: str) -> None:
+def check_mismatch(on_mismatch: str) -> None:
     """Refuse words that are none of the two.
 
     Raises:
         ValueError: It says which there are.
     """
-    if changed not in ("refuse", "continue"):
-        raise ValueError(f'changed is {changed!r}; it must be "refuse" or "continue"')
+    if on_mismatch not in ("refuse", "continue"):
+        raise ValueError(f'on_mismatch is {on_mismatch!r}; it must be "refuse" or "continue"')
 
 
-def check_fields(problem: ContactProblem, fields: Sequence[fem.Function]) -> None:
+def check_fields(problem: ContactProblem, state_fields: Sequence[fem.Function]) -> None:
     """Refuse what cannot be saved with the state. Collective.
 
     That is every function but those of real values at points (Lagrange of any degree, continuous
@@ -187,12 +187,12 @@ def check_fields(problem: ContactProblem, fields: Sequence[fem.Function]) -> Non
         ValueError: It names the field. On all ranks.
     """
     comm = problem.u.function_space.mesh.comm
-    for number, field in enumerate(fields):
+    for number, field in enumerate(state_fields):
         if not isinstance(field, fem.Function):
             raise ValueError(
-                f"fields[{number}] is a {type(field).__name__}; it must be a fem.Function"
+                f"state_fields[{number}] is a {type(field).__name__}; it must be a fem.Function"
             )
-        what, space = f"fields[{number}], {field.name!r},", field.function_space
+        what, space = f"state_fields[{number}], {field.name!r},", field.function_space
         dofmap = space.dofmap
         n_nodes = dofmap.index_map.size_local + dofmap.index_map.num_ghosts
         if field is problem.u:
@@ -261,8 +261,8 @@ def take_up(
     stored: Stored,
     *,
     loads: Callable[[], None] | None = None,
-    fields: Sequence[fem.Function] = (),
-    changed: str = "refuse",
+    state_fields: Sequence[fem.Function] = (),
+    on_mismatch: str = "refuse",
 ) -> None:
     """Make what `read` gave the committed state. Collective.
 
@@ -273,15 +273,15 @@ def take_up(
         stored: What was read.
         loads: Sets the loads as they were; called where the file may be that of the problem. If
             what follows fails, it is the caller's to take them back.
-        fields: See `load`.
-        changed: See `load`.
+        state_fields: See `load`.
+        on_mismatch: See `load`.
 
     Raises:
         ValueError: See `load`.
     """
     comm = problem.u.function_space.mesh.comm
-    check_fields(problem, fields)
-    refuse(stored, why_another_scene(stored, problem, fields))
+    check_fields(problem, state_fields)
+    refuse(stored, why_another_scene(stored, problem, state_fields))
     size = problem.full.scales.mesh_size
     motions = stored.arrays["motions"]
     rows = np.zeros((len(motions), problem.unknowns.n_dofs))
@@ -304,22 +304,24 @@ def take_up(
         values = unpack(find(comm, stored, f"values {contact.name}", places, size), layout)
         points.append((found[:, :n_history], values))
     own = []
-    for number, field in enumerate(fields):
+    for number, field in enumerate(state_fields):
         places = node_places(field.function_space)
         own.append(find(comm, stored, f"field {number}", places, size))
-    before = [field.x.array.copy() for field in fields]
+    before = [field.x.array.copy() for field in state_fields]
     try:
         if loads is not None:
             loads()
-        for field, row in zip(fields, own, strict=True):
+        for field, row in zip(state_fields, own, strict=True):
             set_rows(field, row)
         with problem.at_state(committed.state):
             differences = changed_data(stored, problem, committed, given)
-        if changed == "refuse":
-            refuse(stored, differences, ', or give changed="continue" to go on with what is here')
+        if on_mismatch == "refuse":
+            refuse(
+                stored, differences, ', or give on_mismatch="continue" to go on with what is here'
+            )
     except BaseException as error:
         fail_together(comm, error)
-        for field, array in zip(fields, before, strict=True):
+        for field, array in zip(state_fields, before, strict=True):
             field.x.array[:] = array
         raise
     if differences and comm.rank == 0:

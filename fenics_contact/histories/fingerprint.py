@@ -16,18 +16,18 @@ from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
 from fenics_contact.histories.archive import Stored
 from fenics_contact.histories.places import parts_of, positions
-from fenics_contact.histories.signature import signature_of_law, signature_of_support
+from fenics_contact.histories.signature import signature_of_law, signature_of_obstacle
+from fenics_contact.obstacles.base import SampledObstacle
+from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.problem import ContactProblem
-from fenics_contact.supports.base import SampledSupport
-from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.systems.committed import CommittedState
 from fenics_contact.types import Array
 
 __all__ = ["changed_data", "data_words", "fixed_words", "probe", "why_another_scene"]
 
 # Relative difference up to which data are the same, and, of lengths, relative to the mesh: the gap
-# to a support is a difference of coordinates.
+# to an obstacle is a difference of coordinates.
 _EQUAL, _ROUND_OFF = 1e-9, 1e-11
 _LENGTHS = ("initial_gap", "shift", "about")
 
@@ -104,16 +104,16 @@ def data_words(problem: ContactProblem) -> dict[str, str]:
         gdim, multipliers = problem.u.function_space.mesh.geometry.dim, c.multipliers is not None
         code = signature_of_law(c.law, gdim, multipliers=multipliers)
         words[f"code (UFL) of the law of {c.name}"] = code
-        switches = {n: v for n, v in vars(c.support).items() if isinstance(v, bool | str)}
-        if isinstance(c.support, DeformableBody):
-            switches["search_distance"] = c.support.search_distance
-        if isinstance(c.support, SampledSupport):
-            switches["data"] = c.support.fingerprint
-        words[f"support of {c.name}"] = _name(c.support, switches)
-        if c.finite and c.rigid and not isinstance(c.support, SampledSupport):
+        switches = {n: v for n, v in vars(c.obstacle).items() if isinstance(v, bool | str)}
+        if isinstance(c.obstacle, DeformableBody):
+            switches["search_distance"] = c.obstacle.search_distance
+        if isinstance(c.obstacle, SampledObstacle):
+            switches["data"] = c.obstacle.fingerprint
+        words[f"obstacle of {c.name}"] = _name(c.obstacle, switches)
+        if c.finite and c.rigid and not isinstance(c.obstacle, SampledObstacle):
             # With small displacements its values on Γc are all that counts.
-            code = signature_of_support(c.support, gdim)
-            words[f"code (UFL) of the support of {c.name}"] = code
+            code = signature_of_obstacle(c.obstacle, gdim)
+            words[f"code (UFL) of the obstacle of {c.name}"] = code
         words[f"enforcement of {c.name}"] = (
             "penalty" if c.multipliers is None else f"augmented to {c.tolerance:g}"
         )
@@ -133,7 +133,7 @@ def probe(problem: ContactProblem) -> dict[str, Array]:
 
     Returns:
         "stiffness": v·Kw of every pair of the fields, then what they are compared with; "loads":
-        v·f and the forces on free supports, likewise.
+        v·f and the forces on free obstacles, likewise.
     """
     space = problem.u.function_space
     comm, d = space.mesh.comm, space.mesh.geometry.dim
@@ -219,7 +219,7 @@ def _compare_probes(problem: ContactProblem, theirs: dict[str, Array]) -> list[s
     rigid = problem.bulk.scale * problem.full.scales.mesh_size * np.finfo(float).eps
     for name, words in (
         ("stiffness", "stiffness of the bulk, by smooth fields v·Kw,"),
-        ("loads", "loads of the bulk and on free supports, by smooth fields v·f,"),
+        ("loads", "loads of the bulk and on free obstacles, by smooth fields v·f,"),
     ):
         (a, scale), (b, other) = theirs[name], ours[name]
         allowed = _EQUAL * np.maximum(scale, other) + (rigid if name == "loads" else 0.0)

@@ -46,10 +46,10 @@ def increments(
     estimate: bool = False,
     checkpoint: str | Path | None = None,
     checkpoint_every: int = 1,
-    field: str | int = "every",
-    fields: Sequence[fem.Function] = (),
-    changed: str = "refuse",
-    history: str | Path | None = None,
+    recover_interior: str | int = "every",
+    state_fields: Sequence[fem.Function] = (),
+    on_mismatch: str = "refuse",
+    csv: str | Path | None = None,
     progress: bool | str = False,
 ) -> Iterator[Step]:
     """Lead the load parameter from ``start`` to ``end``; solve and commit increments. Collective.
@@ -60,9 +60,9 @@ def increments(
 
     Args:
         problem: The problem.
-        load: A scalar constant in the bulk form, a boundary condition or a support, which takes
+        load: A scalar constant in the bulk form, a boundary condition or an obstacle, which takes
             the value of the load parameter; or a function that sets whatever depends on it:
-            constants, functions, the forces on supports.
+            constants, functions, the forces on obstacles.
         start: The load parameter now; not solved for.
         end: Its value at the last increment.
         steps: Number of equal increments, by default what the contacts' ``accuracy`` takes, or 1;
@@ -79,22 +79,22 @@ def increments(
             may lead further than before, or by other increments from there on; what is done must be
             what the call asks for.
         checkpoint_every: Write it after every so many increments, and after the last.
-        field: When all of u is found: "every" increment; at the "last" only; or a number: every so
-            many increments, and at the last. Where the problem is condensed, increments in between
-            save the larger part of their cost; there only the contacts' results are those of the
-            increment, u is behind except on Γc until `ContactProblem.complete`, and
-            ``Step.complete`` says so. Before a checkpoint is written u is completed, and in the
-            increment after it.
-        fields: Functions of one's own that belong to the state, such as plastic strains, kept in
-            the checkpoint; see `checkpoint.check_fields`. With them it is written when the next
-            increment is asked for, so that it has what the loop has made of them (and, after the
-            last, when the loop ends by itself). Increments that fail or are cut leave them alone:
-            what ``load`` has made of them it makes anew when it is called again, with the last
-            load that was committed.
-        changed: What to do with a checkpoint of other data (stiffness, laws and their parameters,
-            supports, conditions, loads): "refuse" it, or "continue" from its state with the data as
-            they are now.
-        history: File for a table of the increments (CSV), one row each, written as soon as it is
+        recover_interior: When all of u is found: "every" increment; at the "last" only; or a
+            number: every so many increments, and at the last. Where the problem is condensed,
+            increments in between save the larger part of their cost; there only the contacts'
+            results are those of the increment, u is behind except on Γc until
+            `ContactProblem.complete`, and ``Step.complete`` says so. Before a checkpoint is
+            written u is completed, and in the increment after it.
+        state_fields: Functions of one's own that belong to the state, such as plastic strains,
+            kept in the checkpoint; see `checkpoint.check_fields`. With them it is written when the
+            next increment is asked for, so that it has what the loop has made of them (and, after
+            the last, when the loop ends by itself). Increments that fail or are cut leave them
+            alone: what ``load`` has made of them it makes anew when it is called again, with the
+            last load that was committed.
+        on_mismatch: What to do with a checkpoint of other data (stiffness, laws and their
+            parameters, obstacles, conditions, loads): "refuse" it, or "continue" from its state
+            with the data as they are now.
+        csv: File for a table of the increments (CSV), one row each, written as soon as it is
             committed: load, forces, moment, area, counts of points and largest pressure of every
             contact, energies, iterations, cuts, and the errors that ``estimate`` tells; the header
             says the units in words. Rows that the file has of increments behind the last committed
@@ -124,20 +124,26 @@ def increments(
     if start == end:
         raise ValueError(f"start and end are both {start!r}, and there is no way between them")
     ends = _ends(start, end, problem.increments_wanted if steps is None else steps)
-    if field not in ("every", "last") and not (isinstance(field, int | np.integer) and field >= 1):
-        raise ValueError(f'field is {field!r}; it must be "every", "last", or a number from 1')
+    whole = isinstance(recover_interior, int | np.integer) and recover_interior >= 1
+    if recover_interior not in ("every", "last") and not whole:
+        raise ValueError(
+            f'recover_interior is {recover_interior!r}; it must be "every", "last", or an integer, '
+            "at least 1"
+        )
     for name, number, least in (
         ("max_cuts", max_cuts, 0),
         ("checkpoint_every", checkpoint_every, 1),
     ):
         if not isinstance(number, int | np.integer) or number < least:
             raise ValueError(f"{name} is {number!r}; it must be a whole number from {least}")
-    states.check_changed(changed)
-    if not isinstance(fields, Sequence):
-        raise ValueError(f"fields is a {type(fields).__name__}; it must be a list of fem.Functions")
-    states.check_fields(problem, fields)
-    if fields and checkpoint is None:
-        raise ValueError("fields are kept in a checkpoint, and there is none; give checkpoint=")
+    states.check_mismatch(on_mismatch)
+    if not isinstance(state_fields, Sequence):
+        raise ValueError(
+            f"state_fields is a {type(state_fields).__name__}; it must be a list of fem.Functions"
+        )
+    states.check_fields(problem, state_fields)
+    if state_fields and checkpoint is None:
+        raise ValueError("state_fields are stored in the checkpoint, and there is none; give one")
     if not isinstance(checkpoint, str | Path | None):
         raise ValueError(f"checkpoint is {checkpoint!r}; it must be the name of a file")
     if isinstance(load, fem.Constant):
@@ -162,19 +168,18 @@ def increments(
         if bar is not None:
             bar.lead(value)
 
-    if not isinstance(history, str | Path | None):
-        raise ValueError(f"history is {history!r}; it must be the name of a file")
+    if not isinstance(csv, str | Path | None):
+        raise ValueError(f"csv is {csv!r}; it must be the name of a file")
     table = None
-    if history is not None and file is not None and Path(history).resolve() == file.resolve():
+    if csv is not None and file is not None and Path(csv).resolve() == file.resolve():
         raise ValueError(
-            f"checkpoint and history are both {history}, and each would overwrite the other; give "
-            "two names"
+            f"checkpoint and csv are both {csv}, and each would overwrite the other; give two names"
         )
-    if history is not None:
-        table = Table(Path(history), problem, tuple(quantities(problem)) if estimate else ())
+    if csv is not None:
+        table = Table(Path(csv), problem, tuple(quantities(problem)) if estimate else ())
     leg = _Leg(float(start), ends, float(start), estimate)
-    every = max_cuts, checkpoint_every, field
-    made = _history(problem, apply, leg, file, every, list(fields), changed, table)
+    every = max_cuts, checkpoint_every, recover_interior
+    made = _history(problem, apply, leg, file, every, list(state_fields), on_mismatch, table)
     return _Started(made, comm, bar)
 
 
@@ -250,7 +255,7 @@ def _history(
     checkpoint: Path | None,
     every: tuple[int, int, str | int],
     fields: Sequence[fem.Function],
-    changed: str,
+    on_mismatch: str,
     table: Table | None,
 ) -> Generator[Step, None, None]:
     """What `increments` returns, its arguments checked. Collective."""
@@ -267,7 +272,7 @@ def _history(
         apply(leg.reached)
         return
     if stored is None:
-        problem.expect(len(ends) * (3 if estimate else 1))
+        problem.expected_increments = len(ends) * (3 if estimate else 1)
         apply(start)
     else:
         n = len(dataclasses.fields(_Progress))
@@ -277,7 +282,11 @@ def _history(
         error = dict(zip(error, stored.numbers[n:], strict=True))
         try:
             states.take_up(
-                problem, stored, loads=lambda: apply(at.load), fields=fields, changed=changed
+                problem,
+                stored,
+                loads=lambda: apply(at.load),
+                state_fields=fields,
+                on_mismatch=on_mismatch,
             )
         except BaseException:
             apply(start)
@@ -295,7 +304,7 @@ def _history(
         numbers = [*dataclasses.astuple(at), *error.values()]
         assert checkpoint is not None
         notes = [dataclasses.asdict(each) for each in calls.legs]
-        states.save(problem, checkpoint, numbers, fields=fields, notes=notes)
+        states.save(problem, checkpoint, numbers, state_fields=fields, notes=notes)
 
     direction = 1.0 if end >= start else -1.0
     unsaved = behind = 0
@@ -315,7 +324,7 @@ def _history(
                     halves = [0.5 * (at.load + goal), goal]
                 goal = halves[0] if halves else goal
                 wanted = goal == end or field == "every" or estimate or behind + 1 == field
-                step = _solve_to(goal, problem, apply, at, field=wanted)
+                step = _solve_to(goal, problem, apply, at, recover_interior=wanted)
             except BaseException as failure:
                 apply(at.load)
                 halves = []
@@ -377,11 +386,13 @@ def _solve_to(
     apply: Callable[[float], None],
     at: _Progress,
     *,
-    field: bool = True,
+    recover_interior: bool = True,
 ) -> Step:
     """Solve for a load parameter from the last committed one. Collective."""
     apply(goal)
-    return problem.solve(ahead=(goal - at.load) / at.last if at.last else 1.0, field=field)
+    return problem.solve(
+        ahead=(goal - at.load) / at.last if at.last else 1.0, recover_interior=recover_interior
+    )
 
 
 @dataclasses.dataclass
@@ -533,7 +544,7 @@ class _Watch:
                 self._comm,
                 f"{', '.join(names)} in the bulk form is changed between increments, and is not in "
                 "the checkpoint: a history that goes on from it will not have the values; give "
-                "fields=[...]",
+                "state_fields=[...]",
             )
 
 

@@ -21,7 +21,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.estimates.errors import ErrorBudget
 from fenics_contact.histories import table
 from fenics_contact.installation import information
-from fenics_contact.laws.stiffness import Scaled, Springs
+from fenics_contact.laws.stiffness import NodalSprings, RelativeStiffness
 from fenics_contact.markup import shown
 from fenics_contact.parallel import collective_errors, global_max
 from fenics_contact.problem import ContactProblem
@@ -80,7 +80,7 @@ def report(
     steps: Step | Sequence[Step],
     folder: str | os.PathLike[str],
     *,
-    history: str | os.PathLike[str] | None = None,
+    csv: str | os.PathLike[str] | None = None,
     stress: Any = None,
     budget: ErrorBudget | None = None,
     title: str = "Contact",
@@ -100,7 +100,7 @@ def report(
         steps: What `increments` or `ContactProblem.solve` gave: the steps of the history in their
             order, or the last one alone.
         folder: Where to; it is made.
-        history: Table that `increments` wrote for the same history: the curves are of its rows,
+        csv: Table that `increments` wrote for the same history: the curves are of its rows,
             those of the runs before this one, too. By default they are of the steps.
         stress: UFL tensor (3, 3) on the body, for the colours of the deformed body.
         budget: What `estimate_errors` found of this state.
@@ -122,7 +122,7 @@ def report(
     """
     check_instance("problem", problem, ContactProblem)
     steps = [steps] if isinstance(steps, Step) else steps
-    _check(problem, steps, folder, history, budget, title, units, magnification)
+    _check(problem, steps, folder, csv, budget, title, units, magnification)
     drawing.check_view(view)
     comm, path = problem.u.function_space.mesh.comm, Path(folder) / "report.html"
     shape = drawing.ShapeOf(problem.displacement.u, stress)  # refuses stresses of other shapes
@@ -135,7 +135,7 @@ def report(
                 files.make_folder(path.parent)
                 tempfile.TemporaryFile(dir=path.parent).close()  # whether it can be written to
                 scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-                rows = _rows(problem, steps, history)
+                rows = _rows(problem, steps, csv)
         problem.complete()
         problem.displacement.follow()
         page = _Page(scratch, units, view, per_thickness=table.is_per_thickness(problem))
@@ -162,7 +162,7 @@ def _check(
     problem: ContactProblem,
     steps: Any,
     folder: Any,
-    history: Any,
+    csv: Any,
     budget: Any,
     title: Any,
     units: Any,
@@ -196,9 +196,9 @@ def _check(
             f"and the problem, of contacts {names}, is at increment {problem.increment}; give its "
             "steps in their order, the last one at the end"
         )
-    for name, value in (("folder", folder), ("history", history)):
-        if not (isinstance(value, str | os.PathLike) or (name == "history" and value is None)):
-            what = {"folder": "folder", "history": "file"}[name]
+    for name, value in (("folder", folder), ("csv", csv)):
+        if not (isinstance(value, str | os.PathLike) or (name == "csv" and value is None)):
+            what = {"folder": "folder", "csv": "file"}[name]
             raise ValueError(f"{name} is {value!r}; it must be the name of a {what}")
     if budget is not None:
         check_instance("budget", budget, ErrorBudget)
@@ -289,18 +289,18 @@ class _Page:
 
 
 def _rows(
-    problem: ContactProblem, steps: Sequence[Step], history: str | os.PathLike[str] | None
+    problem: ContactProblem, steps: Sequence[Step], csv: str | os.PathLike[str] | None
 ) -> list[dict[str, str]]:
     """Those of the table, or of the steps. On the first rank."""
-    if history is None:
+    if csv is None:
         names = table.columns(problem)
         return [
             dict(zip(names, map(str, table.values(problem, step)), strict=True)) for step in steps
         ]
-    rows = table.read(Path(history), problem)
+    rows = table.read(Path(csv), problem)
     if int(rows[-1]["increment"]) != steps[-1].increment:
         raise ValueError(
-            f"history is {history}, whose last increment is {rows[-1]['increment']}, and the last "
+            f"csv is {csv}, whose last increment is {rows[-1]['increment']}, and the last "
             f"step is of increment {steps[-1].increment}; give the table of the same history"
         )
     return rows
@@ -332,7 +332,7 @@ def _state(
         checked = ["equilibrium", "the balance of forces and moments"]
         checked += ["the contact laws at every point"] if step.verdict.laws else []
         checked += ["the penetration left by multipliers"] if step.verdict.enforcement else []
-        checked += ["the rigid supports"] if step.verdict.obstacles else []
+        checked += ["the rigid obstacles"] if step.verdict.obstacles else []
         small = [c.name for c in problem.contacts if not c.finite]
         known = step.verdict.kinematics
         checked += ["that displacements are small"] if any(n in known for n in small) else []
@@ -499,7 +499,7 @@ def _choices(page: _Page, problem: ContactProblem, step: Step) -> None:
         rows.append(
             (
                 "largest change of force or pressure by small displacements",
-                f"{problem.kinematics:g}",
+                f"{problem.small_displacement_tolerance:g}",
             )
         )
     page.words("Problem", ("what", "choice"), rows)
@@ -508,7 +508,7 @@ def _choices(page: _Page, problem: ContactProblem, step: Step) -> None:
         facets = count.index_map(count.dim).size_global
         rows = [
             ("law", type(contact.law).__name__),
-            ("support", type(contact.support).__name__),
+            ("obstacle", type(contact.obstacle).__name__),
             ("kinematics", "finite" if contact.finite else "small"),
             ("enforcement", _enforcement(contact)),
             ("facets", str(facets)),
@@ -526,10 +526,10 @@ def _enforcement(contact: Contact) -> str:
 
 
 def _parameter(given: Any, constant: fem.Constant | None) -> str:
-    """Of a law or support: how it was given, and its number as it is now, if it has one."""
-    if isinstance(given, Springs):
+    """Of a law or obstacle: how it was given, and its number as it is now, if it has one."""
+    if isinstance(given, NodalSprings):
         return f"{given.k:g} for each node"
     if constant is None:
         return "given by an expression"
     number = ", ".join(f"{x:g}" for x in np.ravel(constant.value))
-    return f"{number} E/h" if isinstance(given, Scaled) else number
+    return f"{number} E/h" if isinstance(given, RelativeStiffness) else number

@@ -19,12 +19,12 @@ from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.classes import FixedIndex
 from ufl.corealg.traversal import unique_post_traversal
 
-from fenics_contact.laws.base import Kinematics, Law
-from fenics_contact.supports.base import Support
+from fenics_contact.laws.base import Law, PointKinematics
+from fenics_contact.obstacles.base import Obstacle
 
-__all__ = ["signature_of_law", "signature_of_support"]
+__all__ = ["signature_of_law", "signature_of_obstacle"]
 
-# Digits of numbers in a support, whose last ones may be round-off of where they come from.
+# Digits of numbers in an obstacle, whose last ones may be round-off of where they come from.
 _DIGITS = 12
 
 
@@ -55,9 +55,8 @@ def signature_of_law(law: Law, gdim: int, *, multipliers: bool) -> str:
         multipliers: Whether it is enforced by multipliers.
     """
     symbols = _Symbols(gdim)
-    felt = Kinematics(
+    felt = PointKinematics(
         symbols.new("gap"),
-        symbols.new("normal displacement"),
         symbols.new("normal", gdim),
         symbols.new("tangential displacement", gdim) if law.has_tangential else None,
         symbols.new("tangential increment", gdim) if law.has_friction else None,
@@ -68,7 +67,7 @@ def signature_of_law(law: Law, gdim: int, *, multipliers: bool) -> str:
         name: symbols.new(f"parameter {name}", *(gdim,) * (name == "direction"))
         for name in law.parameters()
     }
-    response = law.response(felt, given)
+    response = law.contact_traction(felt, given)
     said = [response.normal_traction, response.opening, response.penetration, *response.slip]
     said.append(law.stored(felt, response, given))
     if law.has_own_normal:
@@ -85,11 +84,11 @@ def signature_of_law(law: Law, gdim: int, *, multipliers: bool) -> str:
     return _word([*map(str, kind), *_hashes(said, symbols.names)])
 
 
-def signature_of_support(support: Support, gdim: int) -> str:
-    """A word that differs where gap or direction of a support are other functions of the place.
+def signature_of_obstacle(obstacle: Obstacle, gdim: int) -> str:
+    """A word that differs where gap or direction of an obstacle are other functions of the place.
 
     Args:
-        support: Of which numbers count by their values, constants and functions do not.
+        obstacle: Of which numbers count by their values, constants and functions do not.
         gdim: Dimension of space.
     """
     symbols = _Symbols(gdim)
@@ -100,7 +99,7 @@ def signature_of_support(support: Support, gdim: int) -> str:
         rounded = np.vectorize(lambda v: float(f"{v:.{_DIGITS}g}"), otypes=[float])(value)
         return ufl.as_ufl(float(rounded)) if rounded.ndim == 0 else ufl.as_tensor(rounded.tolist())
 
-    placement = support.place(symbols.new("place", gdim), None, to_ufl)
+    placement = obstacle.place(symbols.new("place", gdim), None, to_ufl)
     return _word(_hashes([placement.gap, ufl.as_vector(placement.direction)], symbols.names))
 
 

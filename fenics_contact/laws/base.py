@@ -1,12 +1,12 @@
 """Contact laws: pure UFL return maps and potentials. No mesh, no state.
 
-A law maps the kinematics of a point of Γc (`Kinematics`) to the reactions there (`Response`). One
-definition serves two and three dimensions and every support. Signs are the paper's: the traction on
-the body is r_n n + τ, with n from the body to the support and r_n ≤ 0 (but for `Foundation`, which
-may pull).
+A law maps the kinematics of a point of Γc (`PointKinematics`) to the reactions there
+(`ContactTraction`). One definition serves two and three dimensions and every obstacle. Signs are
+the paper's: the traction on the body is r_n n + τ, with n from the body to the obstacle and r_n ≤
+0 (but for `Foundation`, which may pull).
 
 A law of one's own is a subclass of `Law`, or of `FrictionLaw` with friction, and a dataclass of its
-parameters. It says `Law.response`; where r_n is not -k_n δ₋ of a parameter "k_n", also its
+parameters. It says `Law.contact_traction`; where r_n is not -k_n δ₋ of a parameter "k_n", also its
 `normal_potential`, against which the verdict checks r_n; and the parameters that must not vanish,
 `positive`.
 """
@@ -22,18 +22,18 @@ import ufl
 from fenics_contact.laws.return_maps import positive_part
 from fenics_contact.types import Expr
 
-__all__ = ["Kinematics", "Law", "Response", "signorini", "signorini_potential"]
+__all__ = ["ContactTraction", "Law", "PointKinematics", "signorini", "signorini_potential"]
 
 
 @dataclass(frozen=True)
-class Kinematics:
+class PointKinematics:
     """What a law sees at a point (UFL).
 
     Attributes:
-        gap: Initial gap s (length), the motion of the support included.
-        normal_displacement: u_n of eq. (2).
-        normal: Unit normal n from body to support, shape (gdim,).
-        tangential_displacement: u_t of eq. (21), relative to the support, shape (gdim,); None if
+        gap: Normal gap g_N = s - u_n (length): open where positive, penetrated where negative; the
+            motion of the obstacle is included.
+        normal: Unit normal n from body to obstacle, shape (gdim,).
+        tangential_displacement: u_t of eq. (21), relative to the obstacle, shape (gdim,); None if
             the law gives no tangential traction.
         tangential_increment: Δu_t since the last commit, shape (gdim,); None without friction.
         traction: Tangential traction τ at the last commit, or the multiplier λ_t that replaces it,
@@ -43,7 +43,6 @@ class Kinematics:
     """
 
     gap: Expr
-    normal_displacement: Expr
     normal: Expr
     tangential_displacement: Expr | None = None
     tangential_increment: Expr | None = None
@@ -52,7 +51,7 @@ class Kinematics:
 
 
 @dataclass(frozen=True)
-class Response:
+class ContactTraction:
     """The reactions at a point (UFL).
 
     Attributes:
@@ -135,13 +134,13 @@ class Law:
             ValueError: It says what is missing.
         """
         name, parameters = type(self).__name__, self.parameters()
-        if type(self).response is Law.response:
-            raise ValueError(f"{name} is no law: a subclass of Law must say its response")
+        if type(self).contact_traction is Law.contact_traction:
+            raise ValueError(f"{name} is no law: a subclass of Law must define contact_traction")
         if self.has_own_normal and type(self).normal_potential is Law.normal_potential:
             raise ValueError(
                 f"{name} has no parameter k_n; it must say its own normal_potential(kinematics, "
-                "parameters), minus whose derivative by the normal displacement is the normal "
-                "traction: energies, solver and verdict need it"
+                "parameters), whose derivative by the gap is the normal traction: energies, solver "
+                "and verdict need it"
             )
         if self.has_tangential and "k_t" not in parameters:
             raise ValueError(
@@ -149,23 +148,25 @@ class Law:
                 "that stick (stress/length); add one"
             )
 
-    def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
+    def contact_traction(
+        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
+    ) -> ContactTraction:
         """The reactions; ``parameters`` are those of `parameters`, as UFL."""
         raise NotImplementedError
 
-    def normal_potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
-        """Energy per area of r_n, which is minus its derivative by u_n; by default eq. (19)."""
+    def normal_potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
+        """Energy per area whose derivative by the gap is r_n; by default eq. (19)."""
         return signorini_potential(kinematics, parameters["k_n"])
 
-    def normal_stiffness(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+    def normal_stiffness(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
         """-∂r_n/∂u_n where the gap is closed (stress/length)."""
         if not self.has_own_normal:
             return parameters["k_n"]
-        u_n = ufl.variable(kinematics.normal_displacement)
-        density = self.normal_potential(replace(kinematics, normal_displacement=u_n), parameters)
-        return ufl.diff(ufl.diff(density, u_n), u_n)
+        gap = ufl.variable(kinematics.gap)
+        density = self.normal_potential(replace(kinematics, gap=gap), parameters)
+        return ufl.diff(ufl.diff(density, gap), gap)
 
-    def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+    def potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
         """Potential per area whose derivative by the displacement is minus the traction.
 
         Raises:
@@ -190,13 +191,14 @@ class Law:
         return 0
 
     def friction_bound(
-        self, kinematics: Kinematics, pressure: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, pressure: Expr, parameters: Mapping[str, Expr]
     ) -> Expr:
         """Size of the yield surface under a contact pressure (stress), ≥ 0.
 
-        It is all that is known of the strength of friction: the `response` and the checks call it.
-        It may depend on the kinematics, as on the slip distance of the increment. What is μ p, with
-        μ from the parameters alone, bounds tangential forces by normal ones; no other bound does.
+        It is all that is known of the strength of friction: the `contact_traction` and the checks
+        call it. It may depend on the kinematics, as on the slip distance of the increment. What is
+        μ p, with μ from the parameters alone, bounds tangential forces by normal ones; no other
+        bound does.
 
         Args:
             kinematics: Of the point.
@@ -212,19 +214,25 @@ class Law:
         """
         return None
 
-    def tangential_stiffness(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+    def tangential_stiffness(
+        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
+    ) -> Expr:
         """K_t of a sticking point (stress/length), shape (gdim, gdim), with K_t n = 0."""
         n = kinematics.normal
         return parameters["k_t"] * (ufl.Identity(len(n)) - ufl.outer(n, n))
 
     def elastic_displacement(
-        self, kinematics: Kinematics, traction: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, traction: Expr, parameters: Mapping[str, Expr]
     ) -> Expr:
         """K_t⁻¹ τ (length), shape (gdim,): minus the displacement v_e of eq. (24) without slip."""
         return traction / parameters["k_t"]
 
     def yield_functions(
-        self, kinematics: Kinematics, traction: Expr, bound: Expr, parameters: Mapping[str, Expr]
+        self,
+        kinematics: PointKinematics,
+        traction: Expr,
+        bound: Expr,
+        parameters: Mapping[str, Expr],
     ) -> tuple[Expr, ...]:
         """g_j(τ, bound) ≤ 0 of each slip mode (stress), eq. (29), apart from the return map.
 
@@ -233,7 +241,7 @@ class Law:
         return ()
 
     def stored(
-        self, kinematics: Kinematics, response: Response, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, response: ContactTraction, parameters: Mapping[str, Expr]
     ) -> Expr:
         """Energy per area in the springs, r_n²/2k_n or `normal_potential`, and τ·K_t⁻¹τ/2.
 
@@ -253,7 +261,7 @@ class Law:
         return stored
 
     def dissipated(
-        self, kinematics: Kinematics, response: Response, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, response: ContactTraction, parameters: Mapping[str, Expr]
     ) -> Expr:
         """Work per area of friction on the slip of the increment, -τ·(Δu_t + K_t⁻¹ Δτ) ≥ 0."""
         assert response.traction is not None
@@ -263,22 +271,22 @@ class Law:
         return -ufl.dot(response.traction, kinematics.tangential_increment + stretched)
 
 
-def signorini(kinematics: Kinematics, k_n: Expr) -> tuple[Expr, Expr, Expr]:
+def signorini(kinematics: PointKinematics, k_n: Expr) -> tuple[Expr, Expr, Expr]:
     """Regularised normal law, eq. (6-11): r_n, δ₊, δ₋ in closed form, point by point.
 
     With a multiplier r_n = -⟨λ_n + k_n (u_n - s)⟩₊: where λ_n = -r_n the law is exact.
     """
-    closing = kinematics.normal_displacement - kinematics.gap
-    opening = positive_part(kinematics.gap - kinematics.normal_displacement)
+    closing = -kinematics.gap
+    opening = positive_part(kinematics.gap)
     penetration = positive_part(closing)
     if kinematics.multiplier is None:
         return -k_n * penetration, opening, penetration
     return -positive_part(kinematics.multiplier + k_n * closing), opening, penetration
 
 
-def signorini_potential(kinematics: Kinematics, k_n: Expr) -> Expr:
+def signorini_potential(kinematics: PointKinematics, k_n: Expr) -> Expr:
     """½ k_n ⟨u_n - s⟩₊², eq. (19); with a multiplier ⟨λ_n + k_n (u_n - s)⟩₊²/(2 k_n)."""
-    closing = kinematics.normal_displacement - kinematics.gap
+    closing = -kinematics.gap
     if kinematics.multiplier is None:
         return k_n / 2 * positive_part(closing) ** 2
     return positive_part(kinematics.multiplier + k_n * closing) ** 2 / (2 * k_n)

@@ -10,14 +10,20 @@ from typing import Any
 
 import ufl
 
-from fenics_contact.laws.base import Kinematics, Law, Response, signorini, signorini_potential
+from fenics_contact.laws.base import (
+    ContactTraction,
+    Law,
+    PointKinematics,
+    signorini,
+    signorini_potential,
+)
 from fenics_contact.laws.return_maps import (
     norm,
     return_to_cone,
     return_to_polygon,
     return_to_segment,
 )
-from fenics_contact.laws.stiffness import Scaled
+from fenics_contact.laws.stiffness import RelativeStiffness
 from fenics_contact.types import Expr
 
 __all__ = ["Coulomb", "FrictionLaw", "Tresca", "perpendicular"]
@@ -106,7 +112,7 @@ class FrictionLaw(Law):
         return 2 if gdim == 2 else self.modes or 1
 
     def friction_bound(
-        self, kinematics: Kinematics, pressure: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, pressure: Expr, parameters: Mapping[str, Expr]
     ) -> Expr:
         """See `Law.friction_bound`: μ p."""
         return parameters["friction"] * pressure
@@ -161,7 +167,9 @@ class FrictionLaw(Law):
         ratio = parameters["transverse_friction"] / parameters["friction"]
         return ufl.dot(vector, first) * first + ratio**power * ufl.dot(vector, second) * second
 
-    def tangential_stiffness(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+    def tangential_stiffness(
+        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
+    ) -> Expr:
         """See `Law.tangential_stiffness`: k_t B²."""
         if self.transverse_friction is None:
             return super().tangential_stiffness(kinematics, parameters)
@@ -170,13 +178,17 @@ class FrictionLaw(Law):
         return parameters["k_t"] * (ufl.outer(first, first) + ratio**2 * ufl.outer(second, second))
 
     def elastic_displacement(
-        self, kinematics: Kinematics, traction: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, traction: Expr, parameters: Mapping[str, Expr]
     ) -> Expr:
         """See `Law.elastic_displacement`: B⁻² τ/k_t."""
         return self._stretched(traction, -2, kinematics.normal, parameters) / parameters["k_t"]
 
     def yield_functions(
-        self, kinematics: Kinematics, traction: Expr, bound: Expr, parameters: Mapping[str, Expr]
+        self,
+        kinematics: PointKinematics,
+        traction: Expr,
+        bound: Expr,
+        parameters: Mapping[str, Expr],
     ) -> tuple[Expr, ...]:
         """See `Law.yield_functions`: eq. (29) in the plane, |σ| - bound or σ·a_j - bound."""
         n = kinematics.normal
@@ -189,7 +201,7 @@ class FrictionLaw(Law):
         return tuple(ufl.dot(sigma, a) - bound for a, _ in self._sides(n, parameters))
 
     def _return(
-        self, kinematics: Kinematics, bound: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, bound: Expr, parameters: Mapping[str, Expr]
     ) -> tuple[Expr, Expr, tuple[Expr, ...]]:
         """Return map of the increment in σ, eq. (41-45): σ*, σ and Δβ of each mode."""
         n, k_t = kinematics.normal, parameters["k_t"]
@@ -203,15 +215,15 @@ class FrictionLaw(Law):
             sigma, excess = return_to_polygon(trial, bound, self._sides(n, parameters))
         return trial, sigma, tuple(e / k_t for e in excess)
 
-    def slide(
-        self, kinematics: Kinematics, bound: Expr, parameters: Mapping[str, Expr]
+    def return_map(
+        self, kinematics: PointKinematics, bound: Expr, parameters: Mapping[str, Expr]
     ) -> tuple[Expr, tuple[Expr, ...]]:
         """τ at the end of the increment, shape (gdim,), and Δβ of each mode, eq. (41-45)."""
         _, sigma, slip = self._return(kinematics, bound, parameters)
         return self._stretched(sigma, 1, kinematics.normal, parameters), slip
 
     def sliding_potential(
-        self, kinematics: Kinematics, bound: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, bound: Expr, parameters: Mapping[str, Expr]
     ) -> Expr:
         """Minus its derivative by Δu_t is τ for a given bound: ½|σ*|²/k_t, linear beyond it.
 
@@ -234,14 +246,16 @@ class _GivenBound(FrictionLaw):
         """See `Law.has_potential`."""
         return True
 
-    def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
-        """See `Law.response`."""
+    def contact_traction(
+        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
+    ) -> ContactTraction:
+        """See `Law.contact_traction`."""
         bound = parameters["friction_bound"]
-        traction, slip = self._law.slide(kinematics, bound, parameters)
-        found = self._law.response(kinematics, parameters)
+        traction, slip = self._law.return_map(kinematics, bound, parameters)
+        found = self._law.contact_traction(kinematics, parameters)
         return replace(found, traction=traction, friction_bound=bound, slip=slip)
 
-    def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+    def potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
         """See `Law.potential`."""
         normal = self._law.normal_potential(kinematics, parameters)
         bound = parameters["friction_bound"]
@@ -272,20 +286,22 @@ class Coulomb(FrictionLaw):
     """
 
     friction: Any
-    k_n: Any = Scaled()
-    k_t: Any = Scaled()
+    k_n: Any = RelativeStiffness()
+    k_t: Any = RelativeStiffness()
     modes: int | None = None
     transverse_friction: Any = None
     direction: Any = None
 
-    def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
-        """See `Law.response`. Where the gap is open τ = 0, and moving is not slipping."""
+    def contact_traction(
+        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
+    ) -> ContactTraction:
+        """See `Law.contact_traction`. Where the gap is open τ = 0, and moving is not slipping."""
         r_n, opening, penetration = signorini(kinematics, parameters["k_n"])
         closed = ufl.lt(r_n, 0)
         bound = ufl.conditional(closed, self.friction_bound(kinematics, -r_n, parameters), 0)
-        traction, slip = self.slide(kinematics, bound, parameters)
+        traction, slip = self.return_map(kinematics, bound, parameters)
         slip = tuple(ufl.conditional(closed, mode, 0) for mode in slip)
-        return Response(r_n, opening, penetration, traction, bound, slip)
+        return ContactTraction(r_n, opening, penetration, traction, bound, slip)
 
 
 @dataclass(frozen=True)
@@ -306,8 +322,8 @@ class Tresca(FrictionLaw):
 
     friction: Any
     pressure: Any
-    k_n: Any = Scaled()
-    k_t: Any = Scaled()
+    k_n: Any = RelativeStiffness()
+    k_t: Any = RelativeStiffness()
     unilateral: bool = True
     modes: int | None = None
     transverse_friction: Any = None
@@ -329,25 +345,27 @@ class Tresca(FrictionLaw):
         return {n: v for n, v in super().parameters().items() if n not in without}
 
     def friction_bound(
-        self, kinematics: Kinematics, pressure: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, pressure: Expr, parameters: Mapping[str, Expr]
     ) -> Expr:
         """See `Law.friction_bound`: μ times the prescribed pressure, whatever the other is."""
         return parameters["friction"] * parameters["pressure"]
 
-    def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
-        """See `Law.response`."""
+    def contact_traction(
+        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
+    ) -> ContactTraction:
+        """See `Law.contact_traction`."""
         bound = self.friction_bound(kinematics, parameters["pressure"], parameters)
-        traction, slip = self.slide(kinematics, bound, parameters)
+        traction, slip = self.return_map(kinematics, bound, parameters)
         k_n = parameters["k_n"] if self.unilateral else ufl.as_ufl(0)
         r_n, opening, penetration = signorini(kinematics, k_n)
         if not self.unilateral:
             r_n = -parameters["pressure"]
-        return Response(r_n, opening, penetration, traction, bound, slip)
+        return ContactTraction(r_n, opening, penetration, traction, bound, slip)
 
-    def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+    def potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
         """Eq. (19) and (43)."""
         bound = self.friction_bound(kinematics, parameters["pressure"], parameters)
         tangential = self.sliding_potential(kinematics, bound, parameters)
         if not self.unilateral:
-            return tangential + parameters["pressure"] * kinematics.normal_displacement
+            return tangential - parameters["pressure"] * kinematics.gap
         return tangential + signorini_potential(kinematics, parameters["k_n"])

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from numbers import Real
 
-__all__ = ["Scaled", "Springs"]
+__all__ = ["NodalSprings", "RelativeStiffness"]
 
 
 @dataclass(frozen=True)
-class Scaled:
+class RelativeStiffness:
     """A stiffness per area as a multiple of E/h, Young's modulus over the height of the cell there.
 
     E comes from the bulk form itself, h is the cell's height over its facet on Γc, so that the
@@ -31,7 +31,7 @@ class Scaled:
 
 
 @dataclass(frozen=True)
-class Springs:
+class NodalSprings:
     """A stiffness as one spring for each node pair of Γc, the contact springs of section 4.
 
     At a vertex of Γc the stiffness per area is k over the area that the vertex stands for, the
@@ -48,6 +48,6 @@ class Springs:
         """Refuse a stiffness that is no positive number."""
         if not (isinstance(self.k, Real) and 0.0 < self.k < float("inf")):
             raise ValueError(
-                f"k of the Springs is {self.k!r}; it must be a number greater than zero "
+                f"k of the NodalSprings is {self.k!r}; it must be a number greater than zero "
                 "(force/length of one node pair)"
             )

@@ -9,8 +9,14 @@ from typing import Any
 
 import ufl
 
-from fenics_contact.laws.base import Kinematics, Law, Response, signorini, signorini_potential
-from fenics_contact.laws.stiffness import Scaled
+from fenics_contact.laws.base import (
+    ContactTraction,
+    Law,
+    PointKinematics,
+    signorini,
+    signorini_potential,
+)
+from fenics_contact.laws.stiffness import RelativeStiffness
 from fenics_contact.types import Expr
 
 __all__ = ["Foundation", "Frictionless"]
@@ -21,25 +27,27 @@ class Frictionless(Law):
     """Unilateral contact without friction, eq. (6-20).
 
     Args to the constructor:
-        k_n: Normal stiffness (stress/length): a number, constant or UFL expression, `Scaled`, or
-            `Springs`.
+        k_n: Normal stiffness (stress/length): a number, constant or UFL expression,
+            `RelativeStiffness`, or `NodalSprings`.
     """
 
-    k_n: Any = Scaled()
+    k_n: Any = RelativeStiffness()
 
-    def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
-        """See `Law.response`."""
-        return Response(*signorini(kinematics, parameters["k_n"]))
+    def contact_traction(
+        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
+    ) -> ContactTraction:
+        """See `Law.contact_traction`."""
+        return ContactTraction(*signorini(kinematics, parameters["k_n"]))
 
 
 @dataclass(frozen=True)
 class Foundation(Law):
     """An elastic foundation, bond or tie: r_n = -k_n (u_n - s) and τ = -k_t u_t, from the start.
 
-    The stiffness is physical here, that of a layer between body and support (paper, 2.1). It may
-    be zero where there is none. ``Foundation(k, k)`` is a *tie*: it bonds the body to the support,
+    The stiffness is physical here, that of a layer between body and obstacle (paper, 2.1). It may
+    be zero where there is none. ``Foundation(k, k)`` is a *tie*: it bonds the body to the obstacle,
     or two bodies to each other, whose meshes need not match. ``Contact(gap=0)`` with it, or gaps
-    between facets are pulled shut. With `Scaled(10)` it opens as a tenth of a cell does.
+    between facets are pulled shut. With `RelativeStiffness(10)` it opens as a tenth of a cell does.
 
     Args to the constructor:
         k_n: Normal stiffness (stress/length), zero or greater; see `Frictionless`.
@@ -82,30 +90,32 @@ class Foundation(Law):
         """See `Law.parameters`."""
         return {"k_n": self.k_n} | ({"k_t": self.k_t} if self.has_tangential else {})
 
-    def response(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Response:
-        """See `Law.response`."""
+    def contact_traction(
+        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
+    ) -> ContactTraction:
+        """See `Law.contact_traction`."""
         r_n, opening, penetration = signorini(kinematics, parameters["k_n"])
         if self.tension:
-            r_n = parameters["k_n"] * (kinematics.gap - kinematics.normal_displacement)
+            r_n = parameters["k_n"] * kinematics.gap
         if not self.has_tangential:
-            return Response(r_n, opening, penetration)
+            return ContactTraction(r_n, opening, penetration)
         k_t = parameters["k_t"]
         if not self.tension:
             k_t = ufl.conditional(ufl.gt(penetration, 0), k_t, 0)
         traction = -k_t * kinematics.tangential_displacement
-        return Response(r_n, opening, penetration, traction)
+        return ContactTraction(r_n, opening, penetration, traction)
 
     def stored(
-        self, kinematics: Kinematics, response: Response, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, response: ContactTraction, parameters: Mapping[str, Expr]
     ) -> Expr:
         """See `Law.stored`; by displacements, since k_t may be zero."""
-        closing = kinematics.normal_displacement - kinematics.gap
+        closing = -kinematics.gap
         stored = -response.normal_traction * closing / 2
         if response.traction is not None:
             stored -= ufl.dot(response.traction, kinematics.tangential_displacement) / 2
         return stored
 
-    def potential(self, kinematics: Kinematics, parameters: Mapping[str, Expr]) -> Expr:
+    def potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
         """½ k_n (u_n - s)² + ½ k_t |u_t|², or eq. (19) without tension."""
         if not self.has_potential:
             raise ValueError(
@@ -114,7 +124,7 @@ class Foundation(Law):
             )
         if not self.tension:
             return signorini_potential(kinematics, parameters["k_n"])
-        density = parameters["k_n"] / 2 * (kinematics.normal_displacement - kinematics.gap) ** 2
+        density = parameters["k_n"] / 2 * kinematics.gap**2
         if self.has_tangential:
             u_t = kinematics.tangential_displacement
             density += parameters["k_t"] / 2 * ufl.dot(u_t, u_t)

@@ -24,8 +24,8 @@ _LEFT = 1e-8
 _MOST = 0.5
 # The share of a motion at Γc that may go along a Γc that grips: of a body tilted by up to 0.2.
 _ALONG = 0.05
-# How far bodies are set down into their supports, by the largest gap: round-off is to leave none of
-# the points that bear open, ten times the tolerance of the linear programme.
+# How far bodies are set down into their obstacles, by the largest gap: round-off is to leave none
+# of the points that bear open, ten times the tolerance of the linear programme.
 _INTO = 1e-9
 # Relative sizes of motions at points, and of forces, that are none.
 _FELT = 1e-10
@@ -61,7 +61,7 @@ class Approach:
     """Where bodies without contact come from and go to.
 
     Attributes:
-        carried: The state in which bodies have gone with supports that moved, as `lead` found it;
+        carried: The state in which bodies have gone with obstacles that moved, as `lead` found it;
             None: none has.
     """
 
@@ -79,7 +79,7 @@ class Approach:
         """Set bodies that nothing holds yet down, or move them to first touch. Collective.
 
         One that was released before is set down from where it was left, for that may be far along
-        its support.
+        its obstacle.
 
         Args:
             load: External forces at this rank's unknowns (force).
@@ -127,7 +127,7 @@ class Approach:
             chosen: Which of the free motions may be taken along, (n_free,).
 
         Returns:
-            Coefficients of the free motions; None: no support has moved.
+            Coefficients of the free motions; None: no obstacle has moved.
         """
         contacts, comm = self._full.contacts, self._full.unknowns.comm
         n_free = len(self._motions.free)
@@ -192,8 +192,8 @@ class Approach:
                 return
             self._move(which, way)
         self._follow_stiffness()
-        # A support pressed by a force comes to a body as one that is led there does, and may be led
-        # along by then: slip is counted from where its increment starts.
+        # An obstacle pressed by a force comes to a body as one that is led there does, and may be
+        # led along by then: slip is counted from where its increment starts.
         of_bodies = self._motions.of_any_body()[which]
         if not of_bodies.any():
             return
@@ -339,7 +339,7 @@ class Approach:
             angles = turns.T @ ways
             bounds += [angles, -angles]
             most += [np.full(2 * len(angles), turn / far)]
-        # What was let go, supports may have moved into: it goes out, or no deeper where it cannot.
+        # What was let go, obstacles may have moved into: it goes out, or no deeper where it cannot.
         for deep in (gaps, np.maximum(gaps, _INTO)):
             found = scipy.optimize.linprog(
                 -work,

@@ -115,7 +115,7 @@ class Equations:
     def residual(self, x: PETSc.Vec, f: PETSc.Vec) -> Norms:
         """Compute the residual at ``x`` into ``f``, and its norms, kept too. Collective.
 
-        It is not a number where cells are turned inside out, supports have turned too far, Γc has
+        It is not a number where cells are turned inside out, obstacles have turned too far, Γc has
         no tangent plane, or bodies are thrown out of sight of all others.
         """
         self.set_state(x)
@@ -343,7 +343,7 @@ class Equations:
             added += diagonal.array_r
             part.destroy()
             diagonal.destroy()
-        # The motion of a support has no stiffness.
+        # The motion of an obstacle has no stiffness.
         stiffness = np.append(self.full.scales.stiffness, np.full(self.system.n_bodies, np.inf))
         felt = (bulk > _FELT * stiffness[self.system.label]) & ~self.system.constrained
         found = global_max(self._comm, added[felt] / bulk[felt])

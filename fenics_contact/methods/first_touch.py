@@ -57,7 +57,7 @@ class FirstTouch:
         present = full.state()
         contacts = [full.contacts[n] for n in idle]
         full.set_state(start)
-        ways = [self._support_way(contact) for contact in contacts]
+        ways = [self._obstacle_way(contact) for contact in contacts]
         apart = [
             n for n, given in enumerate(zip(contacts, ways, strict=True)) if self._is_apart(*given)
         ]
@@ -85,8 +85,8 @@ class FirstTouch:
         borne = np.abs(contact.history.values("normal_traction"))
         return not global_max(self._full.unknowns.comm, borne) > 0.0
 
-    def _support_way(self, contact: Contact) -> Array:
-        """Displacement of the support since the last commit, (n_points, gdim). Collective."""
+    def _obstacle_way(self, contact: Contact) -> Array:
+        """Displacement of the obstacle since the last commit, (n_points, gdim). Collective."""
         contact.evaluate()
         opposite = contact.opposite
         return opposite.turned(opposite.committed_jump - contact.values.jump)
@@ -146,7 +146,7 @@ class _Path:
         Args:
             full: The system on all unknowns.
             contact: The contact.
-            way: Displacement of its support in the increment, (n_points, gdim) (length).
+            way: Displacement of its obstacle in the increment, (n_points, gdim) (length).
             start: The state in which the increment starts.
             end: The state in which it would end.
         """

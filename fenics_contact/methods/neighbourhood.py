@@ -63,7 +63,7 @@ def linearised(
         if ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
             raise ValueError(
                 "the equations have no unique solution near this state: nothing holds a body or a "
-                "support that moves freely there, as before anything was solved or where contact "
+                "obstacle that moves freely there, as before anything was solved or where contact "
                 "is open; take a state in which contact bears"
             )
         if ksp.getConvergedReason() < 0:

@@ -93,7 +93,7 @@ class PrimalDual(OwnMethod):
         if not self.suits:
             raise ValueError(
                 "method is 'primal_dual', which is for friction by the springs k_n and k_t in "
-                "small displacements, for a bulk that is linear, and supports that do not move "
+                "small displacements, for a bulk that is linear, and obstacles that do not move "
                 "freely; use another method"
             )
 

@@ -31,7 +31,7 @@ from fenics_contact.methods.quasi_newton import QuasiNewton
 from fenics_contact.methods.rounds import INNER, solve_in_rounds
 from fenics_contact.methods.starts import Starts
 from fenics_contact.systems import linear
-from fenics_contact.systems.choice import linear_kind, obstacle_to_condensation
+from fenics_contact.systems.choice import linear_kind, reason_not_to_condense
 from fenics_contact.systems.condensed import CondensedSystem
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
@@ -150,7 +150,7 @@ class Solver:
             settings: What the caller says.
         """
         self.equations = Equations(full, motions, alpha=settings.alpha, phi=settings.phi)
-        self.expected = _EXPECTED
+        self.expected_increments = _EXPECTED
         self.starts = Starts(self.equations)
         self._full = full
         # Which the caller may change later.
@@ -257,8 +257,8 @@ class Solver:
 
         SNES may be made anew, with the monitors that the one before had got.
         """
-        if self.expected != increments:
-            self.expected = increments
+        if self.expected_increments != increments:
+            self.expected_increments = increments
             if self._choose_condensation() != self.condensed:
                 self._configure_anew()
 
@@ -271,12 +271,12 @@ class Solver:
 
     def _choose_condensation(self) -> bool:
         """Whether to iterate on the unknowns that may be touched alone. Collective."""
-        obstacle = obstacle_to_condensation(
+        obstacle = reason_not_to_condense(
             self._full,
             wanted=self._settings.condensation,
             linear_solver=self._settings.linear_solver,
             named=self._named,
-            increments=self.expected,
+            increments=self.expected_increments,
             n_kept=self._kept.count,
         )
         if obstacle and obstacle != self._obstacle and self._comm.rank == 0:

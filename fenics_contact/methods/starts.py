@@ -48,7 +48,7 @@ class Starts:
     Attributes:
         factored: Whether the consistent tangent factored last is that of a solution.
         predict: Whether a step on it may be chosen.
-        carried: The state in which bodies have gone with supports that moved; None: none has.
+        carried: The state in which bodies have gone with obstacles that moved; None: none has.
     """
 
     def __init__(self, equations: Equations) -> None:
@@ -79,7 +79,7 @@ class Starts:
     def keep(self, *, predict: bool) -> None:
         """Take note of what contacts bear in the solution that was just found. Collective.
 
-        Its tangent is factored. Supports that move by the next increment take those points along
+        Its tangent is factored. Obstacles that move by the next increment take those points along
         that stick, and no others.
 
         Args:
@@ -101,8 +101,8 @@ class Starts:
         Collective. The present state; that state moved on by as much as the last increment moved
         it: in proportional loading that is the solution; that state with one step of Newton's
         method on the tangent of the last solution; with a nonlinear bulk what `_followed` finds;
-        `_carried` where supports have moved and no values prescribed have; bodies that have gone
-        with such supports as rigid ones; and the state moved, or the present one, with supports
+        `_carried` where obstacles have moved and no values prescribed have; bodies that have gone
+        with such obstacles as rigid ones; and the state moved, or the present one, with obstacles
         that turn freely rolled to where they are now: where all points would slip no tangent tells
         by how much.
 
@@ -213,7 +213,7 @@ class Starts:
         assert full.stiffness is not None
         full.stiffness.mult(change, image)
         tractions = None if anew else self._tractions()
-        if tractions is not None:  # supports have moved, too
+        if tractions is not None:  # obstacles have moved, too
             for operator, borne, traction in zip(
                 full.operators, self._borne, tractions, strict=True
             ):
@@ -228,14 +228,14 @@ class Starts:
         return present + step.array_r if found else present
 
     def _carried(self, present: Array) -> Array | None:
-        """Where supports that have moved take the body, by one step from before. Collective.
+        """Where obstacles that have moved take the body, by one step from before. Collective.
 
         On the tangent factored last, with the tractions that points would have if those that stuck
         still did, and all others bore what they bore: in the residual at the present state a
-        support is deep in points that were open, and nothing sticks to it any more.
+        obstacle is deep in points that were open, and nothing sticks to it any more.
 
         Returns:
-            The state; None where no support has moved, or no step is found.
+            The state; None where no obstacle has moved, or no step is found.
         """
         equations = self._equations
         equations.system.set_state(present)
@@ -258,12 +258,12 @@ class Starts:
         return moved
 
     def _tractions(self) -> list[Array] | None:
-        """Those of the last solution, as moved supports would change them to first order.
+        """Those of the last solution, as moved obstacles would change them to first order.
 
         Collective.
 
         Returns:
-            (n_points, gdim) (stress) for every contact; None: no support has moved, or Γc is not
+            (n_points, gdim) (stress) for every contact; None: no obstacle has moved, or Γc is not
             where they were found.
         """
         equations, tractions, moved = self._equations, [], False

@@ -18,7 +18,7 @@ from fenics_contact.compat import geometry_dofmap
 from fenics_contact.compiling import compile_expression
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.finite import Frame
-from fenics_contact.supports.base import SampledSupport
+from fenics_contact.obstacles.base import SampledObstacle
 from fenics_contact.types import Array
 
 __all__ = ["ObstacleShape", "box_about", "shapes_of", "zero_level"]
@@ -45,7 +45,7 @@ class ObstacleShape:
         Args:
             contact: See `shapes_of`.
         """
-        self._support, self._d = contact.support, contact.surface.mesh.geometry.dim
+        self._obstacle, self._d = contact.obstacle, contact.surface.mesh.geometry.dim
         n = _POINTS[self._d] ** self._d
         element = basix.ufl.element("Lagrange", "interval", 1, shape=(self._d,))
         # A chain of intervals: the first node of each is a point of the grid, and of the mesh
@@ -61,8 +61,8 @@ class ObstacleShape:
         inputs, place = contact.inputs, ufl.SpatialCoordinate(self._mesh)
         shift = None if inputs.shift is None else self._factor * inputs.shift
         seen: Any = Frame(shift, inputs.rotation).into(place)
-        if not isinstance(self._support, SampledSupport):
-            seen = self._support.place(seen, None, _to_ufl(contact)).gap
+        if not isinstance(self._obstacle, SampledObstacle):
+            seen = self._obstacle.place(seen, None, _to_ufl(contact)).gap
         self._given = [c for c in extract_constants(ufl.as_ufl(seen)) if c is not self._factor]
         self._own = [fem.Constant(self._mesh, c.value.copy()) for c in self._given]
         replaced = ufl.replace(seen, dict(zip(self._given, self._own, strict=True)))
@@ -73,10 +73,10 @@ class ObstacleShape:
         """Whether the obstacle has a place of its own: gaps on Γc, and bodies, have none."""
         if not contact.rigid or contact.gap_prescribed:
             return False
-        if isinstance(contact.support, SampledSupport):
+        if isinstance(contact.obstacle, SampledObstacle):
             return True
         anywhere = fem.Constant(contact.surface.mesh, np.zeros(contact.surface.mesh.geometry.dim))
-        gap = contact.support.place(anywhere, None, _to_ufl(contact)).gap
+        gap = contact.obstacle.place(anywhere, None, _to_ufl(contact)).gap
         fixed = extract_type(gap, (ufl.SpatialCoordinate, ufl.Coefficient))
         return anywhere in extract_constants(gap) and not fixed
 
@@ -108,13 +108,13 @@ class ObstacleShape:
         """Of points in space, (n,) (length)."""
         self._mesh.geometry.x[geometry_dofmap(self._mesh)[:, 0], : self._d] = points
         seen = np.asarray(self._seen.eval(self._mesh, self._cells), dtype=np.float64)
-        if isinstance(self._support, SampledSupport):
-            return self._support.sample_checked(seen.reshape(points.shape)).distance
+        if isinstance(self._obstacle, SampledObstacle):
+            return self._obstacle.sample_checked(seen.reshape(points.shape)).distance
         return seen.ravel()
 
 
 def _to_ufl(contact: Contact) -> Any:
-    return lambda value: contact.inputs.to_ufl("support", value)
+    return lambda value: contact.inputs.to_ufl("obstacle", value)
 
 
 def shapes_of(contacts: Sequence[Contact]) -> list[ObstacleShape]:

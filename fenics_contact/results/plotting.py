@@ -244,7 +244,7 @@ def plot_tractions(
     # Somewhat beyond the contact, but not beyond Γc.
     reach = min(1.15 * np.abs(x[closed]).max(initial=0.0), np.abs(x).max(initial=0.0)) or 1.0
     near = np.abs(x) <= reach
-    # The shear on the body, along x: the direction in which the support holds it.
+    # The shear on the body, along x: the direction in which the obstacle holds it.
     shear = np.abs(points["tangential_traction"][:, 0])
     _draw_tractions(axes, x, points["pressure"], shear, status, [near])
     styles = ("--", ":", "-.")

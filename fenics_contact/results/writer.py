@@ -51,8 +51,8 @@ class Writer:
 
     The first two of a contact have displacement, pressure, tangential_traction (on the body), gap,
     slip (accumulated and committed, the sum of the modes), status (`Status`), normal (from body to
-    support); with finite kinematics true_pressure, per deformed area, the others being nominal; and
-    if the support is deformable paired, the share of points with an opposite. Where nothing is
+    obstacle); with finite kinematics true_pressure, per deformed area, the others being nominal;
+    and if the obstacle is deformable paired, the share of points with an opposite. Where nothing is
     opposite the gap is NaN. Body, Γc and points are on the undeformed body: "Warp By Vector" with
     the displacement moves them alike; obstacles are where they have moved to.
 

@@ -99,7 +99,7 @@ def modulus_over_height(
         surface: Γc.
         modulus: Young's modulus, one value per cell of the mesh (stress).
         opposite: This rank's facets of the opposite surface, whose largest modulus bounds E; none:
-            the support is rigid.
+            the obstacle is rigid.
 
     Returns:
         A continuous function of degree 1 on the submesh of Γc (stress/length).

@@ -1,4 +1,4 @@
-"""A deformable body as the support: what of it lies opposite every point of Γc.
+"""A deformable body as the obstacle: what of it lies opposite every point of Γc.
 
 From a point b of Γc the normal is followed to the opposite surface (paper, section 2.1); where it
 meets it, at the point a, stands u_a. That alone would load the opposite body unevenly where the
@@ -23,8 +23,8 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_mean
-from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.facets import tabulate
 from fenics_contact.surface.projection import (
     COVERED,
@@ -80,7 +80,7 @@ class Pairing:
     """
 
     def __init__(
-        self, support: DeformableBody, quadrature: SurfaceQuadrature, space: fem.FunctionSpace
+        self, obstacle: DeformableBody, quadrature: SurfaceQuadrature, space: fem.FunctionSpace
     ) -> None:
         """Collect both surfaces. Collective.
 
@@ -89,9 +89,9 @@ class Pairing:
         """
         mesh = space.mesh
         self._comm, self._d = mesh.comm, mesh.topology.dim
-        self._support, self._quadrature = support, quadrature
+        self._obstacle, self._quadrature = obstacle, quadrature
         self.round_off = _ROUND_OFF * global_max(mesh.comm, np.abs(mesh.geometry.x))
-        self.rays = rays = Rays(support, quadrature, space)
+        self.rays = rays = Rays(obstacle, quadrature, space)
         self._here, self._there = rays.here.facets, rays.there.facets
         self._sides, self._facet, self._space = (rays.here, rays.there), rays.facet, space
         self.facets, self.surface = rays.facets, quadrature.surface
@@ -106,7 +106,7 @@ class Pairing:
 
         Args:
             x: The points in the undeformed body, (n_points, d).
-            normal: Unit normals from body to support, (n_points, d).
+            normal: Unit normals from body to obstacle, (n_points, d).
             u: Displacement at which to pair; none: undeformed.
             penetration: Of the points as they have been paired, ≥ 0, (n_points,) (length).
 
@@ -154,14 +154,14 @@ class Pairing:
         Args:
             place: Of the points on their facets, (n_points, d - 1).
             x: Likewise, (n_points, d).
-            normal: From body to support, (n_points, d).
+            normal: From body to obstacle, (n_points, d).
 
         Returns:
             That, and how deep the bodies are in each other at each of all facets of Γc (length).
         """
         none = np.zeros(len(self._sides[0].body))
         found = self.rays.follow(self._facet, place, normal, None, none)
-        if self._support.release is None:
+        if self._obstacle.max_initial_penetration is None:
             inside = self._inside(x, found.reason == BEHIND)
             if self._comm.allreduce(np.count_nonzero(inside)):
                 deep = none.copy()
@@ -233,7 +233,7 @@ class Pairing:
             radius = np.maximum(start[1], end[1]) + np.linalg.norm(half, axis=1)
             balls.append((end[0] - half, radius + side.height[side.own]))
         (one, reach), (other, size) = ([gather_rows(comm, v) for v in ball] for ball in balls)
-        reach = reach + max(2 * depth, self._support.release or 0.0)
+        reach = reach + max(2 * depth, self._obstacle.max_initial_penetration or 0.0)
         tree = scipy.spatial.cKDTree(other)
         here, there = near_pairs(tree, one, reach + size.max(initial=0.0))
         close = np.linalg.norm(one[here] - other[there], axis=1) <= reach[here] + size[there]

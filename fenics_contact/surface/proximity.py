@@ -101,7 +101,7 @@ class _Facets:
 
 
 def find_neighbours(
-    space: fem.FunctionSpace, facets: Index, label: Index, distance: float, *, itself: bool
+    space: fem.FunctionSpace, facets: Index, label: Index, distance: float, *, self_contact: bool
 ) -> list[Neighbours]:
     """Find the facets of bodies that may touch another one. Collective.
 
@@ -116,7 +116,7 @@ def find_neighbours(
         facets: Exterior facets that this rank owns, (n,).
         label: Number of the body of each, (n,).
         distance: How near they must come (length).
-        itself: Whether to look for facets of one and the same body as well.
+        self_contact: Whether to look for facets of one and the same body as well.
 
     Returns:
         One item for each two bodies, in the order of their numbers: the same on all ranks.
@@ -133,12 +133,12 @@ def find_neighbours(
         side.corner_vertices(),
     )
     kept: Mask = np.ones(len(facets), dtype=np.bool_)
-    if not itself:
+    if not self_contact:
         kept = _near_another(comm, mine, distance)
     mine, own = mine.of(kept), facets[kept]
     every = mine.gathered(comm)
     first = comm.exscan(len(own)) or 0
-    pairs, away = _pairs(first + np.arange(len(own)), every, distance, itself=itself)
+    pairs, away = _pairs(first + np.arange(len(own)), every, distance, self_contact=self_contact)
     pairs, away = np.concatenate(comm.allgather(pairs)), gather_rows(comm, away)
     # Every pair was found from both sides, but for round-off.
     one, other = every.label[pairs[:, 0]], every.label[pairs[:, 1]]
@@ -187,7 +187,7 @@ def _near_another(comm: MPI.Comm, facets: _Facets, distance: float) -> Mask:
 
 
 def _pairs(
-    mine: Index, every: _Facets, distance: float, *, itself: bool
+    mine: Index, every: _Facets, distance: float, *, self_contact: bool
 ) -> tuple[npt.NDArray[np.int64], Array]:
     """Pairs of facets that may touch, the first of which are this rank's: (m, 2), and distances."""
     pairs = [np.zeros((0, 2), dtype=np.int64)]
@@ -201,7 +201,7 @@ def _pairs(
             one, other = near_pairs(tree, middle[some], reach)
             one = some[one]
             kept = np.einsum("pd,pd->p", every.looks[one], every.looks[other]) < -_FACING
-            kept &= (every.label[one] != every.label[other]) | itself
+            kept &= (every.label[one] != every.label[other]) | self_contact
             one, other = one[kept], other[kept]
             for k in range(0, len(one), _TOGETHER):
                 f, g = one[k : k + _TOGETHER], other[k : k + _TOGETHER]

@@ -15,8 +15,8 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import gather_rows
-from fenics_contact.supports.deformable import DeformableBody
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.surface.surface import SurfaceQuadrature, tagged_facets
@@ -93,7 +93,7 @@ class _Admission:
 
     def __init__(
         self,
-        support: DeformableBody,
+        obstacle: DeformableBody,
         sides: tuple[Side, Side],
         facet: Any,
         undeformed: Array,
@@ -103,23 +103,23 @@ class _Admission:
         """Set the points.
 
         Args:
-            support: Bounds.
+            obstacle: Bounds.
             sides: That of the points, and the one that is searched.
             facet: Of every point, its number among those of all ranks, (n,).
             undeformed: The points without displacement, (n, d).
             normal: The way to what is in front of them there, (n, d).
             deep: How deep the bodies penetrate each other at each of all facets (length).
         """
-        self._support, (self._from, self._to), self._facet = support, sides, facet
+        self._obstacle, (self._from, self._to), self._facet = obstacle, sides, facet
         self._x, self._normal, self._deep = undeformed, normal, deep
         self.reason = np.full(len(normal), _NOTHING)
 
     def __call__(self, point: Any, facet: Any, place: Array, distance: Array) -> Any:
         """Which hits count."""
-        one, other, release = self._from, self._to, self._support.release
+        one, other, release = self._from, self._to, self._obstacle.max_initial_penetration
         here, there = self._facet[point], facet + other.first
         height = one.height[here]
-        near = np.abs(distance) <= self._support.search_distance
+        near = np.abs(distance) <= self._obstacle.search_distance
         depth = np.maximum(height, other.height[there]) if release is None else release
         # What touches lies behind by round-off as often as in front.
         depth = np.maximum(depth, 2 * self._deep[here]) + _TOUCHING * height
@@ -202,7 +202,7 @@ class Rays:
     """
 
     def __init__(
-        self, support: DeformableBody, quadrature: SurfaceQuadrature, space: fem.FunctionSpace
+        self, obstacle: DeformableBody, quadrature: SurfaceQuadrature, space: fem.FunctionSpace
     ) -> None:
         """Collect both surfaces. Collective.
 
@@ -211,8 +211,8 @@ class Rays:
         """
         mesh = space.mesh
         self._comm, self._d, self._space = mesh.comm, mesh.topology.dim, space
-        self._support = support
-        self.facets = tagged_facets(mesh, support.facet_tags, support.tags)
+        self._obstacle = obstacle
+        self.facets = tagged_facets(mesh, obstacle.facet_tags, obstacle.tags)
         _, self.body = connected_bodies(space)
         self.here = Side(FacetSet(space, quadrature.surface.facets), self.body)
         self.there = Side(FacetSet(space, self.facets), self.body)
@@ -256,7 +256,7 @@ class Rays:
         x, ray, start, normal, number = (
             np.concatenate(parts) for parts in zip(*comm.allgather(sent), strict=True)
         )
-        admission = _Admission(self._support, sides, number, start, normal, deep)
+        admission = _Admission(self._obstacle, sides, number, start, normal, deep)
         hit, where, distance = target.facets.search(x, ray, u, admission)
         comm.Allreduce(MPI.IN_PLACE, admission.reason, op=MPI.MAX)
         # The nearest over the ranks is met; of equals the lowest rank's.

@@ -59,7 +59,7 @@ _NARROW = 2.0
 # By how many times as many opposite facets under one of Γc as by the medians they are counted
 # there: less is found in meshes whose facets are meant to be alike.
 _GRADED = 1.5
-# Points of Γc along a rigid support by its smallest radius, at least, times the degree of the
+# Points of Γc along a rigid obstacle by its smallest radius, at least, times the degree of the
 # elements. A cylinder of radius R is pressed 0.3 R into rubber and slides; by facets of length
 # h, the force over that by 8 times as many points, and by how much it rises and falls there (8 and
 # 16 % by the facets themselves):
@@ -112,8 +112,8 @@ class ContactSurface:
                 ones, `ContactProblem` warns.
             quadrature_scheme: "default" (Gauss) or "vertex" (one point per facet vertex, the
                 contact springs of the paper's section 4). By default Gauss, but the vertices for
-                multipliers of linear elements on a rigid support, if no degree is given either, the
-                facets are edges or triangles and the contact's weight is the same everywhere.
+                multipliers of linear elements on a rigid obstacle, if no degree is given either,
+                the facets are edges or triangles and the contact's weight is the same everywhere.
 
         Raises:
             ValueError: Wrong dimension, a tag that no facet has, an interior facet with the tag.
@@ -157,7 +157,7 @@ class ContactSurface:
                 if its own were as small; none: there are none.
             pieces: Whether points feel what the opposite facets cut Γc into, and not themselves
                 alone. Then they are more only from `_PIERCING` opposite facets to one on.
-            radius: Smallest radius of a rigid support, of which facets are to see the shape
+            radius: Smallest radius of a rigid obstacle, of which facets are to see the shape
                 (length).
         """
         degree = self.quadrature_degree or SurfaceQuadrature.default_degree(element_degree)
@@ -183,7 +183,7 @@ class ContactSurface:
         return SurfaceQuadrature(self, degree, scheme, sparse)
 
     def _points_per_node(self, radius: float) -> int:
-        """Points along a facet of median length, by the degree, for a support's radius. Collective.
+        """Points along a facet of median length for a radius of the obstacle. Collective.
 
         See `POINTS_PER_RADIUS`.
         """

@@ -10,8 +10,8 @@ points. What is left of it at the edge stays with the springs, and falls with th
 Of quadratic displacements, whose multipliers are linear, there are more than enough.
 
 It is the conditions that hold a displacement at rest that this is for. One that moves relative to
-the support prescribes a slip, and friction has to reach its limit there; and one that holds a node
-inside of the support is refused, by the normal multipliers that nothing ends.
+the obstacle prescribes a slip, and friction has to reach its limit there; and one that holds a node
+inside of the obstacle is refused, by the normal multipliers that nothing ends.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def leave_out_unanswered(operator: ContactOperator, state: Array, constrained: M
 
 
 def _at_rest(operator: ContactOperator, state: Array, constrained: Mask) -> Mask:
-    """Unknowns that the points feel and a condition keeps where the support is. Collective."""
+    """Unknowns that the points feel and a condition keeps where the obstacle is. Collective."""
     touched = np.zeros(len(constrained), dtype=np.bool_)
     touched[operator.touched] = True
     moved = operator.unknowns.vector()

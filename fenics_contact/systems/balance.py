@@ -1,4 +1,4 @@
-"""Who has to be in balance, and by which measure: every body, free support and contact by its own.
+"""Who has to be in balance, and by which measure: every body, free obstacle and contact by its own.
 
 A residual says nothing until it is compared with forces. Those of another body, of another contact
 or of an earlier increment are no measure: a body loaded by 1e-4 beside one loaded by 10 would be
@@ -37,7 +37,7 @@ _LEAST = np.finfo(float).tiny / np.finfo(float).eps
 
 @dataclass(frozen=True)
 class Norms:
-    """Norms of one state by part, equal on every rank; bodies first, then supports and contacts.
+    """Norms of one state by part, equal on every rank; bodies first, then obstacles and contacts.
 
     Attributes:
         residual: Of the free unknowns, (n_parts,) (force).
@@ -45,7 +45,7 @@ class Norms:
         floor: What round-off excuses, (n_parts,) (force).
         round_off: That of the parts on which forces act, all of it, 0 for others, (n_parts,)
             (force).
-        n_bodies: Bodies and free supports, which share the unknowns between them.
+        n_bodies: Bodies and free obstacles, which share the unknowns between them.
     """
 
     residual: Array
@@ -88,11 +88,11 @@ class Norms:
 
 
 class Parts:
-    """How the unknowns of a space are shared by bodies and free supports, and what contacts touch.
+    """How the unknowns of a space are shared by bodies and free obstacles, and what contacts touch.
 
     Attributes:
         names: Of the parts.
-        label: Body or free support of every unknown of this rank, (n_local,).
+        label: Body or free obstacle of every unknown of this rank, (n_local,).
         n_bodies: Their number.
     """
 
@@ -112,13 +112,13 @@ class Parts:
         Args:
             comm: The ranks.
             label: See the attribute.
-            bodies: Names of bodies, then of free supports.
+            bodies: Names of bodies, then of free obstacles.
             contacts: Names of the contacts.
             touched: Unknowns of this rank that a contact feels or acts on, for every contact.
-            pairs: Bodies and supports that a contact presses on each other, for every contact,
-                (n_pairs, 2); a body on a rigid support is paired with itself.
+            pairs: Bodies and obstacles that a contact presses on each other, for every contact,
+                (n_pairs, 2); a body on a rigid obstacle is paired with itself.
             held: Which bodies Dirichlet conditions hold against every rigid motion, (n_bodies,).
-            motions: Of every free support the number of its contact.
+            motions: Of every free obstacle the number of its contact.
         """
         self._comm, self.label, self._touched = comm, label, touched
         self.n_bodies = len(bodies)
@@ -160,7 +160,7 @@ class Parts:
         loads, terms = np.hypot(loads, outside[0]), np.hypot(terms, outside[1])
         own, pushes = found[5::2], found[6::2]
         for body, number in zip(range(n - len(self._motions), n), self._motions, strict=True):
-            # What acts on a free support may cancel; what it is the sum of does not.
+            # What acts on a free obstacle may cancel; what it is the sum of does not.
             contact[body] = _root(pushes[number])
         force = np.max([loads, reaction, contact], axis=0)
         round_off = np.maximum(_ROUND_OFF * np.maximum(terms, start), _LEAST)

@@ -9,10 +9,10 @@ from fenics_contact.systems.candidates import touched
 from fenics_contact.systems.condensed import all_kept, worthwhile
 from fenics_contact.systems.full import FullSystem
 
-__all__ = ["linear_kind", "obstacle_to_condensation"]
+__all__ = ["linear_kind", "reason_not_to_condense"]
 
 
-def obstacle_to_condensation(
+def reason_not_to_condense(
     full: FullSystem,
     *,
     wanted: bool | None,
@@ -116,5 +116,5 @@ def linear_kind(
             reason = "it is quicker for as many"
         kind = "multigrid" if reason and not condensed and not named else "direct"
     if kind == "multigrid" and full.unknowns.n_motions:
-        return "direct", "supports that move freely are no nodes with rigid motions"
+        return "direct", "obstacles that move freely are no nodes with rigid motions"
     return kind, reason

@@ -183,7 +183,7 @@ class CondensedSystem(System):
         self._full.set_state(self.condensation.recover(self.state(), field))
 
     def bulk_force(self) -> Array:
-        """S x - g: the residual of the bulk and of free supports."""
+        """S x - g: the residual of the bulk and of free obstacles."""
         return self.condensation.schur @ self.state() - self.condensation.response.load
 
     def bulk_energy(self) -> float:

@@ -28,7 +28,7 @@ def find_ejected_bodies(
     Such a body is in equilibrium wherever it is, and a step of an iteration that throws it out of
     sight of all others leaves no residual. A wedge that was pressed in may come out as far: only a
     body that bore nothing at the start of the increment is looked at, and none that a contact with
-    a rigid support touches, whose points may go any way.
+    a rigid obstacle touches, whose points may go any way.
 
     Args:
         full: The system at its present state.

@@ -18,7 +18,7 @@ class Forces:
     Attributes:
         unknowns: Displacements and free motions on this rank.
         internal, external: Forces of the bulk, and loads with reactions, at the unknowns.
-        label: Body or free support of every unknown.
+        label: Body or free obstacle of every unknown.
     """
 
     unknowns: Array

@@ -27,7 +27,7 @@ __all__ = ["FullSystem"]
 
 
 class FullSystem(System):
-    """All unknowns: the dofs of what is solved for and the free motions of supports.
+    """All unknowns: the dofs of what is solved for and the free motions of obstacles.
 
     Attributes:
         displacement: What of it is one.
@@ -175,8 +175,8 @@ class FullSystem(System):
         self.diagonal[:] = 0.0
 
     def bulk_force(self) -> Array:
-        """The residual of the bulk, and the forces on free supports. Collective."""
-        return self.with_supports(self.bulk.residual())
+        """The residual of the bulk, and the forces on free obstacles. Collective."""
+        return self.with_obstacles(self.bulk.residual())
 
     def product_force(self) -> Array:
         """The same by the bulk's matrix, if it is linear: K u less the loads. Collective."""
@@ -194,8 +194,8 @@ class FullSystem(System):
         # F(u) = K u + F(0), so that it is (F(u) + F(0))·u/2.
         return float(0.5 * (self.bulk_force() - self.load) @ self.state())
 
-    def with_supports(self, residual: Array) -> Array:
-        """A residual over the dofs with that of the free supports, which their forces are."""
+    def with_obstacles(self, residual: Array) -> Array:
+        """A residual over the dofs with that of the free obstacles, which their forces are."""
         forces = [motion.force for c in self.contacts for motion in c.motions]
         return self.unknowns.joined(residual, -np.array(forces))
 
@@ -233,7 +233,7 @@ class FullSystem(System):
     def matrix(self, *, symmetric: bool) -> PETSc.Mat:
         """A new matrix for `fill`. Collective.
 
-        Its pattern is that of the bulk and, with deformable or moving supports, of the pairs.
+        Its pattern is that of the bulk and, with deformable or moving obstacles, of the pairs.
         """
         assert self.stiffness is not None
         different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
@@ -245,7 +245,7 @@ class FullSystem(System):
                 part.destroy()
         matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
-        # Not where supports move freely, or pressures are unknown, too.
+        # Not where obstacles move freely, or pressures are unknown, too.
         if matrix.getBlockSize() == self.gdim and not self.displacement.mixed:
             if self._near_nullspace is None:
                 self._near_nullspace = linear.near_nullspace(self.u.function_space)

@@ -1,11 +1,11 @@
 """Contact over the unknowns of a system: a sparse map from these to the points of Γc, and back.
 
 All of contact acts at points: the map D takes unknowns to the displacement that a point feels
-relative to its support, the law makes tractions of it there, and -Dᵀ takes these, times the area of
-their points, to forces. The law is evaluated on Γc alone, whatever the element of the bulk.
+relative to its obstacle, the law makes tractions of it there, and -Dᵀ takes these, times the area
+of their points, to forces. The law is evaluated on Γc alone, whatever the element of the bulk.
 
-D is constant, but for one column: by the angle of a support that is turned by a moment points feel
--ω × r, where they are now. As the unknown is a length, L times the angle, so is this by L.
+D is constant, but for one column: by the angle of an obstacle that is turned by a moment points
+feel -ω × r, where they are now. As the unknown is a length, L times the angle, so is this by L.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class ContactOperator:
             rows.destroy()
 
     def _motion_map(self) -> PETSc.Mat:
-        """The map from the unknowns to the free displacement of the support. Collective."""
+        """The map from the unknowns to the free displacement of the obstacle. Collective."""
         contact, d = self.contact, self._gdim
         n, components = contact.quadrature.n_points, list(contact.free_motion)
         counts = np.tile(np.isin(np.arange(d), components), n)
@@ -149,7 +149,7 @@ class ContactOperator:
         return np.flatnonzero(felt).astype(np.int32)
 
     def jump(self, values: Array) -> Array:
-        """Displacement relative to the support: of unknowns (n_local,), (n_points, gdim).
+        """Displacement relative to the obstacle: of unknowns (n_local,), (n_points, gdim).
 
         Collective.
         """
@@ -216,7 +216,7 @@ class ContactOperator:
             return product
         if tangent.by_shift is None:
             return self.springs(-tangent.by_jump)
-        # Where the support moves its normals may turn: more than the opposite of ∂/∂jump.
+        # Where the obstacle moves its normals may turn: more than the opposite of ∂/∂jump.
         area = -self.contact.area[:, None, None]
         jumps = self._block_diagonal(area * tangent.by_jump, self._map)
         shifts = self._block_diagonal(area * tangent.by_shift, self._map)
@@ -232,7 +232,7 @@ class ContactOperator:
         lifted = self.unknowns.widened(self.contact.displacement.lifted(local_map))
         return self._sandwiched(-self.contact.area[:, None, None] * by_local, lifted)
 
-    # ---- a support that is turned by a moment ----------------------------------------------------
+    # ---- an obstacle that is turned by a moment --------------------------------------------------
 
     def _arms(self) -> Array:
         """ω × r / L at the points, what they feel of the angle's unknown but for the sign.
@@ -323,7 +323,7 @@ class ContactOperator:
         )
 
     def _add_spin(self, product: PETSc.Mat, spun: Array, column: int) -> None:
-        """Add to DᵀBD that tractions turn with the support, and arms move. Collective.
+        """Add to DᵀBD that tractions turn with the obstacle, and arms move. Collective.
 
         With w = ω × T / L and e = ω × r / L the angle changes T by w, besides what follows from the
         jump, and the moment is T·e, whose arm moves with u: T·(ω × du) = -w·du. So w makes the same

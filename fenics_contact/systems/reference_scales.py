@@ -32,9 +32,9 @@ _NO_FORCE = 1e-12
 
 
 class ReferenceScales:
-    """Reference quantities of every body and of every free support, the same on every rank.
+    """Reference quantities of every body and of every free obstacle, the same on every rank.
 
-    Bodies come first, then the supports that move freely (together: the parts). Two of them are
+    Bodies come first, then the obstacles that move freely (together: the parts). Two of them are
     coupled in an increment if a point of a contact belongs to both.
 
     Attributes:
@@ -70,7 +70,7 @@ class ReferenceScales:
             body: Body of every node of this rank, ghosts last.
             label: Part of every unknown of this rank, (n_local,).
             moves: Which of these unknowns are displacements or motions, (n_local,).
-            n_motions: Number of free motions of supports, each of which is a part.
+            n_motions: Number of free motions of obstacles, each of which is a part.
             contacts: Of the problem.
         """
         space = displacement.u.function_space
@@ -214,7 +214,7 @@ class ReferenceScales:
     def pairs(self, operator: ContactOperator, number: int, label: Index) -> Index:
         """Parts that a contact presses on each other, (n_pairs, 2). Collective.
 
-        A body that it presses on a rigid support, or on nothing, is paired with itself.
+        A body that it presses on a rigid obstacle, or on nothing, is paired with itself.
 
         Args:
             operator: Of the contact, over some unknowns.

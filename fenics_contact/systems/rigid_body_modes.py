@@ -51,7 +51,7 @@ class RigidBodyModes:
         displacement: Displacement,
         unknowns: Unknowns,
         scales: ReferenceScales,
-        supports: Sequence[str] = (),
+        obstacles: Sequence[str] = (),
         *,
         turning: Sequence[bool] = (),
     ) -> None:
@@ -59,9 +59,9 @@ class RigidBodyModes:
 
         Args:
             displacement: What moves.
-            unknowns: The dofs and the free motions of supports, each a rigid motion of its own.
+            unknowns: The dofs and the free motions of obstacles, each a rigid motion of its own.
             scales: Reference scales of the bodies.
-            supports: Names of the free motions of supports.
+            obstacles: Names of the free motions of obstacles.
             turning: Which of them are rotations, whose arms change with the state.
         """
         space = displacement.u.function_space
@@ -80,13 +80,13 @@ class RigidBodyModes:
             for name in rigid_motions(x[:0], 1.0):
                 self.names.append(name + (of if n_bodies > 1 else ""))
                 turns.append(self._sizes[b] if name.startswith("rotation") else 0.0)
-        n_modes, n_supports = len(self.names), len(supports)
-        self.names += supports
-        self.turns = np.array(turns + [0.0] * n_supports)
+        n_modes, n_obstacles = len(self.names), len(obstacles)
+        self.names += obstacles
+        self.turns = np.array(turns + [0.0] * n_obstacles)
         self._turning = np.array([False] * n_modes + list(turning), dtype=np.bool_)
         still = np.zeros(unknowns.n_dofs)
-        of_supports = [unknowns.joined(still, row) for row in np.eye(n_supports)]
-        self._of_supports = np.array(of_supports).reshape(n_supports, unknowns.n_local)
+        of_obstacles = [unknowns.joined(still, row) for row in np.eye(n_obstacles)]
+        self._of_obstacles = np.array(of_obstacles).reshape(n_obstacles, unknowns.n_local)
         self._modes = self._modes_at(x)
         shape = n_bodies, n_modes // n_bodies, unknowns.n_local
         self.of_bodies = self._modes[:n_modes].reshape(shape)
@@ -108,11 +108,11 @@ class RigidBodyModes:
             mine = self._body[: len(x), None] == b
             for mode in rigid_motions(x - centre, size).values():
                 modes.append(self._over_unknowns(np.where(mine, mode, 0.0)))
-        return np.concatenate([modes, self._of_supports])
+        return np.concatenate([modes, self._of_obstacles])
 
     def _over_unknowns(self, displacement: Array) -> Array:
-        """A displacement of this rank's nodes, (n_nodes, gdim), with supports at rest."""
-        none = np.zeros(len(self._of_supports))
+        """A displacement of this rank's nodes, (n_nodes, gdim), with obstacles at rest."""
+        none = np.zeros(len(self._of_obstacles))
         return self._unknowns.joined(self._displacement.within(displacement.ravel()), none)
 
     def find_free(self, stiffness: PETSc.Mat, constrained: Mask) -> None:
@@ -124,8 +124,8 @@ class RigidBodyModes:
             stiffness: Bulk tangent without conditions.
             constrained: Mask over this rank's unknowns.
         """
-        # Motions of supports have no bulk energy.
-        stiffest = np.append(self._scales.stiffness, np.ones(len(self._of_supports)))
+        # Motions of obstacles have no bulk energy.
+        stiffest = np.append(self._scales.stiffness, np.ones(len(self._of_obstacles)))
         stiffest = stiffest[self._scales.label]
         gram = np.zeros((2, len(self._modes), len(self._modes)))
         work, image = stiffness.createVecs()
@@ -162,7 +162,7 @@ class RigidBodyModes:
         return self._free_fields
 
     def _moved(self) -> tuple[Mask, Mask]:
-        """Which bodies every free motion moves, (n_free, n_bodies), and which supports."""
+        """Which bodies every free motion moves, (n_free, n_bodies), and which obstacles."""
         n_bodies, n_motions, _ = self.of_bodies.shape
         moves, n_modes = self.free != 0.0, n_bodies * n_motions
         bodies = moves[:, :n_modes].reshape(-1, n_bodies, n_motions).any(axis=2)
@@ -174,7 +174,7 @@ class RigidBodyModes:
         return np.asarray(parts @ parts.T > 0)
 
     def of_any_body(self) -> Mask:
-        """Which of the free motions are not those of supports alone, (n_free,)."""
+        """Which of the free motions are not those of obstacles alone, (n_free,)."""
         bodies, _ = self._moved()
         return np.asarray(bodies.any(axis=1))
 
@@ -215,8 +215,8 @@ class RigidBodyModes:
             change = scipy.linalg.expm(twist)[:d] - np.eye(d + 1)[:d]
             mine = self._body[: len(x)] == b
             way[mine] = (x[mine] - self._centres[b]) @ change[:, :d].T + change[:, d]
-        supports = coefficients[n_bodies * n_motions :] @ self._of_supports
-        return np.asarray(self._over_unknowns(way) + supports, dtype=np.float64)
+        obstacles = coefficients[n_bodies * n_motions :] @ self._of_obstacles
+        return np.asarray(self._over_unknowns(way) + obstacles, dtype=np.float64)
 
     def work(self, operator: ContactOperator, force: Array) -> Array:
         """Of forces at a contact's points, and of what answers them, on the motions of the bodies.
@@ -300,7 +300,7 @@ class RigidBodyModes:
         """Which points to hold, of those that slip, lest tangents let a body go. Collective.
 
         The tangent of friction is none along it. As few as can be, of those that bear most. Motions
-        by which supports turn are not looked at.
+        by which obstacles turn are not looked at.
 
         Args:
             operators: Of evaluated contacts, over all unknowns.
@@ -371,18 +371,18 @@ class RigidBodyModes:
         return agreed(self.comm, (vectors * scale[:, None])[:, sizes < _FELT].T)
 
     def straight(self) -> Index:
-        """Numbers of the free motions but for those by which supports turn."""
+        """Numbers of the free motions but for those by which obstacles turn."""
         return np.flatnonzero(~np.any(self.free[:, self._turning] != 0.0, axis=1))
 
     @property
     def turning(self) -> bool:
-        """Whether some are rotations of supports, whose arms change with the state."""
+        """Whether some are rotations of obstacles, whose arms change with the state."""
         return bool(self._turning.any())
 
     def resultants(self, forces: Array) -> Array:
         """Work of forces at this rank's unknowns on the free motions. Collective.
 
-        But for those by which supports turn: what presses may have no moment.
+        But for those by which obstacles turn: what presses may have no moment.
         """
         return global_sum(self.comm, (self._free_fields @ forces)[self.straight()])
 

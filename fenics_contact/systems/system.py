@@ -29,7 +29,7 @@ from fenics_contact.types import Array, Mask
 
 __all__ = ["System"]
 
-# How far a support may turn in an increment whose angle is found: a right angle.
+# How far an obstacle may turn in an increment whose angle is found: a right angle.
 _TURN = np.pi / 2
 
 
@@ -47,7 +47,7 @@ class System(ABC):
         load: External forces at the unknowns (force).
         diagonal: Diagonal of the matrix assembled last (force/length).
         outside: Norms of load and of `terms` at unknowns outside of the system, (2, n_bodies).
-        label: Body or free support of every unknown of this rank, (n_local,).
+        label: Body or free obstacle of every unknown of this rank, (n_local,).
         n_bodies: Their number.
         scales: Reference scales of the bodies.
         linear_kind: How linear systems are solved, one of `linear.KINDS`.
@@ -120,7 +120,7 @@ class System(ABC):
             moving = [(n, m.way) for n, c in enumerate(self.contacts) for m in c.motions]
             n = self.n_bodies - len(moving)
             bodies = [f"body {b + 1}" if n > 1 else "the body" for b in range(n)]
-            bodies += [f"support of {self.contacts[c].name} {way}" for c, way in moving]
+            bodies += [f"obstacle of {self.contacts[c].name} {way}" for c, way in moving]
             touched = [operator.touched for operator in self.operators]
             scales = self.scales
             parts = Parts(
@@ -223,7 +223,7 @@ class System(ABC):
         return by_body(self.unknowns.comm, vectors, self.label, self.n_bodies)
 
     def motions(self) -> Array:
-        """The present free motions of supports, on every rank."""
+        """The present free motions of obstacles, on every rank."""
         return np.array([motion.value for motion in self._motions])
 
     def set_motions(self, state: Array) -> None:
@@ -232,7 +232,7 @@ class System(ABC):
             motion.set_value(value)
 
     def is_twisted(self) -> bool:
-        """Whether a support that turns freely has turned too far.
+        """Whether an obstacle that turns freely has turned too far.
 
         A turn further its points are where they were: to a solution there are others.
         """
@@ -248,7 +248,7 @@ class System(ABC):
         return any(contact.opposite.degenerate for contact in self.contacts)
 
     def rolled(self, state: Array) -> Array:
-        """A state with supports that turn freely turned to where they slip least. Collective.
+        """A state with obstacles that turn freely turned to where they slip least. Collective.
 
         Args:
             state: What it is without; it becomes the present one.
@@ -323,7 +323,7 @@ class System(ABC):
 
     @abstractmethod
     def bulk_force(self) -> Array:
-        """The residual without contact's: the bulk's and the free supports'. Collective."""
+        """The residual without contact's: the bulk's and the free obstacles'. Collective."""
 
     @abstractmethod
     def bulk_energy(self) -> float:

@@ -1,4 +1,4 @@
-"""The unknowns of a problem: the dofs of the displacement, then the free motions of supports.
+"""The unknowns of a problem: the dofs of the displacement, then the free motions of obstacles.
 
 The motions stand at the end of the last rank's rows, so that the global numbers of the dofs are
 those of DOLFINx with them and without them.
@@ -21,7 +21,7 @@ class Unknowns:
 
     Attributes:
         n_dofs: Dofs of the displacement that this rank owns.
-        n_motions: Free motions of supports, in all.
+        n_motions: Free motions of obstacles, in all.
         n_local: Unknowns of this rank: its dofs, and the motions on the last one.
         n_global: Unknowns of all ranks.
         first: Global number of the first one of this rank.

@@ -1,7 +1,7 @@
-"""What Γc presses on. A support says the gap s and the normal n at a point: by UFL, or in numbers.
+"""Obstacles: what Γc presses on. They give gap s and normal n at a point, as UFL or numbers.
 
-n points **from the body to the support**; s ≥ 0 is the distance along n that is still open. A
-support knows no mesh: numbers become constants of the mesh through the function that is passed in,
+n points **from the body to the obstacle**; s ≥ 0 is the distance along n that is still open. A
+obstacle knows no mesh: numbers become constants of the mesh through the function that is passed in,
 so that a new value never compiles a new form.
 """
 
@@ -20,11 +20,11 @@ from fenics_contact.types import Array
 __all__ = [
     "NOWHERE",
     "Motion",
+    "Obstacle",
     "Placement",
     "Rotation",
     "Sample",
-    "SampledSupport",
-    "Support",
+    "SampledObstacle",
     "ToUFL",
     "as_positive",
     "as_vector",
@@ -39,11 +39,11 @@ NOWHERE = 1e100
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a support is, seen from a point of Γc (UFL expressions).
+    """Where an obstacle is, seen from a point of Γc (UFL expressions).
 
     Attributes:
-        gap: Distance along the normal, with the support moved: s of eq. (3), in length.
-        direction: From body to support, of any length greater than zero.
+        gap: Distance along the normal, with the obstacle moved: s of eq. (3), in length.
+        direction: From body to obstacle, of any length greater than zero.
     """
 
     gap: ufl.core.expr.Expr
@@ -57,13 +57,13 @@ class Placement:
 
 @dataclass(frozen=True)
 class Motion:
-    """A rigid translation of a support of which some components follow from the force on it.
+    """A rigid translation of an obstacle of which some components follow from the force on it.
 
     Per component of space one of the two is given, the other is None. ``Motion(force=(None, -5),
     displacement=(pull, None))`` is pressed down by 5 and pulled along as ``pull`` says.
 
     Args to the constructor:
-        force: External force on the support (force; in 2D force per thickness), numbers or scalar
+        force: External force on the obstacle (force; in 2D force per thickness), numbers or scalar
             ``fem.Constant``; of a symmetric model the modelled part's share.
         displacement: Prescribed components (length), likewise; none: zero where no force is given.
     """
@@ -99,19 +99,19 @@ class Motion:
 
 @dataclass(frozen=True)
 class Rotation:
-    """A turn of a support about an axis that is fixed in it, of any size.
+    """A turn of an obstacle about an axis that is fixed in it, of any size.
 
     One of angle and moment is given, the other is None: ``Rotation(None, about, moment=0.0)`` turns
     as contact turns it, as a roller does. It needs ``Contact(kinematics="finite")``. The
-    displacement of the support moves the axis, too, whether it is prescribed or a `Motion`.
+    displacement of the obstacle moves the axis, too, whether it is prescribed or a `Motion`.
 
     Args to the constructor:
         angle: In radians, right-handed about the axis, in the plane anticlockwise: a number, or a
             scalar ``fem.Constant`` to be changed between increments. None where the moment is
             given; then it is found.
-        about: A point of the axis where the support has not been displaced, gdim numbers (length).
+        about: A point of the axis where the obstacle has not been displaced, gdim numbers (length).
         axis: Its direction, three numbers of any length; in the plane none.
-        moment: External moment on the support about the axis, in the sense of the angle (force
+        moment: External moment on the obstacle about the axis, in the sense of the angle (force
             times length; in 2D per thickness), a number or scalar ``fem.Constant``; of a symmetric
             model the modelled part's share.
     """
@@ -137,7 +137,7 @@ class Rotation:
         return found
 
     def matrix(self, gdim: int, angle: ufl.core.expr.Expr) -> ufl.core.expr.Expr:
-        """R, which takes directions from where the support began to where it is (gdim, gdim).
+        """R, which takes directions from where the obstacle began to where it is (gdim, gdim).
 
         Args:
             gdim: Dimension of the mesh.
@@ -167,23 +167,23 @@ class Rotation:
         return np.asarray(along + c * (vectors - along) + s * np.cross(axis, vectors))
 
     def rate(self, vectors: Array) -> Array:
-        """By how much vectors that turn with the support change by a unit angle, (n, gdim)."""
+        """By how much vectors that turn with the obstacle change by a unit angle, (n, gdim)."""
         if vectors.shape[1] == 2:
             return np.column_stack([-vectors[:, 1], vectors[:, 0]])
         return np.asarray(np.cross(self.unit_axis(3), vectors), dtype=np.float64)
 
 
-class Support:
-    """A rigid support: subclasses say where it is.
+class Obstacle:
+    """A rigid obstacle: subclasses say where it is.
 
     Args to all of them: ``displacement``, the prescribed rigid translation (gdim numbers, a
     ``fem.Constant`` to be changed between increments, or a UFL vector, which may vary along Γc), or
-    a `Motion` where the force on the support is given; none means fixed. One that varies along Γc
-    turns the support without its normals: forces are off by about the angle, of which the verdict
+    a `Motion` where the force on the obstacle is given; none means fixed. One that varies along Γc
+    turns the obstacle without its normals: forces are off by about the angle, of which the verdict
     tells. ``rotation``, a `Rotation`: with finite
     kinematics alone.
 
-    A support that moves is moved by these alone. Where its place or gap is changed instead (a
+    An obstacle that moves is moved by these alone. Where its place or gap is changed instead (a
     constant in ``point``, ``center`` or ``gap``), contact opens and closes as it should, but
     friction does not feel the part along Γc, nor do the energies count work: nothing tells such a
     change from one of shape.
@@ -193,19 +193,19 @@ class Support:
     rotation: Rotation | None = None
 
     def check_complete(self) -> None:
-        """Refuse a subclass that does not say where the support is.
+        """Refuse a subclass that does not say where the obstacle is.
 
         Raises:
             ValueError: It names what is missing.
         """
-        self._check_said(Support, place="its gap and direction, as UFL")
+        self._check_said(Obstacle, place="its gap and direction, as UFL")
 
-    def _check_said(self, abstract: type[Support], **members: str) -> None:
+    def _check_said(self, abstract: type[Obstacle], **members: str) -> None:
         """Refuse members that are still those of a class that has them only to be replaced."""
         for member, meaning in members.items():
             if getattr(type(self), member) is getattr(abstract, member):
                 raise ValueError(
-                    f"{type(self).__name__} is no support: a subclass of {abstract.__name__} must "
+                    f"{type(self).__name__} is no obstacle: a subclass of {abstract.__name__} must "
                     f"say its {member}: {meaning}"
                 )
 
@@ -221,7 +221,7 @@ class Support:
 
     @property
     def smallest_radius(self) -> float:
-        """Smallest radius of curvature where the support is convex (length).
+        """Smallest radius of curvature where the obstacle is convex (length).
 
         Infinite where it is nowhere convex, or where the radius is not known as a number.
         """
@@ -230,12 +230,12 @@ class Support:
     def place(
         self, x: ufl.core.expr.Expr, shift: ufl.core.expr.Expr | None, to_ufl: ToUFL
     ) -> Placement:
-        """Gap and direction at ``x`` with the support translated by ``shift`` (None: not at all).
+        """Gap and direction at ``x`` with the obstacle translated by ``shift`` (None: not at all).
 
         Args:
             x: Coordinates of the point, shape (gdim,): of Γc, or with finite kinematics where it
-                has moved to, seen from where the support began.
-            shift: The displacement of the support, shape (gdim,).
+                has moved to, seen from where the obstacle began.
+            shift: The displacement of the obstacle, shape (gdim,).
             to_ufl: Turns numbers, constants and expressions into UFL.
 
         Raises:
@@ -246,11 +246,11 @@ class Support:
 
 @dataclass(frozen=True)
 class Sample:
-    """What a support says in numbers at n places.
+    """What an obstacle says in numbers at n places.
 
     Attributes:
-        distance: Signed distance, positive outside of the support, (n,) (length).
-        normal: Minus its gradient: unit vectors from body to support, (n, gdim).
+        distance: Signed distance, positive outside of the obstacle, (n,) (length).
+        normal: Minus its gradient: unit vectors from body to obstacle, (n, gdim).
         curvature: Its second derivatives, (n, gdim, gdim) (1/length).
     """
 
@@ -259,18 +259,18 @@ class Sample:
     curvature: Array
 
 
-class SampledSupport(Support):
-    """A rigid support that is known in numbers alone, from data: subclasses sample its distance.
+class SampledObstacle(Obstacle):
+    """A rigid obstacle that is known in numbers alone, from data: subclasses sample its distance.
 
     They are asked at the present places of the points of Γc in every evaluation, so that tractions
     and their derivatives are those of the distance itself. Subclasses have ``displacement`` and
-    ``rotation`` as attributes; see `Support`.
+    ``rotation`` as attributes; see `Obstacle`.
     """
 
     def check_complete(self) -> None:
-        """See `Support.check_complete`."""
+        """See `Obstacle.check_complete`."""
         self._check_said(
-            SampledSupport,
+            SampledObstacle,
             gdim="the dimension of space, 2 or 3",
             fingerprint="a word that tells its data from others",
             sample="distance, normal and curvature at places, in numbers",
@@ -290,7 +290,7 @@ class SampledSupport(Support):
         """Distance, normal and curvature at places; not collective.
 
         Args:
-            x: Finite coordinates where the support has neither moved nor turned, (n, gdim), n ≥ 0;
+            x: Finite coordinates where the obstacle has neither moved nor turned, (n, gdim), n ≥ 0;
                 those of a trial of the solver may be far off. Distance and normal must be finite
                 wherever they are.
         """
@@ -318,12 +318,12 @@ class SampledSupport(Support):
                     f"{name}: {what} of its sample has shape {array.shape}; {n} places in {d} "
                     f"dimensions need {shape}"
                 )
-            if what != "curvature":  # a round support has none at its centre
+            if what != "curvature":  # a round obstacle has none at its centre
                 wrong = ~np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
                 if wrong.any():
                     raise ValueError(
                         f"{name}: {what} of its sample is not finite at "
-                        f"{x[there][wrong][0].tolist()}; a support must have one at every place, "
+                        f"{x[there][wrong][0].tolist()}; an obstacle must have one at every place, "
                         "however far off"
                     )
             arrays[what] = np.full((len(x), *shape[1:]), np.nan)

@@ -1,4 +1,4 @@
-"""Supports: gap and normal at the points of Γc against formulas in numpy."""
+"""Obstacles: gap and normal at the points of Γc against formulas in numpy."""
 
 import logging
 
@@ -74,7 +74,7 @@ SHIFT = {2: (0.03, 0.11), 3: (0.03, -0.05, 0.11)}
 AXIS = {2: None, 3: (0.2, 2.0, 0.3)}
 
 
-def supports(d: int) -> dict:
+def obstacles(d: int) -> dict:
     p, n, axis = POINT[d], SLOPE[d], AXIS[d]
     named = {
         "half-space": (
@@ -98,27 +98,27 @@ def supports(d: int) -> dict:
     return named
 
 
-@pytest.mark.parametrize("kind", supports(2))
+@pytest.mark.parametrize("kind", obstacles(2))
 @pytest.mark.parametrize("d", [2, 3])
 def test_gap_and_normal(d, kind):
-    """Gap and normal of every support, at rest and displaced by a tuple."""
-    make, reference = supports(d)[kind]
+    """Gap and normal of every obstacle, at rest and displaced by a tuple."""
+    make, reference = obstacles(d)[kind]
     surface, u = scene(d)
     law = fc.Frictionless(k_n=1.0)
     check(fc.Contact(u, surface, make(None), law), reference)
     shift = np.array(SHIFT[d])
     moved = fc.Contact(u, surface, make(SHIFT[d]), law)
     check(moved, reference, shift)
-    # The displacement given by numbers is a parameter: a new value moves the support.
+    # The displacement given by numbers is a parameter: a new value moves the obstacle.
     moved.parameters["displacement"].value[:] = -2 * shift
     check(moved, reference, -2 * shift)
 
 
-@pytest.mark.parametrize("kind", supports(2))
+@pytest.mark.parametrize("kind", obstacles(2))
 @pytest.mark.parametrize("d", [2, 3])
 def test_displacement_by_a_constant(d, kind):
-    """A ``fem.Constant`` changed between two evaluations moves the support."""
-    make, reference = supports(d)[kind]
+    """A ``fem.Constant`` changed between two evaluations moves the obstacle."""
+    make, reference = obstacles(d)[kind]
     surface, u = scene(d)
     motion = fem.Constant(surface.mesh, np.zeros(d))
     contact = fc.Contact(u, surface, make(motion), fc.Frictionless(k_n=1.0))
@@ -141,7 +141,7 @@ def test_obstacle_by_ufl(d):
         return 0.1 + x[:, 0] ** 2 + n @ np.broadcast_to(shift, d), n
 
     motion = fem.Constant(surface.mesh, np.zeros(d))
-    obstacle = fc.Obstacle(gap, normal, displacement=motion)
+    obstacle = fc.PrescribedGap(gap, normal, displacement=motion)
     contact = fc.Contact(u, surface, obstacle, fc.Frictionless(k_n=1.0))
     check(contact, reference)
     motion.value[:] = SHIFT[d]
@@ -154,7 +154,7 @@ def test_obstacle_by_a_function(d):
     surface, u = scene(d)
     gap = fem.Function(fem.functionspace(surface.mesh, ("Lagrange", 1)))
     gap.interpolate(lambda x: 0.2 + 0.5 * x[0] - 0.1 * x[1])
-    obstacle = fc.Obstacle(gap, np.eye(d)[-1] * -3.0)
+    obstacle = fc.PrescribedGap(gap, np.eye(d)[-1] * -3.0)
     contact = fc.Contact(u, surface, obstacle, fc.Frictionless(k_n=1.0))
     check(contact, lambda x, s: (0.2 + 0.5 * x[:, 0] - 0.1 * x[:, 1], 0 * x - np.eye(d)[-1]))
 
@@ -162,8 +162,8 @@ def test_obstacle_by_a_function(d):
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("kind", ["half-space", "ball", "cylinder"])
 def test_prescribed_gap_does_not_depend_on_the_geometry(d, kind):
-    """``gap=`` replaces the distance (paper, footnote 1); the support's motion along n adds."""
-    make, reference = supports(d)[kind]
+    """``gap=`` replaces the distance (paper, footnote 1); the obstacle's motion along n adds."""
+    make, reference = obstacles(d)[kind]
     surface, u = scene(d)
     motion = fem.Constant(surface.mesh, np.zeros(d))
     contact = fc.Contact(u, surface, make(motion), fc.Frictionless(k_n=1.0), gap=0.07)
@@ -197,12 +197,12 @@ def test_length_of_the_normal_does_not_matter(d):
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_rigid_motion_of_body_and_support_together(d):
-    """Body and support moved alike: gap as before, and no tangential jump. Round-off of the sum."""
+def test_rigid_motion_of_body_and_obstacle_together(d):
+    """Body and obstacle moved alike: same gap, no tangential jump, up to round-off."""
     surface, u = scene(d)
     shift = np.array(SHIFT[d])
-    support = fc.HalfSpace(POINT[d], SLOPE[d], displacement=SHIFT[d])
-    contact = fc.Contact(u, surface, support, fc.Coulomb(0.3, k_n=1.0, k_t=1.0))
+    obstacle = fc.HalfSpace(POINT[d], SLOPE[d], displacement=SHIFT[d])
+    contact = fc.Contact(u, surface, obstacle, fc.Coulomb(0.3, k_n=1.0, k_t=1.0))
     u.x.array[:] = np.tile(shift, u.x.array.size // d)
     contact.evaluate()
     gap, _ = half_space(gathered(COMM, contact.points), 0.0, POINT[d], SLOPE[d])
@@ -211,7 +211,7 @@ def test_rigid_motion_of_body_and_support_together(d):
     assert close(jump, 0 * jump, EXACT, scale=1.0)
 
 
-def test_a_body_that_starts_inside_its_support_is_reported(caplog):
+def test_a_body_that_starts_inside_its_obstacle_is_reported(caplog):
     """The largest initial penetration is on the problem, and in one warning on rank 0 alone.
 
     Reference: a disc of radius 2 whose top lies 0.125 above the bottom: deepest at the point
@@ -221,7 +221,7 @@ def test_a_body_that_starts_inside_its_support_is_reported(caplog):
     disc = fc.Ball((0.5, 0.125 - 2.0), 2.0)
     with caplog.at_level(logging.WARNING, logger="fenics_contact"):
         problem, contact = scene.problem(
-            fc.Frictionless(k_n=1e3), [scene.hold(LEFT, 0)], contact={"support": disc}
+            fc.Frictionless(k_n=1e3), [scene.hold(LEFT, 0)], contact={"obstacle": disc}
         )
     x = gathered(COMM, contact.points)
     deepest = (2.0 - np.linalg.norm(x - [0.5, -1.875], axis=1)).max()
@@ -247,7 +247,7 @@ def test_a_body_that_touches_does_not_penetrate(caplog):
 
 
 @pytest.mark.parametrize(
-    ("support", "words"),
+    ("obstacle", "words"),
     [
         (fc.HalfSpace((0, 0, 0), (0, 1)), ("point", "HalfSpace")),
         (fc.HalfSpace((0, 0), (0, 0, 1)), ("normal", "HalfSpace")),
@@ -260,23 +260,23 @@ def test_a_body_that_touches_does_not_penetrate(caplog):
         (fc.Ball((0, 0), np.nan), ("radius", "Ball")),
         (fc.Cylinder((0, 0), -1.0), ("radius", "Cylinder")),
         (fc.Cylinder((0, 0), 1.0, axis=(0, 0, 1)), ("axis",)),
-        (fc.Obstacle(0.1, (0, 0)), ("normal", "zero")),
-        (fc.Obstacle((0.1, 0.2), (0, -1)), ("gap", "scalar")),
+        (fc.PrescribedGap(0.1, (0, 0)), ("normal", "zero")),
+        (fc.PrescribedGap((0.1, 0.2), (0, -1)), ("gap", "scalar")),
         (fc.HalfSpace((0, 0), (0, 1), displacement=(0, 0, 0)), ("displacement",)),
         (fc.HalfSpace((0, 0), (0, 1), displacement=1.0), ("displacement",)),
     ],
-    ids=lambda value: type(value).__name__ if isinstance(value, fc.Support) else None,
+    ids=lambda value: type(value).__name__ if isinstance(value, fc.Obstacle) else None,
 )
-def test_bad_support_in_the_plane(support, words):
+def test_bad_obstacle_in_the_plane(obstacle, words):
     """Data of the wrong dimension, without length or not finite: the message names them."""
     surface, u = scene(2)
     raised_everywhere(
-        lambda: fc.Contact(u, surface, support, fc.Frictionless(k_n=1.0)), ValueError, *words
+        lambda: fc.Contact(u, surface, obstacle, fc.Frictionless(k_n=1.0)), ValueError, *words
     )
 
 
 @pytest.mark.parametrize(
-    ("support", "words"),
+    ("obstacle", "words"),
     [
         (fc.Cylinder((0, 0, 0), 1.0), ("axis",)),
         (fc.Cylinder((0, 0, 0), 1.0, axis=(0, 0, 0)), ("axis", "zero")),
@@ -284,11 +284,11 @@ def test_bad_support_in_the_plane(support, words):
         (fc.Ball((0, 0), 1.0), ("center",)),
     ],
 )
-def test_bad_support_in_space(support, words):
+def test_bad_obstacle_in_space(obstacle, words):
     """As in the plane, and the axis of a cylinder is needed."""
     surface, u = scene(3)
     raised_everywhere(
-        lambda: fc.Contact(u, surface, support, fc.Frictionless(k_n=1.0)), ValueError, *words
+        lambda: fc.Contact(u, surface, obstacle, fc.Frictionless(k_n=1.0)), ValueError, *words
     )
 
 
@@ -299,10 +299,10 @@ def test_friction_feels_the_displacement_alone():
         made = block("quadrilateral", n=4)
         motion, up = fem.Constant(made.mesh, np.zeros(2)), np.array([0.0, 1.0])
         place = motion if way == "point" else np.zeros(2)
-        support = fc.HalfSpace(place, up, displacement=motion if way == "displacement" else None)
+        obstacle = fc.HalfSpace(place, up, displacement=motion if way == "displacement" else None)
         gap = -ufl.dot(motion, ufl.as_vector(up)) if way == "gap" else None
         held = [made.hold(TOP, i) for i in range(2)]
-        law, contact = fc.Coulomb(0.3), {"support": support, "gap": gap}
+        law, contact = fc.Coulomb(0.3), {"obstacle": obstacle, "gap": gap}
         problem, contact = made.problem(law, held, contact=contact)
         motion.value[:] = 0.01, 0.01
         problem.solve()

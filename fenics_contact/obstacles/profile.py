@@ -1,4 +1,4 @@
-"""Rigid supports whose surface is a smooth profile: in the plane, extruded or turned in space."""
+"""Rigid obstacles whose surface is a smooth profile: in the plane, extruded or turned in space."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fenics_contact.supports.base import (
+from fenics_contact.obstacles.base import (
     Rotation,
     Sample,
-    SampledSupport,
+    SampledObstacle,
     as_vector,
     nonzero_vector,
 )
-from fenics_contact.supports.curve import Curve
-from fenics_contact.supports.meshed import as_points, fingerprint_of
+from fenics_contact.obstacles.curve import Curve
+from fenics_contact.obstacles.meshed import as_points, fingerprint_of
 from fenics_contact.types import Array
 
 __all__ = ["RigidProfile"]
@@ -25,8 +25,8 @@ __all__ = ["RigidProfile"]
 _ON_AXIS = 1e-9
 
 
-class RigidProfile(SampledSupport):
-    """A rigid support whose surface is the cubic spline through points.
+class RigidProfile(SampledObstacle):
+    """A rigid obstacle whose surface is the cubic spline through points.
 
     Normal and curvature are those of the spline, which has no corners: for these take a
     `RigidSurface`. An open profile must reach beyond where contact may be: places from which its
@@ -46,7 +46,7 @@ class RigidProfile(SampledSupport):
         """Take the profile.
 
         Args:
-            points: On the surface one after the other, (n, gdim) (length), the support on the left
+            points: On the surface one after the other, (n, gdim) (length), the obstacle on the left
                 of the way; the same on every rank. In space ``extruded`` or ``turned`` says what
                 is made of them.
             closed: Whether the profile goes on from the last point to the first.
@@ -56,7 +56,7 @@ class RigidProfile(SampledSupport):
                 revolution, and the left that in the half-plane with the axis upwards and the
                 points on its right. Where an open profile begins or ends on the axis, the surface
                 goes on smoothly across.
-            displacement: See `Support`.
+            displacement: See `Obstacle`.
             rotation: Likewise.
 
         Raises:
@@ -97,21 +97,21 @@ class RigidProfile(SampledSupport):
 
     @property
     def gdim(self) -> int:
-        """See `SampledSupport.gdim`."""
+        """See `SampledObstacle.gdim`."""
         return self._gdim
 
     @property
     def fingerprint(self) -> str:
-        """See `SampledSupport.fingerprint`."""
+        """See `SampledObstacle.fingerprint`."""
         return self._fingerprint
 
     @property
     def smallest_radius(self) -> float:
-        """See `Support.smallest_radius`: that of the profile."""
+        """See `Obstacle.smallest_radius`: that of the profile."""
         return self.curve.smallest_radius
 
     def sample(self, x: Array) -> Sample:
-        """See `SampledSupport.sample`."""
+        """See `SampledObstacle.sample`."""
         if self._section is None:
             return self.curve.sample(x)
         return self._section.lifted(x, self.curve.sample(self._section.plane(x)))

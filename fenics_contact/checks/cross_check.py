@@ -8,21 +8,21 @@ from typing import Any
 import numpy as np
 import ufl
 
-from fenics_contact.checks.verdict import Balance
+from fenics_contact.checks.verdict import ForceBalance
 from fenics_contact.compiling import compile_form
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_sum, longest
 from fenics_contact.surface.mass import assembled
 from fenics_contact.types import Array
 
-__all__ = ["SecondRoute"]
+__all__ = ["CrossCheck"]
 
 
 # Round-off of displacements that two routes add up in different orders, by their size.
 _ROUND_OFF = 100 * np.finfo(float).eps
 
 
-class SecondRoute:
+class CrossCheck:
     """Compares the forces of contacts by two routes."""
 
     def __init__(self, contacts: Sequence[Contact]) -> None:
@@ -30,7 +30,7 @@ class SecondRoute:
         self._contacts = contacts
         self._forms: dict[str, Any] = {}
 
-    def compare(self) -> dict[str, Balance]:
+    def compare(self) -> dict[str, ForceBalance]:
         """Nodal forces on Γc as the solver has them against those of the boundary form. Collective.
 
         Both have the round-off of the displacement, by as much as the springs are stiff.
@@ -47,7 +47,7 @@ class SecondRoute:
             sizes = (longest(comm, f.reshape(-1, d)) for f in (mine - other, mine))
             residual, force = (float(size) for size in sizes)
             allowed = 1e-10 * force + _ROUND_OFF * blur
-            found[contact.name] = Balance(residual, force, allowed)
+            found[contact.name] = ForceBalance(residual, force, allowed)
         return found
 
     def _forces(self, contact: Contact) -> tuple[Array, Array]:
@@ -56,7 +56,7 @@ class SecondRoute:
         Returns:
             (n_owned_dofs,) each (force): as `ContactOperator.add_force` has them, by sums over the
             points; and as DOLFINx assembles the boundary form (46, 55), in which ``u`` itself
-            stands where the support is rigid and no motion of it is unknown, and the jump at the
+            stands where the obstacle is rigid and no motion of it is unknown, and the jump at the
             points otherwise.
         """
         opposite = contact.opposite

@@ -1,4 +1,4 @@
-"""Rigid supports whose surface is given by facets."""
+"""Rigid obstacles whose surface is given by facets."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import numpy as np
 import numpy.typing as npt
 
 from fenics_contact.arguments import is_number
-from fenics_contact.supports.base import Rotation, Sample, SampledSupport
-from fenics_contact.supports.facets import Facets
-from fenics_contact.supports.stl import read_stl
+from fenics_contact.obstacles.base import Rotation, Sample, SampledObstacle
+from fenics_contact.obstacles.facets import Facets
+from fenics_contact.obstacles.stl import read_stl
 from fenics_contact.types import Array
 
 __all__ = ["RigidSurface", "as_points", "fingerprint_of"]
 
 
-class RigidSurface(SampledSupport):
-    """A rigid support given by its surface: triangles in space, in the plane a polyline.
+class RigidSurface(SampledObstacle):
+    """A rigid obstacle given by its surface: triangles in space, in the plane a polyline.
 
     Facets are flat: the normal jumps from one to the next, by less with ``halvings``. Points within
-    the support are pushed out through the closest facet. An open surface must reach beyond where
+    the obstacle are pushed out through the closest facet. An open surface must reach beyond where
     contact may be: points from which its border is closest are outside.
 
     Attributes:
@@ -45,13 +45,13 @@ class RigidSurface(SampledSupport):
         Args:
             points: Corners, (n_points, gdim) (length), the same on every rank; equal ones are one.
             facets: Numbers of the corners of each facet, (n_facets, gdim): in space anticlockwise
-                as seen from outside, as in an STL file; in the plane with the support on the left
+                as seen from outside, as in an STL file; in the plane with the obstacle on the left
                 of the way.
             halvings: How often the edges of triangles are halved, towards the smooth surface that
                 they stand for: each makes four triangles of one, and angles half as large.
             sharp: Angle between neighbours (radians) from which on the edge is one of the surface
                 itself, such as the rim of a cylinder.
-            displacement: See `Support`.
+            displacement: See `Obstacle`.
             rotation: Likewise.
 
         Raises:
@@ -103,7 +103,7 @@ class RigidSurface(SampledSupport):
             scale: Factor of its coordinates, such as 1e-3 for a file in mm and a mesh in m.
             halvings: See the constructor.
             sharp: Likewise.
-            displacement: See `Support`.
+            displacement: See `Obstacle`.
             rotation: Likewise.
 
         Raises:
@@ -124,16 +124,16 @@ class RigidSurface(SampledSupport):
 
     @property
     def gdim(self) -> int:
-        """See `SampledSupport.gdim`."""
+        """See `SampledObstacle.gdim`."""
         return self.facets.points.shape[1]
 
     @property
     def fingerprint(self) -> str:
-        """See `SampledSupport.fingerprint`."""
+        """See `SampledObstacle.fingerprint`."""
         return fingerprint_of(self.facets.points, self.facets.facets)
 
     def sample(self, x: Array) -> Sample:
-        """See `SampledSupport.sample`."""
+        """See `SampledObstacle.sample`."""
         return self.facets.sample(x)
 
 

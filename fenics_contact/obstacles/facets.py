@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fenics_contact.supports.base import Sample
-from fenics_contact.supports.refinement import refined
-from fenics_contact.supports.search import FacetSearch
+from fenics_contact.obstacles.base import Sample
+from fenics_contact.obstacles.refinement import refined
+from fenics_contact.obstacles.search import FacetSearch
 from fenics_contact.types import Array, Mask
 
 __all__ = ["Facets"]
@@ -115,7 +115,7 @@ class Facets:
         return whole, np.concatenate([borders, at_border[self.facets]], axis=1)
 
     def sample(self, x: Array) -> Sample:
-        """See `SampledSupport.sample`."""
+        """See `SampledObstacle.sample`."""
         d = x.shape[1]
         # From afar all facets are as far away as round-off can tell: the rest of the way is added.
         reach = np.linalg.norm(x, axis=1)
@@ -223,7 +223,7 @@ def _check_order(
         raise ValueError(
             f"at {len(bad)} edges or corners, one of them at ({first}), neighbours are ordered "
             "against each other, or more than two facets meet: order all facets "
-            "anticlockwise as seen from outside of the support (in the plane: the support on the "
-            "left of the way), each given once, and take bodies that touch each other as supports "
+            "anticlockwise as seen from outside of the obstacle (in the plane: the obstacle on the "
+            "left of the way), each given once, and take bodies that touch each other as obstacles "
             "of their own"
         )

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from fenics_contact.supports.base import Sample
+from fenics_contact.obstacles.base import Sample
 from fenics_contact.types import Array
 
 __all__ = ["Curve"]
@@ -23,7 +23,7 @@ _CENTRE = 1e-6
 
 
 class Curve:
-    """The cubic spline through points, the support on the left of its way.
+    """The cubic spline through points, the obstacle on the left of its way.
 
     Places from which an end of an open curve is closest are outside.
 
@@ -53,7 +53,7 @@ class Curve:
         self._tree = cKDTree(self._place(self._starts))
 
     def sample(self, x: Array) -> Sample:
-        """See `SampledSupport.sample`."""
+        """See `SampledObstacle.sample`."""
         t = self._closest(x)
         arm, along, bend = x - self._place(t), self._slope(t), self._bend(t)
         speed = np.linalg.norm(along, axis=1)
@@ -75,7 +75,7 @@ class Curve:
 
     @property
     def smallest_radius(self) -> float:
-        """Smallest radius of curvature where the support is convex, infinite if nowhere."""
+        """Smallest radius of curvature where the obstacle is convex, infinite if nowhere."""
         (x, y), (bend_x, bend_y) = self._slope(self._starts).T, self._bend(self._starts).T
         sharpest = float(np.max((x * bend_y - y * bend_x) / np.hypot(x, y) ** 3))
         return 1.0 / sharpest if sharpest > 0.0 else np.inf

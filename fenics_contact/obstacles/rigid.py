@@ -1,4 +1,4 @@
-"""Rigid supports."""
+"""Rigid obstacles given by UFL: half-space, ball, cylinder, signed distance, prescribed gap."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ import ufl
 from dolfinx import fem
 
 from fenics_contact.arguments import is_number
-from fenics_contact.supports.base import (
+from fenics_contact.obstacles.base import (
+    Obstacle,
     Placement,
     Rotation,
-    Support,
     as_positive,
     as_vector,
     nonzero_vector,
 )
 
-__all__ = ["Ball", "Cylinder", "HalfSpace", "Obstacle", "ToUFL"]
+__all__ = ["Ball", "Cylinder", "HalfSpace", "PrescribedGap", "SignedDistance", "ToUFL"]
 
 ToUFL = Callable[[Any], ufl.core.expr.Expr]
 
 
 @dataclass(frozen=True)
-class HalfSpace(Support):
+class HalfSpace(Obstacle):
     """A rigid half-space: the plane through ``point``, ``normal`` pointing out of it.
 
     The body stands on the side the normal points to: a floor has the normal (0, 1).
@@ -39,12 +39,12 @@ class HalfSpace(Support):
 
     @property
     def is_flat(self) -> bool:
-        """See `Support.is_flat`."""
+        """See `Obstacle.is_flat`."""
         given = (self.point, self.normal)
         return not any(isinstance(value, ufl.core.expr.Expr) for value in given)
 
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """Gap (x - point - shift)·normal; see `Support.place`."""
+        """Gap (x - point - shift)·normal; see `Obstacle.place`."""
         gdim = x.ufl_shape[0]
         normal = to_ufl(nonzero_vector("normal of the HalfSpace", self.normal, gdim))
         normal = normal / ufl.sqrt(ufl.dot(normal, normal))
@@ -55,7 +55,7 @@ class HalfSpace(Support):
 
 
 @dataclass(frozen=True)
-class Ball(Support):
+class Ball(Obstacle):
     """A rigid ball (a disc in 2D), or with ``inside=True`` the cavity around the body."""
 
     center: Sequence[float]
@@ -66,11 +66,11 @@ class Ball(Support):
 
     @property
     def smallest_radius(self) -> float:
-        """See `Support.smallest_radius`."""
+        """See `Obstacle.smallest_radius`."""
         return _convex_radius(self.radius, self.inside)
 
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """Gap |x - center - shift| - radius (negated inside); see `Support.place`."""
+        """Gap |x - center - shift| - radius (negated inside); see `Obstacle.place`."""
         gdim = x.ufl_shape[0]
         arm = x - to_ufl(as_vector("center of the Ball", self.center, gdim))
         return _round(
@@ -79,7 +79,7 @@ class Ball(Support):
 
 
 @dataclass(frozen=True)
-class Cylinder(Support):
+class Cylinder(Obstacle):
     """A rigid circular cylinder through ``point`` along ``axis``; in 2D the axis is out of plane.
 
     With ``inside=True`` it is the bore around the body.
@@ -94,11 +94,11 @@ class Cylinder(Support):
 
     @property
     def smallest_radius(self) -> float:
-        """See `Support.smallest_radius`."""
+        """See `Obstacle.smallest_radius`."""
         return _convex_radius(self.radius, self.inside)
 
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """Gap: distance from the axis minus radius (negated inside); see `Support.place`."""
+        """Gap: distance from the axis minus radius (negated inside); see `Obstacle.place`."""
         gdim = x.ufl_shape[0]
         arm = x - to_ufl(as_vector("point of the Cylinder", self.point, gdim))
         if gdim == 2 and self.axis is not None:
@@ -133,62 +133,73 @@ def _round(arm: Any, shift: Any, radius: Any, inside: bool) -> Placement:
 
 
 @dataclass(frozen=True)
-class Obstacle(Support):
-    """Any rigid obstacle, by its distance at every place, or by gap and normal on Γc.
+class SignedDistance(Obstacle):
+    """A rigid obstacle of any shape, given by its signed distance at every place.
 
-    ``Obstacle(distance=lambda x: ufl.sqrt(x[0] ** 2 + x[1] ** 2) - 1)`` is a disc.
+    ``SignedDistance(lambda x: ufl.sqrt(x[0] ** 2 + x[1] ** 2) - 1)`` is a disc.
 
     Args to the constructor:
-        gap: Distance that is open along ``normal`` before any displacement, in length; negative
-            is a penetration: numbers, constants, functions or UFL over Γc. A motion of the obstacle
-            is no part of it: see `Support`. Finite kinematics need ``distance`` in its place.
-        normal: From the body to the obstacle, of any length greater than zero, shape (gdim,).
-        displacement, rotation: See `Support`; the displacement's part along ``normal`` adds to the
-            gap.
-        distance: Instead of gap and normal: a function of a place x, a UFL vector, that gives the
-            signed distance of x from the obstacle (UFL scalar, length), positive outside of it. Its
-            gradient must be of length 1 where contact is: the normal is minus that.
+        distance: Function of a place x, a UFL vector, that returns the signed distance of x from
+            the obstacle (UFL scalar, length), positive outside. Its gradient must have length 1
+            near the contact: the contact normal is minus the gradient.
+        displacement, rotation: See `Obstacle`.
     """
 
-    gap: Any = None
-    normal: Any = None
+    distance: Callable[[Any], Any]
     displacement: Any = None
     rotation: Rotation | None = None
-    distance: Callable[[Any], Any] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse both ways of giving it at once, and half of one.
+        """Refuse a distance that is not a function.
 
         Raises:
-            ValueError: It says what was given.
+            TypeError: The message states what was given.
         """
-        given = [n for n in ("gap", "normal", "distance") if getattr(self, n) is not None]
-        if given not in (["gap", "normal"], ["distance"]):
-            raise ValueError(
-                f"Obstacle has {' and '.join(given) or 'nothing'}; give gap and normal, or distance"
-            )
-        if self.distance is not None and not callable(self.distance):
+        if not callable(self.distance):
             raise TypeError(
-                f"distance of the Obstacle is {self.distance!r}; it must be a function of x, such "
-                "as lambda x: x[1]"
+                f"distance of the SignedDistance is {self.distance!r}; it must be a function of x, "
+                "such as lambda x: x[1]"
             )
 
     @property
     def is_distance(self) -> bool:
-        """See `Support.is_distance`."""
-        return self.distance is not None
+        """See `Obstacle.is_distance`."""
+        return True
 
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """Distance and its gradient at x, or what was given; see `Support.place`."""
-        gdim = x.ufl_shape[0]
-        if self.distance is not None:
-            here = ufl.variable(x if shift is None else x - shift)
-            gap = ufl.as_ufl(self.distance(here))
-            _check_scalar("distance", gap)
-            return Placement(gap, -ufl.diff(gap, here))
-        direction = to_ufl(nonzero_vector("normal of the Obstacle", self.normal, gdim))
+        """Distance at x and minus its gradient; see `Obstacle.place`."""
+        here = ufl.variable(x if shift is None else x - shift)
+        gap = ufl.as_ufl(self.distance(here))
+        _check_scalar("distance of the SignedDistance", gap)
+        return Placement(gap, -ufl.diff(gap, here))
+
+
+@dataclass(frozen=True)
+class PrescribedGap(Obstacle):
+    """A rigid obstacle given by the initial gap and the contact normal on the undeformed Γc.
+
+    Finite kinematics evaluate the gap at the deformed positions: they need a `SignedDistance`.
+
+    Args to the constructor:
+        gap: Distance along ``normal`` before any displacement (length); negative where the
+            body penetrates: numbers, constants, functions or UFL over Γc. The motion of the
+            obstacle is not part of it: see `Obstacle`.
+        normal: Direction from the body to the obstacle, of any length greater than zero, (gdim,).
+        displacement, rotation: See `Obstacle`; the component of the displacement along ``normal``
+            adds to the gap.
+    """
+
+    gap: Any
+    normal: Any
+    displacement: Any = None
+    rotation: Rotation | None = None
+
+    def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
+        """The prescribed gap, moved by the shift along the normal; see `Obstacle.place`."""
+        direction = nonzero_vector("normal of the PrescribedGap", self.normal, x.ufl_shape[0])
+        direction = to_ufl(direction)
         gap = to_ufl(self.gap)
-        _check_scalar("gap", gap)
+        _check_scalar("gap of the PrescribedGap", gap)
         if shift is not None:
             gap = gap + ufl.dot(shift, direction) / ufl.sqrt(ufl.dot(direction, direction))
         return Placement(gap, direction)
@@ -196,4 +207,4 @@ class Obstacle(Support):
 
 def _check_scalar(name: str, value: Any) -> None:
     if value.ufl_shape != ():
-        raise ValueError(f"{name} of the Obstacle has shape {value.ufl_shape}; it must be a scalar")
+        raise ValueError(f"{name} has shape {value.ufl_shape}; it must be a scalar")
