@@ -3,7 +3,6 @@
 import faulthandler
 import gc
 import os
-import zlib
 from collections import defaultdict
 from collections.abc import Iterator
 from math import ceil
@@ -28,28 +27,40 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of the cases of a test, one in six is run each time, and the rest by ``pytest -m slow``.
+    """Mark the cases of parametrized tests that do not run by default as slow.
 
-    Which ones is drawn from their names, so that they lie anywhere among the products of what is
-    varied, and are the same on all ranks and in all runs. Two at least; all of what is marked
-    ``whole``. What runs on all kinds of cells is a long study on hexahedra, whose forms take the
-    longest, except where cells and facets are found, and pairs made.
+    One case in six runs, at least two, and all with ``@pytest.mark.whole``: those that together
+    have the most values of the parameters, in the order of the file; of one parameter those at
+    equal distances. What runs on all kinds of cells is slow on hexahedra, whose forms take longest
+    to compile, except in modules marked ``hexahedra``.
     """
-    kept = ("test_surface", "test_pairs", "test_two_bodies", "test_present", "test_elasticity")
-    kept += ("test_joined_meshes", "test_contact_pairs")
     cases = defaultdict(list)
     for item in items:
         values = getattr(item, "callspec", None)
         if values is None or item.get_closest_marker("whole"):
             continue
-        if "hexahedron" in values.id.split("-") and item.path.stem not in kept:
+        if "hexahedron" in values.id.split("-") and not item.get_closest_marker("hexahedra"):
             item.add_marker(pytest.mark.slow)
         elif not item.get_closest_marker("slow"):
             cases[item.nodeid.partition("[")[0]].append(item)
     for those in cases.values():
-        those.sort(key=lambda item: zlib.crc32(item.nodeid.encode()))
-        for item in those[max(2, ceil(len(those) / 6)) :]:
-            item.add_marker(pytest.mark.slow)
+        kept = _most_varied(those, max(2, ceil(len(those) / 6)))
+        for item in those:
+            if item not in kept:
+                item.add_marker(pytest.mark.slow)
+
+
+def _most_varied(cases: list[pytest.Item], number: int) -> list[pytest.Item]:
+    """Cases that together have the most values of the parameters."""
+    left, kept = cases[:: max(1, len(cases) // number)] + cases, []
+    seen: set[tuple[str, int]] = set()
+    while left and len(kept) < number:
+        values = [set(item.callspec.indices.items()) - seen for item in left]  # type: ignore[attr-defined]
+        best = max(range(len(left)), key=lambda i: len(values[i]))
+        seen |= values[best]
+        kept.append(left[best])
+        left = [item for item in left if item is not kept[-1]]
+    return kept
 
 
 def pytest_exception_interact(report: pytest.TestReport) -> None:

@@ -22,7 +22,7 @@ COMM = MPI.COMM_WORLD
 MIDDLE, INNER, OUTER = np.array([0.3, -0.2]), 1, 2
 N = 24
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
 def ring(oval=1.0):

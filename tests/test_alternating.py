@@ -14,6 +14,8 @@ from scenes.blocks import GRID, TOP, block, wave
 from scenes.comparing import at_points, close, nodal, owned
 from scenes.rubbing import Rub, cushion, pressed
 
+pytestmark = pytest.mark.two_ranks
+
 COMM = MPI.COMM_WORLD
 
 

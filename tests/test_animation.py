@@ -17,7 +17,7 @@ pytest.importorskip("matplotlib")
 Image = pytest.importorskip("PIL.Image")
 COMM = MPI.COMM_WORLD
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
 def rubbed(cell):

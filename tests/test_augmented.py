@@ -189,6 +189,8 @@ def test_rule_by_default(degree: int) -> None:
 
 
 @pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.two_ranks
+@pytest.mark.two_ranks
 def test_stick_is_stick(degree: int) -> None:
     """Sheared to and fro below the limit, a block stays where it is, however often.
 
@@ -286,6 +288,8 @@ def test_force_and_tangent_with_multipliers(law: str) -> None:
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.two_ranks
+@pytest.mark.two_ranks
 def test_soft_springs(degree: int) -> None:
     """Springs of 0.01 E/h, pressed, sheared until points slip, and reversed: as those of 10 E/h.
 

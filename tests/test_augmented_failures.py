@@ -14,7 +14,7 @@ from scenes.rubber import rubber
 
 COMM = MPI.COMM_WORLD
 E = 1000.0
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 # k h/E: springs no stiffer than a few layers of cells.
 SOFT = fc.RelativeStiffness(10.0)

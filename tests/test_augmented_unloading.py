@@ -11,7 +11,7 @@ from scenes.bodies import Bodies, boxes
 from scenes.comparing import close, nodal
 
 HEAVY, LIGHT, TOP, LIGHT_TOP = 1, 2, 3, 4
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from scenes.beside import BUSY, Beside, Box
 from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP
 from scenes.comparing import assemble_number, close, compiled, raised_everywhere
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(300)]
 COMM = MPI.COMM_WORLD
 FLOOR = fc.HalfSpace((0, 0), (0, 1))
 

@@ -8,7 +8,7 @@ import fenics_contact as fc
 from scenes.bolted_joint import FRICTION, BoltedJoint
 from scenes.comparing import raised_everywhere
 
-pytestmark = pytest.mark.mpi
+pytestmark = pytest.mark.two_ranks
 
 
 def test_tightened_and_pulled_until_it_slips() -> None:

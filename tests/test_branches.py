@@ -18,7 +18,7 @@ from scenes.comparing import close
 COMM = MPI.COMM_WORLD
 PRESS = 10.0
 
-pytestmark = pytest.mark.mpi
+pytestmark = pytest.mark.two_ranks
 
 
 def wedge(**options):

@@ -22,7 +22,7 @@ from scenes.comparing import (
 from scenes.elasticity import displacement_space, hold, strain
 from scenes.rubber import rubber
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
 
 # Solver tolerances for comparisons finer than the default of 1e-9 of the forces.

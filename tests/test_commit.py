@@ -16,7 +16,7 @@ from scenes.stacks import FLOOR, LOWER, ROOF, UPPER, stack
 COMM = MPI.COMM_WORLD
 EXACT = 0.0 if COMM.size == 1 else 1e-10
 
-pytestmark = pytest.mark.mpi
+pytestmark = pytest.mark.three_ranks
 
 
 def slid(between, *, enforcement="penalty", recover_interior=True):

@@ -19,7 +19,7 @@ from scenes.comparing import close, gathered, owned, raised_everywhere
 from scenes.rubbing import PATH, Rub, cushion, walk
 from scenes.two_blocks import Slider
 
-pytestmark = pytest.mark.timeout(240)
+pytestmark = [pytest.mark.timeout(240), pytest.mark.three_ranks]
 COMM = MPI.COMM_WORLD
 
 # Both spaces solve to 1e-9 of the forces; a path adds up.

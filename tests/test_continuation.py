@@ -11,6 +11,8 @@ from scenes.blocks import TOP, block
 from scenes.comparing import close, nodal
 from scenes.rubbing import Rub, pressed
 
+pytestmark = pytest.mark.two_ranks
+
 COMM = MPI.COMM_WORLD
 SERIAL = pytest.mark.skipif(COMM.size > 1, reason="the same on several ranks, and slow there")
 

@@ -16,7 +16,7 @@ from scenes.two_blocks import Slider
 
 COMM = MPI.COMM_WORLD
 K_N = 1e7
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
 def test_a_law_with_its_own_normal_part_where_points_have_no_opposite():

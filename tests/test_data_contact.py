@@ -13,7 +13,7 @@ from scenes.comparing import close, gathered, raised_everywhere, shared_folder, 
 from scenes.rubber import TIGHT, disc, domed, rubber
 from scenes.surfaces import ball, circle, ring
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
 
 HISTORY = [(0.0, -0.06, 0.0), (0.04, -0.12, 0.1), (-0.02, -0.1, 0.3)]

@@ -14,7 +14,7 @@ from scenes.bodies import Bodies, boxes
 from scenes.comparing import raised_everywhere
 from scenes.tags import between, near
 
-pytestmark = pytest.mark.mpi
+pytestmark = pytest.mark.two_ranks
 E = 1000.0
 BOTTOM, TOP, FLOOR, HELD, SIDES = range(1, 6)
 KINEMATICS = pytest.mark.parametrize("kinematics", ["small", "finite"])

@@ -12,6 +12,7 @@ from mpi4py import MPI
 from scenes.processes import run_demo
 
 pytestmark = [
+    pytest.mark.newest,
     pytest.mark.demo,
     pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own"),
 ]

@@ -17,7 +17,7 @@ from fenics_contact.parallel import global_max
 E, NU, PRESSURE, K_N = 1000.0, 0.3, 10.0, 1e5
 BOTTOM, TOP = 1, 2
 
-pytestmark = pytest.mark.mpi
+pytestmark = [pytest.mark.two_ranks, pytest.mark.hexahedra]
 
 
 def ends(mesh, axis: int, high: float, low: float = 0.0):

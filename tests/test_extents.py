@@ -10,7 +10,7 @@ from scenes.blocks import CELLS, dimension
 from scenes.comparing import close
 from scenes.rubbing import PATH, Rub, walk
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 CELLS_IN_A = 20
 

@@ -34,7 +34,7 @@ LAST = COMM.size - 1
 METHODS = ("lbfgs", "newton", "continuation", "alternating")[: 4 if COMM.size == 1 else 2]
 
 # Long enough for a loaded machine; what hangs is ended.
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
 class Fault(Exception):

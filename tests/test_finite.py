@@ -16,7 +16,7 @@ from scenes.comparing import raised_everywhere
 from scenes.rubber import disc, rubber
 from scenes.surfaces import ball, circle, ring
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 
 K = 1e3
 LAWS = {

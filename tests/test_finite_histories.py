@@ -14,7 +14,7 @@ import fenics_contact as fc
 from scenes.comparing import close
 from scenes.rubber import TIGHT, Tool, disc, domed, rubber
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(300)]
 COMM = MPI.COMM_WORLD
 PATH = [(0.0, -0.06), (0.0, -0.12), (0.05, -0.15), (0.1, -0.15), (0.06, -0.14)]
 

@@ -14,7 +14,7 @@ from scenes.blocks import BOTTOM, LEFT, TOP, block_mesh
 from scenes.elasticity import displacement_space, hold
 from verification.extreme_finite import turned_with_all
 
-pytestmark = pytest.mark.mpi
+pytestmark = pytest.mark.two_ranks
 
 # Force on half of the disc at every 0.25 of its way: verification/getfem_disc.py, GetFEM 5.4.2.
 GETFEM = (

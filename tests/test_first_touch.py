@@ -16,7 +16,7 @@ from scenes.bodies import Bodies, boxes
 from scenes.comparing import close, gathered
 from scenes.tags import between, near
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 BORE, SURFACE, AXIS = 1, 2, 3
 RADIUS, CLEARANCE = 10.0, 0.05
 LAW = fc.Coulomb(friction=0.3)

@@ -18,7 +18,7 @@ from scenes.comparing import close, gathered, raised_everywhere
 from scenes.laws import Saturating
 
 COMM = MPI.COMM_WORLD
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 MU, COHESION, RATE = 0.3, 1.0, 2.0
 # A low block that hardly deforms, on an area of 1 in the plane: tractions are nearly even, and a

@@ -24,7 +24,7 @@ from scenes.rubbing import Rub
 
 COMM = MPI.COMM_WORLD
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
 @pytest.mark.parametrize("cell", CELLS)

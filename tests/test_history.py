@@ -13,7 +13,7 @@ from scenes.blocks import BOTTOM, CELLS, GRID, RIGHT, block, block_mesh, dimensi
 from scenes.comparing import close, gathered, same_field
 from scenes.elasticity import displacement_space
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
 
 K_N, K_T, FRICTION = 100.0, 60.0, 0.3

@@ -23,7 +23,7 @@ from scenes.rubbing import Rub
 
 COMM = MPI.COMM_WORLD
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.three_ranks, pytest.mark.timeout(120)]
 
 
 def table(path):

@@ -1,11 +1,8 @@
 """What the installation tells of itself, beside what is known by another way."""
 
-import importlib
 import itertools
 import logging
-import re
 import sys
-import sysconfig
 from pathlib import Path
 
 import dolfinx
@@ -24,7 +21,7 @@ from scenes.comparing import raised_everywhere
 
 COMM = MPI.COMM_WORLD
 
-pytestmark = pytest.mark.mpi
+pytestmark = [pytest.mark.two_ranks, pytest.mark.newest]
 
 
 def area():
@@ -55,32 +52,6 @@ def test_orderings_are_tried():
     found = information()["direct solver"]
     words = found.split(";")[0].removeprefix("MUMPS, orderings ").split(", ")
     assert {"AMD", "AMF", "QAMD"} <= set(words) <= {"AMD", "AMF", "QAMD", "PORD", "SCOTCH", "METIS"}
-
-
-def test_what_is_missing_and_what_it_costs(monkeypatch):
-    """It is told, with the reason, and nothing ends."""
-    real = importlib.import_module
-
-    def without(name, *rest):
-        if name == "gmsh":
-            raise OSError("libGLU.so.1: cannot open shared object file")
-        return real(name, *rest)
-
-    monkeypatch.setattr(importlib, "import_module", without)
-    found = information()["gmsh"]
-    assert found.startswith("missing (libGLU.so.1") and "model_to_mesh" in found
-
-
-def test_the_compiler_is_tried(monkeypatch):
-    """As forms take it: no compiler, or no Python.h, is told, with what to install."""
-    compiling.compile_form(area())  # there is one
-    assert not information()["C compiler"].startswith("missing")
-    monkeypatch.setenv("CC", "no-compiler-of-this-name -O2")
-    assert re.match(r"missing \(.*no-compiler-of-this-name", information()["C compiler"])
-    monkeypatch.delenv("CC")
-    monkeypatch.setattr(sysconfig, "get_path", lambda name: "/nowhere")
-    found = information()["C compiler"]
-    assert found.startswith("missing") and "Python.h" in found and "python3-dev" in found
 
 
 def test_the_program(capsys):

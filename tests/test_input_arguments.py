@@ -19,7 +19,7 @@ from scenes.elasticity import displacement_space, strain, stress
 from scenes.processes import environment
 from scenes.sound import MESH, coulomb, pressed
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
 
 

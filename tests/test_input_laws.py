@@ -12,7 +12,7 @@ from scenes.blocks import Block, block
 from scenes.comparing import close, raised_everywhere
 from scenes.sound import build_and_solve, coulomb, pressed
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
 
 

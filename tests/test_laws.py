@@ -25,7 +25,7 @@ from scenes.comparing import (
 )
 from scenes.elasticity import displacement_space
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
 
 K_N, K_T, FRICTION, PRESSURE = 100.0, 60.0, 0.3, 9.0

@@ -21,7 +21,7 @@ from scenes.comparing import close, gathered
 from scenes.elasticity import displacement_space, hold
 from scenes.tags import between, near
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
 BULKS = {"linear": LinearElastic, "rubber": NeoHookean}
 

@@ -16,7 +16,7 @@ import fenics_contact as fc
 from scenes.comparing import raised_everywhere
 
 COMM = MPI.COMM_WORLD
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 LEFT, RIGHT, BOTTOM, TOP = 3, 4, 5, 6
 
 

@@ -22,7 +22,7 @@ from scenes.comparing import raised_everywhere
 from scenes.sound import MESH, coulomb, pressed
 from scenes.stacks import LOWER, SIDES, UPPER, stack
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
 NOWHERE = 77
 

@@ -27,7 +27,7 @@ from scenes.comparing import (
 from scenes.histories import goes_on
 from scenes.rubber import MIXED, TIGHT, Tool, disc, rubber, split
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(300)]
 
 # Nearly as stiff against volume as against shape, then none, then linear at small strains.
 HOW = {

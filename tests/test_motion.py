@@ -12,6 +12,8 @@ from scenes.blocks import BOTTOM, LEFT, TOP, block
 from scenes.comparing import close, gathered, nodal, raised_everywhere
 from scenes.rubbing import cushion
 
+pytestmark = [pytest.mark.three_ranks, pytest.mark.newest]
+
 COMM = MPI.COMM_WORLD
 
 

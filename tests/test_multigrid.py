@@ -23,7 +23,7 @@ from scenes.stacks import ROOF, floor, joint, stack
 from scenes.two_blocks import BOTTOM, LOWER, UPPER, E, two_blocks
 from scenes.two_blocks import TOP as LID
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.three_ranks, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
 
 # Residuals of 1e-12 of the forces, so that what is left is rounding times the condition, 1e4.

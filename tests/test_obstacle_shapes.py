@@ -22,7 +22,7 @@ from scenes.rubbing import Rub
 COMM = MPI.COMM_WORLD
 FINE = 1e-4
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
 def circle(centre, radius):

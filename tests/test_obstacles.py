@@ -19,7 +19,7 @@ from scenes.rubber import Tool, rubber
 from scenes.two_blocks import LOWER, UPPER, two_blocks
 
 COMM = MPI.COMM_WORLD
-pytestmark = pytest.mark.mpi
+pytestmark = pytest.mark.two_ranks
 
 
 def roller(scene, radius, shift, **options):

@@ -6,6 +6,7 @@ All comparisons are bit for bit: what is compared are two readings of the same n
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
@@ -16,6 +17,8 @@ from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.unknowns import Selection, Unknowns
 from scenes.elasticity import displacement_space, hold, residual
 from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, Slider, two_blocks
+
+pytestmark = pytest.mark.two_ranks
 
 COMM = MPI.COMM_WORLD
 LAW = fc.Coulomb(0.3, k_n=1e7, k_t=1e6)

@@ -14,7 +14,7 @@ from scenes.processes import command, environment
 from scenes.rubbing import Rub, walk
 
 COMM = MPI.COMM_WORLD
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 SCRIPT = """
 from scenes.rubbing import PATH, Rub

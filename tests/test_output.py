@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from fenics_contact import output
 
-pytestmark = pytest.mark.mpi
+pytestmark = pytest.mark.two_ranks
 
 
 def displacement():

@@ -15,7 +15,7 @@ from scenes.elasticity import hold
 from scenes.rubber import rubber
 from scenes.tags import sides
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 
 MU = 0.3
 # ∫ r dA over the unit square, r from its middle: (√2 + asinh 1)/6 (polar coordinates).

@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
-import sys
-from contextlib import nullcontext
-from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import pytest
 
@@ -55,35 +49,3 @@ def test_the_recipe_requires_what_the_package_does() -> None:
     assert wanted[0] == "python >=${{ python_min }}" and wanted[-1] == "petsc * real_*"
     assert sorted(map(name_and_bound, wanted[1:-1])) == DEPENDENCIES
     assert f'python_min: "{PYTHON}"' in RECIPE
-
-
-def test_spack_requires_what_the_package_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its package.py runs with stand-ins for Spack that note what it says."""
-    said: list[tuple[str, tuple[Any, ...]]] = []
-
-    def directive(word: str) -> Any:
-        return lambda *values, **options: said.append((word, values))
-
-    words = {word: directive(word) for word in ("license", "version", "variant", "depends_on")}
-    words |= {word: lambda *values, **options: nullcontext() for word in ("default_args", "when")}
-    python = {"PythonPackage": type("PythonPackage", (), {})}
-    modules = {"spack.package": words, "spack_repo.builtin.build_systems.python": python}
-    for full, names in modules.items():
-        parts = full.split(".")
-        for end in range(1, len(parts) + 1):
-            module = ModuleType(".".join(parts[:end]))
-            monkeypatch.setitem(sys.modules, module.__name__, module)
-        vars(module).update(names)
-
-    spec = importlib.util.spec_from_file_location("package", SPACK / "package.py")
-    package = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(package)
-
-    assert Path(package.PyFenicsContact.git.removeprefix("file://")) == ROOT
-    assert ("license", (PROJECT["license"],)) in said
-    wanted = [name_and_bound(values[0]) for word, values in said if word == "depends_on"]
-    names = {f"py-{name}": bound for name, bound in DEPENDENCIES}
-    extra = [re.sub(r"[>=].*", "", each) for each in PROJECT["optional-dependencies"]["demo"]]
-    names |= {f"py-{name}": "" for name in extra}
-    names |= {"py-setuptools": "77", "python": PYTHON, "petsc": ""}
-    assert dict(wanted) == names and len(wanted) == len(names)

@@ -30,7 +30,7 @@ from scenes.tags import near
 
 COMM = MPI.COMM_WORLD
 
-pytestmark = pytest.mark.mpi
+pytestmark = [pytest.mark.three_ranks, pytest.mark.hexahedra]
 
 
 @pytest.mark.parametrize("degree", [1, 2])

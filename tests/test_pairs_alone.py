@@ -15,7 +15,7 @@ from scenes.comparing import close
 from scenes.stacks import FLOOR, LOWER, ROOF, SIDES, UPPER, E, balance, joint, rings, stack, uniform
 from scenes.tags import between, near
 
-pytestmark = pytest.mark.mpi
+pytestmark = pytest.mark.three_ranks
 
 
 # ---- self-contact --------------------------------------------------------------------------------

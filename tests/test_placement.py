@@ -13,7 +13,7 @@ from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block, block_mesh
 from scenes.comparing import close, gathered, raised_everywhere
 from scenes.elasticity import displacement_space
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
 
 # Gap and normal are a handful of operations on coordinates of size one, evaluated by a quotient of

@@ -16,7 +16,7 @@ from scenes.rubbing import Rub
 matplotlib = pytest.importorskip("matplotlib")
 COMM = MPI.COMM_WORLD
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 CORNERS = {"triangle": 3, "quadrilateral": 4, "tetrahedron": 3, "hexahedron": 4}
 

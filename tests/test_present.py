@@ -25,6 +25,8 @@ from scenes.tags import near, tagged
 from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, two_blocks
 from verification.extreme_bodies import Two
 
+pytestmark = [pytest.mark.three_ranks, pytest.mark.hexahedra]
+
 COMM = MPI.COMM_WORLD
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 LAWS = {

@@ -17,7 +17,7 @@ from scenes.blocks import TOP, block, kirchhoff
 from scenes.comparing import close, nodal
 from scenes.rubbing import Rub, cushion, pressed
 
-pytestmark = pytest.mark.mpi
+pytestmark = pytest.mark.two_ranks
 
 SERIAL = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="the same on several ranks")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import logging
 import re
 import sys
 
@@ -11,11 +10,11 @@ import pytest
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.comparing import raised_everywhere, shared_folder
+from scenes.comparing import raised_everywhere
 from scenes.sound import coulomb, pressed
 
 pytest.importorskip("tqdm")
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
 
 
@@ -76,69 +75,6 @@ def test_it_is_silent_without_a_terminal(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     list(history([1.1, 1.4]))
     assert log.getvalue() == sys.stderr.getvalue() == ""
-
-
-def test_what_is_said_stands_on_lines_of_its_own(monkeypatch):
-    """Prints of the script, and lines of the log while an increment is solved."""
-    terminal = terminal_of(monkeypatch)
-    monkeypatch.setattr(sys, "stdout", terminal)
-    log, screen = logging.getLogger("fenics_contact"), logging.StreamHandler(terminal)
-    level = log.level
-    log.addHandler(screen)
-    log.setLevel(logging.INFO)
-    try:
-        for number, _ in enumerate(history([1.1, 1.4], progress=True)):
-            print(f"step {number}")
-            log.warning("between %d", number)
-    finally:
-        log.removeHandler(screen)
-        log.setLevel(level)
-    said = [line for line in terminal.lines() if "100%" not in line]
-    steps = [line for line in said if line.startswith(("step", "between"))]
-    assert steps == ["step 0", "between 0", "step 1", "between 1"]
-    assert not any("|" in line for line in said)
-    assert log.filters == []
-
-
-@pytest.mark.parametrize("way", ["break", "error"])
-def test_a_loop_that_is_left(monkeypatch, way):
-    """The bar is gone, so that what is written next begins a line."""
-    terminal = terminal_of(monkeypatch)
-    made = history([1.1, 1.4], progress=True)
-    try:
-        for _ in made:
-            if way == "break":
-                break
-            raise RuntimeError
-    except RuntimeError:
-        pass
-    made.close()
-    assert terminal.lines()[-1] == ""
-    assert not any("|" in line for line in terminal.lines())
-
-
-def test_an_increment_that_fails(monkeypatch):
-    """The bar stays where it was, and what is written next begins a line."""
-    terminal = terminal_of(monkeypatch)
-    scene = pressed()
-    made = history([1.1, 1.4], scene, progress=True, max_cuts=0)
-    next(made)
-    scene.load(up=float("nan"))
-    raised_everywhere(lambda: next(made), ValueError, "finite")
-    assert terminal.lines()[-1] == ""
-    assert COMM.rank or "25%" in terminal.lines()[0]
-
-
-def test_a_history_that_goes_on(monkeypatch, tmp_path):
-    """From a checkpoint at half of the way: it starts there."""
-    terminal = terminal_of(monkeypatch)
-    kept = {"checkpoint": shared_folder(tmp_path) / "state.npz", "progress": True}
-    made = history([1.1, 1.2], **kept)
-    next(made)
-    made.close()
-    terminal.truncate(0)
-    list(history([1.1, 1.2], **kept))
-    assert terminal.shares() == ([50, 100] if COMM.rank == 0 else [])
 
 
 def test_bad_words():

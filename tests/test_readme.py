@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.two_ranks
+
 
 @pytest.mark.mpi
 def test_script_runs() -> None:

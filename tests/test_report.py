@@ -22,7 +22,7 @@ COMM = MPI.COMM_WORLD
 PNG = b"\x89PNG\r\n\x1a\n"
 EMPTY = {"meta", "img"}  # elements without an end
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
 class Page(HTMLParser):

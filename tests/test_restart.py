@@ -90,6 +90,7 @@ def products() -> list[tuple]:
     return chosen if COMM.size == 1 else chosen[::4]
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize(("obstacle", "law", "how", "method", "extra"), products())
 def test_products(obstacle, law, how, method, extra, tmp_path):
     """Obstacles, laws, enforcement, methods and ways to lead a history, in combination."""

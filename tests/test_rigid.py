@@ -8,6 +8,8 @@ from fenics_contact.methods.load_balance import unbalanced
 from scenes.blocks import block
 from scenes.comparing import raised_everywhere
 
+pytestmark = pytest.mark.two_ranks
+
 
 @pytest.mark.parametrize("m", [1, 2, 3, 6])
 def test_inside_and_outside_of_a_cone(m):

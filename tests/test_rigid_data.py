@@ -15,7 +15,7 @@ from scenes.comparing import close, raised_everywhere, shared_folder
 from scenes.rubber import rubber
 from scenes.surfaces import ball, box, circle, ring, write_stl
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
 RNG = np.random.default_rng(3)
 

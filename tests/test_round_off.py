@@ -17,7 +17,7 @@ from scenes.beside import Beside, Box
 from scenes.blocks import BOTTOM, TOP
 from scenes.comparing import close, raised_everywhere
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(300)]
 WAYS = [
     {},
     {"method": "lbfgs", "condensation": False},

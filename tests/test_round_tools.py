@@ -13,7 +13,7 @@ from scenes.bodies import Bodies, boxes
 from scenes.comparing import close
 from scenes.tags import near
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 RADIUS = 1.0
 
 

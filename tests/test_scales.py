@@ -19,7 +19,7 @@ from scenes.comparing import at_points
 COMM = MPI.COMM_WORLD
 FLOOR, ROOF, FLOOR_2, ROOF_2 = 1, 2, 3, 4
 
-pytestmark = pytest.mark.mpi
+pytestmark = pytest.mark.two_ranks
 
 
 def may_take_long(*, refused: bool) -> None:

@@ -19,7 +19,7 @@ from scenes.comparing import close, gathered
 from scenes.elasticity import displacement_space, hold
 from scenes.stacks import FLOOR, ROOF, joint, stack
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 FINITE = {"kinematics": "finite"}
 BULKS = {"linear": LinearElastic, "rubber": NeoHookean}
 

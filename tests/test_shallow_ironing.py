@@ -21,68 +21,7 @@ SIZES = np.array([0.4, 0.283, 0.2, 0.141])
 # ---- limits and bars -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("order", [0.8, 1.0, 2.0, 3.5])
-def test_the_limit_of_one_order(order: float) -> None:
-    """Exact but for round-off; the bar is 1.25 times the finest mesh's error."""
-    found = page.richardson(SIZES, 300.0 - 7.0 * SIZES**order)
-    assert found.order == pytest.approx(order, rel=1e-9)
-    assert found.value == pytest.approx(300.0, rel=1e-12)
-    assert found.error == pytest.approx(1.25 * 7.0 * SIZES[-1] ** order, rel=1e-6)
-
-
-@pytest.mark.parametrize("second", [-3.0, 0.0, 9.0])
-@pytest.mark.parametrize("order", [1.0, 1.5, 2.0])
-def test_the_bar_covers_a_second_order(order: float, second: float) -> None:
-    """The next term is no part of the fit: the limit moves, by less than the bar."""
-    values = 300.0 + 7.0 * SIZES**order + second * SIZES ** (order + 1)
-    found = page.richardson(SIZES, values)
-    assert np.isfinite(found.order) and abs(found.value - 300.0) <= found.error
-
-
-@pytest.mark.parametrize("values", [(1.0, 1.2, 1.1, 1.3), (1.0, 1.1, 1.3, 1.7), (1, 1, 1, 1)])
-def test_no_order_no_extrapolation(values: tuple[float, ...]) -> None:
-    """To and fro, growing, the same: the finest value, and a bar by the range of all."""
-    found = page.richardson(SIZES, values)
-    assert np.isnan(found.order) and found.value == values[-1]
-    expected = 3 * (max(values) - min(values)) / (SIZES[0] / SIZES[-1] - 1)
-    assert found.error == pytest.approx(expected)
-
-
-def test_ripple_is_taken_off() -> None:
-    """A cosine of ten waves on a parabola: the parabola, to a fifth of the cosine that is seen."""
-    t = np.linspace(0.0, 1.6, 401)
-    smooth = 100.0 + 20.0 * (t - 1.5) - 30.0 * (t - 1.5) ** 2
-    V = smooth + 2.0 * np.cos(2 * np.pi * (t - 1.5) / 0.02)
-    path = [{"time": a, "V": b, "H": 0.3 * b} for a, b in zip(t, V, strict=True)]
-    found = study.evaluate(path)
-    assert found["V(1.5)"] == pytest.approx(102.0)
-    for name, part in (("V", 1.0), ("H", 0.3)):
-        assert found[f"fitted {name}(1.5)"] == pytest.approx(100.0 * part, abs=0.4 * part)
-        assert found[f"ripple of {name}"] == pytest.approx(2.0 * part, rel=0.2)
-    assert study.evaluate(path[:260]).keys() == {"V(1)"}
-
-
 EXACT = {"V(1)": 300.0, "V(1.5)": 380.0, "H(1.5)": 120.0}
-
-
-def made_up(setting: demo.Setting) -> dict[str, float]:
-    """What a run would find whose errors are known, each of one factor: in the limit `EXACT`."""
-    give = 0.0 if setting.enforcement == "augmented" else 4.0 * setting.size / 0.2
-    give /= setting.stiffness
-    points = 0.3 if setting.quadrature is None else 0.3 * 4.0 / setting.quadrature
-    steps = 0.1 * 250 * setting.size / 0.2 / setting.increments
-    off = 20.0 * setting.size**1.5 - give + points + steps + 0.4 * 20 / setting.pressing
-    off += 0.2 if setting.side == "slab" else 0.0
-    found = {page.QUANTITIES[name]: value + off for name, value in EXACT.items()}
-    return found | {"ripple of V": 0.1, "ripple of H": 0.1}
-
-
-def test_the_bars_cover_the_truth() -> None:
-    """Of runs with known errors; they are less than what the springs give way, taken off."""
-    rows = {name: made_up(setting) for name, setting in study.settings().items()}
-    for name, exact in EXACT.items():
-        value, error = page.converged(rows, name)
-        assert abs(value - exact) <= error < 4.0
 
 
 # ---- what is stored ------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from fenics_contact.checks.verdict import Attempt
 from scenes.elasticity import stress
 from scenes.rubbing import Rub
 
-pytestmark = pytest.mark.mpi
+pytestmark = pytest.mark.two_ranks
 
 NAME = "<b>one & two</b>"
 

@@ -16,7 +16,7 @@ from scenes.comparing import raised_everywhere, shared_folder
 from scenes.histories import Press
 
 COMM = MPI.COMM_WORLD
-pytestmark = pytest.mark.mpi
+pytestmark = [pytest.mark.two_ranks, pytest.mark.newest]
 
 
 def made(power=1.0, factor=1.0):

@@ -12,7 +12,7 @@ import fenics_contact as fc
 from fenics_contact.elasticity import NeoHookean
 
 COMM = MPI.COMM_WORLD
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(300)]
 
 E, NU, LENGTH, HEIGHT, CLEARANCE = 1000.0, 0.3, 20.0, 1.0, 3.0
 BOTTOM = 1

@@ -11,7 +11,7 @@ from scenes.two_blocks import LOWER, Slider, two_blocks
 COMM = MPI.COMM_WORLD
 K_N = 1e7
 
-pytestmark = pytest.mark.mpi
+pytestmark = pytest.mark.two_ranks
 
 
 @pytest.mark.parametrize("update", ["increment", "auto"])

@@ -21,7 +21,7 @@ from scenes.elasticity import displacement_space, stress
 COMM = MPI.COMM_WORLD
 RADIUS, DEPTH = 4.0, 0.05
 
-pytestmark = pytest.mark.mpi
+pytestmark = pytest.mark.two_ranks
 
 
 def pressed(

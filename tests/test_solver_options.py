@@ -14,7 +14,7 @@ from scenes.blocks import TOP
 from scenes.comparing import at_points, close, gathered, nodal, raised_everywhere
 from scenes.rubbing import PATH, Rub, pressed, same_states, walk
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.newest, pytest.mark.two_ranks, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
 
 

@@ -10,7 +10,7 @@ from scenes.blocks import BOTTOM, RIGHT, TOP, block
 from scenes.comparing import close, gathered, nodal, owned, same_field
 from scenes.rubbing import PATH, Rub, walk
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
 
 # Solver tolerances for comparisons finer than the default of 1e-9 of the forces.

@@ -15,7 +15,7 @@ from scenes.elasticity import displacement_space, strain, stress
 from scenes.tags import sides
 from scenes.two_blocks import LOWER, UPPER, two_blocks
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
 
 VERTEX = {"quadrature_scheme": "vertex"}

@@ -20,6 +20,8 @@ from scenes.comparing import close, owned, raised_everywhere, shared_folder
 from scenes.processes import command, environment
 from scenes.rubbing import SAME, Rub, limited, same_states
 
+pytestmark = pytest.mark.three_ranks
+
 COMM = MPI.COMM_WORLD
 
 

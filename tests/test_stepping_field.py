@@ -8,6 +8,8 @@ import fenics_contact as fc
 from scenes.comparing import close, owned, raised_everywhere, shared_folder
 from scenes.rubbing import SAME, Rub, limited, same_states
 
+pytestmark = pytest.mark.three_ranks
+
 COMM = MPI.COMM_WORLD
 
 

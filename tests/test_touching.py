@@ -16,7 +16,7 @@ from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block_mesh
 from scenes.comparing import gathered
 from scenes.elasticity import displacement_space, hold
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
 INNER, MIDDLE, OUTER = 1.0, 1.5, 2.0
 TIE = fc.Foundation(fc.RelativeStiffness(10.0), fc.RelativeStiffness(10.0))

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 from mpi4py import MPI
 
 from benchmarks import trade, trade_page, trade_scenes
 from fenics_contact.contact.accuracy import PRESETS
-from scenes.processes import ROOT, environment
+from scenes.processes import ROOT
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="of one process")
 
@@ -60,35 +55,6 @@ def test_no_preset_is_dominated(preset: str, name: str) -> None:
     assert float(row["error"]) <= PRESETS[preset]
 
 
-def test_dominance() -> None:
-    """Both by the margin; a row does not dominate itself, and the front is what nothing beats."""
-    rows = [{"error": e, "time": t} for e, t in ((1.0, 1.0), (0.5, 2.0), (0.6, 3.0), (0.4, 3.0))]
-    assert trade_page.dominating(rows[2], rows) == [rows[1]]
-    assert not any(trade_page.dominating(rows[i], rows) for i in (0, 1, 3))
-    assert trade_page.front(rows) == [rows[0], rows[1], rows[3]]
-
-
-def test_rows_survive_a_kill(tmp_path: Path) -> None:
-    """Whole lines are found again, with all their digits; a line cut off is dropped, not read."""
-    path = tmp_path / "rows.csv"
-    one, other = (trade_scenes.Setting("a scene", h) for h in (0.1, 0.2))
-    trade.Store(path).add("sweep", one, {"error": 1 / 3, "failure": 'NotConverged: a, "b"'})
-    whole = path.read_bytes()
-    trade.Store(path).add("sweep", other, {"error": 0.5})
-    path.write_bytes(path.read_bytes()[:-7])
-    store = trade.Store(path)
-    assert store.find("sweep", other) is None
-    assert path.read_bytes() == whole
-    found = store.find("sweep", one)
-    assert found is not None
-    assert float(found["error"]) == 1 / 3 and found["failure"] == 'NotConverged: a, "b"'
-    store.add("sweep", other, {"error": 0.5})
-    assert [row["error"] for row in trade.read(path)] == [str(1 / 3), "0.5"]
-    path.write_text("other,columns\n1,2\n")
-    with pytest.raises(ValueError, match="other columns"):
-        trade.Store(path)
-
-
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_solve_the_block(preset: str) -> None:
     """The GRECO block of 8 x 8 cells: with residuals as large as the tolerance rounds do not end.
@@ -101,29 +67,3 @@ def test_presets_solve_the_block(preset: str) -> None:
     assert "failure" not in found, found["failure"]
     assert found["normal force"] == pytest.approx(2000.0, rel=1e-3)
     assert found["friction force"] == pytest.approx(1405.36, rel=0.03)
-
-
-@pytest.mark.demo
-def test_short_study_runs_and_goes_on(tmp_path: Path) -> None:
-    """The command ends well, its page is there, and a second start makes no row anew."""
-    command = [sys.executable, str(ROOT / "benchmarks" / "trade.py"), "--short", "--repeat", "1"]
-    command += ["--output", str(tmp_path)]
-
-    def run() -> list[dict[str, str]]:
-        done = subprocess.run(
-            command, env=environment(), capture_output=True, text=True, timeout=300
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert "%|" not in done.stderr, "the progress bar must be silent when not on a terminal"
-        with open(tmp_path / "trade.csv", newline="") as file:
-            return list(csv.DictReader(file))
-
-    rows = run()
-    assert {row["scene"] for row in rows} == set(trade.short_scenes())
-    by_way = {row["enforcement"]: row for row in rows if row["role"] == "sweep"}
-    assert float(by_way["augmented"]["error"]) < float(by_way["penalty"]["error"])
-    for row in rows:
-        assert not row["failure"] and float(row["time"]) > 0
-    assert "| base" in (tmp_path / "trade.md").read_text()
-    assert len(list(tmp_path.glob("*.png"))) == len(trade.short_scenes())
-    assert run() == rows

@@ -15,7 +15,7 @@ from scenes.comparing import close, raised_everywhere, shared_folder
 from scenes.histories import goes_on
 from scenes.rubber import TIGHT, Tool, disc, rubber
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(300)]
 COMM = MPI.COMM_WORLD
 
 K = 1e3

@@ -9,7 +9,7 @@ import fenics_contact as fc
 from scenes.comparing import identical
 from scenes.rubbing import PATH, Rub, snapshot, walk
 
-pytestmark = [pytest.mark.mpi, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
 
 
