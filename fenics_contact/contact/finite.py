@@ -338,7 +338,7 @@ def check_places(name: str, place: Callable[[Any], Placement], mesh: Any) -> Non
     if not is_known_everywhere(place, mesh):
         raise ValueError(
             f"{name}: the obstacle is given on the undeformed Γc, and finite kinematics need it at "
-            "every place: give an SignedDistance(lambda x: ...), with all coordinates taken "
+            "every place: give a SignedDistance(lambda x: ...), with all coordinates taken "
             "from its argument, or another rigid obstacle by numbers and constants"
         )
 
