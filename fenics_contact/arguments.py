@@ -51,7 +51,8 @@ def check_instance(name: str, value: Any, kind: type, advice: str = "") -> None:
     if isinstance(value, type) and issubclass(value, kind):
         made = value.__name__
         raise ValueError(f"{name} is the class {made}; give an object of it, {made}(...){advice}")
-    raise ValueError(f"{name} is a {type(value).__name__}; it must be a {kind.__name__}{advice}")
+    expected = f"{'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"
+    raise ValueError(f"{name} is a {type(value).__name__}; it must be {expected}{advice}")
 
 
 def listed(name: str, values: Iterable[Any], kind: type) -> list[Any]:

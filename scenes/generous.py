@@ -121,7 +121,7 @@ class Shod(History):
         *,
         within: float = 1.0,
         deep: float = DEEP,
-        update: str = "increment",
+        update_pairs: str = "increment",
         contact: dict | None = None,
         **options: Any,
     ) -> None:
@@ -153,7 +153,7 @@ class Shod(History):
         self.along, self.down = (fem.Constant(mesh, 0.0) for _ in range(2))
         bcs = [hold(self.u, tags, BASE, i) for i in range(2)]
         bcs += [hold(self.u, tags, LID, i, c) for i, c in enumerate((self.along, self.down))]
-        shoe = fc.DeformableBody(tags, ROUND, update_pairs=update)
+        shoe = fc.DeformableBody(tags, ROUND, update_pairs=update_pairs)
         law = law or fc.Coulomb(0.3, k_n=1e5, k_t=1e5)
         surface = fc.ContactSurface(mesh, tags, TOP)
         self.contact = fc.Contact(self.u, surface, shoe, law, **(contact or {}))

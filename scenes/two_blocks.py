@@ -103,8 +103,8 @@ class Slider:
         *,
         start: float,
         slope: float = 0.0,
-        update: str = "increment",
-        release: float | None = None,
+        update_pairs: str = "increment",
+        max_initial_penetration: float | None = None,
         n: tuple[int, int] = (14, 4),
         contact: dict | None = None,
         **options: Any,
@@ -119,7 +119,9 @@ class Slider:
         bcs = [hold(self.u, tags, BOTTOM, i) for i in range(d)]
         bcs += [hold(self.u, tags, TOP, i, value) for i, value in enumerate(self.move)]
         surface = fc.ContactSurface(mesh, tags, UPPER)
-        base = fc.DeformableBody(tags, LOWER, update_pairs=update, max_initial_penetration=release)
+        base = fc.DeformableBody(
+            tags, LOWER, update_pairs=update_pairs, max_initial_penetration=max_initial_penetration
+        )
         self.contact = fc.Contact(self.u, surface, base, law, **(contact or {}))
         F = residual(self.u, v, E, 0.3)
         self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=[self.contact], **options)

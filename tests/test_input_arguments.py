@@ -402,14 +402,14 @@ def test_shares_out_of_range(name, value):
 
 
 @pytest.mark.parametrize("value", [0, -0.1, np.nan, "20 %", True])
-def test_share_of_the_kinematics_out_of_range(value):
+def test_small_displacement_tolerance_out_of_range(value):
     """A positive number, infinite included."""
     scene = pressed()
     raised_everywhere(
-        lambda: scene.problem(coulomb(), scene.rollers(), kinematics=value),
+        lambda: scene.problem(coulomb(), scene.rollers(), small_displacement_tolerance=value),
         ValueError,
-        "kinematics",
-        "infinite",
+        "small_displacement_tolerance",
+        "infinity",
     )
 
 
