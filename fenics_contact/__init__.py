@@ -19,7 +19,7 @@ from fenics_contact.laws.base import ContactTraction, Law, PointKinematics
 from fenics_contact.laws.friction import Coulomb, FrictionLaw, Tresca
 from fenics_contact.laws.stiffness import NodalSprings, RelativeStiffness
 from fenics_contact.laws.unilateral import Foundation, Frictionless
-from fenics_contact.meshes import model_to_mesh
+from fenics_contact.meshes import mesh_from_arrays, model_to_mesh
 from fenics_contact.obstacles.base import (
     Motion,
     Obstacle,
@@ -89,6 +89,7 @@ __all__ = [
     "find_contact_pairs",
     "increments",
     "join_meshes",
+    "mesh_from_arrays",
     "model_to_mesh",
     "output",
     "plotting",

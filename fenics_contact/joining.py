@@ -19,7 +19,7 @@ from fenics_contact.arguments import check_cells, check_instance, is_number
 from fenics_contact.parallel import collective_errors
 from fenics_contact.types import Array, Index
 
-__all__ = ["JoinedMesh", "join_meshes"]
+__all__ = ["JoinedMesh", "exchange_rows", "join_meshes", "tag_facets"]
 
 Part: TypeAlias = dolfinx.mesh.Mesh | Sequence[Any]
 Numbers: TypeAlias = Mapping[Hashable, Mapping[int | None, int]]
@@ -152,10 +152,10 @@ def join_meshes(parts: Mapping[Hashable, Part] | Iterable[Part]) -> JoinedMesh:
     mesh = dolfinx.mesh.create_mesh(comm, cells=cells, x=x, e=domain, partitioner=partitioner)
 
     # Cells keep the order of their nodes, and with it that of their facets.
-    data = _rows(comm, data, np.asarray(mesh.topology.original_cell_index))
+    data = exchange_rows(comm, data, np.asarray(mesh.topology.original_cell_index))
     every = np.arange(len(data), dtype=np.int32)
     cell_tags = dolfinx.mesh.meshtags(mesh, d, every, data[:, 0].astype(np.int32))
-    facet_tags = _facet_tags(mesh, data[:, 1:])
+    facet_tags = tag_facets(mesh, data[:, 1:])
     mesh.topology.create_connectivity(d - 1, d)  # for Dirichlet conditions on tagged facets
     return JoinedMesh(mesh, cell_tags, facet_tags, names, cell_numbers, facet_numbers)
 
@@ -324,7 +324,7 @@ def _facets_of_cells(mesh: dolfinx.mesh.Mesh) -> Index:
     return of_cell.array.reshape(-1, n)
 
 
-def _rows(comm: MPI.Comm, rows: Any, wanted: Index) -> Any:
+def exchange_rows(comm: MPI.Comm, rows: Any, wanted: Index) -> Any:
     """Rows by their numbers over all ranks, from the ranks that have them. Collective.
 
     Args:
@@ -346,7 +346,7 @@ def _rows(comm: MPI.Comm, rows: Any, wanted: Index) -> Any:
     return found
 
 
-def _facet_tags(mesh: dolfinx.mesh.Mesh, tags: Any) -> dolfinx.mesh.MeshTags:
+def tag_facets(mesh: dolfinx.mesh.Mesh, tags: Any) -> dolfinx.mesh.MeshTags:
     """Tags of facets, the same on all ranks that share them. Collective.
 
     Args:
