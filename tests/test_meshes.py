@@ -172,7 +172,15 @@ def test_arrays_with_tags(rank: int) -> None:
     assert any(COMM.allgather(len(facets.find(0)) == 1))
 
 
-def vtk_grid(kind: str, order: int) -> tuple[Any, Any, Any]:
+def test_arrays_in_the_order_of_dolfinx() -> None:
+    """The third node of a quadrilateral is then opposite to the second."""
+    cells = np.array(SQUARES["cells"])[:, [0, 1, 3, 2]]
+    mesh, tags, _ = from_arrays(cells=cells, node_order="dolfinx")
+    dx = ufl.Measure("dx", domain=mesh, subdomain_data=tags)
+    assert measure(ufl.SpatialCoordinate(mesh)[0] * dx(RIGHT)) == pytest.approx(1.5)
+
+
+def gmsh_grid(kind: str, order: int) -> tuple[Any, Any, Any]:
     """Points, cells and the facets at x = 0 of a unit square or cube, by the gmsh of rank 0."""
     gmsh.initialize()
     gmsh.option.setNumber("General.Terminal", 0)
@@ -212,7 +220,7 @@ def vtk_grid(kind: str, order: int) -> tuple[Any, Any, Any]:
 @pytest.mark.parametrize("kind", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
 def test_arrays_of_every_cell_type(kind: str, order: int) -> None:
     """Volume, and area and place of the tagged side, of cells as gmsh numbers them."""
-    points, cells, side = vtk_grid(kind, order) if COMM.rank == 0 else (None, None, None)
+    points, cells, side = gmsh_grid(kind, order) if COMM.rank == 0 else (None, None, None)
     facets = {LEFT: side, TOP: []} if COMM.rank == 0 else None
     mesh, tags, sides = fc.mesh_from_arrays(
         COMM, points, cells, cell_type=kind, facets=facets, node_order="gmsh"

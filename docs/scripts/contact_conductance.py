@@ -11,16 +11,21 @@ LENGTH, CONDUCTIVITY = {"hot": 0.03, "cold": 0.05}, {"hot": 50.0, "cold": 15.0} 
 T_HOT, T_COLD = 400.0, 300.0  # K
 E, PRESSURE, H_PER_PRESSURE = 2e11, 5e6, 4e-4  # Pa, Pa, W/(m² K) per Pa
 WIDTH, LOW, HIGH = 0.01, 1, 2
+ANGLE = np.pi / 6  # of the bars: the interface has any direction
+AXIS = np.array([-np.sin(ANGLE), np.cos(ANGLE)])
 
 
 # begin bodies
 def bar(low: float, high: float, cells: tuple[int, int]):
-    """A bar between two heights; mesh and tags of its ends."""
+    """A bar between two heights along its axis; mesh and tags of its ends."""
     msh = mesh.create_rectangle(MPI.COMM_WORLD, [(0, low), (WIDTH, high)], cells)
     facets = mesh.locate_entities_boundary(msh, 1, lambda x: np.isfinite(x[0]))
     y = mesh.compute_midpoints(msh, 1, facets)[:, 1]
     where = np.select([np.isclose(y, low), np.isclose(y, high)], [LOW, HIGH])
-    return msh, None, mesh.meshtags(msh, 1, facets, where.astype(np.int32))
+    tags = mesh.meshtags(msh, 1, facets, where.astype(np.int32))
+    across, along = msh.geometry.x[:, :2].T
+    msh.geometry.x[:, :2] = np.outer(across, [AXIS[1], -AXIS[0]]) + np.outer(along, AXIS)
+    return msh, None, tags
 
 
 bars = {"cold": bar(-LENGTH["cold"], 0, (3, 6)), "hot": bar(0, LENGTH["hot"], (5, 6))}
@@ -39,7 +44,7 @@ ds = ufl.Measure("ds", domain=msh, subdomain_data=tags)
 foot = fem.locate_dofs_topological(V, 1, tags.find(bottom))
 pressed = fc.Contact(u, surface, opposite, fc.Coulomb(0.3))
 problem = fc.ContactProblem(
-    body.residual(v) + PRESSURE * v[1] * ds(top),
+    body.residual(v) + PRESSURE * ufl.dot(ufl.as_vector(AXIS.tolist()), v) * ds(top),
     u,
     bcs=[fem.dirichletbc(np.zeros(2), foot, V)],
     contacts=[pressed],

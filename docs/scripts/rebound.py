@@ -1,7 +1,7 @@
 """Impact and rebound by Newmark and HHT: a bar on a rigid wall, a mass on a spring.
 
 python docs/scripts/rebound.py              # HHT, α = -0.3
-python docs/scripts/rebound.py 0 0.6        # α and γ: here Newmark's method with γ = 0.6
+python docs/scripts/rebound.py 0 0.6 40     # α, γ and cells: here Newmark's method with γ = 0.6
 """
 
 import sys
@@ -67,7 +67,7 @@ def impact(modulus: float, cells: int, law: fc.Law, dt: float, steps: int):
 
 
 # begin bar
-E, CELLS = 1000.0, 40
+E, CELLS = 1000.0, int(sys.argv[3]) if len(sys.argv) > 3 else 40
 c = float(np.sqrt(E / DENSITY))
 dt = LENGTH / CELLS / c  # a wave passes one cell in a step
 forces, states = impact(E, CELLS, fc.Frictionless(), dt, 3 * CELLS)
@@ -76,8 +76,9 @@ plateau = forces / (DENSITY * c * SPEED * WIDTH)
 inside, touching = (time > 0.4) & (time < 1.6), time[plateau > 0.02]
 mean, scatter, last = plateau[inside].mean(), plateau[inside].std(), touching[-1]
 energy = states[-1, :2].sum()
-print(f"bar: force {mean:.4f} ρcvA, scatter {scatter:.4f}, largest {plateau.max():.2f}")
-print(f"bar: contact ends at {last:.3f} L/c, momentum {states[-1, 2]:.4f}, energy {energy:.4f}")
+if MPI.COMM_WORLD.rank == 0:
+    print(f"bar: force {mean:.4f} ρcvA, scatter {scatter:.4f}, largest {plateau.max():.2f}")
+    print(f"bar: contact ends at {last:.3f} L/c, momentum {states[-1, 2]:.4f}, energy {energy:.4f}")
 
 # begin spring
 K = 50.0  # of the spring, stress per length
@@ -89,7 +90,8 @@ t = spring_dt * np.arange(1, 51)
 peak = SPEED * WIDTH * np.sqrt(K * DENSITY * LENGTH)
 exact = peak * np.maximum(0, np.sin(omega * t)) * (t < np.pi / omega)
 error = np.abs(spring_forces - exact).max() / peak
-print(f"spring: force off by {error:.4f} of v √(km), momentum {spring_states[-1, 2]:.4f}")
+if MPI.COMM_WORLD.rank == 0:
+    print(f"spring: force off by {error:.4f} of v √(km), momentum {spring_states[-1, 2]:.4f}")
 
 # begin picture
 Path("output").mkdir(exist_ok=True)
