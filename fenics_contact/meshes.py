@@ -297,7 +297,11 @@ def _to_dolfinx(kind: str, n_nodes: int, order: str) -> Index:
 
 
 def _check_jacobians(x: Array, nodes: Index, kind: str, node_order: str) -> None:
-    """Refuse cells without volume, or with a Jacobian of both signs, at their vertices."""
+    """Refuse cells without volume, and those whose nodes are in another order.
+
+    The Jacobian determinant has one sign at the vertices. Edge nodes of second-order cells are
+    closer to the middle of their edge than its ends are.
+    """
     shape, gdim = basix.CellType[kind], x.shape[1]
     degree = _DEGREES[kind][nodes.shape[1]]
     element = basix.create_element(
@@ -315,13 +319,21 @@ def _check_jacobians(x: Array, nodes: Index, kind: str, node_order: str) -> None
             f"{len(small)} cells have no volume, the first is cells[{small[0]}] with the points "
             f"{corners[small[0]].tolist()}; remove them, or mesh without them"
         )
-    mixed = np.flatnonzero(det.min(axis=1) * det.max(axis=1) <= 0)
+    tangled = det.min(axis=1) * det.max(axis=1) <= 0
+    edges = np.array(basix.topology(shape)[1])
+    for edge, dofs in zip(edges, element.entity_dofs[1], strict=True):
+        ends = corners[:, edge]
+        for node in dofs:  # none in linear cells
+            offset = corners[:, node] - ends.mean(axis=1)
+            half = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / 2
+            tangled |= np.linalg.norm(offset, axis=1) >= half
+    mixed = np.flatnonzero(tangled)
     if len(mixed):
         raise ValueError(
-            f"{len(mixed)} of {len(nodes)} cells have a Jacobian determinant that changes sign or "
-            f"vanishes, the first is cells[{mixed[0]}]; if it is all of them, their nodes are not "
-            f"in the order node_order={node_order!r}: give another of {_NODE_ORDERS}; else the "
-            "cells are too distorted"
+            f"{len(mixed)} of {len(nodes)} cells have a Jacobian determinant that changes sign, or "
+            f"an edge node far from the middle of its edge, the first is cells[{mixed[0]}]; if it "
+            f"is all of them, their nodes are not in the order node_order={node_order!r}: give "
+            f"another of {_NODE_ORDERS}; else the cells are too distorted"
         )
 
 

@@ -231,6 +231,12 @@ def test_arrays_of_every_cell_type(kind: str, order: int) -> None:
     assert measure(1.0 * dx(0)) == pytest.approx(1.0)
     assert measure(x[1] ** 2 * ds(LEFT)) == pytest.approx(1 / 3)
     assert measure(x[0] * ds(LEFT)) == pytest.approx(0.0, abs=1e-12)
+    if order == 2 or kind in ("quadrilateral", "hexahedron"):
+        raised_everywhere(
+            lambda: fc.mesh_from_arrays(COMM, points, cells, cell_type=kind, node_order="dolfinx"),
+            ValueError,
+            "node_order='dolfinx'",
+        )
 
 
 def test_arrays_in_a_contact() -> None:

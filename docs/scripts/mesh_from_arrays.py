@@ -12,7 +12,7 @@ import fenics_contact as fc
 
 try:
     import meshio
-except ImportError:  # the arrays are below, too
+except ImportError:
     meshio = None
 
 comm = MPI.COMM_WORLD
@@ -45,14 +45,15 @@ INP = """*NODE
 def read_abaqus(path):
     """Points, cells, cell tags and node sets of quadrilaterals in the plane."""
     read = meshio.read(path)
-    points = read.points[:, :2]
-    cells = np.concatenate([block.data for block in read.cells if block.type == "quad"])
-    tags = np.zeros(len(cells), dtype=np.int32)
-    offsets = np.cumsum([0] + [len(block.data) for block in read.cells])
-    for tag, name in ((SOFT, "SOFT"), (STIFF, "STIFF")):
-        for offset, members in zip(offsets, read.cell_sets[name], strict=False):
-            tags[offset + np.asarray(members, dtype=int)] = tag
-    return points, cells, tags, read.point_sets
+    sets = {SOFT: read.cell_sets["SOFT"], STIFF: read.cell_sets["STIFF"]}
+    cells, tags = [], []
+    for number, block in enumerate(read.cells):
+        if block.type == "quad":
+            cells.append(block.data)
+            tags.append(np.zeros(len(block.data), dtype=np.int32))
+            for tag, members in sets.items():
+                tags[-1][np.asarray(members[number], dtype=int)] = tag
+    return read.points[:, :2], np.concatenate(cells), np.concatenate(tags), read.point_sets
 
 
 # begin facets
@@ -67,23 +68,24 @@ def boundary_facets(cells, nodes):
 
 
 # begin arrays
-points = cells = cell_tags = facets = None
+points = cells = tags = facets = None
 if comm.rank == 0:
     points = [[x, y] for y in (0.0, 1.0, 2.0) for x in (0.0, 1.0, 2.0)]
     cells = np.array([[0, 1, 4, 3], [1, 2, 5, 4], [3, 4, 7, 6], [4, 5, 8, 7]])
-    cell_tags = [SOFT, SOFT, STIFF, STIFF]
+    tags = [SOFT, SOFT, STIFF, STIFF]
+    facets = {FLOOR: [[0, 1], [1, 2]], TOP: [[6, 7], [7, 8]]}
+msh, cell_tags, facet_tags = fc.mesh_from_arrays(
+    comm, points, cells, cell_type="quadrilateral", facets=facets, cell_tags=tags
+)
+# begin check
+if comm.rank == 0:
     sets = {"FLOOR": [0, 1, 2], "TOP": [6, 7, 8]}
     if meshio is not None:
         Path("part.inp").write_text(INP)
-        read, (points, cells, cell_tags, sets) = cells, read_abaqus("part.inp")
-        assert np.array_equal(read, cells) and cell_tags.tolist() == [SOFT, SOFT, STIFF, STIFF]
-    facets = {
-        FLOOR: boundary_facets(cells, sets["FLOOR"]),
-        TOP: boundary_facets(cells, sets["TOP"]),
-    }
-msh, cell_tags, facet_tags = fc.mesh_from_arrays(
-    comm, points, cells, cell_type="quadrilateral", facets=facets, cell_tags=cell_tags
-)
+        *found, sets = read_abaqus("part.inp")
+        assert all(map(np.array_equal, found, (points, cells, tags)))
+    assert np.array_equal(boundary_facets(cells, sets["FLOOR"]), facets[FLOOR])
+    assert np.array_equal(boundary_facets(cells, sets["TOP"]), facets[TOP])
 
 # begin xdmf
 msh.name, cell_tags.name, facet_tags.name = "part", "cells", "facets"
