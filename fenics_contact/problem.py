@@ -562,7 +562,7 @@ class ContactProblem:
 
         See `solve` with ``recover_interior=False``, and `increments`. The field is checked apart
         from how it was found: the product of the bulk's matrix with it must meet loads and contact
-            forces.
+        forces.
 
         Returns:
             The verdict; None if nothing was behind.
