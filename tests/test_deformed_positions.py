@@ -135,6 +135,110 @@ def test_a_blade_does_not_pierce_a_facet(steps, at, kinematics):
     assert reached - 0.04 <= 0.07 * 0.25
 
 
+@KINEMATICS
+@pytest.mark.parametrize(("at", "aside"), [(0.3, 0.1), (0.35, -0.15), (0.7, -0.15)])
+def test_a_pin_that_moves_aside_is_not_overlooked(kinematics, at, aside):
+    """Of 8 % of a facet, led in by 35 % of it and aside: its place at the end was not pierced.
+
+    It is above Γc at last by more than the 7 % that is allowed, and no point resists.
+    """
+    body = block(n=(2, 1))
+    move = body.constant(np.zeros(2))
+    body.hold(TOP, 0, 1)
+    contact = body.contact(
+        BOTTOM,
+        fc.Ball((at, -0.04), 0.04, displacement=move),
+        fc.Frictionless(),
+        kinematics=kinematics,
+        quadrature=2,
+    )
+    problem = body.problem(contact)
+    move.value[:] = aside, 0.175
+    fails(problem, "has crossed")
+
+
+def capsule(center, half, radius):
+    """A plate with round ends along x."""
+
+    def distance(x):
+        along = x[0] - center[0]
+        along -= ufl.max_value(-half, ufl.min_value(half, along))
+        return ufl.sqrt(along**2 + (x[1] - center[1]) ** 2) - radius
+
+    return distance
+
+
+@pytest.mark.parametrize("half", [0.07, 0.0])
+def test_what_slides_past_a_thin_tip_has_not_crossed_it(half):
+    """A plate of 0.14, and a pin, pressed in by 2 % of a facet and led aside in one increment.
+
+    Places of Γc come from one end to the other at less than the radius below the tip. The force is
+    that of three increments, to 1e-6: there is no friction.
+    """
+    forces = []
+    for steps in (1, 3):
+        body = block(n=(8, 2))
+        move = body.constant(np.zeros(2))
+        body.hold(TOP, 0, 1)
+        obstacle = fc.SignedDistance(capsule((0.25, -0.01), half, 0.01), displacement=move)
+        contact = body.contact(BOTTOM, obstacle, fc.Frictionless(), kinematics="finite")
+        problem = body.problem(contact)
+        for move.value[:] in [
+            (0.0, 0.0025),
+            *((x, 0.0025) for x in 0.3 * np.arange(1, steps + 1) / steps),
+        ]:
+            problem.solve()
+            problem.commit()
+        forces.append(contact.resultants().normal_force)
+    assert forces[0] == pytest.approx(forces[1], rel=1e-6, abs=1e-9 * E)
+
+
+@KINEMATICS
+@pytest.mark.parametrize("sides", [(BOTTOM,), (BOTTOM, SIDES)])
+def test_a_blade_does_not_cut_a_body_off(kinematics, sides):
+    """Upright beside the body, led 1.6 aside: all of it is beside the body again, and nothing cut.
+
+    Also where the flanks, through which it enters and leaves, are not in Γc.
+    """
+    flanks = {SIDES: lambda x, cell: near(0, 0.0)(x, cell) | near(0, 1.0)(x, cell)}
+    axes = [[np.linspace(0.0, 1.0, 9), np.linspace(0.0, 0.5, 5)]]
+    body = Bodies(boxes(axes, {BOTTOM: near(1, 0.0), TOP: near(1, 0.5), **flanks}), E, 0.3)
+    move = body.constant(np.zeros(2))
+    body.hold(TOP, 0, 1)
+
+    def blade(x):
+        along = ufl.max_value(-0.65, ufl.min_value(0.2, x[1]))
+        return ufl.sqrt((x[0] + 0.3) ** 2 + (x[1] - along) ** 2) - 0.01
+
+    obstacle = fc.SignedDistance(blade, displacement=move)
+    problem = body.problem(body.contact(sides, obstacle, fc.Frictionless(), kinematics=kinematics))
+    move.value[0] = -0.2
+    assert problem.solve().verdict.failures == []
+    move.value[0] = 1.6
+    fails(problem, "has crossed")
+
+
+def test_a_bent_facet_is_not_taken_for_crossed():
+    """A ball bends two quadratic facets by half of its radius, in one increment and in five.
+
+    Their chords are crossed by 12 % of their length, they are not: the force is the same to 1e-6.
+    """
+    forces = []
+    for steps in (1, 5):
+        axes = [[np.linspace(0.0, 1.0, 3), np.linspace(0.0, 0.5, 3)]]
+        body = Bodies(boxes(axes, {BOTTOM: near(1, 0.0), TOP: near(1, 0.5)}), E, 0.3, degree=2)
+        move = body.constant(np.zeros(2))
+        body.hold(TOP, 0, 1)
+        ball = fc.Ball((0.25, -0.3), 0.3, displacement=move)
+        contact = body.contact(BOTTOM, ball, fc.Frictionless(), kinematics="finite")
+        problem = body.problem(contact)
+        for move.value[1] in 0.15 * np.arange(1, steps + 1) / steps:
+            problem.solve()
+            problem.commit()
+        forces.append(contact.resultants().normal_force)
+    assert forces[0] == pytest.approx(forces[1], rel=1e-6)
+
+
 @pytest.mark.parametrize("steps", [1, 4])
 def test_a_blade_is_not_turned_through_a_body(steps):
     """By one radian: beneath it at first, above at last, and no point was in it at either end."""

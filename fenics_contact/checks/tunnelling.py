@@ -6,8 +6,8 @@ Here the geometry is taken where it is at the end of an increment, X + u, on all
 - *Depth.* At points, corners, middles of edges and of facets the penetration must not exceed that
   of the nearby points, which the law resists, by more than the tangent planes seen from these
   points explain.
-- *Path.* On its way through the increment no such place may enter the obstacle on one side and
-  leave it, or be about to, on the other.
+- *Path.* In the increment no such place may enter an opposing body on one side and leave it, or be
+  about to, on the other; and no point of a rigid obstacle that is near Γc may enter the body.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ _PREDICTED_DEPTH, _PREDICTED_UNRESISTED = 0.15, 0.05
 _DEPTH_RESOLUTION = 0.02
 # Cosine of the angle between the normals of opposite sides of an obstacle: 120 degrees and more.
 _OPPOSITE_SIDES = -0.5
-# A path is sampled at this many places for each facet's length, and at so many at most.
-_SAMPLES_PER_FACET, _MOST_SAMPLES = 4, 64
-# Bisections of a part of a path in which the normal turns to the opposite side.
+# Parts into which the rotation in an increment is divided at most.
+_MOST_TURNS = 64
+# Bisections of a path at the place where the normal turns to the opposite side.
 _BISECTIONS = 20
 # Steps along a facet towards the place that is deepest in an obstacle.
 _DESCENT_STEPS = 12
@@ -115,7 +115,8 @@ class Tunnelling:
         """
         depth, allowed = probe.depth(resisted)
         worst = _worst(comm, depth - allowed, np.column_stack([depth, allowed, probe.x]))
-        crossed = _worst(comm, np.where(probe.crossed(allowed), 1.0, -1.0), probe.x)
+        through = probe.crossed(allowed)
+        crossed = _worst(comm, np.ones(len(through)), through)
         return cls(
             depth=0.0 if worst is None else float(worst[0]),
             allowed=0.0 if worst is None else float(worst[1]),
@@ -237,8 +238,8 @@ class Probe(Protocol):
     def depth(self, resisted: ResistedDepth) -> tuple[Array, Array]:
         """Penetration at the places, and what is allowed there, (n,) (length). Collective."""
 
-    def crossed(self, allowed: Array) -> Mask:
-        """Which places have crossed what lies opposite in the increment, (n,). Collective."""
+    def crossed(self, allowed: Array) -> Array:
+        """Find the undeformed places, (n, gdim) (length), that crossed the opposite. Collective."""
 
 
 class RigidObstacleProbe:
@@ -270,7 +271,7 @@ class RigidObstacleProbe:
         if known is not None and not opposite.turns:
             self._start = known.points
         self._rotate = opposite.rotation_in_increment(values)
-        self._facet, self._reference, self._distance, self._toward = self._find_places()
+        self._facet, self._reference, self._distance, self._toward = self._deepest(self.points)
         self.x, _ = places.facets.positions(self._facet, self._reference)
         self._z = self._at(self.points)
         closed = contact.status != Status.OPEN
@@ -282,34 +283,6 @@ class RigidObstacleProbe:
         """A point field at the places."""
         return self._places.values(field, self._facet, self._reference)
 
-    def _find_places(self) -> tuple[Index, Array, Array, Array]:
-        """All places that may be deep in the obstacle now, or on their path. Collective.
-
-        Facets that move by more than their size are looked at in between, too: what passes them
-        leaves no trace in their distance at the end.
-
-        Returns:
-            Facet, reference coordinates, distance (length), and unit normal towards the obstacle,
-            (n, ...).
-        """
-        end = self._rotate(self.points, 1.0)
-        way = np.linalg.norm(end - self._start, axis=1) + np.linalg.norm(end - self.points, axis=1)
-        ways = way[self._places.rows].max(axis=1, initial=0.0) / self._places.size
-        n = int(np.ceil(np.clip(global_max(self._comm, ways, empty=0.0), 1, _MOST_SAMPLES)))
-        facet, reference, distance, normal = self._deepest(self.points)
-        found = []
-        for share in np.arange(1, n) / n:
-            points = self._rotate(self._start + share * (end - self._start), -share)
-            between, at, *_ = self._deepest(points)
-            met = slice(len(self._places.facet), None)
-            found.append((between[met], at[met]))
-        if found:
-            facets, references = (np.concatenate(parts) for parts in zip(*found, strict=True))
-            there = self._sampler.sample(self._places.values(self.points, facets, references))
-            facet, reference = np.append(facet, facets), np.concatenate([reference, references])
-            distance, normal = np.append(distance, there[0]), np.concatenate([normal, there[1]])
-        return facet, reference, distance, normal
-
     def _deepest(self, points: Array) -> tuple[Index, Array, Array, Array]:
         """The places of Γc, then those that the obstacle comes closest to between them. Collective.
 
@@ -320,7 +293,8 @@ class RigidObstacleProbe:
             points: The points of Γc in the frame of the obstacle, (n_points, gdim) (length).
 
         Returns:
-            See `_find_places`.
+            Facet, reference coordinates, distance (length), and unit normal towards the obstacle,
+            (n, ...).
         """
         places, size = self._places, self._places.size
         facet, at = places.facet, places.reference
@@ -365,6 +339,10 @@ class RigidObstacleProbe:
         )
         return np.stack([end - origin for end in ends], axis=2)
 
+    def _outward(self, facet: Index, points: Array) -> Array:
+        """Outward unit normals at the first corners of facets, (n, gdim)."""
+        return self._places.facets.outward_normals(facet, self._tangents(facet, points))
+
     def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
         """See `Probe`: by where the points are in the frame of the obstacle."""
         committed = contact.values.x + contact.opposite.committed_jump
@@ -406,10 +384,7 @@ class RigidObstacleProbe:
         facet, place, toward = self._facet[some], self._z[some], self._toward[some]
         # Half way through an obstacle there is no normal.
         depth[some[~(np.linalg.norm(toward, axis=1) > 0.5)]] = np.inf
-        inward = -self._places.facets.outward[facet, None] * across(
-            self._tangents(facet, self.points)
-        )
-        inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+        inward = -self._outward(facet, self.points)
         aside = np.nan_to_num(toward - _dot(toward, inward)[:, None] * inward)
         length = np.linalg.norm(aside, axis=1, keepdims=True)
         aside *= size[some, None] / np.where(length > 0, length, 1.0)
@@ -426,87 +401,117 @@ class RigidObstacleProbe:
             depth[some] = reach
         return depth
 
-    def crossed(self, allowed: Array) -> Mask:
-        """See `Probe`.
+    def crossed(self, allowed: Array) -> Array:
+        """Find the places of Γc that have crossed the obstacle in the increment. Collective.
 
-        In the increment a place goes straight on, as does the obstacle, which turns evenly.
+        In the frame of the obstacle a place of Γc moves along a straight line, while the obstacle
+        rotates at a constant rate. Points of the obstacle are at rest there: those nearest to
+        places of Γc at either end of the increment. A place has crossed the obstacle
+
+        - if its point enters the body through a facet and ends deeper below Γc than is allowed;
+        - if it ends on the opposite side of the obstacle, and its point has been inside of the body
+          or what is below the place, by the largest depth that is explained, has passed through it.
         """
-        comm, rotate = self._comm, self._rotate
-        found = np.zeros(len(self._facet), dtype=np.bool_)
-        start = self._at(self._start)
-        end = rotate(self._z, 1.0)  # in the frame of the start, which does not turn
-        straight = np.linalg.norm(end - start, axis=1)
-        length = straight + np.linalg.norm(end - self._z, axis=1)
-        # A distance changes by no more than the way: what is farther away was not touched.
-        some = np.flatnonzero(~(self._distance > length))
-        start, end, length = start[some], end[some], length[some]
-        samples = _SAMPLES_PER_FACET * length / self._places.size[self._facet[some]]
-        n = int(np.ceil(np.clip(global_max(comm, samples, empty=0.0), 1, _MOST_SAMPLES)))
-        if not comm.allreduce(len(some)):
-            return found
+        comm = self._comm
+        start, end = self._at(self._start), self._rotate(self._z, 1.0)
+        turn = np.linalg.norm(end - self._z, axis=1)
+        # A distance changes by no more than the path: what is farther away was not touched.
+        near = np.flatnonzero(~(self._distance > np.linalg.norm(end - start, axis=1) + turn))
+        if not comm.allreduce(len(near)):
+            return self.x[:0]
+        start, end, facet = start[near], self._z[near], self._facet[near]
+        distance, normal = self._sampler.sample(start)
+        normal, toward = np.nan_to_num(normal), np.nan_to_num(self._toward[near])
+        feet = start + distance[:, None] * normal, end + self._distance[near, None] * toward
+        points = np.concatenate(feet)
+        inward, inward_end = (-self._outward(facet, p) for p in (self._start, self.points))
+        entered = np.zeros(len(points), dtype=np.bool_)
+        entered[: len(near)] = (distance < 0) & (_dot(normal, inward) < 0)
+        last = self._enter(points, entered, global_max(comm, turn / self._places.size[self._facet]))
+        most = np.zeros(len(self._places.size))
+        np.maximum.at(most, self._facet, allowed)
+        found: Any = self._is_deeper(points, last, most).reshape(2, -1).any(axis=0)
+        opposite = np.flatnonzero(_dot(normal, toward) < _OPPOSITE_SIDES)
+        # On the way the tangent planes are not known.
+        depth = (allowed[near] + _PREDICTED_DEPTH * self._places.size[facet])[:, None]
+        start, end = start + depth * inward, end + depth * inward_end
+        passed = self._pass_through(start[opposite], end[opposite])
+        found[opposite] |= entered[opposite] | passed
+        return self.x[near[found]]
 
-        def at(share: Array | float, rows: Index | slice = slice(None)) -> tuple[Array, ...]:
-            t = np.broadcast_to(share, len(start))[rows]
-            place = rotate(start[rows] + t[:, None] * (end[rows] - start[rows]), -t)
-            return place, *self._sampler.sample(place)
-
-        crossed = np.zeros(len(some), dtype=np.bool_)
-        place, distance, normal = at(0.0)
-        entry_place, entry_normal = place, normal
-        for k in range(1, n + 1):
-            was = place, distance, normal
-            place, distance, normal = at(k / n)
-            enters = (was[1] >= 0) & (distance < 0)
-            hidden = (was[1] >= 0) & (distance >= 0) & (_dot(was[2], normal) < _OPPOSITE_SIDES)
-            hidden &= was[1] + distance <= np.linalg.norm(place - was[0], axis=1) * (1 + 1e-9)
-            turned = enters & (_dot(was[2], normal) < -_OPPOSITE_SIDES)
-            inside, outer, at_entry = self._bisect(at, (k - 1) / n, k / n, was, turned | hidden)
-            crossed |= hidden & inside
-            entry_place = np.where(enters[:, None], was[0], entry_place)
-            entry_normal = np.where(enters[:, None], was[2], entry_normal)
-            entry_place = np.where(turned[:, None], outer, entry_place)
-            entry_normal = np.where(turned[:, None], at_entry, entry_normal)
-            way = place - entry_place
-            through = (was[1] < 0) | (distance < 0)
-            through &= _dot(entry_normal, normal) < _OPPOSITE_SIDES
-            crossed |= through & (_dot(way, entry_normal) > 0) & (_dot(way, normal) < 0)
-        found[some] = crossed
-        return found
-
-    def _bisect(self, at: Any, low: float, high: float, was: Any, chosen: Mask) -> Any:
-        """Where paths come inside of the obstacle, of the chosen ones. Collective.
+    def _enter(self, points: Array, entered: Mask, turns: float) -> Index:
+        """Follow points of the obstacle through the facets of Γc. Collective.
 
         Args:
-            at: Place, distance and normal at a share of the paths.
-            low: Share from which on the normal turns.
-            high: Share up to which it does.
-            was: Place, distance and normal at the former.
-            chosen: The paths.
+            points: In the frame of the obstacle, (n, gdim) (length).
+            entered: Which points are inside of the body at first, and have been at last, (n,).
+            turns: Largest path due to rotation (size of its facet).
 
         Returns:
-            Whether a place inside was found, and place and normal at the last one before, of all.
+            The flat piece of Γc, of those of all ranks, through which each point has entered the
+            body; -1 for those outside of it at the end, or inside from the start, (n,).
         """
-        inside = np.zeros(len(chosen), dtype=np.bool_)
-        place, normal = was[0].copy(), was[2].copy()
-        rows = np.flatnonzero(chosen)
-        if not self._comm.allreduce(len(rows)):
-            return inside, place, normal
-        a: Array = np.full(len(rows), low)
-        b: Array = np.full(len(rows), high)
-        far = np.linalg.norm(at(high, rows)[0] - place[rows], axis=1)
+        n = int(np.ceil(np.clip(turns, 1, _MOST_TURNS)))
+        change = self._rotate(self.points, 1.0) - self._start
+        path = [self._rotate(self._start + t * change, -t) for t in np.arange(n) / n]
+        vertices, last = np.full((len(points), 1), -1), np.full(len(points), -1)
+        for before, after in zip(path, [*path[1:], self.points], strict=True):
+            facets = self._places.moving_facets(before, after)
+            met = find_crossings(self._comm, points, points, vertices, facets)
+            entered[met.place[met.inward]] = True
+            final = np.append(np.diff(met.place) > 0, True)[: len(met.place)]
+            last[met.place[final]] = np.where(met.inward, met.facet, -1)[final]
+        return last
+
+    def _pass_through(self, start: Array, end: Array) -> Mask:
+        """Whether places pass through the obstacle, by bisection of their paths. Collective.
+
+        Args:
+            start: In the frame of the obstacle at the start of the increment, (n, gdim) (length).
+            end: In that at its end, (n, gdim) (length).
+        """
+        found, end = np.zeros(len(start), dtype=np.bool_), self._rotate(end, 1.0)
+        if not self._comm.allreduce(len(start)):
+            return found
+        first = self._sampler.sample(start)[1]
+        resolution = np.linalg.norm(end - start, axis=1) * 2.0 ** (2 - _BISECTIONS)
+        low: Array = np.zeros(len(start))
+        high: Array = np.ones(len(start))
         for _ in range(_BISECTIONS):
-            middle = (a + b) / 2
-            share = np.zeros(len(chosen))
-            share[rows] = middle
-            here, distance, turned = at(share, rows)
-            # Into the half in which the obstacle is entered, or the normal turns.
-            before = (distance >= 0) & (_dot(normal[rows], turned) > _OPPOSITE_SIDES)
-            inside[rows] |= distance < 0
-            a, b = np.where(before, middle, a), np.where(before, b, middle)
-            place[rows] = np.where(before[:, None], here, place[rows])
-            normal[rows] = np.where(before[:, None], turned, normal[rows])
-            inside[rows] |= distance <= far * 2.0 ** (2 - _BISECTIONS)
-        return inside, place, normal
+            middle = (low + high) / 2
+            place = self._rotate(start + middle[:, None] * (end - start), -middle)
+            distance, normal = self._sampler.sample(place)
+            # Into the half in which the obstacle is entered, or its normal turns.
+            before = (distance >= 0) & (_dot(first, normal) > _OPPOSITE_SIDES)
+            low, high = np.where(before, middle, low), np.where(before, high, middle)
+            found |= distance <= resolution
+        return found
+
+    def _is_deeper(self, points: Array, facet: Index, allowed: Array) -> Mask:
+        """Whether points are deeper below Γc at the end than is allowed, (n,). Collective.
+
+        Args:
+            points: In the frame of the obstacle, (n, gdim) (length).
+            facet: Flat piece of Γc through which each point has entered the body, or -1, (n,).
+            allowed: Allowed depth at every facet of this rank, (n_facets,) (length).
+        """
+        comm, found = self._comm, np.zeros(len(points), dtype=np.bool_)
+        if not comm.allreduce(int((facet >= 0).any())):
+            return found
+        facets = self._places.moving_facets(self.points, self.points)
+        each = np.repeat(allowed, len(facets.start) // max(len(allowed), 1))
+        table = gather_rows(comm, np.column_stack([each, facets.start[:, 0], facets.normals()]))
+        (through, normal), allowed = np.split(table[:, 1:], 2, axis=1), table[:, 0]
+        depth = -_dot(points - through[facet], normal[facet])
+        rows = np.flatnonzero((facet >= 0) & (depth > allowed[facet]))
+        # Beside Γc a point is below none of its facets.
+        reach, start, vertices = 2 * depth[rows], points[rows], np.full((len(rows), 1), -1)
+        end = start + reach[:, None] * normal[facet[rows]]
+        met = find_crossings(comm, start, end, vertices, facets)
+        first = np.append(True, np.diff(met.place) > 0)[: len(met.place)] & ~met.inward
+        place = met.place[first]
+        found[rows[place]] = met.time[first] * reach[place] > allowed[met.facet[first]]
+        return found
 
 
 class OpposingBodyProbe:
@@ -614,14 +619,14 @@ class OpposingBodyProbe:
         through, normal = (gather_rows(self._comm, v[self._rows]) for v in (through, normal))
         return through, normal
 
-    def crossed(self, allowed: Array) -> Mask:
+    def crossed(self, allowed: Array) -> Array:
         """See `Probe`.
 
         A place has crossed if it came in through a facet and is deeper below it than is allowed at
         the end, or has left the body through its opposite side.
         """
         if self._before is None:
-            return np.zeros(len(allowed), dtype=np.bool_)
+            return self.x[:0]
         here, there, n = self._here, self._there, len(self._here.facet)
         # What both surfaces have in common of their motion crosses nothing.
         shift = global_mean(self._comm, here.place - here.at(self._before))
@@ -629,7 +634,7 @@ class OpposingBodyProbe:
             one.crossed(self._before, shift, other, allowed[part])
             for one, other, part in ((here, there, slice(n)), (there, here, slice(n, None)))
         ]
-        return np.concatenate(found)
+        return self.x[np.concatenate(found)]
 
 
 class _Side:

@@ -37,6 +37,13 @@ class MovingFacets:
     sign: Array
     vertices: Index
 
+    def normals(self) -> Array:
+        """Outward unit normals at the end of the increment, (m, d)."""
+        edges = self.end[:, 1 : self.end.shape[2]] - self.end[:, :1]
+        normal = self.sign[:, None] * across(np.swapaxes(edges, 1, 2))
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        return np.asarray(normal / np.maximum(length, np.finfo(float).tiny))
+
 
 @dataclass(frozen=True)
 class Crossings:
@@ -48,6 +55,7 @@ class Crossings:
         inward: Whether the place comes into the body through the facet, (n,).
         normal: Outward unit normal of the facet at that time, (n, d).
         depth: How deep the place is at the end below the plane of the facet, (n,) (length).
+        facet: Number of the facet among those of all ranks, (n,).
     """
 
     place: Index
@@ -55,6 +63,7 @@ class Crossings:
     inward: Mask
     normal: Array
     depth: Array
+    facet: Index
 
 
 def find_crossings(
@@ -76,19 +85,21 @@ def find_crossings(
     d = start.shape[1]
     starts, ends = (gather_rows(comm, rows) for rows in (start, end))
     mine = _crossings(starts, ends, np.concatenate(comm.allgather(vertices)), facets)
+    mine[:, -1] += comm.exscan(len(facets.start)) or 0
     found = gather_rows(comm, mine)
     number = found[:, 0].astype(np.int64) - first
     own = (number >= 0) & (number < len(start))
     found, number = found[own], number[own]
     order = np.lexsort((found[:, 1], number))
     found = found[order]
-    return Crossings(number[order], found[:, 1], found[:, 2] > 0, found[:, 4 : 4 + d], found[:, 3])
+    time, inward, depth, normal = found[:, 1], found[:, 2] > 0, found[:, 3], found[:, 4 : 4 + d]
+    return Crossings(number[order], time, inward, normal, depth, found[:, -1].astype(np.int64))
 
 
 def _crossings(start: Array, end: Array, vertices: Index, facets: MovingFacets) -> Array:
-    """Rows of place, time, inward, depth and normal, of facets of this rank."""
+    """Rows of place, time, inward, depth, normal and facet, of facets of this rank."""
     d = start.shape[1]
-    nothing: Array = np.zeros((0, 4 + d))
+    nothing: Array = np.zeros((0, 5 + d))
     if not (len(start) and len(facets.start)):
         return nothing
     # Balls around the ways: of the places, and of the facets, whose corners they hold.
@@ -119,7 +130,7 @@ def _crossings(start: Array, end: Array, vertices: Index, facets: MovingFacets) 
         met = moving.meets(rows, time)
         rows, time, inward = rows[met], time[met], inward[met]
         normal, depth = moving.normal(rows, time), -moving.distance(rows)
-        columns = place[rows], time, np.where(inward, 1.0, -1.0), depth, normal
+        columns = place[rows], time, np.where(inward, 1.0, -1.0), depth, normal, facet[rows]
         found.append(np.column_stack(columns))
     return np.concatenate(found)
 

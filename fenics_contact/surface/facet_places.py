@@ -6,6 +6,7 @@ import numpy as np
 from dolfinx import fem
 
 from fenics_contact.compat import geometry_element
+from fenics_contact.surface.crossings import MovingFacets
 from fenics_contact.surface.facets import FacetSet, tabulate
 from fenics_contact.surface.projection import polynomials
 from fenics_contact.surface.surface import SurfaceQuadrature
@@ -55,6 +56,7 @@ class FacetPlaces:
         self._basis = polynomials(d, self.facets.simplex, min(n_points, n_basis))
         table = tabulate(self._basis, 0, at)[0, :, :, 0]
         table = table.reshape(n_facets, n_points, self._basis.dim)
+        self._pieces = self.facets.flat_pieces(degree)
         self._coefficients = np.linalg.pinv(table) if n_facets else table.swapaxes(1, 2)
 
     def values(self, field: Array, facet: Index, reference: Array) -> Array:
@@ -71,3 +73,21 @@ class FacetPlaces:
         table = tabulate(self._basis, 0, reference)[0, :, :, 0]
         weights = np.einsum("nb,nbq->nq", table, self._coefficients[facet])
         return np.asarray(np.einsum("nq,nq...->n...", weights, field[self.rows[facet]]))
+
+    def moving_facets(self, start: Array, end: Array) -> MovingFacets:
+        """The facets of this rank, in flat pieces, whose points move from a start to an end.
+
+        Args:
+            start: Of this rank's points, (n_points, gdim) (length).
+            end: Of this rank's points, (n_points, gdim) (length).
+        """
+        n, (n_pieces, n_corners, _) = len(self.rows), self._pieces.shape[:3]
+        facet = np.repeat(np.arange(n), n_pieces * n_corners)
+        at = np.tile(np.concatenate(self._pieces), (n, 1))
+        first, last = (
+            self.values(points, facet, at).reshape(n * n_pieces, n_corners, -1)
+            for points in (start, end)
+        )
+        vertices = np.repeat(self.facets.vertices(), n_pieces, axis=0)
+        sign = np.repeat(self.facets.outward, n_pieces)
+        return MovingFacets(first, last, sign, vertices)

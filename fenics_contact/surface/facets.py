@@ -188,6 +188,24 @@ class FacetSet:
         facets = np.arange(len(self.cells)) if facets is None else facets
         return np.repeat(facets, len(places)), np.tile(places, (len(facets), 1))
 
+    def flat_pieces(self, degree: int) -> Array:
+        """Reference corners of the pieces, in order, that are taken as flat: (n, n_corners, d - 1).
+
+        Args:
+            degree: Of the polynomials on the facets; those of degree 1 are one piece.
+        """
+        corner = self._corners
+        if degree == 1:
+            return corner[None]
+        if self._d == 2:
+            return np.array([[[0.0], [0.5]], [[0.5], [1.0]]])
+        edge = (corner + np.roll(corner, -1, axis=0)) / 2
+        previous = np.roll(edge, 1, axis=0)
+        if self.simplex:
+            return np.concatenate([np.stack([corner, edge, previous], axis=1), edge[None]])
+        middle = np.broadcast_to(self._middle, edge.shape)
+        return np.stack([corner, edge, middle, previous], axis=1)
+
     def clipped(self, reference: Array) -> Array:
         """Reference coordinates of the places, (n, d - 1), moved onto the facet."""
         inside = np.clip(reference, 0.0, 1.0)
