@@ -71,6 +71,32 @@ def test_a_thin_plate_is_not_crossed_slowly():
     assert np.all(np.diff(forces) > 0)
 
 
+@pytest.mark.parametrize("law", [fc.Frictionless(8000.0), fc.Tresca(0.2, 1.0, 8000.0, 4000.0)])
+def test_a_plate_does_not_change_sides_within_the_resolution(law):
+    """A plate of 2 % of a facet, led towards it by 1.2 % in one increment.
+
+    Such a path opens no gap that matters, but the points of Γc come out below the middle of the
+    plate, which draws them down. In increments of 0.4 % it pushes them up, and more every time.
+    """
+    body = block(n=(1, 1))
+    up = body.constant(np.zeros(2))
+    body.hold(TOP, 0, 1)
+    obstacle = fc.SignedDistance(lambda x: abs(x[1] + 0.0105) - 0.01, displacement=up)
+    contact = body.contact(BOTTOM, obstacle, law, kinematics="finite")
+    problem = body.problem(contact)
+    problem.solve()
+    problem.commit()
+    up.value[1] = 0.012
+    fails(problem, "has crossed")
+    forces = []
+    for up.value[1] in (0.004, 0.008, 0.012):
+        problem.solve()
+        problem.commit()
+        forces.append(contact.resultants().force[1])
+    assert forces[0] > 0
+    assert np.all(np.diff(forces) > 0)
+
+
 @KINEMATICS
 def test_a_plate_is_not_crossed_after_a_cut(kinematics):
     """A trial state that was refused is no start of a path, though its displacement is zero."""

@@ -265,6 +265,7 @@ class RigidObstacleProbe:
         self._sampler: ObstacleSampler = opposite.sampler
         self._comm = contact.surface.mesh.comm
         self.points = values.x + values.jump
+        self._law_normal = values.normal.copy()
         self._gap, self._normal = self._sampler.sample(self.points)
         self._data = self._sampler.data()
         self._start = values.x + opposite.committed_jump
@@ -355,8 +356,10 @@ class RigidObstacleProbe:
         known = known and np.array_equal(data, then)  # type: ignore[arg-type]
         moved = self._at(contact.values.x + contact.values.jump) - self._z
         clear = _DEPTH_RESOLUTION * self._places.size[self._facet] + self._distance
-        # A point that the law resists has not entered unseen.
         known = known and bool(np.all(np.linalg.norm(moved, axis=1) <= clear))
+        # A point may have come to the opposite side of what is thinner.
+        turned = _dot(contact.values.normal, self._law_normal) < _OPPOSITE_SIDES
+        known = known and not turned.any()
         return self._comm.allreduce(int(not known)) == 0
 
     def depth(self, resisted: ResistedDepth) -> tuple[Array, Array]:
