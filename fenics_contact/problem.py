@@ -465,7 +465,7 @@ class ContactProblem:
         stiffness_changed = self.full.update_stiffness()
         if stiffness_changed and self.bulk.linear:
             self._modulus.measure()
-        cold = self._approach.lead(load, first=self.increment == 0)
+        cold = self._approach.lead(load, before, first=self.increment == 0)
         if solver.chooses():
             return None
         solver.update_system(stiffness_changed)

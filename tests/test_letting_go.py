@@ -245,6 +245,39 @@ def _between_two(n: int, m: int) -> tuple[fc.ContactProblem, fem.Constant, Bodie
     return blocks.problem(*contacts), down, blocks
 
 
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+@pytest.mark.parametrize("law", [fc.Coulomb(0.3), fc.Tresca(0.3, 1e-3)])
+def test_what_prescribed_values_carry_along_does_not_slip(law, kinematics):
+    """A block set down on a slab slips by the same, to 1e-6, at rest and carried along with it.
+
+    Both are led aside by prescribed values, the block by those of its left side, one node of which
+    is on the slab. That would slip by all of the path if the others were taken to stay behind.
+    """
+    forces = []
+    for carried in (0.0, 2.0):
+        axes = [
+            [np.linspace(0.0, 1.0, 5), np.linspace(0.0, 0.5, 3)],
+            [np.linspace(0.1, 0.9, 5), 0.5 + np.linspace(0.0, 0.5, 3)],
+        ]
+        sides = {
+            BOTTOM: near(1, 0.0),
+            7: between(1, 0.5, above=False),
+            8: between(1, 0.5, above=True),
+            TOP: near(1, 1.0),
+            LEFT: near(0, 0.1),
+        }
+        body = Bodies(boxes(axes, sides), 1000.0, 0.3)
+        body.hold(BOTTOM, 0, value=carried)
+        body.hold(BOTTOM, 1)
+        body.hold(LEFT, 0, value=carried)
+        load = body.constant([0.01, -0.1])
+        body.F -= ufl.inner(load, body.v) * body.ds(TOP)
+        contact = body.contact(7, 8, law, kinematics=kinematics)
+        body.problem(contact).solve()
+        forces.append(contact.resultants().force)
+    assert forces[1] == pytest.approx(forces[0], rel=1e-6, abs=1e-9)
+
+
 @pytest.mark.parametrize(("n", "m"), [(8, 4), (8, 5)])
 def test_no_block_is_thrown_out_from_between_two_others(n, m):
     """A step of the iteration threw the middle one out sideways, and all was in balance, at zero.

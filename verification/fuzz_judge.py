@@ -225,8 +225,7 @@ class Judge:
         """
         problem, old = self.problem, list(self._old)
         size = np.ptp(problem.body.places, axis=0).max()
-        before = self._u.copy()
-        before[load.fixed] = load.values
+        before = self._u
         borne = None if self._before is None else [c["size"] for c in self._before["contacts"]]
         for i, record_of in enumerate(record["contacts"]):
             told, model = record_of["set_down"], problem.contacts[i]

@@ -75,7 +75,7 @@ class Approach:
         self._full, self._motions = full, motions
         self.carried: Array | None = None
 
-    def lead(self, load: Array, *, first: bool) -> bool:
+    def lead(self, load: Array, before: Array, *, first: bool) -> bool:
         """Set bodies that nothing holds yet down, or move them to first touch. Collective.
 
         One that was released before is set down from where it was left, for that may be far along
@@ -83,6 +83,7 @@ class Approach:
 
         Args:
             load: External forces at this rank's unknowns (force).
+            before: The state before Dirichlet conditions took their present values.
             first: Whether it is the first increment.
 
         Returns:
@@ -117,7 +118,7 @@ class Approach:
         if len(which):
             # Those that bore no more than round-off were let go.
             released = (borne < _LEFT * load_size)[groups[which]]
-            self._set_down(load, which, released)
+            self._set_down(load, before, which, released)
         return first or bool(idle.any())
 
     def _carried(self, chosen: Mask) -> Array | None:
@@ -169,13 +170,15 @@ class Approach:
         for contact in self._full.contacts:
             contact.evaluate()
 
-    def _set_down(self, load: Array, which: Index, released: Mask) -> None:
+    def _set_down(self, load: Array, before: Array, which: Index, released: Mask) -> None:
         """Move bodies that touch nothing to where they rest, or to first touch. Collective.
 
-        Slip is counted from there, for until then nothing is touched.
+        Slip is counted from there, for until then nothing is touched. Prescribed displacements
+        change after that, at their nodes as in the rest of the body.
 
         Args:
             load: As in `lead`.
+            before: As in `lead`.
             which: Numbers of their free motions.
             released: Which of these are of bodies that were let go, (n_which,).
         """
@@ -198,8 +201,11 @@ class Approach:
         if not of_bodies.any():
             return
         which, released = which[of_bodies], released[of_bodies]
-        for contact, jumps in zip(full.contacts, self._felt(which)[1], strict=True):
+        landed, felt = full.state(), self._felt(which)[1]
+        self._go(np.where(full.constrained, before, landed))
+        for contact, jumps in zip(full.contacts, felt, strict=True):
             contact.set_down(_feeling(jumps), _feeling(jumps[released]))
+        self._go(landed)
 
     def _follow_stiffness(self) -> None:
         """Take that of a nonlinear bulk which has turned. Collective."""
