@@ -85,7 +85,7 @@ class FacetPlaces:
         facet = np.repeat(np.arange(n), n_pieces * n_corners)
         at = np.tile(np.concatenate(self._pieces), (n, 1))
         first, last = (
-            self.values(points, facet, at).reshape(n * n_pieces, n_corners, -1)
+            self.values(points, facet, at).reshape(n * n_pieces, n_corners, points.shape[1])
             for points in (start, end)
         )
         vertices = np.repeat(self.facets.vertices(), n_pieces, axis=0)
