@@ -666,9 +666,7 @@ class ContactProblem:
             rtol=equations.rtol,
             laws=laws,
             respond=self.solver.respond if kinematics else None,
-            before=(
-                self.full.displacement_at(self._committed) if laws and system is self.full else None
-            ),
+            before=self.full.displacement_at(self._committed) if laws else None,
         )
 
     @interrupts_held()

@@ -115,6 +115,26 @@ def test_a_plate_is_not_crossed_after_a_cut(kinematics):
 
 
 @KINEMATICS
+def test_a_ball_is_not_crossed_where_u_is_found_later(kinematics):
+    """Of the radius 0.2, led by 0.9 until it is all in the block, and then on.
+
+    Where u was left behind the first increment passed without a force, and the next one, of which
+    all is found, began inside.
+    """
+    body = block()
+    up = body.constant(np.zeros(2))
+    body.hold(TOP, 0, 1)
+    ball = fc.Ball((0.5, -0.65), 0.2, displacement=up)
+    contact = body.contact(BOTTOM, ball, fc.Frictionless(), kinematics=kinematics)
+    problem = body.problem(contact, condensation=True)
+    up.value[1] = 0.9
+    raised_everywhere(lambda: problem.solve(recover_interior=False), fc.NotConverged, "has crossed")
+    up.value[1] = 0.44
+    assert not problem.solve(recover_interior=False).complete
+    assert contact.resultants().normal_force == 0.0
+
+
+@KINEMATICS
 @pytest.mark.parametrize("at", [0.07, 0.3, 0.55])
 @pytest.mark.parametrize("steps", [1, 2, 4])
 def test_a_pin_does_not_pass_between_places(steps, at, kinematics):

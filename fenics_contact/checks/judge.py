@@ -53,7 +53,8 @@ class Judge:
         self._full, self._motions = full, motions
         self._cross_check = CrossCheck(full.contacts) if cross_check else None
         self._contacts, self._comm = full.contacts, full.unknowns.comm
-        self._tunnelling = TunnellingCheck(full.contacts)
+        self._obstacles = TunnellingCheck([c for c in full.contacts if c.rigid])
+        self._bodies = TunnellingCheck([c for c in full.contacts if not c.rigid])
         self._warned: dict[str, float] = {}
         self._inexact: set[str] = set()
         self._few: set[tuple[str, str]] = set()
@@ -89,7 +90,7 @@ class Judge:
                 whatever has become of the laws' data since.
             respond: To look at what small displacements leave out; None: it is not looked at.
             before: The displacement at the last commit, to look at the paths of the increment;
-                None: they are not looked at.
+                None: those of opposite bodies are not looked at.
 
         Returns:
             The verdict, and the forces at the unknowns, reactions included.
@@ -108,6 +109,10 @@ class Judge:
         parts = np.split(imbalance, [self._full.gdim], axis=1)
         unbalanced = np.max([np.linalg.norm(part, axis=1) for part in parts], axis=0)
         sums = zip(names, unbalanced, sizes[1], allowed, strict=False)
+        complete = system is self._full
+        # Of the opposite only what Γc meets is known before u is complete; of rigid obstacles all.
+        tunnelling = self._obstacles.evaluate(before) if laws else {}
+        tunnelling |= self._bodies.evaluate(before) if complete else {}
         verdict = Verdict(
             equations={name: ForceBalance(*map(float, row)) for name, *row in equations},
             sums={name: ForceBalance(*map(float, row)) for name, *row in sums},
@@ -115,13 +120,12 @@ class Judge:
             enforcement={c.name: c.enforcement_error() for c in augmented},
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
             obstacles={c.name: ObstacleCheck.of(c) for c in self._contacts if laws and c.rigid},
-            # Of the opposite only what Γc meets is known before u is complete.
-            tunnelling=self._tunnelling.evaluate(before) if system is self._full else {},
+            tunnelling=tunnelling,
             kinematics=self._linearisation(respond) if respond else {},
             small_displacement_tolerance=self.small_displacement_tolerance,
             deformation=self._deformation(),
             ejected_bodies=find_ejected_bodies(self._full, self._motions, contacts, began)
-            if laws and system is self._full
+            if laws and complete
             else {},
             inverted=self._full.bulk.is_inverted(),
             cross_check=self._cross_check.compare() if self._cross_check and laws else {},
