@@ -1,4 +1,4 @@
-"""Contact: binds displacement, surface, obstacle and law; the boundary form and its results."""
+"""Contact: a displacement, a surface, an obstacle and a law; boundary form, state and results."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ __all__ = ["Committed", "Contact", "Found"]
 
 @dataclass(frozen=True)
 class Found:
-    """A solved state of a contact, which a commit makes its history.
+    """A solved state of a contact, which `Contact.commit` makes the history.
 
     Attributes:
-        points: All fields at this rank's points.
-        history: Those of them that become history, as it has them.
-        counted: `PointFields.rows` that its slip is counted from; None: what was committed.
+        points: All fields at this rank's quadrature points.
+        history: The fields that become history, by name.
+        counted: `PointFields.rows` from which its slip is measured; None: the committed state.
     """
 
     points: PointValues
@@ -60,9 +60,9 @@ class Committed:
 
     Attributes:
         history: `PointFields.rows`.
-        opposite: What was committed of what lies opposite.
+        opposite: Committed state of the obstacle and of the pairs.
         commits: `Contact.commits`.
-        points: All fields at this rank's points; None: nothing was committed.
+        points: All fields at this rank's points; None before the first commit.
     """
 
     history: Array
@@ -72,35 +72,67 @@ class Committed:
 
 
 class Contact(PointResults):
-    """Frictional contact of Γc with an obstacle, as a boundary form and a committed history.
+    """Frictional contact of the surface Γc with an obstacle.
+
+    A Contact has the boundary form -∫ (r_n v_n + τ·v_t) of eq. (9), the history at the quadrature
+    points of Γc, and the results. The constructor is collective and compiles the expressions that
+    are evaluated at the points.
+
+    Args:
+        u: Displacement, a vector-valued Lagrange function of any degree on the surface's mesh. If
+            it is a part of a mixed function w, beside a pressure for instance, pass the part that
+            ``u, p = ufl.split(w)`` gives. Bubble functions, which vanish on Γc, may be added to it.
+        surface: The potential contact surface Γc.
+        obstacle: The rigid obstacle or the opposing `DeformableBody`.
+        law: The contact law.
+        gap: Initial gap s (length), independent of the obstacle's geometry: a number, constant or
+            UFL expression; by default s follows from the geometry. 0 is right for surfaces that
+            coincide initially, between whose facets there are gaps. The motion of the obstacle is
+            added, and belongs in its ``displacement``: a change of ``gap`` itself, such as a
+            growing interference, opens and closes the contact, but causes no slip, and friction
+            does no work on it.
+        weight: Factor of the surface measure, as in the bulk form: a thickness, or 2πr for
+            axisymmetric problems; 1 by default.
+        modulus: Young's modulus near Γc (stress), a number or a function with one value per cell,
+            for `RelativeStiffness`. By default `ContactProblem` measures it from the bulk form.
+        accuracy: "draft", "standard", "fine", or the relative error wanted in contact force and
+            pressure: the default of enforcement, tolerance and stiffness, of the solver's tolerance
+            and of the number of increments. `Accuracy` has the values.
+        enforcement: "penalty" (default): the body penetrates by p/k_n and creeps by τ/k_t before it
+            slips. "augmented": augmented Lagrangian method, eq. (8), in which k_n and k_t
+            determine only the rate of convergence.
+        tolerance: Tolerance of the augmented Lagrangian method, between 0 and 1, 1e-5 by default:
+            the largest `enforcement_error`, the traction left to the penalty relative to the
+            largest traction.
+        kinematics: "small" (default): gap and normals are those of the undeformed body, eq. (1),
+            and the error of that is estimated after every increment. "finite": displacements,
+            rotations and slip of any size, eq. (2) and (3), on a rigid obstacle whose geometry is
+            known everywhere or on a `DeformableBody`; the bulk form should admit them, too.
+            Tractions and stiffness are per undeformed area.
+        name: Name in messages and files.
 
     Attributes:
-        u: The displacement, a vector-valued Lagrange function; of a mixed function one of its own,
-            which has the values of the last evaluation.
-        displacement: What it is in the function that is solved for.
-        surface, obstacle, law: What was given.
-        quadrature: The points of Γc.
+        u: The displacement; for a part of a mixed function, a copy with the values of the last
+            evaluation.
+        displacement: The relation of u to the function that is solved for.
+        surface, obstacle, law: The arguments.
+        quadrature: The quadrature points of Γc.
         history: The committed state.
-        multipliers: λ_n and λ_t of augmented enforcement, None under penalty.
-        accuracy: What was chosen for the accuracy wanted, None if none was said.
-        tolerance: What `enforcement_error` must come below, with multipliers.
-        parameters: Every parameter of law and obstacle given by a number, as a ``fem.Constant``
-            by name ("friction", "k_n", "displacement" …): set ``.value`` to change it. Of a
-            `RelativeStiffness` stiffness that is the multiple of E/h.
-        entity_maps: For compiling `form` in a problem of one's own.
-        name: In messages and files.
-        free_motion: Components of the obstacle's displacement that follow from the force on it, as
-            scalar constants by number of the component: their values are results (length).
-        applied_force: The forces on it, likewise (force).
-        free_angle: Angle of an obstacle that is turned by a moment, a scalar constant whose value
-            is a result (radians); None: there is none.
-        applied_moment: The moment, likewise (force times length).
-        inputs: All that was given, as UFL.
-        gap_prescribed: Whether the gap was given apart from the geometry.
-        finite: Whether gap, normal and slip are those of displacements of any size.
-        opposite: What lies opposite the points, and what they feel of it.
-        acting: The law at the points.
+        multipliers: λ_n and λ_t of the augmented Lagrangian method; None with a penalty.
+        accuracy: The `Accuracy` chosen; None if the argument was not given.
+        tolerance: Largest `enforcement_error` accepted, with multipliers.
+        entity_maps: Entity maps with which to compile `form`.
+        name: Name in messages and files.
+        inputs: Data of law, obstacle and contact, as UFL.
+        gap_prescribed: Whether the initial gap was given by ``gap``.
+        finite: Whether the kinematics are finite.
+        opposite: The contact kinematics, those of the obstacle or the opposing body.
+        acting: The law evaluated at the points.
         commits: Number of commits.
+
+    Raises:
+        ValueError: ``u`` is no displacement of this mesh, or data of obstacle or law are invalid.
+        TypeError: A parameter is of a type that cannot be a coefficient.
     """
 
     def __init__(
@@ -119,49 +151,8 @@ class Contact(PointResults):
         kinematics: str = "small",
         name: str = "contact",
     ) -> None:
-        """Bind the parts. Collective; compiles what evaluates the points.
-
-        Args:
-            u: Displacement; vector-valued Lagrange of any degree on the surface's mesh. Where it is
-                a part of a mixed function w, beside a pressure, that of ``u, p = ufl.split(w)``;
-                parts that are bubbles may be added to it, which Γc does not feel.
-            surface: Γc.
-            obstacle: What it presses on.
-            law: The reactions.
-            gap: Initial gap s (length) prescribed independently of the obstacle's geometry (paper,
-                footnote 1): a number, constant or UFL. The obstacle's motion is added to it, and
-                belongs into ``displacement`` of the obstacle: a constant in the gap that is changed
-                opens and closes it, as an interference that grows does, and no more. Friction feels
-                nothing of what moves along Γc with it, and does no work on it. 0 is for bodies that
-                touch all over at first, whose facets alone leave gaps.
-            weight: Factor of the surface measure where the bulk form carries one: a thickness, or
-                2πr for axisymmetric problems.
-            modulus: Young's modulus near Γc (stress), a number or function with one value per
-                cell, for `RelativeStiffness`. By default it is measured from the bulk
-                form, by `ContactProblem`.
-            accuracy: "draft", "standard", "fine", or the relative error wanted in contact force and
-                pressure: sets enforcement, tolerance and stiffness where they are not given, the
-                solver's tolerance and the number of increments; see `Accuracy`.
-            enforcement: By default "penalty": k_n and k_t alone hold the body, which penetrates by
-                p/k_n and creeps by τ/k_t before it slips. "augmented": multipliers take the forces
-                over from these springs, round by round, until neither is left (`multipliers`); k_n
-                and k_t set how fast.
-            tolerance: Of augmented enforcement, by default 1e-5: how much of the largest traction
-                the springs may still bear, between 0 and 1, see `enforcement_error`. To the
-                functions of the multipliers the penetration is that share of the penalty's.
-            kinematics: "small": gap and normals are those of the undeformed body, and the verdict
-                looks at what that leaves out. "finite": displacements and rotations may be of any
-                size, on a rigid obstacle whose place is known everywhere or on a `DeformableBody`;
-                the bulk form should bear them, too. Tractions and stiffness are per undeformed
-                area.
-            name: In messages and files.
-
-        Raises:
-            ValueError: ``u`` is no displacement of this mesh, or data of obstacle or law are wrong.
-            TypeError: A parameter is of a type that cannot be a coefficient.
-        """
         check_instance("name", name, str)
-        order = "the order is Contact(u, surface, obstacle, law)"
+        order = "the arguments are Contact(u, surface, obstacle, law)"
         check_kind(u, name, order)
         for what, value, kind in (
             ("surface", surface, ContactSurface),
@@ -184,11 +175,11 @@ class Contact(PointResults):
         self.accuracy = None if accuracy is None else Accuracy.of(accuracy)
         self.finite = is_finite(name, kinematics, obstacle, law, gap)
         augments, self.tolerance = enforcement_of(name, enforcement, tolerance, law, self.accuracy)
-        # Linear elements hold a curved gap at their nodes alone (docs/enforcement.md). But between
-        # two meshes, and on quadrilaterals of any shape, nodes carry no uniform pressure over.
+        # Linear elements meet a curved gap at their nodes only (docs/enforcement.md). But between
+        # two meshes, and on quadrilaterals of any shape, nodes do not transfer a uniform pressure.
         nodal = augments and degree == 1 and not isinstance(obstacle, DeformableBody)
         nodal = nodal and surface.submesh.topology.cell_name() != "quadrilateral"
-        # Nor where the area of a vertex is not that of its share of a uniform pressure.
+        # Nor with a weight that varies, where vertex areas do not integrate a uniform pressure.
         nodal = nodal and not varies(weight)
         opposite = None
         if isinstance(obstacle, DeformableBody):
@@ -226,8 +217,8 @@ class Contact(PointResults):
         self.history = PointFields(self.quadrature, fields)
         self.commits = 0
 
-        # All of contact is a sparse map from u to the jump at the points, and the law there: as
-        # expressions for the form on Γc, and sampled at the points for all else.
+        # Contact is a sparse matrix from u to the jump at the points, and the law there: as
+        # expressions for the form on Γc, and evaluated at the points for everything else.
         parts = Parts(
             name=name,
             displacement=self.displacement,
@@ -243,7 +234,7 @@ class Contact(PointResults):
         self.acting = ActingLaw(law, self.opposite, self.quadrature)
         self._values: PointValues | None = None
         self._committed_values: PointValues | None = None
-        self._aloft: Array | None = None  # history rows as committed, where slip is counted anew
+        self._aloft: Array | None = None  # history rows as committed, if slip has a new reference
         if not self.rigid:
             self.pair()
         self.opposite.begins_anew()
@@ -252,57 +243,59 @@ class Contact(PointResults):
     # ---- forms -----------------------------------------------------------------------------------
 
     def form(self, v: ufl.Argument) -> ufl.Form:
-        """Virtual work of contact, to be **added** to a residual: -∫ (r_n v_n + τ·v_t) (46, 55).
+        """Return the virtual work of contact, -∫ (r_n v_n + τ·v_t), to be **added** to a residual.
+
+        Eq. (9). Compile the form with ``entity_maps=contact.entity_maps``. With a `SampledObstacle`
+        call `evaluate` before assembling whenever ``u`` or the obstacle has moved: the form
+        expands the distance about the positions sampled last.
 
         Args:
-            v: Test function of ``u``'s space, of a mixed function the part of the test function
-                that ``ufl.split`` gives. Compile with ``entity_maps=contact.entity_maps``.
-                With a `SampledObstacle` call `evaluate` before assembling, wherever ``u`` or the
-                obstacle has moved: the form has the expansion about where it was sampled last.
+            v: Test function of ``u``'s space; with a mixed function, the part of its test function
+                that ``ufl.split`` gives.
 
         Raises:
             ValueError: A stiffness is `RelativeStiffness` and the modulus is not known; or the
-                obstacle is another body, or moves by an amount that is unknown.
+                obstacle is another body, or has unknown motions.
         """
         self._check_form()
         return self.form_at(self.displacement.expression, v)
 
     def form_at(self, displacement: Any, v: ufl.Argument) -> ufl.Form:
-        """`form` at a displacement relative to what lies opposite (UFL)."""
+        """Return `form` at a displacement relative to the obstacle (UFL)."""
         traction = self.acting.in_form.traction(displacement)
         return -self.inputs.weight * ufl.dot(traction, v) * self.quadrature.ds
 
     def _check_form(self) -> None:
-        """Refuse what no form on Γc can hold."""
+        """Raise a ValueError if the contact has no boundary form."""
         if self.motions:
             raise ValueError(
-                f"{self.name}: the form on Γc cannot hold the unknown motion of the obstacle; use "
-                "ContactProblem, or prescribe the displacement"
+                f"{self.name}: the boundary form cannot contain the unknown motion of the obstacle;"
+                " use ContactProblem, or prescribe the displacement"
             )
         if not self.rigid:
             raise ValueError(
-                f"{self.name}: the form on Γc cannot reach the opposite body's unknowns; use "
-                "ContactProblem, or a ContactOperator"
+                f"{self.name}: the boundary form cannot couple Γc to the dofs of the opposing body;"
+                " use ContactProblem, or a ContactOperator"
             )
         if self.needs_modulus:
             raise ValueError(
                 f"{self.name}: k_n or k_t is a multiple of E/h, and E is not known; give "
-                "Contact(modulus=...), give k_n and k_t in stress/length, or use ContactProblem, "
-                "which measures E in the bulk form"
+                "Contact(modulus=...) or k_n and k_t in stress/length, or use ContactProblem, "
+                "which measures E from the bulk form"
             )
 
     def potential(self) -> ufl.Form:
-        """Energy whose derivative by ``u`` is `form` (eq. 19, 43).
+        """Return the energy whose derivative with respect to ``u`` is `form`.
 
         Raises:
-            ValueError: The law has none (Coulomb; a foundation with k_t and without tension; any
-                friction in a frame that turns), or as for `form`.
+            ValueError: The law has no potential (Coulomb; a foundation with k_t and without
+                tension; friction with finite kinematics), or the contact has no `form`.
         """
         self._check_form()
         if self.law.has_potential and not self.acting.has_potential:
             raise ValueError(
-                f"{self.name}: friction has no potential with finite kinematics, whose tangent "
-                "planes turn; use the form"
+                f"{self.name}: friction has no potential with finite kinematics, because the "
+                "tangent planes rotate; use Contact.form"
             )
         return (
             self.inputs.weight
@@ -311,45 +304,48 @@ class Contact(PointResults):
         )
 
     def tangent(self, v: ufl.Argument, du: ufl.Argument) -> ufl.Form:
-        """Consistent tangent, the derivative of `form`; unsymmetric where Coulomb slips."""
+        """Return the consistent tangent, the derivative of `form`.
+
+        It is unsymmetric where a point slips with Coulomb friction.
+        """
         return ufl.derivative(self.form(v), self.displacement.whole, du)
 
-    # ---- the same, point by point: see `ContactOperator` -----------------------------------------
+    # ---- pointwise evaluation, for `ContactOperator` ---------------------------------------------
 
     @property
     def area(self) -> Array:
-        """Area that each point stands for, the weight as it was sampled last, (n_points,)."""
+        """Quadrature weights times the contact's weight as evaluated last, (n_points,)."""
         return self.quadrature.weights * self.opposite.data.values["weight"]
 
     def energy(self) -> float:
-        """`potential` at the present ``u``, this rank's points only. Collective.
+        """Return the value of `potential` at the present ``u``, summed over this rank's points.
+
+        Collective.
 
         Raises:
-            ValueError: The law has none.
+            ValueError: The law has no potential.
         """
         potential = self.acting.potential()
         return float(self.area @ potential)
 
     def confine(self, points: Mask | None = None) -> None:
-        """Let the law act at some of the points alone. Collective.
-
-        At the others nothing acts, whatever they do: they are open.
+        """Restrict the law to some of the points; the others are open. Collective.
 
         Args:
-            points: Mask of them, (n_points,); None: all, as at first.
+            points: Mask of the points, (n_points,); None: all points.
         """
         self.acting.confine(points)
         self.forget()
 
     def springs(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> Array:
-        """Symmetric stiffness a K_n + b K_t of section 5 at the points as evaluated.
+        """Return the symmetric stiffness a K_n + b K_t of the quasi-Newton method at the points.
 
         Args:
-            normal: a, a number or one per owned point.
-            tangential: b, likewise.
+            normal: The factor a, a number or one per point of this rank.
+            tangential: The factor b, a number or one per point of this rank.
 
         Returns:
-            (n_points, gdim, gdim) (stress/length).
+            Array (n_points, gdim, gdim) (stress/length).
         """
         values = self.values
         n = self.quadrature.n_points
@@ -360,11 +356,15 @@ class Contact(PointResults):
             stiffness[:, None, None] * along + share[:, None, None] * values.tangential_stiffness
         )
 
-    # ---- what was given --------------------------------------------------------------------------
+    # ---- data ------------------------------------------------------------------------------------
 
     @property
     def parameters(self) -> dict[str, fem.Constant]:
-        """What was given by a number; see the class."""
+        """The parameters of law and obstacle that were given by numbers, as ``fem.Constant``.
+
+        They are sorted by name ("friction", "k_n", "displacement" …); set ``.value`` to change one.
+        The value of a `RelativeStiffness` is the multiple of E/h.
+        """
         return self.inputs.constants
 
     @property
@@ -374,53 +374,60 @@ class Contact(PointResults):
 
     @property
     def stiffness_factor(self) -> fem.Constant:
-        """Factor of k_n and k_t, 1 but for the while in which stiffness is led up to it."""
+        """Factor of k_n and k_t: 1, except during continuation in the stiffness."""
         return self.inputs.stiffness_factor
 
     @property
     def free_motion(self) -> dict[int, fem.Constant]:
-        """Unknown components of the obstacle's displacement; see the class."""
+        """Unknown components of the obstacle's displacement, by number of the component.
+
+        The values of these scalar constants are results (length).
+        """
         return self.inputs.free_motion
 
     @property
     def applied_force(self) -> dict[int, Any]:
-        """The forces on them; see the class."""
+        """Given forces on the obstacle (force), by number of the component."""
         return self.inputs.applied_force
 
     @property
     def free_angle(self) -> fem.Constant | None:
-        """Unknown angle of the obstacle; see the class."""
+        """Unknown rotation angle of the obstacle, a result (radians); None if it is not free."""
         return self.inputs.free_angle
 
     @property
     def applied_moment(self) -> fem.Constant | None:
-        """The moment that turns it; see the class."""
+        """Given moment on the obstacle (force times length); None if its angle is not free."""
         return self.inputs.applied_moment
 
     @property
     def motions(self) -> list[FreeMotion]:
-        """All unknowns of the obstacle, displacements before the angle."""
+        """All unknown motions of the obstacle: displacements, then the angle."""
         return self.inputs.motions
 
     @property
     def needs_modulus(self) -> bool:
-        """Whether a stiffness is `RelativeStiffness` and still waits for `set_modulus`."""
+        """Whether a stiffness is `RelativeStiffness` and `set_modulus` was not called yet."""
         return self.inputs.needs_modulus
 
     def set_modulus(self, modulus: Any) -> None:
-        """Set E for `RelativeStiffness`: a number or a function, one value a cell. Collective."""
+        """Set Young's modulus E of `RelativeStiffness`. Collective.
+
+        Args:
+            modulus: A number, or a function with one value per cell (stress).
+        """
         self.inputs.set_modulus(modulus)
 
     @property
     def regularised(self) -> bool:
-        """Whether the stiffness stands for none at all, and is not that of physical springs."""
+        """Whether the stiffness regularises rigid contact, and is not that of a physical layer."""
         return is_regularised(self.law)
 
     def check_input(self) -> None:
-        """Refuse parameters that are out of range or not finite at some point of Γc. Collective.
+        """Check that all parameters are finite and in range at every point of Γc. Collective.
 
         Raises:
-            ValueError: On all ranks.
+            ValueError: A parameter is not; raised on all ranks.
         """
         self.surface.check_places(self.name)
         self.inputs.update()
@@ -429,9 +436,9 @@ class Contact(PointResults):
         self.inputs.check(self.opposite.data.values)
 
     def given(self) -> dict[str, Array]:
-        """The data of law, obstacle and contact at this rank's points, by name. Collective.
+        """Return the data of law, obstacle and contact at this rank's points, by name. Collective.
 
-        What was evaluated before stays.
+        The results of the last evaluation are not changed.
         """
         self.inputs.update()
         self.opposite.update_data()
@@ -443,9 +450,9 @@ class Contact(PointResults):
         return {n: v for n, v in data.items() if n in names or n.startswith("parameter ")}
 
     def reads(self, constant: fem.Constant) -> bool:
-        """Whether law, obstacle, gap or weight were given with it.
+        """Return whether law, obstacle, gap or weight depend on a constant.
 
-        True where that cannot be seen: shapes in numbers, and laws from elsewhere, may hold it.
+        Returns True if that cannot be decided: for a `SampledObstacle` and for user-defined laws.
         """
         own = type(self.law).__module__.split(".")[0] == __name__.split(".")[0]
         seen = own and not isinstance(self.obstacle, SampledObstacle)
@@ -456,40 +463,40 @@ class Contact(PointResults):
 
     @property
     def rigid(self) -> bool:
-        """Whether the obstacle is rigid: its reactions are then external to the mesh."""
+        """Whether the obstacle is rigid, so that its reactions are external forces."""
         return self.opposite.is_rigid
 
     @property
     def pairs(self) -> Pairs:
-        """What lies opposite the points."""
+        """The pairs of points of Γc and opposite points."""
         return self.opposite.pairs
 
     @property
     def couples(self) -> bool:
-        """Whether contact ties unknowns together that the bulk does not."""
+        """Whether contact couples unknowns that the bulk does not couple."""
         return not self.rigid or bool(self.motions)
 
     @property
     def paired(self) -> Mask:
-        """Which of this rank's points have an opposite, (n_points,); all on a rigid obstacle.
+        """Mask of this rank's points that have an opposite point, (n_points,).
 
-        The others bear nothing and are open.
+        Points without one are open. On a rigid obstacle every point has one.
         """
         return self.pairs.paired
 
     @property
     def n_unpaired(self) -> int:
-        """Points without an opposite, on all ranks."""
+        """Number of points without an opposite point, on all ranks."""
         return self.pairs.n_unpaired
 
     def pair(self, u: fem.Function | None = None) -> None:
-        """Find the opposites of all points. Collective.
+        """Find the opposite points of all points. Collective.
+
+        Points without an opposite point are open, and `n_unpaired` counts them. If they are more
+        than half of all points, a warning states the reasons.
 
         Args:
-            u: Displacement of the bodies in which to find them; none: the undeformed bodies.
-
-        Points that find none are open, whatever they do, and counted in ``n_unpaired``. A warning
-        says why, if they are more than half of all.
+            u: Displacement of the bodies in which to search; None: the undeformed bodies.
         """
         self.opposite.update()
         none = np.zeros(self.quadrature.n_points)
@@ -497,66 +504,75 @@ class Contact(PointResults):
         self.forget()
 
     def own_displacement(self) -> Array:
-        """Of the body that has Γc, at the points, (n_points, gdim) (length). Collective."""
+        """Return the displacement of the body that has Γc, (n_points, gdim) (length). Collective.
+
+        It is evaluated at this rank's quadrature points.
+        """
         return self.pairs.own_displacement()
 
     def places(self) -> Array:
-        """Where tractions act, (n_points, gdim) (length): X, or X + u with finite kinematics.
+        """Return the points where tractions act: X, or X + u with finite kinematics. Collective.
 
-        Collective.
+        Returns:
+            Array (n_points, gdim) (length).
         """
         x = self.values.x
         return x + self.own_displacement() if self.finite else x
 
     def true_placement(self) -> tuple[Array, Array]:
-        """Gap and normal where the body has moved to: at X + u instead of X. Collective.
+        """Return the gap and the normal at the deformed position X + u. Collective.
 
-        See `Opposite.true_placement`: (n_points,) (length) and (n_points, gdim).
+        Returns:
+            Arrays (n_points,) (length) and (n_points, gdim).
         """
         return self.opposite.true_placement(self.values)
 
     @cached_property
     def traces(self) -> TraceProjection:
-        """The projection on functions on Γc that displacements can answer to. Collective."""
+        """The L² projection onto the multiplier space on Γc. Collective."""
         return TraceProjection(self.quadrature, self.displacement.degree)
 
     @cached_property
     def facet_places(self) -> FacetPlaces:
-        """Places between the points, on the facets of Γc. Collective."""
+        """Additional points on the facets of Γc, between the quadrature points. Collective."""
         return FacetPlaces(self.quadrature, self.u.function_space, self.points)
 
     # ---- state -----------------------------------------------------------------------------------
 
     def evaluate(self) -> None:
-        """Evaluate gap, reactions and slip at the present ``u``; the history stays. Collective."""
+        """Evaluate gap, tractions and slip at the present ``u``. Collective.
+
+        The history is not changed.
+        """
         self.opposite.update()
         self._values = self._evaluate()
 
     def _evaluate(self) -> PointValues:
-        """Everything at the points, as they were updated last. Collective."""
+        """Return all fields at the points, as they were updated last. Collective."""
         arrays = {**self.opposite.data.values, **self.acting.own.evaluate()}
         return PointValues.of(arrays | self.opposite.told(arrays))
 
     def evaluate_yield(self) -> tuple[Array, Array]:
-        """The law's yield functions at the present ``u``, and their gradients. Collective.
+        """Evaluate the law's yield functions and their gradients at the present ``u``. Collective.
 
         Returns:
-            g_j(τ, limit) (stress), (n_points, n_modes), and ∂g_j/∂τ, (n_points, n_modes, gdim).
+            g_j(τ, bound) (stress), (n_points, n_modes), and ∂g_j/∂τ, (n_points, n_modes, gdim).
         """
         self.opposite.update()
         return self.acting.own.evaluate_yield()
 
     def forget(self) -> None:
-        """Drop what was evaluated: the next look at a result evaluates the present ``u``."""
+        """Discard the last evaluation: the next access to a result evaluates the present ``u``."""
         self._values = None
 
     def restore(self, found: Found | None = None) -> None:
-        """Multipliers as at the last commit, and results; before one none are. Collective.
+        """Restore multipliers and results of the last commit. Collective.
 
-        At that state the law would call points that have slipped to it sticking ones.
+        The results are restored, not evaluated again: at the committed state the law would return
+        stick at points that slipped to it. Before the first commit there are no results.
 
         Args:
-            found: A state solved since, whose results these are to be.
+            found: A state solved since then, whose results are restored instead.
         """
         counted = self._aloft if found is None or found.counted is None else found.counted
         if counted is not None:
@@ -568,31 +584,32 @@ class Contact(PointResults):
         self._values = self._committed_values if found is None else found.points
 
     def enforcement_error(self) -> float:
-        """What the springs bear at the last evaluated state, relative: 0 if exact. Collective.
+        """Return the traction that is left to the penalty, relative to the largest. Collective.
 
-        The largest |Π p - λ_n| and |Π τ - λ_t| over the points, by the largest pressure or
-        traction of the same connected part of Γc, and of all parts the largest: what another round
-        would change. k_n times the penetration is that, and k_t times the elastic slip, as far as
-        displacements of Γc can undo them. Infinite where nothing is borne any more and multipliers
-        are left. Where multipliers grow from round to round, and springs bear what they did, it is
-        relative to the tractions of the first round.
+        It is the maximum of |Π p - λ_n| and |Π τ - λ_t| over the points, divided by the largest
+        pressure or traction of the same connected part of Γc, at the last evaluated state; Π is the
+        L² projection onto the multiplier space. It is the change of the multipliers in another
+        augmentation, and zero if the contact conditions hold exactly. It is infinite if tractions
+        vanish and multipliers do not. If multipliers grow from augmentation to augmentation and the
+        penalty part does not decrease, it is relative to the tractions of the first augmentation.
 
         Raises:
-            ValueError: There are no multipliers.
+            ValueError: The enforcement is not "augmented".
         """
         return self._augmented().error(self.values, self.history, self.moved())
 
     def augment(self) -> float:
-        """Let the multipliers bear what the springs did at the present ``u``. Collective.
+        """Set the multipliers to the projected tractions at the present ``u``. Collective.
 
-        One round: solve with `form`, then call this, until what it returns is small enough;
-        `commit` comes after the last. `ContactProblem` does it by itself.
+        This is one augmentation of the augmented Lagrangian method: solve with `form` and call
+        `augment` until the returned error is small enough, then call `commit`. `ContactProblem`
+        does so itself.
 
         Returns:
-            `enforcement_error` before.
+            The `enforcement_error` before the update.
 
         Raises:
-            ValueError: There are no multipliers.
+            ValueError: The enforcement is not "augmented".
         """
         multipliers = self._augmented()
         self.evaluate()
@@ -602,10 +619,10 @@ class Contact(PointResults):
         return error
 
     def moved(self) -> Array:
-        """Displacements that the jump is the difference of, whose round-off it has. Collective.
+        """Return |u| + |⟦u⟧| at this rank's points, the scale of the jump's round-off. Collective.
 
         Returns:
-            Sum of their sizes at this rank's points, (n_points,) (length).
+            Array (n_points,) (length).
         """
         parts = self.own_displacement(), self.values.jump
         return np.asarray(sum(np.linalg.norm(part, axis=1) for part in parts))
@@ -613,12 +630,13 @@ class Contact(PointResults):
     def _augmented(self) -> Multipliers:
         if self.multipliers is None:
             raise ValueError(
-                f'{self.name}: there are no multipliers; make it with enforcement="augmented"'
+                f"{self.name}: there are no multipliers with a penalty; create the contact with "
+                'enforcement="augmented"'
             )
         return self.multipliers
 
     def found(self) -> Found:
-        """The state as evaluated, for `commit`: nothing that changes later changes it."""
+        """Return a copy of the evaluated state, for `commit`."""
         points = self.values
         values = {n: points.arrays[n] for n in ("opening", "penetration", "normal_traction")}
         if self.law.has_friction:
@@ -634,27 +652,27 @@ class Contact(PointResults):
         return Found(points, self.opposite.committed_fields(values), counted)
 
     def set_down(self, moved: Mask, released: Mask) -> None:
-        """Let slip be counted from the state evaluated last, where points bore nothing before.
+        """Measure slip from the state evaluated last at points that were unloaded. Collective.
 
-        `restore` takes it back. Collective.
+        It is called after the initial positioning of bodies. `restore` undoes it.
 
         Args:
-            moved: Which points moved as bodies were set down, (n_points,).
-            released: Of these, the points of bodies that bore no force by then, (n_points,): the
-                tractions committed there are round-off.
+            moved: Mask of the points that the positioning moved, (n_points,).
+            released: Mask of the points of bodies that had no contact force before, (n_points,),
+                whose committed tractions are round-off.
         """
         bore = self.history.values("normal_traction") != 0.0
         self._count_from_here(released | (moved & ~bore))
 
     def count_slip_from_here(self) -> None:
-        """Let slip be counted from the state evaluated last, at which surfaces first touch.
+        """Measure slip from the state evaluated last, at which surfaces first touch. Collective.
 
-        `restore` takes it back. Collective.
+        `restore` undoes it.
         """
         self._count_from_here(np.ones(self.quadrature.n_points, dtype=np.bool_))
 
     def _count_from_here(self, points: Mask) -> None:
-        """Let slip at some points be counted from the state evaluated last. Collective."""
+        """Measure slip at some points from the state evaluated last. Collective."""
         if not self.law.has_friction:
             return
         if self._aloft is None:
@@ -666,16 +684,16 @@ class Contact(PointResults):
         self.forget()
 
     def begin(self) -> None:
-        """Let slip be counted from the present ``u``, if nothing has been committed. Collective.
+        """Measure slip from the present ``u`` if nothing has been committed yet. Collective.
 
-        The obstacle is where it was given, not displaced. `ContactProblem` calls it before its
-        first increment; the constructor has done so for the ``u`` of then.
+        The obstacle is taken in its initial position. The constructor does so with the ``u`` at
+        construction, and `ContactProblem` again before its first increment.
         """
         if not self.commits and self.opposite.begins_anew():
             self._count_anew()
 
     def _count_anew(self) -> None:
-        """Let the history have the displacements that ways are counted from. Collective."""
+        """Store the displacements from which slip is measured in the history. Collective."""
         if self.law.has_friction:
             start = {name: self.history.values(name) for name in self.history.names}
             self.history.commit(start | self.opposite.start())
@@ -685,7 +703,7 @@ class Contact(PointResults):
         """Make a state the history of the next increment. Collective.
 
         Args:
-            found: What `found` gave; by default the state at the present ``u``.
+            found: A state returned by `found`; by default the state at the present ``u``.
         """
         if found is None:
             self.evaluate()
@@ -703,25 +721,30 @@ class Contact(PointResults):
             self.multipliers.restore(self.history)
 
     def committed(self) -> Committed:
-        """The committed state, for `set_committed`."""
+        """Return the committed state, for `set_committed`."""
         rows, state = self.history.rows(), self.opposite.state()
         rows = rows if self._aloft is None else self._aloft.copy()
         return Committed(rows, state, self.commits, self._committed_values)
 
     def set_committed(self, state: Committed) -> None:
-        """Make a state the committed one again; `restore` drops what came after it. Collective."""
+        """Reset the committed state to an earlier one. Collective.
+
+        Call `restore` afterwards to discard what was evaluated since then.
+        """
         self.history.set_rows(state.history)
         self._aloft = None
         self.opposite.set_state(state.opposite)
         self.commits, self._committed_values = state.commits, state.points
 
     def take_up(self, history: Array, values: Mapping[str, Array], *, anew: bool) -> None:
-        """Make a state of another run the committed one, at the u that it has. Collective.
+        """Make a state of another run the committed one. Collective.
+
+        ``u`` and the loads must be those of that run.
 
         Args:
-            history: `PointFields.rows` of that run, with ``u`` and loads as they were in it.
-            values: The arrays of its `values`, for the results to be those of its solution.
-            anew: Whether pairs were found anew at its commits.
+            history: `PointFields.rows` of that run.
+            values: The arrays of its `values`, which become the results.
+            anew: Whether its pairs are updated at every commit.
         """
         self.history.set_rows(history)
         self._aloft = None
