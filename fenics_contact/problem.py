@@ -1,4 +1,4 @@
-"""ContactProblem: one increment of a body in contact, solved by PETSc SNES, then checked."""
+"""ContactProblem: solves one increment of a contact problem by PETSc SNES and verifies it."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ __all__ = ["ContactProblem"]
 
 logger = logging.getLogger("fenics_contact")
 
-# What became of an attempt on too few unknowns.
-_SPREADS = "contact spreads beyond the unknowns kept"
+# Outcome of an attempt that retained too few unknowns.
+_SPREADS = "contact spreads beyond the retained dofs"
 
 
 @dataclass(frozen=True)
@@ -82,25 +82,71 @@ class _Balance:
 
 
 class ContactProblem:
-    """A body, its Dirichlet conditions and its contacts: one increment at a time.
+    """The nonlinear problem of one or several bodies with contacts, solved increment by increment.
 
-    SNES sees a dimensionless problem: displacements by the size of the mesh, stiffness by the
-    largest entry of the bulk's diagonal. The options database reaches everything under
-    ``prefix``, for example ``-contact_snes_monitor`` or ``-contact_snes_type newtonls``; what the
-    caller's ``petsc_options`` and the command line do not set comes from ``method``.
+    PETSc's SNES solves the weak form (9) in dimensionless unknowns: displacements are divided by
+    the size of the mesh, stiffness by the largest diagonal entry of the bulk. Options are read
+    under ``prefix``, for example ``-contact_snes_monitor`` or ``-contact_snes_type newtonls``;
+    the command line takes precedence over ``petsc_options``, and these over the settings of
+    ``method``. The constructor is collective: it compiles the forms and checks the input.
+
+    Args:
+        F: Residual F(u; v) of the bulk with all loads, without contact.
+        u: Displacement, or a mixed function w of which it is a part, beside a pressure for
+            instance; its values are the initial state. The contacts of a mixed function have the
+            displacement of ``ufl.split(w)``.
+        bcs: Dirichlet conditions on ``u`` or its components, or on parts of w.
+        contacts: Contacts of ``u``.
+        method: "newton": Newton's method with the consistent tangent. "lbfgs": quasi-Newton with
+            H₀ = (K + αK_n + φK_t)⁻¹. "continuation": Newton's method with contact stiffness
+            increased step by step, and alternation where it stagnates. "primal_dual": primal-dual
+            active set method with the tractions as additional unknowns, for stiff frictional
+            contact of a linear bulk. "alternating": Signorini and Tresca problems in turn, each a
+            minimisation by Newton's method with a line search on the energy; not for mixed
+            functions, whose equations are those of a saddle point. By default "newton"; "lbfgs" for
+            a linear bulk on all unknowns that is solved by multigrid, or in three dimensions if
+            Dirichlet conditions constrain all bodies and pairs do not change. Where contact with
+            friction is 50 to 1e5 times as stiff as the bulk, "primal_dual" is tried first if
+            nothing was in contact before, and otherwise after a failure; "continuation" is tried
+            last.
+        alpha: Factor α of the normal contact stiffness in H₀, 0 to 1 (source paper: 1).
+        phi: Factor φ of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
+            source paper has 0; with 1 a third of the iterations suffices once points stick.
+        fallback: Whether other methods are tried after a failure. They are not tried if the limit
+            on iterations was set below its default.
+        condensation: Whether to eliminate the unknowns away from the contact of a linear bulk by
+            static condensation, eq. (11). Of a large Γc, the dofs near the active contact zone are
+            retained, and chosen again when it moves or grows. By default if it is possible and
+            saves time, unless an option names a linear solver.
+        linear_solver: "direct" (MUMPS) or "multigrid" (GAMG: one V-cycle as H₀ of L-BFGS, or the
+            preconditioner of CG and GMRES in Newton's method), for systems over all unknowns. By
+            default multigrid for three-dimensional problems that it solves faster, and where the
+            factors would not fit in half of the memory. Obstacles with unknown motions need
+            "direct". The log reports the choice.
+        petsc_options: PETSc options without the prefix.
+        prefix: Prefix of the PETSc options.
+        small_displacement_tolerance: Largest relative error of the contact force and pressure
+            (between two bodies: of the force) due to the assumption of small displacements. An
+            increment with a larger estimate fails; from 1 % on there is a warning. With
+            infinity no increment fails for this reason.
+        cross_check: Whether every solution's contact forces are compared with those that DOLFINx
+            assembles from the boundary form. It costs one compiled form per contact, and one
+            assembly per increment.
 
     Attributes:
-        u: What is solved for: the displacement, or a mixed function of which it is a part.
+        u: The function that is solved for: the displacement, or a mixed function.
         displacement: The displacement in it.
         contacts: The contacts.
         bulk: The bulk form.
-        motions: The rigid motions of its bodies, and which of them are free.
-        solver: What solves an increment: system, methods and SNES.
-        accuracy: That of the contact that wants most, None if not every contact says one.
+        motions: The rigid-body modes of the bodies, and which of them are free.
+        solver: The solver of an increment: system, methods and SNES.
+        accuracy: The strictest `Accuracy` of the contacts; None if any contact has none.
         increment: Number of committed increments.
-        small_displacement_tolerance: See the argument; it may be set between increments.
-        initial_penetration: Largest penetration of the undeformed body (length), 0 if none; an
-            interference by a prescribed gap is none.
+        initial_penetration: Largest penetration of the undeformed body (length), 0 if none. An
+            interference prescribed by ``gap`` does not count.
+
+    Raises:
+        ValueError: Invalid input; raised on all ranks.
     """
 
     def __init__(
@@ -121,55 +167,6 @@ class ContactProblem:
         small_displacement_tolerance: float = 0.2,
         cross_check: bool = False,
     ) -> None:
-        """Compile the forms, measure the scales and check the input. Collective.
-
-        Args:
-            F: Residual of the bulk in ``u`` and one test function, loads included, contact not.
-            u: Displacement, or a mixed function w of which it is a part, beside a pressure for
-                instance; its values are the starting state. The contacts then have the displacement
-                of ``ufl.split(w)``.
-            bcs: Dirichlet conditions on ``u`` or its components, or on parts of w.
-            contacts: Contacts of ``u``.
-            method: "lbfgs" (quasi-Newton, H₀ = (K + αK_n + φK_t)⁻¹), "newton" (consistent
-                tangent), "continuation" (the same, from soft contact to stiff; alternating where
-                it is stuck), "primal_dual" (tractions of the points are unknowns beside
-                displacements: friction on stiff contact of a linear bulk), or "alternating"
-                (minimum problems in turn, each by Newton's method with a line search on the
-                energy). By default "newton", but "lbfgs" for a linear bulk on all unknowns
-                that is solved by multigrid, or in space, if conditions hold all bodies and pairs
-                stay: a tangent costs dozens of its iterations there. Where friction
-                meets contact 50 to 1e5 times as stiff as the bulk "primal_dual", if it can be had,
-                comes first where nothing was in contact before, and else after a failure;
-                "continuation" comes last. With a mixed function the equations are those of a saddle
-                point: "alternating" is refused there.
-            alpha: Share of the normal contact stiffness in H₀, 0 to 1 (paper: 1).
-            phi: Share of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
-                paper has 0; 1 needs a third of the iterations once a point sticks.
-            fallback: Whether to go on by other methods where the method fails with no less than its
-                usual limit on iterations.
-            condensation: Whether to iterate on the unknowns that contact touches alone, all others
-                eliminated: for a linear bulk. Of a large Γc on those near the contact; where it
-                moves on or spreads they are chosen anew. By default where it can be done and is
-                worth it (`condensed.worthwhile`), unless an option names a linear solver.
-            linear_solver: How systems over all unknowns are solved: "direct" (MUMPS) or "multigrid"
-                (GAMG: a V-cycle as H₀ of L-BFGS, or inside CG and GMRES for Newton's method). By
-                default multigrid for three-dimensional problems that it solves sooner, and where
-                the factors would not fit in half of the memory; obstacles that move freely need
-                "direct". The log says what was chosen.
-            petsc_options: Options without prefix; they win over the method's, the command line
-                over both.
-            prefix: Prefix of the options.
-            small_displacement_tolerance: Largest relative error of the contact force and pressure
-                (between two bodies: of the force) due to the assumption of small displacements. An
-                increment with a larger estimate fails; from 1 % on there is a warning. With
-                infinity no increment fails for this reason.
-            cross_check: Whether every verdict also compares the forces on Γc with those that
-                DOLFINx assembles from the boundary form; one more form to compile for each contact,
-                and an assembly for each increment.
-
-        Raises:
-            ValueError: Input that has no sense; the text says what and what to do. On all ranks.
-        """
         tolerance = small_displacement_tolerance
         if not (is_number(tolerance) and tolerance > 0):
             raise ValueError(
@@ -277,14 +274,17 @@ class ContactProblem:
     def snes(self) -> PETSc.SNES:
         """The main PETSc solver.
 
-        Setting `expected_increments`, as `increments` does, may make it anew before the first
-        solution: monitors that were set on it are kept; anything else is better said by options.
+        Setting `expected_increments`, as `increments` does, may replace it before the first
+        solution: monitors are transferred; set everything else by options.
         """
         return self.solver.snes
 
     @property
     def small_displacement_tolerance(self) -> float:
-        """Accepted error of the small-displacement assumption; see the argument. Settable."""
+        """Largest relative error accepted of the small-displacement assumption; settable.
+
+        It limits the errors of contact force and pressure, between two bodies that of the force.
+        """
         return self._judge.small_displacement_tolerance
 
     @small_displacement_tolerance.setter
@@ -314,13 +314,16 @@ class ContactProblem:
 
     @property
     def increments_wanted(self) -> int:
-        """How many increments a load history takes for the accuracy; 1 if none is said."""
+        """Default number of increments of a load history, by `Accuracy`; 1 without one."""
         friction = any(c.law.has_friction for c in self.contacts)
         return self.accuracy.increments if self.accuracy and friction else 1
 
     @property
     def operators(self) -> list[ContactOperator]:
-        """The contacts over all unknowns, with the pairs as they are. Collective."""
+        """The `ContactOperator` of every contact over all unknowns, with the present pairs.
+
+        Collective.
+        """
         return self.full.operators
 
     @property
@@ -330,11 +333,14 @@ class ContactProblem:
 
     @property
     def committed_energy(self) -> EnergyState:
-        """Forces and energies at the last commit, from which those of an increment are counted."""
+        """Forces and energies at the last commit, the start of the increment's energy balance."""
         return self._then.energy
 
     def present_state(self) -> Array:
-        """This rank's unknowns as they are now, completed; a copy (length). Collective."""
+        """Return a copy of this rank's present unknowns (length). Collective.
+
+        The interior displacement is recovered first, if it is out of date.
+        """
         self.complete()
         return self.full.state()
 
@@ -342,18 +348,18 @@ class ContactProblem:
     def linearised(
         self, springs: Sequence[Array]
     ) -> Iterator[Callable[[Sequence[Array] | None], Array]]:
-        """Solve with the bulk's tangent and given springs on Γc, about the present state.
+        """Solve linear systems with the tangent of the bulk and given contact stiffness.
 
-        Collective.
+        The tangent is that of the present state. Collective.
 
         Args:
-            springs: For every contact the stiffness at its points, (n_points, gdim, gdim)
+            springs: Stiffness at the points of every contact, (n_points, gdim, gdim)
                 (stress/length).
 
         Yields:
-            A function of the tractions that are added on the body, one array (n_points, gdim) for
-            every contact, or of None for the residual that is left; it returns the change of this
-            rank's unknowns. Collective.
+            A collective function that returns the change of this rank's unknowns. Its argument is
+            either the tractions added on the body, one array (n_points, gdim) per contact, or None:
+            then the right-hand side is the present residual.
         """
         self.complete()
         with self.solver.linearised(springs, self._now.load) as solve:
@@ -363,27 +369,27 @@ class ContactProblem:
 
     @interrupts_held()
     def solve(self, *, ahead: float = 1.0, recover_interior: bool = True) -> Step:
-        """Solve the next increment with the loads and conditions as they are now. Collective.
+        """Solve the next increment with the present loads and conditions. Collective.
 
-        The history does not change: `commit` does that.
+        The history does not change until `commit`.
 
         Args:
-            ahead: Size of this increment in units of the last one, for the guess to start from.
-            recover_interior: Whether to find all of u. If not, and if the problem is condensed, u
-                may stay behind: then only what contact touches, all results of the contacts
-                included, is that of the increment, and the verdict is on the condensed equations.
-                `complete` brings up the rest, for a fifteenth to a thirtieth of a factorisation.
-                Where not all of Γc is kept u is found all the same, to see that the rest of Γc
-                stays open.
+            ahead: Size of this increment relative to the last one, for the predictor.
+            recover_interior: Whether to recover the interior displacement after static
+                condensation. If False, u away from the contact may remain that of an earlier
+                increment; the results of all contacts are those of this one, and the verification
+                is that of the condensed equations. `complete` recovers the interior, for 1/15 to
+                1/30 of the cost of a factorisation. If only a part of Γc is retained, the interior
+                is always recovered, to verify that the rest of Γc is open.
 
         Returns:
-            What was done, the verdict included.
+            The `Step`, with the verdict.
 
         Raises:
-            NotConverged: No solution was found, or what was found failed the verdict; u and
-                history are as before.
-            ValueError: Input that is not finite, out of range, or a load that no contact force
-                can balance.
+            NotConverged: No solution was found, or it failed the verification; u and history are
+                unchanged.
+            ValueError: The input is not finite or out of range, or no contact force can balance
+                the load.
         """
         start = time.perf_counter()
         self._check_committed()
@@ -434,8 +440,8 @@ class ContactProblem:
         self._told = True
         warn(
             self._comm,
-            f"increment {self.increment + 1} was solved and not committed, and is solved again "
-            "from the same start: call commit() after each that is to be history, or restore()",
+            f"increment {self.increment + 1} was solved but not committed, and is solved again "
+            "from the same state: call commit() to accept an increment, or restore() to discard it",
         )
 
     def _go_back(self, state: Array, balance: _Balance) -> None:
@@ -558,17 +564,17 @@ class ContactProblem:
         self._then.energy.forces.setdefault(self.solver.system.mark, nothing)
 
     def complete(self) -> Verdict | None:
-        """Bring all of u up to the increment solved last, if it is behind. Collective.
+        """Recover the interior displacement of the increment solved last. Collective.
 
-        See `solve` with ``recover_interior=False``, and `increments`. The field is checked apart
-        from how it was found: the product of the bulk's matrix with it must meet loads and contact
+        It is needed after `solve` or `increments` with ``recover_interior``. The field is verified
+        independently: the product of the bulk's matrix with it must balance loads and contact
         forces.
 
         Returns:
-            The verdict; None if nothing was behind.
+            The verdict; None if u was complete.
 
         Raises:
-            NotConverged: The equations do not hold on all of u.
+            NotConverged: The equations do not hold on all unknowns.
         """
         now = self._now
         if now.pending is None:
@@ -615,18 +621,19 @@ class ContactProblem:
         for contact, commits in zip(self.contacts, self._commits, strict=True):
             if contact.commits != commits:
                 raise ValueError(
-                    f"{contact.name}: its history was committed by another problem, or by a call "
-                    "of its own, since this problem's last commit, which is no more the state to "
-                    "go on from; make a new ContactProblem of these contacts, with u as it is"
+                    f"{contact.name}: its history was committed by another problem or by "
+                    "Contact.commit() since this problem's last commit, so that this problem "
+                    "cannot continue; create a new ContactProblem with these contacts and the "
+                    "present u"
                 )
             contact.check_input()
         load = self.present_load()
         size = global_max(self._comm, np.abs(load))
         if not np.isfinite(size):
             raise ValueError(
-                "the external load, which is F at u = 0, is not finite (NaN or inf) at some dof: "
-                "check the loads, and what is divided by in F (λ = E ν/((1 + ν)(1 - 2ν)) is "
-                "infinite at ν = 0.5)"
+                "the external load, F at u = 0, is not finite (NaN or inf) at some dof: check the "
+                "loads, and the denominators in F (λ = E ν/((1 + ν)(1 - 2ν)) is infinite at "
+                "ν = 0.5)"
             )
         check_values(self._bcs, self.u)
         if self.bulk.has_new_data():
@@ -671,10 +678,11 @@ class ContactProblem:
 
     @interrupts_held()
     def commit(self) -> None:
-        """Make the solved state the start of the next increment, history included. Collective.
+        """Make the solved state the start of the next increment, with its history. Collective.
 
-        It is what `solve` found, whatever has changed since: constants, or u. Where nothing was
-        solved since the last commit nothing happens. If it fails, the history is as before.
+        The committed state is the one that `solve` found, even if constants or u have been changed
+        since. Without a solution since the last commit there is no effect. If the commit fails,
+        the history is unchanged.
         """
         if self._solved is None:
             return
@@ -704,9 +712,9 @@ class ContactProblem:
         self.increment += 1
 
     def restore(self) -> None:
-        """Drop a solved increment that was not committed: u is that of the last commit again.
+        """Discard an increment that was not committed: u is reset to the last commit. Collective.
 
-        The history needs no restoring: it changes at `commit` alone. Collective.
+        The history changes at `commit` only.
         """
         self._solved = None
         self.full.set_state(self._committed)
@@ -717,12 +725,12 @@ class ContactProblem:
     # ---- going on in another run -----------------------------------------------------------------
 
     def committed_state(self) -> CommittedState:
-        """What another run needs of the last commit to go on from it. Collective.
+        """Return the committed state from which another run can continue. Collective.
 
-        u is completed, if it is behind.
+        The interior displacement is recovered first, if it is out of date.
 
         Raises:
-            ValueError: The state is not that of the last commit.
+            ValueError: The present state is not that of the last commit.
         """
         now = self.full.state()
         differs = self._now.pending is not self._then.pending or not np.array_equal(
@@ -730,8 +738,8 @@ class ContactProblem:
         )
         if self._comm.allreduce(int(differs)):
             raise ValueError(
-                "u is not that of the last commit: a solved increment was not committed, or its "
-                "values were changed; call commit() or restore() before the state is saved"
+                "u is not that of the last commit: an increment was not committed, or values of u "
+                "were changed; call commit() or restore() before saving the state"
             )
         self.complete()
         forces = self._then.energy.forces[self.full.mark]
@@ -752,10 +760,10 @@ class ContactProblem:
 
     @contextmanager
     def at_state(self, state: Array) -> Iterator[None]:
-        """Let unknowns be the present ones inside of the block. Collective.
+        """Set the unknowns to ``state`` within a ``with`` block. Collective.
 
-        Where the bulk is linear, stiffnesses that are multiples of E/h are those of its present
-        data there, as `solve` would have them.
+        With a linear bulk, stiffnesses that are multiples of E/h follow its present data within
+        the block, as in `solve`.
         """
         before, modulus = self.full.state(), self._modulus.present
         try:
@@ -768,7 +776,10 @@ class ContactProblem:
             self._modulus.put_back(modulus)
 
     def reads(self, constant: fem.Constant) -> bool:
-        """Whether F, a Dirichlet condition or a contact was given with it. Collective."""
+        """Return whether F, a Dirichlet condition or a contact depends on a constant.
+
+        Collective.
+        """
         if constant in self.bulk.form.constants() or any(c.reads(constant) for c in self.contacts):
             return True
         value, prescribed = constant.value.copy(), list[Array]()
@@ -781,11 +792,11 @@ class ContactProblem:
         return bool(self._comm.allreduce(int(not np.array_equal(prescribed[0], prescribed[1]))))
 
     def present_load(self) -> Array:
-        """External forces as they are now at this rank's unknowns (force). Collective."""
+        """Return the present external forces at this rank's unknowns (force). Collective."""
         return -self.full.with_obstacles(self.bulk.update_load())
 
     def prescribed_values(self) -> Array:
-        """Values of the Dirichlet conditions as they are now, u elsewhere, at the unknowns."""
+        """Return this rank's unknowns with the present values of the Dirichlet conditions."""
         values = self.u.x.array.copy()
         for bc in self._bcs:
             bc.set(values)
@@ -795,11 +806,13 @@ class ContactProblem:
     def set_committed(
         self, taken: CommittedState, points: Sequence[tuple[Array, Mapping[str, Array]]]
     ) -> None:
-        """Take up what `committed_state` gave in another run, under its loads. Collective.
+        """Continue from the state that `committed_state` returned in another run. Collective.
+
+        The loads must be those of that state.
 
         Args:
-            taken: What it gave.
-            points: Of every contact what `Contact.take_up` takes.
+            taken: The state.
+            points: For every contact, the history and values that `Contact.take_up` takes.
         """
         self.expected_increments = taken.expected
         self._fresh, self._solved = False, None
@@ -823,7 +836,7 @@ class ContactProblem:
         self.restart_solver()
 
     def restart_solver(self) -> None:
-        """Drop what the solver has kept from earlier increments. Collective."""
+        """Discard what the solver stores from earlier increments. Collective."""
         self.solver.restart()
         for mark in set(self._then.energy.forces) - {self.full.mark}:
             del self._then.energy.forces[mark]

@@ -271,7 +271,7 @@ def test_a_solution_that_is_not_committed():
     scene = pressed()
     problem = problem_of(scene)
     problem.solve()
-    with pytest.warns(UserWarning, match="increment 1 was solved and not committed"):
+    with pytest.warns(UserWarning, match="increment 1 was solved but not committed"):
         problem.solve()
     scene = pressed()
     smooth, _ = scene.problem(fc.Frictionless(k_n=1e4), scene.rollers())
