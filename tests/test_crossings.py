@@ -130,5 +130,5 @@ def test_no_contact_and_the_last_resort():
 def test_a_form_that_cannot_hold_the_contact_has_no_potential_either():
     """Between two bodies u itself stands in no potential on Γc."""
     made = Slider("quadrilateral", fc.Frictionless(K_N), start=0.4)
-    with pytest.raises(ValueError, match="opposite body"):
+    with pytest.raises(ValueError, match="opposing body"):
         made.contact.potential()

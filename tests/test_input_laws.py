@@ -99,7 +99,7 @@ def test_polygon_of_too_few_sides(value):
     """A polygon has a whole number of sides, three or more: refused by the law itself."""
     for law in (fc.Coulomb, lambda mu, **kwargs: fc.Tresca(mu, 1.0, **kwargs)):
         raised_everywhere(
-            lambda law=law: law(0.3, modes=value), ValueError, "modes", repr(value), "3 or more"
+            lambda law=law: law(0.3, modes=value), ValueError, "modes", repr(value), "at least 3"
         )
 
 

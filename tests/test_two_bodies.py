@@ -147,7 +147,7 @@ def test_reach() -> None:
 def test_form_alone_says_what_it_lacks() -> None:
     """The boundary form cannot reach the opposite body's unknowns, and says so."""
     problem, contact, _ = pressed("triangle", 1, 0.0, fc.Frictionless(k_n=1e6))
-    with pytest.raises(ValueError, match="opposite body"):
+    with pytest.raises(ValueError, match="opposing body"):
         contact.form(ufl.TestFunction(problem.u.function_space))
 
 

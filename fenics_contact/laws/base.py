@@ -1,14 +1,13 @@
-"""Contact laws: pure UFL return maps and potentials. No mesh, no state.
+"""Contact laws: return maps and potentials in UFL, without mesh and state.
 
-A law maps the kinematics of a point of Γc (`PointKinematics`) to the reactions there
-(`ContactTraction`). One definition serves two and three dimensions and every obstacle. Signs are
-the paper's: the traction on the body is r_n n + τ, with n from the body to the obstacle and r_n ≤
-0 (but for `Foundation`, which may pull).
+A law maps the kinematics at a point of Γc (`PointKinematics`) to the tractions there
+(`ContactTraction`), in two and three dimensions and for every obstacle. The traction on the body is
+r_n n + τ, with n from the body to the obstacle and r_n ≤ 0 (> 0 only with `Foundation`). Equation
+numbers (n) are those of docs/formulation.md, and [n] those of the source paper.
 
-A law of one's own is a subclass of `Law`, or of `FrictionLaw` with friction, and a dataclass of its
-parameters. It says `Law.contact_traction`; where r_n is not -k_n δ₋ of a parameter "k_n", also its
-`normal_potential`, against which the verdict checks r_n; and the parameters that must not vanish,
-`positive`.
+A user-defined law is a subclass of `Law`, or of `FrictionLaw` with friction, and a dataclass of its
+parameters. It defines `Law.contact_traction`; `Law.normal_potential`, if r_n is not -k_n δ₋ with a
+parameter "k_n"; and `Law.positive`, the parameters that must not vanish.
 """
 
 from __future__ import annotations
@@ -27,19 +26,18 @@ __all__ = ["ContactTraction", "Law", "PointKinematics", "signorini", "signorini_
 
 @dataclass(frozen=True)
 class PointKinematics:
-    """What a law sees at a point (UFL).
+    """The local kinematics at a point of Γc, the input of a contact law (UFL).
 
     Attributes:
         gap: Normal gap g_N = s - u_n (length): open where positive, penetrated where negative; the
             motion of the obstacle is included.
         normal: Unit normal n from body to obstacle, shape (gdim,).
-        tangential_displacement: u_t of eq. (21), relative to the obstacle, shape (gdim,); None if
-            the law gives no tangential traction.
+        tangential_displacement: u_t of eq. (1), relative to the obstacle, shape (gdim,); None if
+            the law has no tangential traction.
         tangential_increment: Δu_t since the last commit, shape (gdim,); None without friction.
         traction: Tangential traction τ at the last commit, or the multiplier λ_t that replaces it,
             shape (gdim,); None without friction.
-        multiplier: Pressure λ_n ≥ 0 that acts where the gap is closed and not penetrated; None
-            under penalty enforcement, where there is none.
+        multiplier: Multiplier λ_n ≥ 0 of the augmented Lagrangian, eq. (8); None with a penalty.
     """
 
     gap: Expr
@@ -52,16 +50,16 @@ class PointKinematics:
 
 @dataclass(frozen=True)
 class ContactTraction:
-    """The reactions at a point (UFL).
+    """The tractions at a point of Γc, the result of a contact law (UFL).
 
     Attributes:
         normal_traction: r_n (stress).
         opening: δ₊ ≥ 0 (length), eq. (6).
         penetration: δ₋ ≥ 0 (length), eq. (6).
-        traction: τ (stress), shape (gdim,); None if the law gives none.
+        traction: τ (stress), shape (gdim,); None if the law has no tangential traction.
         friction_bound: Size of the yield surface, μ p of Coulomb's law (stress); None without
             friction.
-        slip: Δβ ≥ 0 of each slip mode (length), eq. (44).
+        slip: Slip increment Δβ ≥ 0 of each slip mode (length), eq. (7).
     """
 
     normal_traction: Expr
@@ -73,42 +71,45 @@ class ContactTraction:
 
 
 class Law:
-    """A contact law. What a subclass does not say is as for unilateral contact without friction."""
+    """Base class of contact laws; its defaults are those of frictionless unilateral contact.
+
+    A subclass is a dataclass of the law's parameters and defines at least `contact_traction`.
+    """
 
     @property
     def has_tangential(self) -> bool:
-        """Whether there are tangential tractions."""
+        """Whether the law has tangential tractions."""
         return self.has_friction
 
     @property
     def has_friction(self) -> bool:
-        """Whether points slip, so that tangential state is needed."""
+        """Whether points can slip, so that the history has tangential state."""
         return False
 
     @property
     def has_potential(self) -> bool:
-        """Whether the reactions are the gradient of a potential (symmetric tangent)."""
+        """Whether the tractions derive from a potential, so that the tangent is symmetric."""
         return True
 
     @property
     def has_normal_stiffness(self) -> bool:
-        """Whether r_n answers the gap by k_n; False where the normal traction is prescribed."""
+        """Whether r_n depends on the gap; False if the normal traction is prescribed."""
         return True
 
     @property
     def has_own_normal(self) -> bool:
-        """Whether r_n follows from a `normal_potential` of the subclass, and not from k_n."""
+        """Whether r_n derives from a `normal_potential` of the subclass, not from k_n."""
         own = type(self).normal_potential is not Law.normal_potential
         return self.has_normal_stiffness and (own or "k_n" not in self.parameters())
 
     @property
     def has_tension(self) -> bool:
-        """Whether r_n pulls where the gap is open: such points are never open."""
+        """Whether r_n is tensile where the gap is open; then no point has the status open."""
         return False
 
     @property
     def is_physical(self) -> bool:
-        """Whether the stiffness is that of a layer that is there, and stands for no constraint."""
+        """Whether the stiffness is that of a physical layer, not a penalty for rigid contact."""
         return self.has_own_normal
 
     @property
@@ -117,49 +118,57 @@ class Law:
         return frozenset({"k_n", "k_t"})
 
     def parameters(self) -> dict[str, Any]:
-        """The law's parameters by name, as the user gave them."""
+        """Return the law's parameters by name, as the user gave them."""
         return dict(vars(self))
 
     def check_dimension(self, gdim: int) -> None:
-        """Refuse what makes no sense in ``gdim`` dimensions.
+        """Check that the law is defined in ``gdim`` dimensions.
 
         Raises:
-            ValueError: It says what was given, and what is expected.
+            ValueError: It is not.
         """
 
     def check_complete(self) -> None:
-        """Refuse a subclass that does not say what the solver and the verdict ask of it.
+        """Check that a subclass defines all that the solver and the verification need.
 
         Raises:
-            ValueError: It says what is missing.
+            ValueError: A method or parameter is missing.
         """
         name, parameters = type(self).__name__, self.parameters()
         if type(self).contact_traction is Law.contact_traction:
-            raise ValueError(f"{name} is no law: a subclass of Law must define contact_traction")
+            raise ValueError(f"{name} is no law: a subclass of Law must define contact_traction()")
         if self.has_own_normal and type(self).normal_potential is Law.normal_potential:
             raise ValueError(
-                f"{name} has no parameter k_n; it must say its own normal_potential(kinematics, "
-                "parameters), whose derivative by the gap is the normal traction: energies, solver "
-                "and verdict need it"
+                f"{name} has no parameter k_n; it must define normal_potential(kinematics, "
+                "parameters), whose derivative with respect to the gap is the normal traction: "
+                "energies, solver and verification need it"
             )
         if self.has_tangential and "k_t" not in parameters:
             raise ValueError(
-                f"{name} has tangential tractions, but no parameter k_t, the stiffness of points "
-                "that stick (stress/length); add one"
+                f"{name} has tangential tractions, but no parameter k_t, the stiffness of sticking "
+                "points (stress/length); add one"
             )
 
     def contact_traction(
         self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
     ) -> ContactTraction:
-        """The reactions; ``parameters`` are those of `parameters`, as UFL."""
+        """Return the tractions at a point.
+
+        Args:
+            kinematics: The local kinematics.
+            parameters: The values of `parameters`, as UFL.
+        """
         raise NotImplementedError
 
     def normal_potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
-        """Energy per area whose derivative by the gap is r_n; by default eq. (19)."""
+        """Return the energy per area whose derivative with respect to the gap is r_n.
+
+        By default it is ½ k_n ⟨u_n - s⟩₊² [19].
+        """
         return signorini_potential(kinematics, parameters["k_n"])
 
     def normal_stiffness(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
-        """-∂r_n/∂u_n where the gap is closed (stress/length)."""
+        """Return -∂r_n/∂u_n where the gap is closed (stress/length)."""
         if not self.has_own_normal:
             return parameters["k_n"]
         gap = ufl.variable(kinematics.gap)
@@ -167,64 +176,64 @@ class Law:
         return ufl.diff(ufl.diff(density, gap), gap)
 
     def potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
-        """Potential per area whose derivative by the displacement is minus the traction.
+        """Return the energy per area whose derivative by the displacement is minus the traction.
 
         Raises:
-            ValueError: There is none.
+            ValueError: The law has no potential.
         """
         if self.has_potential and not self.has_tangential:
             return self.normal_potential(kinematics, parameters)
         raise ValueError(
-            f"{type(self).__name__} has no potential: what friction takes depends on the way "
-            "there; the energies of an increment are in step.energy"
+            f"{type(self).__name__} has no potential: frictional dissipation depends on the path; "
+            "use step.energy, the energies of an increment"
         )
 
     def with_given_friction_bound(self) -> Law:
-        """This law with its friction bound given by a parameter "friction_bound" ≥ 0 (stress).
+        """Return this law with a friction bound given by a parameter "friction_bound" ≥ 0 (stress).
 
-        Tractions of such a law have a potential. A law that has one is returned as it is.
+        The tractions of the law returned have a potential. A law that has a potential is returned
+        unchanged.
         """
         return self
 
     def n_modes(self, gdim: int) -> int:
-        """Number of slip modes."""
+        """Return the number of slip modes in ``gdim`` dimensions."""
         return 0
 
     def friction_bound(
         self, kinematics: PointKinematics, pressure: Expr, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """Size of the yield surface under a contact pressure (stress), ≥ 0.
+        """Return the size of the yield surface under a contact pressure (stress), ≥ 0.
 
-        It is all that is known of the strength of friction: the `contact_traction` and the checks
-        call it. It may depend on the kinematics, as on the slip distance of the increment. What is
-        μ p, with μ from the parameters alone, bounds tangential forces by normal ones; no other
-        bound does.
+        `contact_traction` and the verification call it. It may depend on the kinematics, such as
+        the slip distance of the increment. Limit analysis applies only to a bound μ p with μ from
+        the parameters alone.
 
         Args:
-            kinematics: Of the point.
-            pressure: -r_n ≥ 0 (stress).
-            parameters: Of the law, as UFL.
+            kinematics: The local kinematics.
+            pressure: Contact pressure -r_n ≥ 0 (stress).
+            parameters: The values of `parameters`, as UFL.
         """
         return ufl.as_ufl(0.0)
 
     def circumradius(self, parameters: Mapping[str, Expr]) -> Expr | None:
-        """Largest |τ| on the yield surface of friction bound 1; None where it is not known.
+        """Return the largest |τ| on the yield surface of friction bound 1; None if it is unknown.
 
-        Where it is not known no load is refused because of friction.
+        If it is unknown, limit analysis does not apply, and no load is refused because of friction.
         """
         return None
 
     def tangential_stiffness(
         self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """K_t of a sticking point (stress/length), shape (gdim, gdim), with K_t n = 0."""
+        """Return K_t of a sticking point (stress/length), shape (gdim, gdim), with K_t n = 0."""
         n = kinematics.normal
         return parameters["k_t"] * (ufl.Identity(len(n)) - ufl.outer(n, n))
 
     def elastic_displacement(
         self, kinematics: PointKinematics, traction: Expr, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """K_t⁻¹ τ (length), shape (gdim,): minus the displacement v_e of eq. (24) without slip."""
+        """Return K_t⁻¹ τ (length), shape (gdim,): minus the elastic displacement v_e [24]."""
         return traction / parameters["k_t"]
 
     def yield_functions(
@@ -234,18 +243,20 @@ class Law:
         bound: Expr,
         parameters: Mapping[str, Expr],
     ) -> tuple[Expr, ...]:
-        """g_j(τ, bound) ≤ 0 of each slip mode (stress), eq. (29), apart from the return map.
+        """Return the yield functions g_j(τ, bound) ≤ 0 of the slip modes (stress) [29].
 
-        Slip is associated with them: K_t⁻¹ Δτ = -(Δu_t + Σ Δβ_j ∂g_j/∂τ), eq. (44).
+        Slip is associated: K_t⁻¹ Δτ = -(Δu_t + Σ Δβ_j ∂g_j/∂τ) [44]. The verification evaluates
+        them, independently of the return map.
         """
         return ()
 
     def stored(
         self, kinematics: PointKinematics, response: ContactTraction, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """Energy per area in the springs, r_n²/2k_n or `normal_potential`, and τ·K_t⁻¹τ/2.
+        """Return the elastic energy per area, r_n²/2k_n or `normal_potential`, plus τ·K_t⁻¹τ/2.
 
-        With multipliers the springs bear what these do not, in the end nothing.
+        With multipliers it is the energy of the penalty part of the tractions, which vanishes at
+        convergence.
         """
         stored = ufl.as_ufl(0.0)
         r_n, tau = response.normal_traction, response.traction
@@ -263,7 +274,7 @@ class Law:
     def dissipated(
         self, kinematics: PointKinematics, response: ContactTraction, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """Work per area of friction on the slip of the increment, -τ·(Δu_t + K_t⁻¹ Δτ) ≥ 0."""
+        """Return the frictional dissipation per area, -τ·(Δu_t + K_t⁻¹ Δτ) ≥ 0."""
         assert response.traction is not None
         assert kinematics.traction is not None and kinematics.tangential_increment is not None
         change = response.traction - kinematics.traction
@@ -272,9 +283,9 @@ class Law:
 
 
 def signorini(kinematics: PointKinematics, k_n: Expr) -> tuple[Expr, Expr, Expr]:
-    """Regularised normal law, eq. (6-11): r_n, δ₊, δ₋ in closed form, point by point.
+    """Return r_n, δ₊ and δ₋ of the regularised normal law, eq. (6).
 
-    With a multiplier r_n = -⟨λ_n + k_n (u_n - s)⟩₊: where λ_n = -r_n the law is exact.
+    With a multiplier r_n = -⟨λ_n + k_n (u_n - s)⟩₊, eq. (8).
     """
     closing = -kinematics.gap
     opening = positive_part(kinematics.gap)
@@ -285,7 +296,7 @@ def signorini(kinematics: PointKinematics, k_n: Expr) -> tuple[Expr, Expr, Expr]
 
 
 def signorini_potential(kinematics: PointKinematics, k_n: Expr) -> Expr:
-    """½ k_n ⟨u_n - s⟩₊², eq. (19); with a multiplier ⟨λ_n + k_n (u_n - s)⟩₊²/(2 k_n)."""
+    """Return ½ k_n ⟨u_n - s⟩₊² [19], or with a multiplier ⟨λ_n + k_n (u_n - s)⟩₊²/(2 k_n)."""
     closing = -kinematics.gap
     if kinematics.multiplier is None:
         return k_n / 2 * positive_part(closing) ** 2

@@ -1,4 +1,4 @@
-"""Friction: Coulomb's law and Tresca's, and what one's own has from them."""
+"""Friction laws of Coulomb and Tresca, and their common base class."""
 
 from __future__ import annotations
 
@@ -30,14 +30,13 @@ __all__ = ["Coulomb", "FrictionLaw", "Tresca", "perpendicular"]
 
 
 class FrictionLaw(Law):
-    """What laws with friction share: the yield surface in the tangent plane, and slip.
+    """Base class of friction laws: the yield surface in the tangent plane, and the return map (7).
 
-    Its size is the `friction_bound`, which a subclass may replace; its shape is this:
-
-    In the plane it is ±bound. In space it is the cone |τ| ≤ bound; with ``modes`` the regular
-    polygon around that circle; with ``transverse_friction`` the cone (or polygon) is stretched
-    across the direction by r = μ₂/μ₁. In σ = B⁻¹τ, B = diag(1, r), it is the unstretched one, and
-    with K_t = k_t B² the closest point in the metric of K_t is the closest point in σ.
+    The size of the yield surface is `friction_bound`, which a subclass may override. In the plane
+    it is |τ| ≤ bound. In space it is the circular cone |τ| ≤ bound; with ``modes``, the regular
+    polygon around that circle; with ``transverse_friction``, the cone or polygon stretched across
+    ``direction`` by r = μ₂/μ₁. In σ = B⁻¹τ with B = diag(1, r) it is not stretched, and with
+    K_t = k_t B² the closest point in the metric of K_t is the closest point in σ.
     """
 
     friction: Any
@@ -47,80 +46,91 @@ class FrictionLaw(Law):
     direction: Any = None
 
     def __post_init__(self) -> None:
-        """Refuse a polygon of fewer than three sides, and a direction that is missing or unused.
+        """Check the number of the polygon's sides, and that a direction is given where needed.
 
         Raises:
-            ValueError: It says what was given, and what is expected.
+            ValueError: There are fewer than three sides, or the direction is missing or unused.
         """
         if self.modes is not None and not (isinstance(self.modes, Integral) and self.modes >= 3):
             raise ValueError(
-                f"modes is {self.modes!r}; it must be a whole number, 3 or more: the sides of the "
-                "polygon; leave it out for the cone"
+                f"modes is {self.modes!r}; it must be an integer, at least 3, the number of sides "
+                "of the polygonal cone; omit it for the circular cone"
             )
         if self.transverse_friction is not None and self.direction is None:
             raise ValueError(
                 f"transverse_friction is {self.transverse_friction!r}, but direction is missing; "
-                "give the direction that friction acts along, direction=(x, y, z)"
+                "give the first principal direction of friction, direction=(x, y, z)"
             )
         if self.direction is not None and self.modes is None and self.transverse_friction is None:
             raise ValueError(
-                f"direction is {self.direction!r}, but the cone has none; give modes or "
-                "transverse_friction with it, or leave it out"
+                f"direction is {self.direction!r}, but the circular cone has none; give modes or "
+                "transverse_friction too, or omit it"
             )
 
     @property
     def has_friction(self) -> bool:
-        """See `Law.has_friction`."""
+        """Whether points can slip: always True."""
         return True
 
     @property
     def has_potential(self) -> bool:
-        """See `Law.has_potential`: none where the limit follows the pressure."""
+        """Whether the tractions derive from a potential: not if the bound depends on pressure."""
         return False
 
     @property
     def positive(self) -> frozenset[str]:
-        """See `Law.positive`: the axes of an ellipse must not vanish."""
+        """Names of the parameters that must be greater than zero.
+
+        With ``transverse_friction`` both friction coefficients belong to them.
+        """
         axes = (
             {"friction", "transverse_friction"} if self.transverse_friction is not None else set()
         )
         return super().positive | axes
 
     def parameters(self) -> dict[str, Any]:
-        """See `Law.parameters`: all but the number of sides, and what may be left out."""
+        """Return the parameters by name, without ``modes`` and without those that are not given."""
         optional = ("transverse_friction", "direction")
         given = {n: v for n, v in vars(self).items() if not (v is None and n in optional)}
         given.pop("modes", None)
         return given
 
     def with_given_friction_bound(self) -> Law:
-        """See `Law.with_given_friction_bound`."""
+        """Return this law with a friction bound given by a parameter "friction_bound" (stress)."""
         return self if self.has_potential else _GivenBound(self)
 
     def check_dimension(self, gdim: int) -> None:
-        """See `Law.check_dimension`."""
+        """Check that ``modes`` and ``transverse_friction`` are given in space only.
+
+        Raises:
+            ValueError: One of them is given in two dimensions.
+        """
         for name in ("modes", "transverse_friction"):
             value = getattr(self, name)
             if gdim == 2 and value is not None:
                 raise ValueError(
-                    f"{name} is {value!r} on a mesh in two dimensions; friction along a line has "
-                    "the two modes ± and no other: leave it out"
+                    f"{name} is {value!r} on a mesh in two dimensions, where friction has the two "
+                    "slip modes ±; omit it"
                 )
 
     def n_modes(self, gdim: int) -> int:
-        """Slip modes: ± in the plane (eq. 29), in space the one cone or the polygon's sides."""
+        """Return the number of slip modes: 2 in the plane [29], in space 1 or the polygon's sides.
+
+        In the plane they are the two directions of slip.
+        """
         return 2 if gdim == 2 else self.modes or 1
 
     def friction_bound(
         self, kinematics: PointKinematics, pressure: Expr, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """See `Law.friction_bound`: μ p."""
+        """Return the friction bound μ p (stress)."""
         return parameters["friction"] * pressure
 
     def circumradius(self, parameters: Mapping[str, Expr]) -> Expr | None:
-        """See `Law.circumradius`: of the polygon's vertices, and along the larger half-axis.
+        """Return the largest |τ| on the yield surface of friction bound 1.
 
-        A subclass with yield functions of its own has another surface.
+        It is that of the polygon's vertices, along the larger half-axis; None if a subclass has
+        its own yield functions.
         """
         if type(self).yield_functions is not FrictionLaw.yield_functions:
             return None
@@ -170,7 +180,7 @@ class FrictionLaw(Law):
     def tangential_stiffness(
         self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """See `Law.tangential_stiffness`: k_t B²."""
+        """Return K_t = k_t B² of a sticking point (stress/length), shape (gdim, gdim)."""
         if self.transverse_friction is None:
             return super().tangential_stiffness(kinematics, parameters)
         first, second = self._frame(kinematics.normal, parameters)
@@ -180,7 +190,7 @@ class FrictionLaw(Law):
     def elastic_displacement(
         self, kinematics: PointKinematics, traction: Expr, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """See `Law.elastic_displacement`: B⁻² τ/k_t."""
+        """Return the elastic displacement K_t⁻¹ τ = B⁻² τ/k_t (length), shape (gdim,)."""
         return self._stretched(traction, -2, kinematics.normal, parameters) / parameters["k_t"]
 
     def yield_functions(
@@ -190,7 +200,11 @@ class FrictionLaw(Law):
         bound: Expr,
         parameters: Mapping[str, Expr],
     ) -> tuple[Expr, ...]:
-        """See `Law.yield_functions`: eq. (29) in the plane, |σ| - bound or σ·a_j - bound."""
+        """Return the yield functions of the slip modes (stress).
+
+        They are ±τ - bound in the plane [29], |σ| - bound on the circular cone and σ·a_j - bound
+        on a polygonal one, with the outward normals a_j of its sides.
+        """
         n = kinematics.normal
         if len(n) == 2:
             along = ufl.dot(traction, perpendicular(n))
@@ -203,7 +217,7 @@ class FrictionLaw(Law):
     def _return(
         self, kinematics: PointKinematics, bound: Expr, parameters: Mapping[str, Expr]
     ) -> tuple[Expr, Expr, tuple[Expr, ...]]:
-        """Return map of the increment in σ, eq. (41-45): σ*, σ and Δβ of each mode."""
+        """Return σ*, σ and Δβ of each mode by the return map in σ, eq. (7)."""
         n, k_t = kinematics.normal, parameters["k_t"]
         trial = self._stretched(kinematics.traction, -1, n, parameters)
         trial = trial - k_t * self._stretched(kinematics.tangential_increment, 1, n, parameters)
@@ -218,23 +232,23 @@ class FrictionLaw(Law):
     def return_map(
         self, kinematics: PointKinematics, bound: Expr, parameters: Mapping[str, Expr]
     ) -> tuple[Expr, tuple[Expr, ...]]:
-        """τ at the end of the increment, shape (gdim,), and Δβ of each mode, eq. (41-45)."""
+        """Return τ at the end of the increment, shape (gdim,), and Δβ of each mode, eq. (7)."""
         _, sigma, slip = self._return(kinematics, bound, parameters)
         return self._stretched(sigma, 1, kinematics.normal, parameters), slip
 
     def sliding_potential(
         self, kinematics: PointKinematics, bound: Expr, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """Minus its derivative by Δu_t is τ for a given bound: ½|σ*|²/k_t, linear beyond it.
+        """Return the potential of τ for a given bound, with τ = -∂/∂Δu_t.
 
-        That is (|σ*|² - |σ* - σ|²)/(2 k_t), whose gradient by σ* is the closest point σ over k_t.
+        It is (|σ*|² - |σ* - σ|²)/(2 k_t), whose gradient by σ* is the closest point σ over k_t.
         """
         trial, sigma, _ = self._return(kinematics, bound, parameters)
         return ufl.dot(sigma, trial - sigma / 2) / parameters["k_t"]
 
 
 class _GivenBound(FrictionLaw):
-    """Another law with its friction bound given by the parameter "friction_bound"."""
+    """A friction law with a friction bound given by the parameter "friction_bound"."""
 
     def __init__(self, law: FrictionLaw) -> None:
         self._law, self.friction, self.k_t = law, law.friction, law.k_t
@@ -243,46 +257,50 @@ class _GivenBound(FrictionLaw):
 
     @property
     def has_potential(self) -> bool:
-        """See `Law.has_potential`."""
+        """Whether the tractions derive from a potential: always True."""
         return True
 
     def contact_traction(
         self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
     ) -> ContactTraction:
-        """See `Law.contact_traction`."""
+        """Return the tractions of the law, with τ by the given friction bound."""
         bound = parameters["friction_bound"]
         traction, slip = self._law.return_map(kinematics, bound, parameters)
         found = self._law.contact_traction(kinematics, parameters)
         return replace(found, traction=traction, friction_bound=bound, slip=slip)
 
     def potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
-        """See `Law.potential`."""
+        """Return the energy per area of the normal tractions and of given friction."""
         normal = self._law.normal_potential(kinematics, parameters)
         bound = parameters["friction_bound"]
         return normal + self._law.sliding_potential(kinematics, bound, parameters)
 
 
 def perpendicular(normal: Expr) -> Expr:
-    """A unit normal turned by a right angle, in two dimensions."""
+    """Return a unit normal rotated by a right angle, in two dimensions."""
     return ufl.as_vector([-normal[1], normal[0]])
 
 
 @dataclass(frozen=True)
 class Coulomb(FrictionLaw):
-    """Unilateral contact with Coulomb friction, eq. (21-50).
+    """Unilateral contact with Coulomb friction |τ| ≤ μ p, eq. (5) to (7).
 
-    Args to the constructor:
+    Args:
         friction: Friction coefficient μ ≥ 0: a number, constant or UFL expression over Γc.
-        k_n: Normal stiffness (stress/length); see `Frictionless`.
-        k_t: Tangential stiffness (stress/length), likewise.
-        modes: Sides of a polygonal cone around the circular one, 3 or more, in space only; by
-            default the circular one.
+        k_n: Normal stiffness (stress/length): a number, constant or UFL expression,
+            `RelativeStiffness` or `NodalSprings`.
+        k_t: Tangential stiffness (stress/length), given like k_n.
+        modes: Number of sides of a polygonal friction cone around the circular one, at least 3, in
+            space only; by default the cone is circular.
         transverse_friction: Friction coefficient μ₂ > 0 across ``direction``, in space only;
-            ``friction`` is then the one along it, and > 0 too: (τ₁/μ₁)² + (τ₂/μ₂)² ≤ p², with
-            associated slip. The tangential stiffness is k_t along and k_t (μ₂/μ₁)² across: a
-            metric of the regularisation, for which the return map has a closed form.
-        direction: Of anisotropic friction, or that which the polygon's first side is across: three
-            numbers or UFL, projected on the tangent plane.
+            ``friction`` is then μ₁ > 0 along it: (τ₁/μ₁)² + (τ₂/μ₂)² ≤ p², with associated slip.
+            The tangential stiffness is k_t along and k_t (μ₂/μ₁)² across, for which the return map
+            has a closed form.
+        direction: First principal direction of anisotropic friction, or the normal of the
+            polygon's first side: three numbers or UFL, projected onto the tangent plane.
+
+    Raises:
+        ValueError: ``modes`` is below 3, or ``direction`` is missing or unused.
     """
 
     friction: Any
@@ -295,7 +313,7 @@ class Coulomb(FrictionLaw):
     def contact_traction(
         self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
     ) -> ContactTraction:
-        """See `Law.contact_traction`. Where the gap is open τ = 0, and moving is not slipping."""
+        """Return the tractions by eq. (6) and (7); where the gap is open, τ = 0 and Δβ = 0."""
         r_n, opening, penetration = signorini(kinematics, parameters["k_n"])
         closed = ufl.lt(r_n, 0)
         bound = ufl.conditional(closed, self.friction_bound(kinematics, -r_n, parameters), 0)
@@ -306,18 +324,24 @@ class Coulomb(FrictionLaw):
 
 @dataclass(frozen=True)
 class Tresca(FrictionLaw):
-    """Friction whose limit μ p does not depend on the contact pressure (Duvaut-Lions, section 3).
+    """Tresca friction |τ| ≤ μ p with a given pressure p (Duvaut and Lions) [43].
 
-    Args to the constructor:
+    Args:
         friction: Friction coefficient μ ≥ 0.
-        pressure: The normal force per area p ≥ 0 (stress) that sets the limit.
-        k_n: Normal stiffness (stress/length); see `Frictionless`.
-        k_t: Tangential stiffness (stress/length).
-        unilateral: True: the normal reaction is that of unilateral contact, and only the limit
-            of friction is prescribed: it acts on all of Γc, whether a point touches or not (the
-            classical problem of given friction). False: the normal traction on the body *is* -p,
-            gap or not (eq. 43); k_n is not used.
-        modes, transverse_friction, direction: See `Coulomb`.
+        pressure: Given pressure p ≥ 0 (stress) of the friction bound μ p.
+        k_n: Normal stiffness (stress/length): a number, constant or UFL expression,
+            `RelativeStiffness` or `NodalSprings`.
+        k_t: Tangential stiffness (stress/length), given like k_n.
+        unilateral: Whether the normal traction is that of unilateral contact. The friction bound
+            then acts on all of Γc, also where the gap is open (the classical problem of given
+            friction). If False, the normal traction on the body is -p everywhere, and k_n is not
+            used.
+        modes: Number of sides of a polygonal friction cone, as for `Coulomb`.
+        transverse_friction: Friction coefficient across ``direction``, as for `Coulomb`.
+        direction: First principal direction of friction, as for `Coulomb`.
+
+    Raises:
+        ValueError: ``modes`` is below 3, or ``direction`` is missing or unused.
     """
 
     friction: Any
@@ -331,29 +355,29 @@ class Tresca(FrictionLaw):
 
     @property
     def has_normal_stiffness(self) -> bool:
-        """See `Law.has_normal_stiffness`."""
+        """Whether r_n depends on the gap: as ``unilateral`` says."""
         return self.unilateral
 
     @property
     def has_potential(self) -> bool:
-        """See `Law.has_potential`."""
+        """Whether the tractions derive from a potential: always True."""
         return True
 
     def parameters(self) -> dict[str, Any]:
-        """See `Law.parameters`."""
+        """Return the parameters by name; k_n is one of them only if ``unilateral``."""
         without = {"unilateral"} if self.unilateral else {"unilateral", "k_n"}
         return {n: v for n, v in super().parameters().items() if n not in without}
 
     def friction_bound(
         self, kinematics: PointKinematics, pressure: Expr, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """See `Law.friction_bound`: μ times the prescribed pressure, whatever the other is."""
+        """Return the friction bound, μ times the given pressure (stress)."""
         return parameters["friction"] * parameters["pressure"]
 
     def contact_traction(
         self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
     ) -> ContactTraction:
-        """See `Law.contact_traction`."""
+        """Return the tractions: r_n by eq. (6) or -p, and τ by eq. (7) with the bound μ p."""
         bound = self.friction_bound(kinematics, parameters["pressure"], parameters)
         traction, slip = self.return_map(kinematics, bound, parameters)
         k_n = parameters["k_n"] if self.unilateral else ufl.as_ufl(0)
@@ -363,7 +387,7 @@ class Tresca(FrictionLaw):
         return ContactTraction(r_n, opening, penetration, traction, bound, slip)
 
     def potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
-        """Eq. (19) and (43)."""
+        """Return the energy per area of unilateral contact [19] and of given friction [43]."""
         bound = self.friction_bound(kinematics, parameters["pressure"], parameters)
         tangential = self.sliding_potential(kinematics, bound, parameters)
         if not self.unilateral:

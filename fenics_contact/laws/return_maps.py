@@ -1,4 +1,4 @@
-"""Closest admissible tractions: return maps of section 3 (UFL)."""
+"""Return maps: closest-point projections onto the friction cone, eq. (7), in UFL."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ _TIE = 1e-12
 
 
 def positive_part(value: Expr) -> Expr:
-    """⟨value⟩₊, with the derivative 0 at the kink."""
+    """Return ⟨value⟩₊, with derivative 0 at the kink."""
     return ufl.conditional(ufl.gt(value, 0), value, 0)
 
 
 def norm(vector: Expr) -> Expr:
-    """|vector|, with the derivative 0 at zero."""
+    """Return |vector|, with derivative 0 at zero."""
     squared = ufl.dot(vector, vector)
     return ufl.conditional(ufl.gt(squared, 0), ufl.sqrt(squared), 0)
 
 
 def clip(value: Expr, limit: Expr) -> Expr:
-    """The number between -limit and limit that is nearest to ``value``."""
+    """Return the number in [-limit, limit] that is closest to ``value``."""
     below = ufl.conditional(ufl.lt(value, -limit), -limit, value)
     return ufl.conditional(ufl.gt(value, limit), limit, below)
 
 
 def return_to_segment(trial: Expr, limit: Expr, tangent: Expr) -> tuple[Expr, tuple[Expr, ...]]:
-    """In the plane: the two modes g = (τ - limit, -τ - limit), eq. (29).
+    """Return map in the plane, with the two modes g = (τ - limit, -τ - limit) [29].
 
-    Needs no norm and is piecewise linear.
+    It needs no norm and is piecewise linear.
 
     Args:
-        trial: τ*, what adherence alone would give, shape (2,).
+        trial: Trial traction τ* of a sticking point, shape (2,).
         limit: μ p ≥ 0.
         tangent: Unit vector, shape (2,).
 
@@ -61,21 +61,21 @@ def return_to_segment(trial: Expr, limit: Expr, tangent: Expr) -> tuple[Expr, tu
 
 
 def _where_borne(limit: Expr, value: Expr) -> Expr:
-    """A value, or none where the limit is zero: there nothing sticks, not even what is at rest.
+    """Return the value, or zero where the limit is zero: a point without friction never sticks.
 
-    An open point has the trial zero and the limit zero; taken for sticking it would put k_t into
-    the tangent, or not, by round-off.
+    Trial and limit of an open point are both zero; if it counted as sticking, k_t would enter the
+    tangent or not by round-off.
     """
     return ufl.conditional(ufl.gt(limit, 0), value, 0 * value)
 
 
 def _beyond(value: Expr, limit: Expr) -> Expr:
-    """By how much a value exceeds the limit, where it slips."""
+    """Return value - limit where the point slips, else 0."""
     return ufl.conditional(ufl.gt(value, (1 + _TIE) * limit), value - limit, 0)
 
 
 def return_to_cone(trial: Expr, limit: Expr) -> tuple[Expr, tuple[Expr, ...]]:
-    """In space: the one mode g = |τ| - limit; see `return_to_segment`."""
+    """Return τ and k_t Δβ in space, with the one mode g = |τ| - limit of the circular cone."""
     # The norm is only used, and only differentiated, where it exceeds the limit: never at zero.
     size = ufl.sqrt(ufl.dot(trial, trial))
     slips = ufl.gt(size, (1 + _TIE) * limit)
@@ -86,11 +86,11 @@ def return_to_cone(trial: Expr, limit: Expr) -> tuple[Expr, tuple[Expr, ...]]:
 def return_to_polygon(
     trial: Expr, limit: Expr, sides: list[tuple[Expr, Expr]]
 ) -> tuple[Expr, tuple[Expr, ...]]:
-    """In space: g_j = τ·a_j - limit, the sides of a regular polygon (paper's fig. 3).
+    """Return map in space, with the modes g_j = τ·a_j - limit of a regular polygon.
 
     With x = τ*·a_j, y = τ*·b_j and half a side H = limit tan(π/n), mode j is exceeded by
     ⟨x - limit - cot(2π/n) ⟨|y| - H⟩₊⟩₊: beyond the end of the side it shares the excess with its
-    neighbour, which is the same formula for the other one. No sector has to be told.
+    neighbour, which is the same formula for the other one. No search for the sector is needed.
 
     Args:
         trial: τ*, shape (3,).
@@ -98,7 +98,7 @@ def return_to_polygon(
         sides: Outward unit normal a_j of every side, and the unit vector b_j along it.
 
     Returns:
-        See `return_to_segment`.
+        τ, shape (3,), and k_t Δβ of each mode (stress).
     """
     half, share = math.tan(math.pi / len(sides)), 1 / math.tan(2 * math.pi / len(sides))
     traction, excess = trial, []

@@ -1,4 +1,4 @@
-"""Stiffness in other measures than stress/length."""
+"""Contact stiffness relative to the elements, or per node."""
 
 from __future__ import annotations
 
@@ -10,20 +10,23 @@ __all__ = ["NodalSprings", "RelativeStiffness"]
 
 @dataclass(frozen=True)
 class RelativeStiffness:
-    """A stiffness per area as a multiple of E/h, Young's modulus over the height of the cell there.
+    """A contact stiffness factor·E/h (stress/length), relative to the elements at Γc.
 
-    E comes from the bulk form itself, h is the cell's height over its facet on Γc, so that the
-    penetration is about 1/factor of the elastic displacement over the first layer of cells. Between
-    two bodies E is that of the softer one, whichever has Γc.
+    `ContactProblem` measures Young's modulus E from the bulk form; h is the height of the cell over
+    its facet on Γc. The penetration is then about 1/factor of the elastic displacement over the
+    first layer of cells. Between two bodies E is that of the softer one.
 
-    Args to the constructor:
-        factor: The multiple; by default that of the contact's ``accuracy``, or 10.
+    Args:
+        factor: The multiple of E/h, > 0; by default that of the contact's `Accuracy`, or 10.
+
+    Raises:
+        ValueError: The factor is not a positive number.
     """
 
     factor: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a factor that is no positive number."""
+        """Check that the factor is a positive number."""
         if self.factor is None:
             return
         if not (isinstance(self.factor, Real) and 0.0 < self.factor < float("inf")):
@@ -32,20 +35,23 @@ class RelativeStiffness:
 
 @dataclass(frozen=True)
 class NodalSprings:
-    """A stiffness as one spring for each node pair of Γc, the contact springs of section 4.
+    """A contact stiffness given as one spring per node of Γc.
 
-    At a vertex of Γc the stiffness per area is k over the area that the vertex stands for, the
-    contact's weight included: the reactions of the vertex add up to k times its displacement,
-    whatever the facets around it. Wants a surface with ``quadrature_scheme="vertex"``.
+    The stiffness per area at a vertex of Γc is k divided by the tributary area of the vertex,
+    multiplied by the contact's weight: the nodal force is k times the displacement. It needs a
+    `ContactSurface` with ``quadrature_scheme="vertex"``.
 
-    Args to the constructor:
-        k: Stiffness of one spring (force/length; per thickness in 2D without weight).
+    Args:
+        k: Stiffness of one spring, > 0 (force/length; in 2D without weight per thickness).
+
+    Raises:
+        ValueError: k is not a positive number.
     """
 
     k: float
 
     def __post_init__(self) -> None:
-        """Refuse a stiffness that is no positive number."""
+        """Check that the stiffness is a positive number."""
         if not (isinstance(self.k, Real) and 0.0 < self.k < float("inf")):
             raise ValueError(
                 f"k of the NodalSprings is {self.k!r}; it must be a number greater than zero "

@@ -1,4 +1,4 @@
-"""Unilateral contact without friction, and elastic foundations."""
+"""Frictionless unilateral contact, and elastic foundations."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ __all__ = ["Foundation", "Frictionless"]
 
 @dataclass(frozen=True)
 class Frictionless(Law):
-    """Unilateral contact without friction, eq. (6-20).
+    """Frictionless unilateral contact, eq. (4) and (6).
 
-    Args to the constructor:
+    Args:
         k_n: Normal stiffness (stress/length): a number, constant or UFL expression,
             `RelativeStiffness`, or `NodalSprings`.
     """
@@ -36,25 +36,27 @@ class Frictionless(Law):
     def contact_traction(
         self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
     ) -> ContactTraction:
-        """See `Law.contact_traction`."""
+        """Return r_n = -k_n δ₋, δ₊ and δ₋ by eq. (6)."""
         return ContactTraction(*signorini(kinematics, parameters["k_n"]))
 
 
 @dataclass(frozen=True)
 class Foundation(Law):
-    """An elastic foundation, bond or tie: r_n = -k_n (u_n - s) and τ = -k_t u_t, from the start.
+    """An elastic foundation or tie: r_n = -k_n (u_n - s) and τ = -k_t u_t.
 
-    The stiffness is physical here, that of a layer between body and obstacle (paper, 2.1). It may
-    be zero where there is none. ``Foundation(k, k)`` is a *tie*: it bonds the body to the obstacle,
-    or two bodies to each other, whose meshes need not match. ``Contact(gap=0)`` with it, or gaps
-    between facets are pulled shut. With `RelativeStiffness(10)` it opens as a tenth of a cell does.
+    The stiffness is that of a physical layer between body and obstacle, and zero where there is
+    none. ``Foundation(k, k)`` is a *tie*: it bonds the body to the obstacle, or two bodies with
+    non-matching meshes to each other. Use it with ``Contact(gap=0)``, or the initial gaps between
+    facets are pulled shut. With `RelativeStiffness(10)` the tie opens about as much as a tenth of a
+    cell deforms.
 
-    Args to the constructor:
-        k_n: Normal stiffness (stress/length), zero or greater; see `Frictionless`.
-        k_t: Tangential stiffness (stress/length), likewise; zero by default.
-        tension: True: the foundation is bonded to the body, and pulls as it pushes. False: it acts
-            where the gap is closed and nowhere else; with k_t there is no potential then, since τ
-            jumps where the gap closes.
+    Args:
+        k_n: Normal stiffness (stress/length), ≥ 0: a number, constant or UFL expression,
+            `RelativeStiffness` or `NodalSprings`.
+        k_t: Tangential stiffness (stress/length), ≥ 0, given like k_n; zero by default.
+        tension: Whether the foundation is bonded to the body and bears tension. If False, it acts
+            only where the gap is closed; with k_t there is no potential then, because τ jumps
+            where the gap closes.
     """
 
     k_n: Any
@@ -63,37 +65,37 @@ class Foundation(Law):
 
     @property
     def has_tangential(self) -> bool:
-        """See `Law.has_tangential`."""
+        """Whether the law has tangential tractions: if k_t is not the number 0."""
         return not (isinstance(self.k_t, Real) and self.k_t == 0)
 
     @property
     def has_potential(self) -> bool:
-        """See `Law.has_potential`."""
+        """Whether the tractions derive from a potential: not with k_t and without tension."""
         return self.tension or not self.has_tangential
 
     @property
     def has_tension(self) -> bool:
-        """See `Law.has_tension`."""
+        """Whether r_n is tensile where the gap is open: as ``tension`` says."""
         return self.tension
 
     @property
     def is_physical(self) -> bool:
-        """See `Law.is_physical`."""
+        """Whether the stiffness is that of a physical layer: always True."""
         return True
 
     @property
     def positive(self) -> frozenset[str]:
-        """See `Law.positive`: both may be zero, where there is no layer."""
+        """Names of the parameters that must be greater than zero: none, both may vanish."""
         return frozenset()
 
     def parameters(self) -> dict[str, Any]:
-        """See `Law.parameters`."""
+        """Return k_n, and k_t if there are tangential tractions, by name."""
         return {"k_n": self.k_n} | ({"k_t": self.k_t} if self.has_tangential else {})
 
     def contact_traction(
         self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
     ) -> ContactTraction:
-        """See `Law.contact_traction`."""
+        """Return r_n = -k_n (u_n - s) and τ = -k_t u_t, without tension where closed only."""
         r_n, opening, penetration = signorini(kinematics, parameters["k_n"])
         if self.tension:
             r_n = parameters["k_n"] * kinematics.gap
@@ -108,7 +110,7 @@ class Foundation(Law):
     def stored(
         self, kinematics: PointKinematics, response: ContactTraction, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """See `Law.stored`; by displacements, since k_t may be zero."""
+        """Return the elastic energy per area, -r_n (u_n - s)/2 - τ·u_t/2."""
         closing = -kinematics.gap
         stored = -response.normal_traction * closing / 2
         if response.traction is not None:
@@ -116,11 +118,15 @@ class Foundation(Law):
         return stored
 
     def potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
-        """½ k_n (u_n - s)² + ½ k_t |u_t|², or eq. (19) without tension."""
+        """Return ½ k_n (u_n - s)² + ½ k_t |u_t|², or without tension ½ k_n ⟨u_n - s⟩₊² [19].
+
+        Raises:
+            ValueError: The law has k_t and no tension, and therefore no potential.
+        """
         if not self.has_potential:
             raise ValueError(
-                "Foundation has no potential with k_t and without tension: τ jumps where the gap "
-                "closes; set k_t=0 or tension=True where one is needed"
+                "Foundation has no potential with k_t and without tension, because τ jumps where "
+                "the gap closes; set k_t=0 or tension=True"
             )
         if not self.tension:
             return signorini_potential(kinematics, parameters["k_n"])
