@@ -295,7 +295,7 @@ def test_a_history_that_jumps():
     pull = scene.E  # any constant of the form
     value = float(pull.value)
     list(fc.increments(problem, pull, value, 2 * value))
-    with pytest.warns(UserWarning, match="will not be solved for"):
+    with pytest.warns(UserWarning, match="will not be solved"):
         list(fc.increments(problem, pull, value, 1.5 * value))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -55,12 +55,12 @@ def test_ends_of_increments_as_given():
     [
         ("load", 1, "function"),
         (None, 0, "at least 1"),
-        (None, [0.5, 0.25, 1.0], "rising or"),
+        (None, [0.5, 0.25, 1.0], "monotonic"),
         (None, [0.5], "end"),
         (None, [], "end"),
-        (None, [[0.5, 1.0]], "ends of increments"),
-        (None, [[0.5], [0.7, 1.0]], "ends of increments"),
-        (None, ["half", 1.0], "ends of increments"),
+        (None, [[0.5, 1.0]], "ends of the increments"),
+        (None, [[0.5], [0.7, 1.0]], "ends of the increments"),
+        (None, ["half", 1.0], "ends of the increments"),
     ],
 )
 def test_wrong_histories(load, steps, word):

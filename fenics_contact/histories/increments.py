@@ -1,4 +1,4 @@
-"""Load histories: loads led through their values, one committed increment after another."""
+"""Load histories: a load parameter is increased in committed increments."""
 
 from __future__ import annotations
 
@@ -52,69 +52,65 @@ def increments(
     csv: str | Path | None = None,
     progress: bool | str = False,
 ) -> Iterator[Step]:
-    """Lead the load parameter from ``start`` to ``end``; solve and commit increments. Collective.
+    """Increase the load parameter from ``start`` to ``end`` in committed increments. Collective.
 
-    An increment that does not converge is halved, and halved again; after two that do it is doubled
-    until it has its size again. All of the parameter's values that were asked for are met. What is
-    returned is to be iterated over: increments are solved as they are asked for.
+    The function returns an iterator; each increment is solved and committed when the iterator is
+    advanced. An increment that does not converge is halved repeatedly; after two converged
+    increments its size is doubled again, up to the original size. The load parameter takes all
+    requested values.
 
     Args:
         problem: The problem.
         load: A scalar constant in the bulk form, a boundary condition or an obstacle, which takes
-            the value of the load parameter; or a function that sets whatever depends on it:
-            constants, functions, the forces on obstacles.
-        start: The load parameter now; not solved for.
-        end: Its value at the last increment.
-        steps: Number of equal increments, by default what the contacts' ``accuracy`` takes, or 1;
-            or the ends of the increments themselves, monotonic from ``start`` to ``end``.
-        max_cuts: How often an increment may be halved.
-        estimate: Whether to tell the error that the size of the increments makes: every one is
-            solved twice, whole, which is not committed, and in two halves, which are. The steps at
-            the ends of whole ones have ``increment_error``.
-        checkpoint: File to keep the last committed state in (``.npz``). If it is there when the
-            history starts, the history goes on behind it; see `checkpoint.save`. Several calls one
-            after another, there and back, may share a file: it knows which are done. A program that
-            is started again makes the same calls; those that are done set their last load and
-            solve nothing (u stays as it is until the call that goes on). The last call of a file
-            may lead further than before, or by other increments from there on; what is done must be
-            what the call asks for.
-        checkpoint_every: Write it after every so many increments, and after the last.
-        recover_interior: When all of u is found: "every" increment; at the "last" only; or a
-            number: every so many increments, and at the last. Where the problem is condensed,
-            increments in between save the larger part of their cost; there only the contacts'
-            results are those of the increment, u is behind except on Γc until
-            `ContactProblem.complete`, and ``Step.complete`` says so. Before a checkpoint is
-            written u is completed, and in the increment after it.
-        state_fields: Functions of one's own that belong to the state, such as plastic strains,
-            kept in the checkpoint; see `checkpoint.check_fields`. With them it is written when the
-            next increment is asked for, so that it has what the loop has made of them (and, after
-            the last, when the loop ends by itself). Increments that fail or are cut leave them
-            alone: what ``load`` has made of them it makes anew when it is called again, with the
-            last load that was committed.
-        on_mismatch: What to do with a checkpoint of other data (stiffness, laws and their
-            parameters, obstacles, conditions, loads): "refuse" it, or "continue" from its state
-            with the data as they are now.
-        csv: File for a table of the increments (CSV), one row each, written as soon as it is
-            committed: load, forces, moment, area, counts of points and largest pressure of every
-            contact, energies, iterations, cuts, and the errors that ``estimate`` tells; the header
-            says the units in words. Rows that the file has of increments behind the last committed
-            one (all, where a history starts; those behind the checkpoint, where it goes on) are
-            replaced, those before it stay, so that several calls may share a file, which is not
-            that of the checkpoint.
-        progress: Whether to show, in a terminal or a notebook, how much of the way is done and the
-            time left; words for the head of the bar. It takes tqdm. Nothing is shown elsewhere.
+            the value of the load parameter; or a function of the load parameter that sets
+            everything that depends on it: constants, functions, forces on obstacles.
+        start: The present load parameter, which is not solved for.
+        end: Load parameter of the last increment.
+        steps: Number of equal increments, or the load parameters at the ends of the increments,
+            monotonic up to ``end``. By default the number that the contacts' `Accuracy` sets, or 1.
+        max_cuts: Largest number of successive halvings of an increment.
+        estimate: Whether to estimate the error of the increment size: every increment is solved in
+            one step, which is discarded, and in two halves, which are committed. The second of two
+            halves has ``Step.increment_error``.
+        checkpoint: File of the last committed state (``.npz``). If it exists when the history
+            starts, the history continues after it. Several successive calls, such as loading and
+            unloading, may share a file: a restarted program makes the same calls, and those that
+            are done set their last load without solving. The last call may be extended, or continue
+            with other increments; what is done must agree with the arguments.
+        checkpoint_every: Number of increments between checkpoints; the last increment is always
+            saved.
+        recover_interior: When the interior displacement is recovered after static condensation:
+            "every" increment, at the "last" one, or a number n: at every n-th and the last. The
+            increments between cost much less; their contact results are complete, but u away
+            from Γc is not up to date (``Step.complete`` is False) until `ContactProblem.complete`.
+            It is also recovered for every checkpoint, and in the increment after it.
+        state_fields: Functions that belong to the state, such as plastic strains, and are saved in
+            the checkpoint. The checkpoint is then written when the iterator is advanced, with the
+            values that the loop body has assigned, and after the last increment when the loop ends
+            normally. Increments that fail or are cut do not reset them: ``load`` is called again
+            with the last committed load parameter.
+        on_mismatch: What to do if the checkpoint has other data (stiffness, laws and parameters,
+            obstacles, conditions, loads): "refuse" it with an error, or "continue" from its state
+            with the present data.
+        csv: File of a table with one row per increment (CSV), written after its commit: load
+            parameter; forces, moment, area, numbers of points and largest pressure of every
+            contact; energies; iterations; cuts; errors with ``estimate``. The header states the
+            units. Rows after the last committed increment are replaced, and earlier ones remain, so
+            that several calls may share a file. It must not be the checkpoint.
+        progress: Whether to show a progress bar with the remaining time, in a terminal or a
+            notebook; a string is its title. Needs tqdm.
 
     Yields:
-        The step, after its commit; ``load`` is its load parameter, and ``attempts`` has what was
-        tried before the increment was cut, too.
+        The `Step` after its commit. Its ``load`` is the load parameter, and its ``attempts``
+        include those before the increment was cut.
 
     Raises:
-        ValueError: An argument has no sense, at the call; or, at the first increment, the
-            checkpoint is damaged, of another problem or history, or of one without ``estimate``:
-            problem and file are as before.
+        ValueError: An argument is invalid, at the call; or, at the first increment, the checkpoint
+            is damaged, or of another problem, history or ``estimate``; problem and file are then
+            unchanged.
         OSError: The checkpoint or the table cannot be read or written.
-        NotConverged: An increment failed even when cut; u, history and load are those of the last
-            committed one.
+        NotConverged: An increment failed after ``max_cuts`` halvings; u, history and load are those
+            of the last commit.
     """
     check_instance("problem", problem, ContactProblem)
     comm, set_load = problem.u.function_space.mesh.comm, _setter(load)
@@ -122,7 +118,7 @@ def increments(
         if not (isinstance(place, Real) and np.isfinite(place)):
             raise ValueError(f"{name} is {place!r}; it must be a finite number")
     if start == end:
-        raise ValueError(f"start and end are both {start!r}, and there is no way between them")
+        raise ValueError(f"start and end are both {start!r}; they must differ")
     ends = _ends(start, end, problem.increments_wanted if steps is None else steps)
     whole = isinstance(recover_interior, int | np.integer) and recover_interior >= 1
     if recover_interior not in ("every", "last") and not whole:
@@ -135,7 +131,7 @@ def increments(
         ("checkpoint_every", checkpoint_every, 1),
     ):
         if not isinstance(number, int | np.integer) or number < least:
-            raise ValueError(f"{name} is {number!r}; it must be a whole number from {least}")
+            raise ValueError(f"{name} is {number!r}; it must be an integer, at least {least}")
     states.check_mismatch(on_mismatch)
     if not isinstance(state_fields, Sequence):
         raise ValueError(
@@ -143,7 +139,7 @@ def increments(
         )
     states.check_fields(problem, state_fields)
     if state_fields and checkpoint is None:
-        raise ValueError("state_fields are stored in the checkpoint, and there is none; give one")
+        raise ValueError("state_fields are saved in the checkpoint; give checkpoint=..., too")
     if not isinstance(checkpoint, str | Path | None):
         raise ValueError(f"checkpoint is {checkpoint!r}; it must be the name of a file")
     if isinstance(load, fem.Constant):
@@ -156,7 +152,7 @@ def increments(
             _check_folder(file)
 
     if not isinstance(progress, bool | str):
-        raise ValueError(f"progress is {progress!r}; it must be True, False, or words for the bar")
+        raise ValueError(f"progress is {progress!r}; it must be True, False, or a title (str)")
     bar = None
     with collective_errors(comm):
         if progress and comm.rank == 0:
@@ -173,7 +169,7 @@ def increments(
     table = None
     if csv is not None and file is not None and Path(csv).resolve() == file.resolve():
         raise ValueError(
-            f"checkpoint and csv are both {csv}, and each would overwrite the other; give two names"
+            f"checkpoint and csv are both {csv}, and would overwrite each other; give two names"
         )
     if csv is not None:
         table = Table(Path(csv), problem, tuple(quantities(problem)) if estimate else ())
@@ -187,11 +183,11 @@ def _check_folder(checkpoint: Path) -> None:
     """Refuse a folder that is not there, or where nothing can be written. On the calling rank."""
     folder = checkpoint.parent
     if not folder.is_dir():
-        raise ValueError(f"checkpoint is {checkpoint}, and there is no folder {folder}; make it")
+        raise ValueError(f"checkpoint is {checkpoint}, but there is no folder {folder}; create it")
     try:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        words = f"checkpoint is {checkpoint}, and nothing can be written in {folder}"
+        words = f"checkpoint is {checkpoint}, but folder {folder} is not writable"
         raise OSError(f"{words}: {error.strerror}") from error
 
 
@@ -201,14 +197,14 @@ def _check_constant(problem: ContactProblem, load: fem.Constant, start: float, e
     if not problem.reads(load):
         warn(
             comm,
-            "load is a constant that neither F, nor a Dirichlet condition, nor a contact was given "
-            "with: nothing will change with it; put the fem.Constant itself there, not its value",
+            "load is a constant on which neither F, nor a Dirichlet condition, nor a contact "
+            "depends, so that it has no effect; use the fem.Constant itself there, not its value",
         )
     if problem.increment and abs(now - start) > _SAME * max(abs(now), abs(end - start)):
         warn(
             comm,
-            f"start is {start:g}, and the load is {now:g} after {problem.increment} increments: "
-            f"the way from there to {start:g} will not be solved for; go on from where it is, "
+            f"start is {start:g}, but the load is {now:g} after {problem.increment} increments: "
+            f"the load path from there to {start:g} will not be solved; continue with "
             f"increments(problem, load, {now:g}, ...)",
         )
 
@@ -242,7 +238,7 @@ class _Started(Iterator[Step]):
         if not self._asked:
             warn(
                 self._comm,
-                "increments(...) was called, and nothing was solved: iterate over what it returns, "
+                "increments(...) was called, but nothing was solved: iterate over the result, "
                 "for step in increments(...)",
                 category=RuntimeWarning,
             )
@@ -277,7 +273,9 @@ def _history(
     else:
         n = len(dataclasses.fields(_Progress))
         if len(stored.numbers) != n + len(error):
-            raise ValueError(f"{checkpoint} is of no such history; remove it to start anew")
+            raise ValueError(
+                f"{checkpoint} was not written by such a load history; remove it to start again"
+            )
         at = _Progress(*stored.numbers[:n])
         error = dict(zip(error, stored.numbers[n:], strict=True))
         try:
@@ -292,7 +290,7 @@ def _history(
             apply(start)
             raise
         ends = ends[leg.passed() :]
-        logger.info("going on from %s, at load %g", checkpoint, at.load)
+        logger.info("continuing from %s, at load %g", checkpoint, at.load)
     if checkpoint is not None:
         _calls[problem][checkpoint.absolute()] = calls
     watch = _Watch(problem, fields) if checkpoint is not None else None
@@ -339,7 +337,7 @@ def _history(
                 failed.append(Attempt("cut", 0, f"to {at.largest:g}"))
                 if comm.rank == 0:
                     logger.warning(
-                        "increment %d, to load %g, did not converge: cut to %g",
+                        "increment %d, to load %g, did not converge: cut to size %g",
                         failure.increment,
                         goal,
                         at.largest,
@@ -490,22 +488,22 @@ def _place(
         return _Calls([*earlier, leg], True), None
     if len(theirs) <= len(earlier):
         raise ValueError(
-            f"{checkpoint} has {len(theirs)} calls of increments, and this is number "
-            f"{len(earlier) + 1}: it was written by something else; remove it to start anew"
+            f"{checkpoint} has {len(theirs)} calls of increments(), and this is number "
+            f"{len(earlier) + 1}: it was written by another program; remove it to start again"
         )
     there_leg = theirs[len(earlier)]
     if leg.estimate != there_leg.estimate:
         raise ValueError(
             f"{checkpoint} is of a history {'with' if there_leg.estimate else 'without'} estimate; "
-            "go on in the same way, or remove it to start anew"
+            "use the same argument, or remove it to start again"
         )
     is_last = len(theirs) == len(earlier) + 1
     if not leg.same(there_leg, up_to=there_leg.reached if is_last else None):
         raise ValueError(
-            f"{checkpoint} is of another load path: its increments number {len(earlier) + 1} lead "
-            f"{there_leg}, and are done up to {there_leg.reached:g}; here they lead {leg}. Make "
-            "the same calls in the same order (those that are done solve nothing), or remove it "
-            "to start anew"
+            f"{checkpoint} is of another load path: its call number {len(earlier) + 1} of "
+            f"increments() goes {there_leg}, and is done up to {there_leg.reached:g}; this one "
+            f"goes {leg}. Make the same calls in the same order (those that are done solve "
+            "nothing), or remove it to start again"
         )
     leg.reached = there_leg.reached
     if is_last:
@@ -542,8 +540,8 @@ class _Watch:
             self._functions = []
             warn(
                 self._comm,
-                f"{', '.join(names)} in the bulk form is changed between increments, and is not in "
-                "the checkpoint: a history that goes on from it will not have the values; give "
+                f"{', '.join(names)} in the bulk form is changed between increments, but is not "
+                "saved in the checkpoint, from which a history cannot continue correctly; give "
                 "state_fields=[...]",
             )
 
@@ -604,9 +602,9 @@ def _ends(start: float, end: float, steps: int | Sequence[float]) -> list[float]
             ways = np.diff([start, *ends])
         if not (np.all(np.isfinite(ends)) and (np.all(ways > 0) or np.all(ways < 0))):
             raise ValueError(
-                f"steps is {steps}; so many numbers from start = {start!r} to end = {end!r} "
-                "cannot be told apart, or their distance is no number: take fewer, or let the "
-                "load parameter run from 0 to 1 and scale it in a function load"
+                f"steps is {steps}; so many increments from start = {start!r} to end = {end!r} "
+                "cannot be distinguished in double precision, or overflow: take fewer, or let the "
+                "load parameter go from 0 to 1 and scale it in a function load"
             )
         return ends
     try:
@@ -615,11 +613,14 @@ def _ends(start: float, end: float, steps: int | Sequence[float]) -> list[float]
     except (TypeError, ValueError):  # words, or rows of unequal length
         flat = False
     if not flat:
-        raise ValueError(f"steps is {steps!r}; it must be a whole number, or ends of increments")
+        raise ValueError(
+            f"steps is {steps!r}; it must be an integer, or the load parameters at the "
+            "ends of the increments"
+        )
     ways = np.diff([start, *ends])
     if not ends or ends[-1] != end or not (np.all(ways > 0) or np.all(ways < 0)):
         raise ValueError(
-            f"steps is {ends}; it must be a number, or the ends of the increments, rising or "
-            f"falling from start = {start:g} to end = {end:g}"
+            f"steps is {ends}; it must be an integer, or the ends of the increments, monotonic "
+            f"from start = {start:g} to end = {end:g}"
         )
     return ends
