@@ -214,7 +214,7 @@ def test_an_obstacle_in_numbers_that_says_too_little(missing):
     del said[missing]
     obstacle = type("Floor", (fc.SampledObstacle,), said)()
     scene = block("triangle", 1)
-    words = "Floor is no obstacle", f"must say its {missing}"
+    words = "Floor is no obstacle", f"must define {missing}"
     raised_everywhere(
         lambda: scene.contact(fc.Frictionless(), obstacle=obstacle, kinematics="finite"),
         ValueError,

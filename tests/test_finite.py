@@ -244,7 +244,7 @@ FLOOR = fc.HalfSpace((0, 1), (0, -1))
         (
             _refused(fc.HalfSpace((0, 1), (0, -1), rotation=fc.Rotation(0.1, (0, 0), (0, 0, 1)))),
             ValueError,
-            "takes none",
+            "omit it",
         ),
         (
             _refused(fc.HalfSpace((0, 1), (0, -1), rotation=fc.Rotation(0.1, (0, 0, 0)))),

@@ -457,7 +457,7 @@ FLAT = {"point": (0, 1), "normal": (0, -1)}
         (fc.Rotation(None, (0, 1), moment=(1.0, 2.0)), {}, TypeError, "moment of the Rotation"),
         (fc.Rotation(None, (0, 1), moment="1"), {}, TypeError, "moment of the Rotation"),
         (fc.Rotation(None, (0, 1, 0), moment=1.0), {}, ValueError, "about"),
-        (fc.Rotation(None, (0, 1), (0, 0, 1), moment=1.0), {}, ValueError, "takes none"),
+        (fc.Rotation(None, (0, 1), (0, 0, 1), moment=1.0), {}, ValueError, "omit it"),
         (
             fc.Rotation(None, (0, 1), moment=1.0),
             {"kinematics": "small"},

@@ -1,8 +1,8 @@
-"""Obstacles: what Γc presses on. They give gap s and normal n at a point, as UFL or numbers.
+"""Obstacles: they return gap s and normal n at a point of Γc, as UFL or as numbers.
 
-n points **from the body to the obstacle**; s ≥ 0 is the distance along n that is still open. A
-obstacle knows no mesh: numbers become constants of the mesh through the function that is passed in,
-so that a new value never compiles a new form.
+n points **from the body to the obstacle**; s is the gap along n, ≥ 0 where open. An obstacle is
+independent of the mesh: numbers become constants of the mesh through the function that is passed
+to `Obstacle.place`, so that a new value does not compile a new form.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ __all__ = [
 
 ToUFL = Callable[[Any], ufl.core.expr.Expr]
 
-# A coordinate whose square is still a number: a diverged state has points beyond.
+# A coordinate whose square does not overflow: a diverged state has points beyond.
 NOWHERE = 1e100
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where an obstacle is, seen from a point of Γc (UFL expressions).
+    """Gap and contact normal of an obstacle at a point (UFL expressions).
 
     Attributes:
-        gap: Distance along the normal, with the obstacle moved: s of eq. (3), in length.
-        direction: From body to obstacle, of any length greater than zero.
+        gap: Gap s along the normal, with the obstacle displaced (length).
+        direction: Direction from body to obstacle, of any length greater than zero.
     """
 
     gap: ufl.core.expr.Expr
@@ -51,44 +51,46 @@ class Placement:
 
     @property
     def normal(self) -> ufl.core.expr.Expr:
-        """The direction of length 1."""
+        """The unit normal n, ``direction`` divided by its length."""
         return self.direction / ufl.sqrt(ufl.dot(self.direction, self.direction))
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A rigid translation of an obstacle of which some components follow from the force on it.
+    """A rigid translation of an obstacle, of which components with a given force are unknown.
 
-    Per component of space one of the two is given, the other is None. ``Motion(force=(None, -5),
-    displacement=(pull, None))`` is pressed down by 5 and pulled along as ``pull`` says.
+    For every component either force or displacement is given, and the other is None. An obstacle
+    with ``Motion(force=(None, -5), displacement=(pull, None))`` is pressed down with force 5 and
+    moved by ``pull`` in x.
 
-    Args to the constructor:
-        force: External force on the obstacle (force; in 2D force per thickness), numbers or scalar
-            ``fem.Constant``; of a symmetric model the modelled part's share.
-        displacement: Prescribed components (length), likewise; none: zero where no force is given.
+    Args:
+        force: External force on the obstacle (force; in 2D force per thickness), gdim numbers or
+            scalar ``fem.Constant``; in a symmetric model, the part on the modelled half.
+        displacement: Prescribed components (length), numbers or scalar ``fem.Constant``; by
+            default zero where no force is given.
     """
 
     force: Sequence[Any]
     displacement: Sequence[Any] | None = None
 
     def components(self, gdim: int) -> tuple[dict[int, Any], dict[int, Any]]:
-        """Forces and prescribed displacements by component.
+        """Return the given forces and the prescribed displacements, by number of the component.
 
         Raises:
-            ValueError: A component has both or is missing.
+            ValueError: A component has both, or the number of components is not ``gdim``.
         """
         given = self.displacement if self.displacement is not None else (None,) * gdim
         lists = (v if isinstance(v, Sequence | np.ndarray) else () for v in (self.force, given))
         sizes = [len(v) for v in lists]
         if sizes != [gdim, gdim]:
             raise ValueError(
-                f"Motion has {sizes[0]} forces and {sizes[1]} displacements; it must have "
-                f"{gdim} of each on this mesh, None where the other one is given"
+                f"Motion has {sizes[0]} forces and {sizes[1]} displacements; on this mesh it must "
+                f"have {gdim} of each, None where the other one is given"
             )
         both = [i for i in range(gdim) if self.force[i] is not None and given[i] is not None]
         if both:
             raise ValueError(
-                f"Motion gives force and displacement of component {both[0]}; give one of them, "
+                f"Motion has force and displacement of component {both[0]}; give one of them, "
                 "and None for the other"
             )
         forces = {i: f for i, f in enumerate(self.force) if f is not None}
@@ -99,21 +101,20 @@ class Motion:
 
 @dataclass(frozen=True)
 class Rotation:
-    """A turn of an obstacle about an axis that is fixed in it, of any size.
+    """A finite rotation of an obstacle about an axis that is fixed in the obstacle.
 
-    One of angle and moment is given, the other is None: ``Rotation(None, about, moment=0.0)`` turns
-    as contact turns it, as a roller does. It needs ``Contact(kinematics="finite")``. The
-    displacement of the obstacle moves the axis, too, whether it is prescribed or a `Motion`.
+    Either angle or moment is given. ``Rotation(None, about, moment=0.0)`` is a free roller, rotated
+    by friction. A rotation needs ``Contact(kinematics="finite")``. The displacement of the obstacle
+    moves the axis, whether it is prescribed or a `Motion`.
 
-    Args to the constructor:
-        angle: In radians, right-handed about the axis, in the plane anticlockwise: a number, or a
-            scalar ``fem.Constant`` to be changed between increments. None where the moment is
-            given; then it is found.
-        about: A point of the axis where the obstacle has not been displaced, gdim numbers (length).
-        axis: Its direction, three numbers of any length; in the plane none.
+    Args:
+        angle: Angle (radians), right-handed about the axis, anticlockwise in the plane: a number or
+            a scalar ``fem.Constant``. None if the moment is given: the angle is then unknown.
+        about: A point of the axis before any displacement, gdim numbers (length).
+        axis: Direction of the axis, three numbers of any length; None in the plane.
         moment: External moment on the obstacle about the axis, in the sense of the angle (force
-            times length; in 2D per thickness), a number or scalar ``fem.Constant``; of a symmetric
-            model the modelled part's share.
+            times length; in 2D per thickness): a number or a scalar ``fem.Constant``; in a
+            symmetric model, the part on the modelled half.
     """
 
     angle: Any
@@ -122,13 +123,13 @@ class Rotation:
     moment: Any = None
 
     def unit_axis(self, gdim: int) -> Array:
-        """Direction of the axis, (3,); in the plane out of it.
+        """Return the unit vector along the axis, (3,); in the plane, the one out of the plane.
 
         Raises:
-            ValueError: There is an axis in the plane, or none in space.
+            ValueError: ``axis`` is given in the plane, or missing in space.
         """
         if gdim == 2 and self.axis is not None:
-            raise ValueError(f"axis of the Rotation is {self.axis!r}; in 2D it takes none")
+            raise ValueError(f"axis of the Rotation is {self.axis!r}; omit it in 2D")
         if gdim == 3 and self.axis is None:
             raise ValueError("axis of the Rotation is missing; in 3D give its direction")
         if self.axis is None:
@@ -137,14 +138,15 @@ class Rotation:
         return found
 
     def matrix(self, gdim: int, angle: ufl.core.expr.Expr) -> ufl.core.expr.Expr:
-        """R, which takes directions from where the obstacle began to where it is (gdim, gdim).
+        """Return the rotation matrix R, from initial to present directions, (gdim, gdim).
 
         Args:
             gdim: Dimension of the mesh.
-            angle: As UFL, given or found.
+            angle: Angle as UFL (radians).
 
         Raises:
-            ValueError: There is an axis in the plane, or none in space; or the angle is no scalar.
+            ValueError: ``axis`` is given in the plane, or missing in space, or the angle is not a
+                scalar.
         """
         x, y, z = (float(v) for v in self.unit_axis(gdim))
         if angle.ufl_shape != ():
@@ -158,7 +160,7 @@ class Rotation:
         return ufl.Identity(3) + s * across + (1 - c) * ufl.dot(across, across)
 
     def turned(self, vectors: Array, angle: float | Array) -> Array:
-        """Vectors turned by an angle (radians), one for all or one for each, (n, gdim)."""
+        """Return vectors (n, gdim) rotated by one angle, or by one angle each (radians)."""
         c, s = (np.reshape(f(angle), (-1, 1)) for f in (np.cos, np.sin))
         if self.axis is None:
             return np.asarray(c * vectors + s * self.rate(vectors))
@@ -167,91 +169,92 @@ class Rotation:
         return np.asarray(along + c * (vectors - along) + s * np.cross(axis, vectors))
 
     def rate(self, vectors: Array) -> Array:
-        """By how much vectors that turn with the obstacle change by a unit angle, (n, gdim)."""
+        """Return axis × vectors, the derivative of rotating vectors by the angle, (n, gdim)."""
         if vectors.shape[1] == 2:
             return np.column_stack([-vectors[:, 1], vectors[:, 0]])
         return np.asarray(np.cross(self.unit_axis(3), vectors), dtype=np.float64)
 
 
 class Obstacle:
-    """A rigid obstacle: subclasses say where it is.
+    """Base class of obstacles; subclasses define gap and normal at a point by `place`.
 
-    Args to all of them: ``displacement``, the prescribed rigid translation (gdim numbers, a
-    ``fem.Constant`` to be changed between increments, or a UFL vector, which may vary along Γc), or
-    a `Motion` where the force on the obstacle is given; none means fixed. One that varies along Γc
-    turns the obstacle without its normals: forces are off by about the angle, of which the verdict
-    tells. ``rotation``, a `Rotation`: with finite
-    kinematics alone.
+    All rigid obstacles have the arguments ``displacement`` and ``rotation``. Move an obstacle by
+    these only. If its position or gap is changed instead (a constant in ``point``, ``center`` or
+    ``gap``), contact opens and closes correctly, but the tangential part causes no slip and the
+    energies contain no work of it, because it cannot be distinguished from a change of shape.
 
-    An obstacle that moves is moved by these alone. Where its place or gap is changed instead (a
-    constant in ``point``, ``center`` or ``gap``), contact opens and closes as it should, but
-    friction does not feel the part along Γc, nor do the energies count work: nothing tells such a
-    change from one of shape.
+    Attributes:
+        displacement: Prescribed rigid translation: gdim numbers, a ``fem.Constant`` that may be
+            changed between increments, or a UFL vector; or a `Motion`, if the force on the obstacle
+            is given; None: fixed. One that varies along Γc rotates the obstacle but not its
+            normals, with an error of the forces of about the angle, which is estimated after
+            every increment.
+        rotation: A `Rotation`, with finite kinematics only; None: no rotation.
     """
 
     displacement: Any = None
     rotation: Rotation | None = None
 
     def check_complete(self) -> None:
-        """Refuse a subclass that does not say where the obstacle is.
+        """Check that a subclass defines `place`.
 
         Raises:
-            ValueError: It names what is missing.
+            ValueError: It does not.
         """
         self._check_said(Obstacle, place="its gap and direction, as UFL")
 
     def _check_said(self, abstract: type[Obstacle], **members: str) -> None:
-        """Refuse members that are still those of a class that has them only to be replaced."""
+        """Check that a subclass overrides the abstract members of a class."""
         for member, meaning in members.items():
             if getattr(type(self), member) is getattr(abstract, member):
                 raise ValueError(
                     f"{type(self).__name__} is no obstacle: a subclass of {abstract.__name__} must "
-                    f"say its {member}: {meaning}"
+                    f"define {member}: {meaning}"
                 )
 
     @property
     def is_distance(self) -> bool:
-        """Whether the direction of `place` is the gradient of its gap, as it was given."""
+        """Whether the direction that `place` returns is minus the gradient of its gap."""
         return False
 
     @property
     def is_flat(self) -> bool:
-        """Whether it is a plane: of one normal, with a gap that is linear in the place."""
+        """Whether the obstacle is a plane, with a constant normal and a linear gap."""
         return False
 
     @property
     def smallest_radius(self) -> float:
-        """Smallest radius of curvature where the obstacle is convex (length).
+        """Smallest radius of curvature of the convex parts (length).
 
-        Infinite where it is nowhere convex, or where the radius is not known as a number.
+        It is infinite if there are none, or if the radius is not known as a number.
         """
         return np.inf
 
     def place(
         self, x: ufl.core.expr.Expr, shift: ufl.core.expr.Expr | None, to_ufl: ToUFL
     ) -> Placement:
-        """Gap and direction at ``x`` with the obstacle translated by ``shift`` (None: not at all).
+        """Return gap and direction at a point, with the obstacle translated.
 
         Args:
-            x: Coordinates of the point, shape (gdim,): of Γc, or with finite kinematics where it
-                has moved to, seen from where the obstacle began.
-            shift: The displacement of the obstacle, shape (gdim,).
-            to_ufl: Turns numbers, constants and expressions into UFL.
+            x: Coordinates of the point, shape (gdim,): on the undeformed Γc, or with finite
+                kinematics the deformed position, in the frame of the obstacle.
+            shift: Displacement of the obstacle, shape (gdim,); None: not displaced.
+            to_ufl: Converts numbers, constants and expressions to UFL.
 
         Raises:
-            ValueError: Data that are not of the mesh's dimension or out of range.
+            ValueError: Data have the wrong dimension or are out of range.
         """
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What an obstacle says in numbers at n places.
+    """Signed distance of an obstacle and its derivatives at n points.
 
     Attributes:
-        distance: Signed distance, positive outside of the obstacle, (n,) (length).
-        normal: Minus its gradient: unit vectors from body to obstacle, (n, gdim).
-        curvature: Its second derivatives, (n, gdim, gdim) (1/length).
+        distance: Signed distance d, positive outside of the obstacle, (n,) (length).
+        normal: Contact normal -∇d, unit vectors from body to obstacle, (n, gdim).
+        curvature: Second derivatives of d, (n, gdim, gdim) (1/length).
     """
 
     distance: Array
@@ -260,20 +263,24 @@ class Sample:
 
 
 class SampledObstacle(Obstacle):
-    """A rigid obstacle that is known in numbers alone, from data: subclasses sample its distance.
+    """A rigid obstacle given by data; subclasses return its signed distance by `sample`.
 
-    They are asked at the present places of the points of Γc in every evaluation, so that tractions
-    and their derivatives are those of the distance itself. Subclasses have ``displacement`` and
-    ``rotation`` as attributes; see `Obstacle`.
+    `sample` is called in every evaluation, at the present positions of the points of Γc, so that
+    tractions and tangent are those of the exact distance. Subclasses have the attributes
+    ``displacement`` and ``rotation`` of `Obstacle`.
     """
 
     def check_complete(self) -> None:
-        """See `Obstacle.check_complete`."""
+        """Check that a subclass defines `gdim`, `fingerprint` and `sample`.
+
+        Raises:
+            ValueError: It does not.
+        """
         self._check_said(
             SampledObstacle,
             gdim="the dimension of space, 2 or 3",
-            fingerprint="a word that tells its data from others",
-            sample="distance, normal and curvature at places, in numbers",
+            fingerprint="a string that identifies its data",
+            sample="distance, normal and curvature at given points, in numbers",
         )
 
     @property
@@ -283,27 +290,26 @@ class SampledObstacle(Obstacle):
 
     @property
     def fingerprint(self) -> str:
-        """A word that tells the data from others, the same on every rank."""
+        """A string that identifies the data, the same on every rank."""
         raise NotImplementedError
 
     def sample(self, x: Array) -> Sample:
-        """Distance, normal and curvature at places; not collective.
+        """Return signed distance, normal and curvature at points. Not collective.
 
         Args:
-            x: Finite coordinates where the obstacle has neither moved nor turned, (n, gdim), n ≥ 0;
-                those of a trial of the solver may be far off. Distance and normal must be finite
-                wherever they are.
+            x: Finite coordinates in the frame of the obstacle, (n, gdim), n ≥ 0. Trial states of
+                the solver may be far from the obstacle; distance and normal must be finite there,
+                too.
         """
         raise NotImplementedError
 
     def sample_checked(self, x: Array) -> Sample:
-        """`sample`, which may change its argument; NaN at places of a diverged state.
+        """Return `sample` after checking shapes and values; NaN at points of a diverged state.
 
         Not collective.
 
         Raises:
-            ValueError: Something has a wrong shape, or a distance or normal is not finite: a NaN
-                would pass for a gap that is open.
+            ValueError: An array has the wrong shape, or a distance or normal is not finite.
         """
         there = np.abs(x).max(axis=1, initial=0.0) < NOWHERE
         given = self.sample(x[there])
@@ -315,16 +321,16 @@ class SampledObstacle(Obstacle):
             array = np.asarray(getattr(given, what), dtype=np.float64)
             if array.shape != shape:
                 raise ValueError(
-                    f"{name}: {what} of its sample has shape {array.shape}; {n} places in {d} "
-                    f"dimensions need {shape}"
+                    f"{name}: {what} of its sample has shape {array.shape}; for {n} points in {d} "
+                    f"dimensions it must be {shape}"
                 )
             if what != "curvature":  # a round obstacle has none at its centre
                 wrong = ~np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
                 if wrong.any():
                     raise ValueError(
                         f"{name}: {what} of its sample is not finite at "
-                        f"{x[there][wrong][0].tolist()}; an obstacle must have one at every place, "
-                        "however far off"
+                        f"{x[there][wrong][0].tolist()}; it must be finite at every point, however "
+                        "far from the obstacle"
                     )
             arrays[what] = np.full((len(x), *shape[1:]), np.nan)
             arrays[what][there] = array
@@ -349,7 +355,7 @@ def nonzero_vector(name: str, value: Any, gdim: int) -> Any:
     if isinstance(value, np.ndarray):
         length = np.linalg.norm(value)
         if length == 0.0:
-            raise ValueError(f"{name} is {value.tolist()}; a direction of length zero has no sense")
+            raise ValueError(f"{name} is {value.tolist()}; it must not have length zero")
         return value / length
     return value
 

@@ -1,4 +1,4 @@
-"""A deformable body as the obstacle: which it is, and how it is looked for."""
+"""An opposing deformable body: its surface, and how pairs of points are found."""
 
 from __future__ import annotations
 
@@ -17,25 +17,28 @@ __all__ = ["DeformableBody"]
 
 @dataclass(frozen=True)
 class DeformableBody(Obstacle):
-    """The obstacle is another part of the same mesh and displacement space.
+    """An opposing deformable body: another part of the same mesh and displacement space.
 
-    Γc should be the surface of the softer or more finely meshed body. Forces on both are equal and
-    opposite to round-off.
+    Γc should be on the softer or more finely meshed body. Contact forces on both bodies are equal
+    and opposite up to round-off.
 
-    Args to the constructor:
+    Args:
         facet_tags: Tags on the facets of the mesh.
-        tags: Tag, or tags, of the opposite surface.
-        search_distance: Points whose opposite lies farther (length) than this have none; no limit
-            by default.
-        update_pairs: "never": the pairs are those of the undeformed bodies; "increment": they are
-            found anew in the deformed bodies at every commit; "auto": likewise, from the first
-            commit on at which a closed point, or where none is any, has moved along its opposite
-            by more than its facet. Normals stay those of the undeformed Γc (small rotations). With
-            `Contact(kinematics="finite")` they are those of the present bodies, whatever this says.
-        max_initial_penetration: How far behind a point (length) its opposite may lie, where the
-            bodies penetrate each other from the start. By default as far as they do, if they are
-            two; in one and the same body half the height of the point's cell. In deformed bodies
-            always twice as far as they penetrate there.
+        tags: Tag or tags of the opposite surface.
+        search_distance: Largest distance of an opposite point (length), infinite by default.
+        update_pairs: When pairs of points are found again. "never": the pairs are those of the
+            undeformed bodies. "increment": at every commit, in the deformed bodies. "auto": at
+            every commit from the first one at which a closed point has moved along the opposite
+            surface by more than its facet (any point, if none is closed). Normals remain those of
+            the undeformed Γc. With `Contact(kinematics="finite")` pairs and normals are always
+            those of the deformed bodies.
+        max_initial_penetration: Largest depth of a point of Γc behind its opposite point in the
+            undeformed bodies (length). By default the penetration of the two bodies; within one
+            body, half the height of the point's cell. In deformed bodies it is twice the present
+            penetration.
+
+    Raises:
+        ValueError: A distance is negative or no number, or ``update_pairs`` is unknown.
     """
 
     facet_tags: dolfinx.mesh.MeshTags
@@ -45,7 +48,7 @@ class DeformableBody(Obstacle):
     max_initial_penetration: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what has no sense."""
+        """Check the arguments."""
         if not (is_number(self.search_distance) and self.search_distance > 0):
             raise ValueError(
                 f"search_distance is {self.search_distance!r}; it must be a length greater "
@@ -62,4 +65,4 @@ class DeformableBody(Obstacle):
             )
 
     def check_complete(self) -> None:
-        """Its place is found by a search: nothing is missing."""
+        """Accept the obstacle as complete: its position is found by a search."""

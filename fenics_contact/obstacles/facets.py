@@ -67,7 +67,7 @@ class Facets:
         corners = self.points[self.facets]
         normals, has = _facet_normals(corners)
         if not has.any():
-            raise ValueError("no facet has an area: they lie on a point or on a line")
+            raise ValueError("no facet has an area: all are degenerate to points or lines")
         whole, borders = self._pseudo_normals(corners, normals)
         self.closed = not borders.any()
         # Facets without a normal have their part at edges and corners: neighbours cover them.
@@ -221,9 +221,9 @@ def _check_order(
     if len(bad):
         first = ", ".join(f"{v:.4g}" for v in places[bad[0]])
         raise ValueError(
-            f"at {len(bad)} edges or corners, one of them at ({first}), neighbours are ordered "
-            "against each other, or more than two facets meet: order all facets "
-            "anticlockwise as seen from outside of the obstacle (in the plane: the obstacle on the "
-            "left of the way), each given once, and take bodies that touch each other as obstacles "
-            "of their own"
+            f"at {len(bad)} edges or corners, one of them at ({first}), neighbours have opposite "
+            "orientations, or more than two facets meet: order the corners of every facet "
+            "anticlockwise seen from outside of the obstacle (in the plane: with the obstacle on "
+            "the left), give each facet once, and make bodies that touch each other separate "
+            "obstacles"
         )

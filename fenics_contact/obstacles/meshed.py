@@ -20,14 +20,29 @@ __all__ = ["RigidSurface", "as_points", "fingerprint_of"]
 
 
 class RigidSurface(SampledObstacle):
-    """A rigid obstacle given by its surface: triangles in space, in the plane a polyline.
+    """A rigid obstacle given by facets: triangles in space, a polyline in the plane.
 
-    Facets are flat: the normal jumps from one to the next, by less with ``halvings``. Points within
-    the obstacle are pushed out through the closest facet. An open surface must reach beyond where
-    contact may be: points from which its border is closest are outside.
+    The normal is constant on each facet and jumps between facets, by less with ``halvings``. Points
+    in the obstacle are pushed out through the closest facet. An open surface must extend beyond the
+    contact: points whose closest point is on its boundary are outside.
+
+    Args:
+        points: Corners, (n_points, gdim) (length), the same on every rank; coincident ones are
+            merged.
+        facets: Indices of the corners of each facet, (n_facets, gdim): in space anticlockwise
+            seen from outside, as in an STL file; in the plane with the obstacle on the left.
+        halvings: Number of uniform refinements of the triangles, each into four, whose new corners
+            lie on a smooth surface through the corners; each halves the angles between facets.
+        sharp: Angle between neighbouring facets (radians) from which on their edge is an edge of
+            the smooth surface, too, such as the rim of a cylinder.
+        displacement: Rigid translation, as for `Obstacle`.
+        rotation: Rotation, as for `Obstacle`.
 
     Attributes:
-        facets: The surface, as it is searched.
+        facets: The refined surface, with its search tree.
+
+    Raises:
+        ValueError: Shapes or indices are invalid, or neighbours have opposite orientations.
     """
 
     def __init__(
@@ -40,42 +55,25 @@ class RigidSurface(SampledObstacle):
         displacement: Any = None,
         rotation: Rotation | None = None,
     ) -> None:
-        """Take the surface.
-
-        Args:
-            points: Corners, (n_points, gdim) (length), the same on every rank; equal ones are one.
-            facets: Numbers of the corners of each facet, (n_facets, gdim): in space anticlockwise
-                as seen from outside, as in an STL file; in the plane with the obstacle on the left
-                of the way.
-            halvings: How often the edges of triangles are halved, towards the smooth surface that
-                they stand for: each makes four triangles of one, and angles half as large.
-            sharp: Angle between neighbours (radians) from which on the edge is one of the surface
-                itself, such as the rim of a cylinder.
-            displacement: See `Obstacle`.
-            rotation: Likewise.
-
-        Raises:
-            ValueError: Shapes or numbers are wrong, or neighbours are ordered against each other.
-        """
         corners = as_points("points of the RigidSurface", points)
         numbers = np.asarray(facets)
         d = corners.shape[1]
         kind = numbers.dtype.kind in "iu"
         if numbers.ndim != 2 or numbers.shape[1] != d or not len(numbers) or not kind:
             raise ValueError(
-                f"facets of the RigidSurface are {numbers.dtype} of shape {numbers.shape}; give "
-                f"whole numbers of shape (n_facets, {d}) with points in {d} dimensions"
+                f"facets of the RigidSurface are {numbers.dtype} of shape {numbers.shape}; they "
+                f"must be integers of shape (n_facets, {d}) with points in {d} dimensions"
             )
         if numbers.min() < 0 or numbers.max() >= len(corners):
             raise ValueError(
-                f"facets of the RigidSurface have numbers from {numbers.min()} to {numbers.max()}; "
-                f"there are {len(corners)} points: give numbers from 0 to {len(corners) - 1}"
+                f"facets of the RigidSurface have indices from {numbers.min()} to {numbers.max()}; "
+                f"with {len(corners)} points they must be from 0 to {len(corners) - 1}"
             )
         whole = is_number(halvings) and isinstance(halvings, Integral)
         if not whole or halvings < 0 or (halvings and d == 2):
             raise ValueError(
-                f"halvings of the RigidSurface is {halvings!r}; it must be a whole number, zero or "
-                "greater, and zero in the plane: a smooth curve through points is a RigidProfile"
+                f"halvings of the RigidSurface is {halvings!r}; it must be an integer, at least 0, "
+                "and 0 in the plane: use a RigidProfile for a smooth curve through points"
             )
         if not (is_number(sharp) and 0 < sharp <= np.pi):
             raise ValueError(f"sharp is {sharp!r}; it must be an angle in radians, from 0 to pi")
@@ -96,19 +94,20 @@ class RigidSurface(SampledObstacle):
         displacement: Any = None,
         rotation: Rotation | None = None,
     ) -> RigidSurface:
-        """The surface in an STL file, binary or ASCII. Every rank reads it.
+        """Read the surface from an STL file, binary or ASCII. Every rank reads it.
 
         Args:
-            path: Of the file.
+            path: Name of the file.
             scale: Factor of its coordinates, such as 1e-3 for a file in mm and a mesh in m.
-            halvings: See the constructor.
-            sharp: Likewise.
-            displacement: See `Obstacle`.
-            rotation: Likewise.
+            halvings: Number of uniform refinements, as for the constructor.
+            sharp: Angle of edges that remain sharp (radians), as for the constructor.
+            displacement: Rigid translation, as for `Obstacle`.
+            rotation: Rotation, as for `Obstacle`.
 
         Raises:
-            ValueError: The file has no triangles, or the scale is none; see the constructor, too.
-            OSError: It cannot be read.
+            ValueError: The file has no triangles, the scale is not a positive number, or
+                neighbouring triangles have opposite orientations.
+            OSError: The file cannot be read.
         """
         if not (is_number(scale) and np.isfinite(scale) and scale > 0):
             raise ValueError(f"scale is {scale!r}; it must be a number greater than zero")
@@ -124,24 +123,24 @@ class RigidSurface(SampledObstacle):
 
     @property
     def gdim(self) -> int:
-        """See `SampledObstacle.gdim`."""
+        """Dimension of space, 2 or 3."""
         return self.facets.points.shape[1]
 
     @property
     def fingerprint(self) -> str:
-        """See `SampledObstacle.fingerprint`."""
+        """A string that identifies points and facets."""
         return fingerprint_of(self.facets.points, self.facets.facets)
 
     def sample(self, x: Array) -> Sample:
-        """See `SampledObstacle.sample`."""
+        """Return signed distance, normal and curvature (zero on facets) at points (n, gdim)."""
         return self.facets.sample(x)
 
 
 def as_points(name: str, value: npt.ArrayLike) -> Array:
-    """Check points given by numbers: (n, 2) or (n, 3), finite, not all the same.
+    """Return points as an array, after checking its shape, (n, 2) or (n, 3), and values.
 
     Raises:
-        ValueError: It says what was given.
+        ValueError: The shape is another one, or numbers are not finite.
     """
     points = np.asarray(value)
     shape = points.shape
@@ -153,12 +152,12 @@ def as_points(name: str, value: npt.ArrayLike) -> Array:
     points = points.astype(np.float64)
     if not np.isfinite(points).all():
         bad = int(np.sum(~np.isfinite(points).all(axis=1)))
-        raise ValueError(f"{name}: {bad} of the {len(points)} are not finite; give finite numbers")
+        raise ValueError(f"{name}: {bad} of the {len(points)} are not finite; all must be finite")
     return points
 
 
 def fingerprint_of(*arrays: npt.NDArray[Any]) -> str:
-    """A word that tells the numbers in arrays from others."""
+    """Return a string that identifies the numbers in arrays."""
     digest = hashlib.sha256()
     for array in arrays:
         digest.update(f"{array.shape}{array.dtype.kind}".encode())

@@ -26,11 +26,24 @@ _ON_AXIS = 1e-9
 
 
 class RigidProfile(SampledObstacle):
-    """A rigid obstacle whose surface is the cubic spline through points.
+    """A rigid obstacle whose surface is a cubic spline through points, extruded or revolved in 3D.
 
-    Normal and curvature are those of the spline, which has no corners: for these take a
-    `RigidSurface`. An open profile must reach beyond where contact may be: places from which its
-    end is closest are outside.
+    The spline has no corners: use a `RigidSurface` for a profile with corners. An open profile must
+    extend beyond the contact: points whose closest point is one of its ends are outside.
+
+    Args:
+        points: Successive points of the surface, (n, gdim) (length), with the obstacle on the left;
+            the same on every rank. In space give ``extruded`` or ``turned``, too.
+        closed: Whether the last point is connected to the first.
+        extruded: Direction of extrusion, three numbers of any length; left is as seen against it.
+        turned: A point of the axis of revolution and its direction, three numbers each; left is in
+            the half-plane with the axis upwards and the points on its right. If an open profile
+            begins or ends on the axis, the surface is smooth there.
+        displacement: Rigid translation, as for `Obstacle`.
+        rotation: Rotation, as for `Obstacle`.
+
+    Raises:
+        ValueError: Shapes or numbers are invalid, or successive points coincide.
     """
 
     def __init__(
@@ -43,32 +56,13 @@ class RigidProfile(SampledObstacle):
         displacement: Any = None,
         rotation: Rotation | None = None,
     ) -> None:
-        """Take the profile.
-
-        Args:
-            points: On the surface one after the other, (n, gdim) (length), the obstacle on the left
-                of the way; the same on every rank. In space ``extruded`` or ``turned`` says what
-                is made of them.
-            closed: Whether the profile goes on from the last point to the first.
-            extruded: Direction along which the profile stays the same, three numbers of any
-                length; the left is that seen against it.
-            turned: A point of an axis and its direction, three numbers each: the surface is that of
-                revolution, and the left that in the half-plane with the axis upwards and the
-                points on its right. Where an open profile begins or ends on the axis, the surface
-                goes on smoothly across.
-            displacement: See `Obstacle`.
-            rotation: Likewise.
-
-        Raises:
-            ValueError: Shapes or numbers are wrong, or neighbouring points are the same.
-        """
         given = as_points("points of the RigidProfile", points)
         self._gdim = given.shape[1]
         ways = [v for v in (extruded, turned) if v is not None]
         if len(ways) != self._gdim - 2:
             raise ValueError(
-                "a RigidProfile takes neither extruded nor turned with points in the plane, and "
-                f"one of them with points in space; given are points in {self._gdim} dimensions, "
+                "a RigidProfile needs neither extruded nor turned with points in the plane, and "
+                f"one of them with points in space; it has points in {self._gdim} dimensions, "
                 f"extruded={extruded!r} and turned={turned!r}"
             )
         self._section: _Prism | _Revolution | None = None
@@ -86,9 +80,9 @@ class RigidProfile(SampledObstacle):
         same = np.flatnonzero(np.all(following == given[: len(following)], axis=1))
         if len(same) or len(given) < 2 + closed:
             raise ValueError(
-                f"points of the RigidProfile: {len(given)} in its plane, of which those with the "
-                f"numbers {same.tolist()} are where the next one is; give at least {2 + closed} "
-                "distinct points, in the order in which they lie on the surface"
+                f"points of the RigidProfile: of {len(given)} in its plane, those with the indices "
+                f"{same.tolist()} coincide with the next one; give at least {2 + closed} "
+                "distinct points, in their order on the surface"
             )
         self.curve = Curve(given, closed=closed)
         ends = [a for way in ways for a in np.ravel(np.asarray(way, dtype=np.float64))]
@@ -97,21 +91,21 @@ class RigidProfile(SampledObstacle):
 
     @property
     def gdim(self) -> int:
-        """See `SampledObstacle.gdim`."""
+        """Dimension of space, 2 or 3."""
         return self._gdim
 
     @property
     def fingerprint(self) -> str:
-        """See `SampledObstacle.fingerprint`."""
+        """A string that identifies points, extrusion and axis."""
         return self._fingerprint
 
     @property
     def smallest_radius(self) -> float:
-        """See `Obstacle.smallest_radius`: that of the profile."""
+        """Smallest radius of curvature of the convex parts of the profile (length)."""
         return self.curve.smallest_radius
 
     def sample(self, x: Array) -> Sample:
-        """See `SampledObstacle.sample`."""
+        """Return signed distance, normal and curvature at points (n, gdim)."""
         if self._section is None:
             return self.curve.sample(x)
         return self._section.lifted(x, self.curve.sample(self._section.plane(x)))

@@ -27,9 +27,14 @@ ToUFL = Callable[[Any], ufl.core.expr.Expr]
 
 @dataclass(frozen=True)
 class HalfSpace(Obstacle):
-    """A rigid half-space: the plane through ``point``, ``normal`` pointing out of it.
+    """A rigid half-space, bounded by a plane.
 
-    The body stands on the side the normal points to: a floor has the normal (0, 1).
+    Args:
+        point: A point of the plane, gdim numbers (length).
+        normal: Normal of the plane, of any length, pointing out of the half-space to the body: a
+            floor has the normal (0, 1).
+        displacement: Rigid translation, as for `Obstacle`.
+        rotation: Rotation, as for `Obstacle`.
     """
 
     point: Sequence[float]
@@ -39,12 +44,12 @@ class HalfSpace(Obstacle):
 
     @property
     def is_flat(self) -> bool:
-        """See `Obstacle.is_flat`."""
+        """Whether the obstacle is a plane known in numbers: if point and normal are numbers."""
         given = (self.point, self.normal)
         return not any(isinstance(value, ufl.core.expr.Expr) for value in given)
 
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """Gap (x - point - shift)·normal; see `Obstacle.place`."""
+        """Return the gap (x - point - shift)·normal and the direction -normal."""
         gdim = x.ufl_shape[0]
         normal = to_ufl(nonzero_vector("normal of the HalfSpace", self.normal, gdim))
         normal = normal / ufl.sqrt(ufl.dot(normal, normal))
@@ -56,7 +61,15 @@ class HalfSpace(Obstacle):
 
 @dataclass(frozen=True)
 class Ball(Obstacle):
-    """A rigid ball (a disc in 2D), or with ``inside=True`` the cavity around the body."""
+    """A rigid ball, in 2D a disc, or a spherical cavity.
+
+    Args:
+        center: Centre, gdim numbers (length).
+        radius: Radius, > 0 (length).
+        inside: Whether the body is inside of the sphere, which is then a cavity.
+        displacement: Rigid translation, as for `Obstacle`.
+        rotation: Rotation, as for `Obstacle`.
+    """
 
     center: Sequence[float]
     radius: float
@@ -66,11 +79,11 @@ class Ball(Obstacle):
 
     @property
     def smallest_radius(self) -> float:
-        """See `Obstacle.smallest_radius`."""
+        """Radius (length); infinite for a cavity, or if it is not known as a number."""
         return _convex_radius(self.radius, self.inside)
 
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """Gap |x - center - shift| - radius (negated inside); see `Obstacle.place`."""
+        """Return the gap |x - center - shift| - radius, negated inside, and the direction."""
         gdim = x.ufl_shape[0]
         arm = x - to_ufl(as_vector("center of the Ball", self.center, gdim))
         return _round(
@@ -80,9 +93,16 @@ class Ball(Obstacle):
 
 @dataclass(frozen=True)
 class Cylinder(Obstacle):
-    """A rigid circular cylinder through ``point`` along ``axis``; in 2D the axis is out of plane.
+    """A rigid circular cylinder, in 2D a disc, or a cylindrical bore.
 
-    With ``inside=True`` it is the bore around the body.
+    Args:
+        point: A point of the axis, gdim numbers (length).
+        radius: Radius, > 0 (length).
+        axis: Direction of the axis, three numbers of any length; None in 2D, where the axis is
+            normal to the plane.
+        inside: Whether the body is inside of the cylinder, which is then a bore.
+        displacement: Rigid translation, as for `Obstacle`.
+        rotation: Rotation, as for `Obstacle`.
     """
 
     point: Sequence[float]
@@ -94,15 +114,19 @@ class Cylinder(Obstacle):
 
     @property
     def smallest_radius(self) -> float:
-        """See `Obstacle.smallest_radius`."""
+        """Radius (length); infinite for a bore, or if it is not known as a number."""
         return _convex_radius(self.radius, self.inside)
 
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """Gap: distance from the axis minus radius (negated inside); see `Obstacle.place`."""
+        """Return the distance from the axis minus radius, negated inside, and the direction.
+
+        Raises:
+            ValueError: ``axis`` is given in 2D or missing in 3D, or data are out of range.
+        """
         gdim = x.ufl_shape[0]
         arm = x - to_ufl(as_vector("point of the Cylinder", self.point, gdim))
         if gdim == 2 and self.axis is not None:
-            raise ValueError(f"axis of the Cylinder is {self.axis!r}; in 2D it takes none")
+            raise ValueError(f"axis of the Cylinder is {self.axis!r}; omit it in 2D")
         if gdim == 3:
             if self.axis is None:
                 raise ValueError("axis of the Cylinder is missing; in 3D give its direction")
@@ -134,15 +158,19 @@ def _round(arm: Any, shift: Any, radius: Any, inside: bool) -> Placement:
 
 @dataclass(frozen=True)
 class SignedDistance(Obstacle):
-    """A rigid obstacle of any shape, given by its signed distance at every place.
+    """A rigid obstacle of any shape, given by its signed distance at every point.
 
-    ``SignedDistance(lambda x: ufl.sqrt(x[0] ** 2 + x[1] ** 2) - 1)`` is a disc.
+    ``SignedDistance(lambda x: ufl.sqrt(x[0] ** 2 + x[1] ** 2) - 1)`` is a disc of radius 1.
 
-    Args to the constructor:
-        distance: Function of a place x, a UFL vector, that returns the signed distance of x from
-            the obstacle (UFL scalar, length), positive outside. Its gradient must have length 1
+    Args:
+        distance: Function of the point x, a UFL vector, that returns its signed distance from the
+            obstacle (UFL scalar, length), positive outside. Its gradient must have length 1
             near the contact: the contact normal is minus the gradient.
-        displacement, rotation: See `Obstacle`.
+        displacement: Rigid translation, as for `Obstacle`.
+        rotation: Rotation, as for `Obstacle`.
+
+    Raises:
+        TypeError: ``distance`` is not callable.
     """
 
     distance: Callable[[Any], Any]
@@ -150,11 +178,7 @@ class SignedDistance(Obstacle):
     rotation: Rotation | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a distance that is not a function.
-
-        Raises:
-            TypeError: The message states what was given.
-        """
+        """Check that the distance is a function."""
         if not callable(self.distance):
             raise TypeError(
                 f"distance of the SignedDistance is {self.distance!r}; it must be a function of x, "
@@ -163,11 +187,11 @@ class SignedDistance(Obstacle):
 
     @property
     def is_distance(self) -> bool:
-        """See `Obstacle.is_distance`."""
+        """Whether the normal is minus the gradient of the gap: always True."""
         return True
 
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """Distance at x and minus its gradient; see `Obstacle.place`."""
+        """Return the signed distance at x - shift and minus its gradient."""
         here = ufl.variable(x if shift is None else x - shift)
         gap = ufl.as_ufl(self.distance(here))
         _check_scalar("distance of the SignedDistance", gap)
@@ -180,13 +204,13 @@ class PrescribedGap(Obstacle):
 
     Finite kinematics evaluate the gap at the deformed positions: they need a `SignedDistance`.
 
-    Args to the constructor:
-        gap: Distance along ``normal`` before any displacement (length); negative where the
-            body penetrates: numbers, constants, functions or UFL over Γc. The motion of the
-            obstacle is not part of it: see `Obstacle`.
+    Args:
+        gap: Initial gap s along ``normal`` (length), negative where the body penetrates: a number,
+            constant, function or UFL expression over Γc, without the motion of the obstacle.
         normal: Direction from the body to the obstacle, of any length greater than zero, (gdim,).
-        displacement, rotation: See `Obstacle`; the component of the displacement along ``normal``
-            adds to the gap.
+        displacement: Rigid translation, as for `Obstacle`; its component along ``normal`` is added
+            to the gap.
+        rotation: Rotation, as for `Obstacle`.
     """
 
     gap: Any
@@ -195,7 +219,7 @@ class PrescribedGap(Obstacle):
     rotation: Rotation | None = None
 
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """The prescribed gap, moved by the shift along the normal; see `Obstacle.place`."""
+        """Return the prescribed gap plus shift·normal, and the direction."""
         direction = nonzero_vector("normal of the PrescribedGap", self.normal, x.ufl_shape[0])
         direction = to_ufl(direction)
         gap = to_ufl(self.gap)

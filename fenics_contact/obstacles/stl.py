@@ -49,7 +49,7 @@ def _from_text(path: Path, data: bytes) -> Array:
         rows = []
     if not rows or {len(row) for row in rows} != {3} or len(rows) % 3:
         raise ValueError(
-            f"{path} holds no triangles: {len(data)} bytes that are neither a binary STL file of "
-            "the length that it says nor an ASCII one of whole facets"
+            f"{path} holds no triangles: its {len(data)} bytes are neither a binary STL file of "
+            "the length in its header nor an ASCII one with complete facets"
         )
     return np.array(rows)
