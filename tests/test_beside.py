@@ -185,10 +185,10 @@ def beyond_its_limit(busy):
 
 
 REFUSED = {
-    pops_out: "friction would drive the slip",
+    pops_out: "friction supplies energy",
     too_soft: "times its size",
-    slides_far: "too large to be taken as small",
-    held_inside: "penetration or elastic slip left",
+    slides_far: "too large for the small-displacement",
+    held_inside: "augmented Lagrangian method has not converged",
     not_held: "nothing will ever hold",
     pulled_off: "no contact force can balance",
     pushed_aside: "no contact force can balance",

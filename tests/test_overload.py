@@ -81,7 +81,7 @@ def test_it_ends_soon_and_says_why(method):
                 failed.append(error)
                 raise
 
-        words = "overload: along the rotation about z", "Try less load, more friction"
+        words = "overload: along the rotation about z", "Try a smaller load, more friction"
         raised_everywhere(solve, fc.NotConverged, *words)
         assert failed[0].iterations < 300
 

@@ -249,7 +249,7 @@ def test_a_limit_of_another_law():
     with pytest.raises(fc.NotConverged, match="friction bound violated by") as caught:
         problem.solve()
     # Smaller increments would not mend it.
-    assert "response, friction_bound and normal_potential" in str(caught.value)
+    assert "contact_traction, friction_bound and normal_potential" in str(caught.value)
     assert "smaller increments" not in str(caught.value)
 
 

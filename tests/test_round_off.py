@@ -86,4 +86,4 @@ def test_a_stiff_slab_that_nothing_else_holds():
 
     high, low = between(1.0)
     assert close(high + low, 0 * high, 1e-8 * np.linalg.norm(high), scale=1.0)
-    raised_everywhere(lambda: between(1e12), fc.NotConverged, "leave a round-off of")
+    raised_everywhere(lambda: between(1e12), fc.NotConverged, "with a round-off of")

@@ -64,7 +64,7 @@ def test_a_step(solved):
 @pytest.mark.parametrize(
     ("iterations", "told"),
     [
-        (0, "solved by its first guess"),
+        (0, "solved by the predictor"),
         (1, "1 iteration"),
         (7, "7 iterations"),
     ],

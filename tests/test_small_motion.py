@@ -97,7 +97,7 @@ def test_the_true_gap(cell):
 
 def test_motion_that_is_not_small_fails():
     problem, contact = pressed(body=-1.0, small_displacement_tolerance=0.2)
-    with pytest.raises(fc.NotConverged, match="too large to be taken as small"):
+    with pytest.raises(fc.NotConverged, match="too large for the small-displacement"):
         problem.solve()
     assert close(contact.history.rows(), 0 * contact.history.rows(), 0.0, scale=1.0)
 

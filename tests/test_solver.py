@@ -274,7 +274,7 @@ def test_summary_without_forces(lift):
     assert "; no forces; " in step.summary()
     assert "reason" not in step.summary()
     problem.commit()
-    assert "solved by its first guess" in problem.solve().summary()
+    assert "solved by the predictor" in problem.solve().summary()
 
 
 def test_why_all_unknowns_is_said_once(caplog):

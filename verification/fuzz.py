@@ -56,9 +56,9 @@ FIELDS = ("seed", "ranks", "outcome", "kind", "increments", "seconds", "features
 METHODS = {"newton": 100, "continuation": 100, "primal_dual": 100, "lbfgs": 1000}
 # What refusals say, by what they are about.
 CATEGORIES = {
-    "half of its radius": "too deep",
+    "half of the radius": "too deep",
     "gone through Γc": "gone through",
-    "cells are turned inside out": "inside out",
+    "cells are inverted": "inverted",
     "rad in one increment": "turned too far",
     "no contact force can balance": "load not balanced",
     "nothing will ever hold": "not held",

@@ -1,4 +1,4 @@
-"""What one increment came to, in numbers and in words."""
+"""The result of one increment, in numbers and in words."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ _NOTHING = 1e-9
 
 @dataclass(frozen=True)
 class Step:
-    """What one solve did.
+    """The result of one increment.
 
     Attributes:
         increment: Number of the increment, from 1.
         reason: SNES reason of the last solve (positive: converged).
-        iterations: SNES iterations in all, those on too few unknowns included.
-        augmentations: Updates of the multipliers, the first solution included.
-        method: The method that found the solution; see `ContactProblem`.
-        factorisations: Sparse matrices factored; dense ones of a condensed problem do not count.
-        verdict: The independent check.
-        contacts: Resultants of every contact, by name.
+        iterations: Number of SNES iterations of all attempts.
+        augmentations: Number of solutions with different multipliers, 1 with a penalty.
+        method: Method of `ContactProblem` that found the solution.
+        factorisations: Number of sparse factorisations, without dense ones of condensed problems.
+        verdict: The verification of the solution.
+        contacts: `Resultants` of every contact, by name.
         energy: Works and energies of the increment.
-        attempts: Everything that was tried, in its order; the last is what found the solution.
-        wall_seconds: Time of the solve on this rank.
-        load: Load parameter, where `increments` set one.
-        increment_error: Errors by the size of the increments so far, by quantity, where
-            `increments` estimates them; see `ErrorBudget`.
-        complete: Whether all of u is that of the increment; else `ContactProblem.complete` makes
-            it so.
+        attempts: All attempts in their order; the last one found the solution.
+        wall_seconds: Time of the solve on this rank (s).
+        load: Load parameter, if the step was made by `increments`.
+        increment_error: Accumulated error of the increment size, by quantity of `ErrorBudget`, with
+            ``increments(estimate=True)``.
+        complete: Whether all of u is up to date; if not, `ContactProblem.complete` recovers the
+            interior displacement.
     """
 
     increment: int
@@ -58,14 +58,13 @@ class Step:
     complete: bool = True
 
     def summary(self) -> str:
-        """One line for people.
+        """Return a summary of the increment in one line.
 
-        Of every contact "force" is ∫ -r_n, "friction ∫|τ|" the sum of the sizes over the points,
-        and "resultant" the force on the body, in which tractions of opposite ways cancel. A contact
-        whose forces are no more than the residual that passes has "no contact force"
-        (`ForceBalance.is_loaded`): how many of its points stick or slip is round-off. What small
-        displacements leave out is said from 1 % of force or pressure on. Where forces and areas are
-        per unit thickness (`Resultants.per_thickness`) the line ends with these words.
+        For every contact, "force" is ∫ -r_n, "friction ∫|τ|" the integral of the magnitude, and
+        "resultant" the force vector on the body. A contact whose forces do not exceed the tolerance
+        of the residual (`ForceBalance.is_loaded`) has "no contact force", and its numbers of points
+        are round-off. The error of the small-displacement assumption is stated from 1 % of force or
+        pressure on. The line states at its end if forces and areas are per unit thickness.
         """
         parts = [f"increment {self.increment}"]
         if self.load is not None:
@@ -85,10 +84,10 @@ class Step:
         return "; ".join([*parts, *self._left_out(), *per_thickness])
 
     def _left_out(self) -> list[str]:
-        """What taking displacements as small leaves out of every contact, where it is notable."""
+        """Return the small-displacement error of every contact in words, if it is notable."""
         found = self.verdict.kinematics.items()
         return [
-            f"{name}: displacements are taken as small, else {left_out.describe()}"
+            f"{name}: displacements are assumed small; otherwise {left_out.describe()}"
             for name, left_out in found
             if left_out.is_notable
         ]
@@ -113,13 +112,13 @@ class Step:
         return normal, friction, _components(loaded * r.force)
 
     def _made(self) -> str:
-        """By which method, and in how many iterations."""
+        """Return the method and the number of iterations in words."""
         if not self.iterations:
-            return f"{self.method}: solved by its first guess"
+            return f"{self.method}: solved by the predictor"
         return f"{self.method}: {self.iterations} iteration{'s' if self.iterations > 1 else ''}"
 
     def _repr_html_(self) -> str:
-        """The same as a table, for notebooks."""
+        """Return the summary as a table for notebooks."""
         title = f"Increment {self.increment}"
         if self.load is not None:
             title += f", load {self.load:.6g}"

@@ -1,4 +1,4 @@
-"""The verdict on a solution: what it must satisfy, checked apart from the solver and the forms."""
+"""The verdict on a solution: equations, laws and kinematics, independent of the solver."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ _MOST_DEFORMED = 5.0
 
 @dataclass(frozen=True)
 class ForceBalance:
-    """What is left of forces that should balance, and what it is judged by.
+    """The residual of forces in balance, with the forces and the tolerance it is compared with.
 
     Attributes:
-        residual: What is left (force).
-        force: Size of the forces of the present increment (force).
-        tolerance: Largest residual that passes (force).
-        round_off: Of what the stiffness sums up; 0 where no force acts, or it is not known (force).
+        residual: Norm of the residual (force).
+        force: Magnitude of the forces of the present increment (force).
+        tolerance: Largest residual accepted (force).
+        round_off: Round-off of the internal forces; 0 without forces, or if it is unknown (force).
     """
 
     residual: float
@@ -49,60 +49,58 @@ class ForceBalance:
 
     @property
     def is_loaded(self) -> bool:
-        """Whether there are forces: more than the residual that passes, which none is told from."""
+        """Whether there are forces, that is, more than the residual accepted."""
         return self.force > self.tolerance
 
     def holds(self, times: float = 1.0) -> bool:
-        """Whether the residual passes, and all is finite."""
+        """Return whether all is finite and the residual at most ``times`` the tolerance."""
         finite = np.isfinite([self.residual, self.force, self.tolerance]).all()
         return bool(finite and self.residual <= times * self.tolerance)
 
     def excess(self) -> float:
-        """Residual over tolerance; infinite where something is not finite."""
+        """Return the residual divided by the tolerance; infinite if something is not finite."""
         if not self.holds(np.inf):
             return np.inf
         return self.residual / self.tolerance if self.residual > 0 else 0.0
 
     def __str__(self) -> str:
-        """What is left, and what would pass."""
+        """Return residual, tolerance and forces in words."""
         found = f"{self.residual:.3e} above {self.tolerance:.3e}, of forces of {self.force:.3e}"
         if self.round_off > self.tolerance:
             found += (
-                f", where its displacements leave a round-off of {self.round_off:.3e}: its "
-                "stiffness, or how far it is carried, is too large beside the forces"
+                f", with a round-off of {self.round_off:.3e}: its stiffness, or its rigid-body "
+                "displacement, is too large relative to the forces"
             )
         return found
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was checked after a solve, the same on every rank.
+    """The verification of a solution, the same on every rank.
 
     Attributes:
-        equations: Norms of the free residual, recomputed by assembly, by body, free obstacle and
-            contact: each is judged by the forces that act on it in the present increment.
-        sums: Largest component of load + contact + reactions, by body, and of their moments about
-            its middle, by its size: contact by its tractions at the points and not by its nodal
-            forces.
-        laws: Largest violations by contact and by law, relative; see `check_laws`.
+        equations: Residuals of the free dofs, recomputed by assembly, by body, free obstacle and
+            contact; each is compared with the forces of the present increment on it.
+        sums: By body, the resultant of loads, contact tractions and reactions, and their moment
+            about the centre of the body, divided by its size. Contact enters by the tractions at
+            the quadrature points, not by nodal forces.
+        laws: Largest relative violations of the contact laws, by contact and condition.
         enforcement: `Contact.enforcement_error` of the contacts with multipliers, by name.
-        enforcement_tolerance: What passes, by name.
-        obstacles: What is found of obstacles that are rigid or go far, by contact.
-        tunnelling: Penetration that the points of a contact do not resist, and places that have
-            crossed what lies opposite, by contact; see `Tunnelling`.
-        kinematics: What taking displacements as small changes, relative, by contact.
-        small_displacement_tolerance: What passes; where it is finite no body passes that is
-            deformed by more than five times its size.
-        deformation: Of every body its largest displacement, rigid motion apart, by its size, or by
-            how far its Dirichlet values differ, if that is more.
-        ejected_bodies: Bodies that nothing touches any more, how far they have gone, and how far
-            anything else has (length), by their names; see `find_ejected_bodies`.
-        friction_energy_gain: Share of the energy exchanged that friction has given; see
-            `Energy.friction_energy_gain`.
-        inverted: Whether cells of a nonlinear bulk are turned inside out.
-        cross_check: By contact the largest difference of its nodal forces from those that DOLFINx
-            assembles from the boundary form; empty where it was not asked for, see ``cross_check``
-            of `ContactProblem`.
+        enforcement_tolerance: Largest error accepted, by name.
+        obstacles: Distance gradient, depth and rotation of rigid obstacles, by contact.
+        tunnelling: Penetration between the quadrature points, and points that have crossed the
+            obstacle, by contact.
+        kinematics: Relative error of the small-displacement assumption, by contact.
+        small_displacement_tolerance: Largest such error accepted. If it is finite, no body may
+            deform by more than five times its size.
+        deformation: By body, the largest displacement without rigid-body motion, divided by the
+            size of the body or the range of its Dirichlet values, whichever is larger.
+        ejected_bodies: By name of bodies without contact force that have moved much farther than
+            anything else: their displacement, and the largest other one (length).
+        friction_energy_gain: Energy that friction has supplied, relative to the energy exchanged.
+        inverted: Whether cells of a nonlinear bulk are inverted, det(I + grad u) ≤ 0.
+        cross_check: By contact, the largest difference of its nodal forces from those that DOLFINx
+            assembles from the boundary form; empty without ``ContactProblem(cross_check=True)``.
     """
 
     equations: dict[str, ForceBalance]
@@ -122,7 +120,7 @@ class Verdict:
 
     @property
     def inexact(self) -> dict[str, float]:
-        """Share of the forces on a body that is left by round-off, where it is more than 1e-5."""
+        """Relative residual, by body, where round-off makes it more than 1e-5."""
         return {
             name: balance.residual / balance.force
             for name, balance in self.equations.items()
@@ -131,27 +129,27 @@ class Verdict:
 
     @property
     def residual(self) -> float:
-        """That of the equations which hold least well (force)."""
+        """Largest residual relative to its tolerance (force)."""
         return self._worst(self.equations).residual
 
     @property
     def force(self) -> float:
-        """What that residual is judged by (force)."""
+        """Magnitude of the forces where `residual` is (force)."""
         return self._worst(self.equations).force
 
     @property
     def tolerance(self) -> float:
-        """Largest residual that passes there (force)."""
+        """Tolerance where `residual` is (force)."""
         return self._worst(self.equations).tolerance
 
     @property
     def imbalance(self) -> float:
-        """Of the sums of forces the one that is balanced least well (force)."""
+        """Largest resultant of all forces on a body, relative to its tolerance (force)."""
         return self._worst(self.sums).residual
 
     @property
     def imbalance_tolerance(self) -> float:
-        """Largest imbalance that passes there (force)."""
+        """Tolerance where `imbalance` is (force)."""
         return self._worst(self.sums).tolerance
 
     @property
@@ -161,7 +159,7 @@ class Verdict:
 
     @property
     def relative_residual(self) -> float:
-        """The largest residual relative to the forces it is judged by; 0 where there are none."""
+        """Largest residual relative to the forces; 0 without forces."""
         loaded = (balance for balance in self.equations.values() if balance.is_loaded)
         return max((balance.residual / balance.force for balance in loaded), default=0.0)
 
@@ -170,7 +168,7 @@ class Verdict:
         return max(balances.values(), key=ForceBalance.excess)
 
     def _repr_html_(self) -> str:
-        """What is left of what must vanish, and what passes, for notebooks."""
+        """Return a table of errors and tolerances for notebooks."""
         balances = {f"equations, {name}": b for name, b in self.equations.items()}
         balances |= {f"sums of forces, {name}": b for name, b in self.sums.items()}
         balances |= {f"cross-check, {name}": b for name, b in self.cross_check.items()}
@@ -183,16 +181,16 @@ class Verdict:
             rows.append((f"enforcement, {contact}", f"{error:.2e}", allowed))
         failures = self.failures
         title = "Verdict: " + ("does not hold" if failures else "holds")
-        return shown(title, ("check", "left", "passes"), rows, failures)
+        return shown(title, ("check", "error", "tolerance"), rows, failures)
 
     @property
     def only_laws_fail(self) -> bool:
-        """Whether all but laws holds, and some of these do not."""
+        """Whether only contact laws are violated."""
         return bool(self.failures) and not replace(self, laws={}).failures
 
     @property
     def failures(self) -> list[str]:
-        """What does not hold, in words; empty for a solution."""
+        """The conditions that are violated, in words; empty for a verified solution."""
         found = []
         # Twice: the solver's residual is a product with K, this one an assembly.
         for name, balance in self.equations.items():
@@ -204,8 +202,8 @@ class Verdict:
         for contact, balance in self.cross_check.items():
             if not balance.holds():
                 found.append(
-                    f"{contact}: forces differ from those of the boundary form as DOLFINx "
-                    f"assembles it: {balance}"
+                    f"{contact}: the contact forces differ from those that DOLFINx assembles from "
+                    f"the boundary form: {balance}"
                 )
         for contact, laws in self.laws.items():
             found += [
@@ -217,59 +215,60 @@ class Verdict:
             allowed = self.enforcement_tolerance[contact]
             if not error <= allowed:
                 found.append(
-                    f"{contact}: penetration or elastic slip left, {error:.3e} of the largest "
-                    f"traction in the springs, above {allowed:.3e}; a larger tolerance, or "
-                    "k_n and k_t nearer to 10 E/h, take fewer rounds; where a Dirichlet condition "
-                    "holds a node of Γc inside of the obstacle nothing undoes it: take such facets "
-                    "out of Γc"
+                    f"{contact}: the augmented Lagrangian method has not converged: the penalty "
+                    f"still carries {error:.3e} of the largest traction, above {allowed:.3e}. "
+                    "Use a larger tolerance, or k_n and k_t closer to 10 E/h. If a Dirichlet "
+                    "condition prescribes a node of Γc inside of the obstacle, its penetration "
+                    "remains: take such facets out of Γc"
                 )
         if not self.friction_energy_gain <= _MAX_FRICTION_ENERGY_GAIN:
             found.append(
-                "friction would drive the slip, by "
-                f"{100 * self.friction_energy_gain:.2g} % of the energy exchanged. Several "
-                "states satisfy the equations; smaller increments lead to another one. Use smaller "
-                "increments (increments() halves them where needed)"
+                "friction supplies energy, "
+                f"{100 * self.friction_energy_gain:.2g} % of the energy exchanged: the equations "
+                "have several solutions, and this one is not reached by a continuous load path. "
+                "Use smaller increments (increments() halves them where needed)"
             )
         for contact, change in self.kinematics.items():
             if self.small_displacement_tolerance == np.inf:
                 continue
             if not np.isfinite(change.judged):
                 found.append(
-                    f"{contact}: how far displacements are too large to be taken as small cannot "
-                    "be told, because the springs of contact at its points hold a body against "
-                    "nothing; where friction alone holds it and all points slip, the load is at "
-                    "its limit; hold it by a condition or a weak spring, or accept it: "
+                    f"{contact}: the small-displacement error could not be estimated, because the "
+                    "contact tangent leaves a rigid-body mode of a body free. If all of its points "
+                    "slip, the load has reached the friction limit. Constrain the body by a "
+                    "Dirichlet condition or a weak spring, or accept the error: "
                     "ContactProblem(small_displacement_tolerance=inf)"
                 )
             elif change.judged > self.small_displacement_tolerance:
                 found.append(
-                    f"{contact}: displacements are too large to be taken as small: with gap and "
-                    "normals where the body has moved to, the contact force would differ by "
-                    f"{100 * change.force:.2g} % and the pressure by "
+                    f"{contact}: displacements are too large for the small-displacement "
+                    "assumption: with gap and normals of the deformed bodies, the contact force "
+                    f"would differ by {100 * change.force:.2g} % and the pressure by "
                     f"{100 * change.pressure:.2g} %, above "
-                    f"{100 * self.small_displacement_tolerance:.2g} %; "
-                    "load in smaller steps, describe the motion as one of the obstacle, find pairs "
-                    'anew (update_pairs="increment"), or accept it: '
-                    "ContactProblem(small_displacement_tolerance=inf)"
+                    f"{100 * self.small_displacement_tolerance:.2g} %. Use smaller increments, "
+                    "move the obstacle instead of the body, update the pairs "
+                    '(update_pairs="increment"), use Contact(kinematics="finite"), or accept the '
+                    "error: ContactProblem(small_displacement_tolerance=inf)"
                 )
         for name, deformation in self.deformation.items():
             if self.small_displacement_tolerance == np.inf or deformation <= _MOST_DEFORMED:
                 continue
             found.append(
-                f"{name} is deformed by {deformation:.2g} times its size: nothing holds a part of "
-                "it, or stiffness and loads are in other units than lengths; or accept it: "
-                "ContactProblem(small_displacement_tolerance=inf)"
+                f"{name} is deformed by {deformation:.2g} times its size: a part of it is not "
+                "constrained, or the units of stiffness, loads and lengths are not consistent; or "
+                "accept it: ContactProblem(small_displacement_tolerance=inf)"
             )
         for name, (way, others) in self.ejected_bodies.items():
             found.append(
-                f"{name} is thrown out: it has gone {way:.2g} and touches nothing, where nothing "
-                f"else has moved by more than {others:.2g}; load in smaller steps (increments() "
-                "cuts them by itself), bring bodies to touch first, or hold it by a weak spring"
+                f"{name} is ejected: it has moved by {way:.2g} and has no contact force, while "
+                f"nothing else has moved by more than {others:.2g}. Use smaller increments "
+                "(increments() halves them where needed), start with the bodies in contact, or "
+                "constrain it by a weak spring"
             )
         if self.inverted:
             found.append(
-                "cells are turned inside out, det(I + grad u) ≤ 0: no deformation of a body; load "
-                "in smaller steps (increments() cuts them by itself), or refine the mesh there"
+                "cells are inverted, det(I + grad u) ≤ 0. Use smaller increments (increments() "
+                "halves them where needed), or refine the mesh there"
             )
         for contact, obstacle in self.obstacles.items():
             found += obstacle.failures(contact)
@@ -279,7 +278,9 @@ class Verdict:
 
 
 def check_laws(contact: Contact) -> dict[str, float]:
-    """Check the laws at every quadrature point by inequalities, not by the return map. Collective.
+    """Evaluate the contact conditions at every quadrature point, without the return map.
+
+    Collective.
 
     Args:
         contact: An evaluated contact.
@@ -382,12 +383,12 @@ def check_laws(contact: Contact) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Attempt:
-    """One thing that was tried to solve an increment.
+    """An attempt to solve an increment by one method.
 
     Attributes:
-        method: A method of `ContactProblem`; or "cut", where `increments` halved the increment.
-        iterations: SNES iterations.
-        outcome: "converged", or what went wrong, in words.
+        method: A method of `ContactProblem`; or "cut", if `increments` halved the increment.
+        iterations: Number of SNES iterations.
+        outcome: "converged", or the reason of the failure in words.
     """
 
     method: str
@@ -395,21 +396,29 @@ class Attempt:
     outcome: str
 
     def __str__(self) -> str:
-        """For logs and messages."""
+        """Return method, outcome and iterations in words."""
         iterations = f"{self.iterations} iteration{'s' if self.iterations != 1 else ''}"
         return f"{self.method}: {self.outcome} ({iterations})"
 
 
 class NotConverged(RuntimeError):
-    """No solution of an increment was found. u and history are as before the increment.
+    """An increment has no verified solution; u and history are unchanged.
+
+    Args:
+        increment: Number of the increment.
+        reason: SNES reason of the last attempt.
+        verdict: Verification of the last state.
+        attempts: The attempts, in their order.
+        prefix: Prefix of the problem's PETSc options.
+        stiffnesses: Names of the stiffness parameters that may be lowered, the first one first.
 
     Attributes:
-        increment: Its number, from 1.
-        reason: SNES reason of what was tried last (negative: diverged; positive: it claimed
-            convergence).
-        iterations: SNES iterations made.
-        verdict: The last state, as checked.
-        attempts: What was tried, in its order.
+        increment: Number of the increment, from 1.
+        reason: SNES reason of the last attempt (negative: diverged; positive: SNES converged, but
+            the verification failed).
+        iterations: Number of SNES iterations of all attempts.
+        verdict: Verification of the last state.
+        attempts: The attempts, in their order.
     """
 
     def __init__(
@@ -422,36 +431,28 @@ class NotConverged(RuntimeError):
         prefix: str = "contact_",
         stiffnesses: Sequence[str] = ("k_t", "k_n"),
     ) -> None:
-        """Compose the message: what happened, the numbers, and what to try.
-
-        Args:
-            increment: See the attributes.
-            reason: See the attributes.
-            verdict: See the attributes.
-            attempts: See the attributes.
-            prefix: Of the problem's options.
-            stiffnesses: Parameters of the laws that may be lowered, what to try first.
-        """
         self.increment, self.reason, self.verdict = increment, reason, verdict
         self.attempts = tuple(attempts)
         self.iterations = sum(attempt.iterations for attempt in attempts)
-        what = "; ".join(verdict.failures) or "the last state passes the checks"
+        what = "; ".join(verdict.failures) or "the last state passes the verification"
         tried = ". ".join(str(attempt) for attempt in attempts)
         super().__init__(
             f"increment {increment} did not converge: SNES reason {reason} after {self.iterations} "
-            f"iterations; {what}; forces are of size {verdict.force:.3e}. Tried: {tried}. "
+            f"iterations; {what}; the forces have magnitude {verdict.force:.3e}. Tried: {tried}. "
             + _advice(reason, verdict, attempts, stiffnesses)
             + f"; -{prefix}snes_monitor shows the iterations"
         )
 
 
-# How `Overload.in_words` begins, and what no increment mends.
+# How `Overload.in_words` begins; smaller increments do not help.
 _OVERLOAD = "overload:"
 _OF_A_LAW = (
-    "The law itself does not hold where the equations do: of a law of your own look whether its "
-    "response, friction_bound and normal_potential belong together"
+    "The equations hold, but the contact law does not: check that contact_traction, friction_bound "
+    "and normal_potential of a user-defined law are consistent"
 )
-_OF_OVERLOAD = "Try less load, more friction, or a condition that holds the body along this motion"
+_OF_OVERLOAD = (
+    "Try a smaller load, more friction, or a Dirichlet condition that constrains this motion"
+)
 
 
 def _advice(
