@@ -133,7 +133,7 @@ def test_a_condition_on_nothing():
     dofs = fem.locate_dofs_topological(V, 1, scene.tags.find(NOWHERE))
     empty = fem.dirichletbc(fem.Function(V), dofs)
     bcs = [*scene.rollers(), empty]
-    with pytest.warns(UserWarning, match=rf"bcs\[{len(bcs) - 1}\] holds nothing"):
+    with pytest.warns(UserWarning, match=rf"bcs\[{len(bcs) - 1}\] has no effect"):
         problem_of(scene, bcs=bcs)
 
 
@@ -177,7 +177,7 @@ def test_one_obstacle_twice():
     plane = fc.HalfSpace(point=(0.3, 0.0), normal=(0.0, 2.0))
     for obstacle in (scene.floor(), plane):
         (told,) = doubled(scene, obstacle)
-        assert told.startswith("floor and other press on one and the same obstacle at 2 facets")
+        assert told.startswith("floor and other have the same obstacle at 2 facets")
 
 
 def test_two_obstacles_of_one_surface():

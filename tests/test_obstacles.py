@@ -126,7 +126,7 @@ def test_a_turn_by_more_than_a_right_angle_is_refused(shape):
         tool.go(0.0, 0.01, -angle)
         tool.go(0.0, -0.05, -angle)
         tool.go(0.0, -0.1, -angle)
-        with pytest.raises(fc.NotConverged, match=r"turns by .* rad in one increment"):
+        with pytest.raises(fc.NotConverged, match=r"rotates by .* rad in one increment"):
             tool.go(0.0, -0.1, 0.0)
 
         def turn(t, tool=tool, angle=angle):

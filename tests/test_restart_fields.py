@@ -106,7 +106,7 @@ def test_plastic_strains_go_on(bulk, tmp_path):
     whole, broken, after = (Press(bulk=bulk, n=4) for _ in range(3))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=".*taken as small")
+        warnings.filterwarnings("ignore", message=".*assumed small")
         run(whole, folder / "whole.npz")
         run(broken, folder / "part.npz", stop=3)
         run(after, folder / "part.npz")

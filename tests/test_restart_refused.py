@@ -373,7 +373,7 @@ def test_increments_that_are_never_asked_for(caplog):
     assert caplog.text.count("nothing was solved") == (COMM.rank == 0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=".*taken as small")
+        warnings.filterwarnings("ignore", message=".*assumed small")
         next(made.increments(1.0))
     assert made.problem.increment == 1
 

@@ -102,7 +102,7 @@ def test_few_points_are_told_of(enforcement):
 
     Reference: with the degree that is told the force is that of 40 points, to 4 %.
     """
-    with pytest.warns(UserWarning, match="as long as the radius of the obstacle") as told:
+    with pytest.warns(UserWarning, match="as long as the radius of curvature") as told:
         forces("distance", 2.0, enforcement=enforcement)
     degree = int(str(told[0].message).split("quadrature_degree=")[1].split(")")[0])
     with warnings.catch_warnings():

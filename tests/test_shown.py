@@ -39,7 +39,7 @@ def test_a_step(solved):
     _, step = solved
     r = step.contacts[NAME]
     title, (header, row), (remark, *left_out, units) = table(step)
-    assert all("taken as small" in text for text in left_out)
+    assert all("assumed small" in text for text in left_out)
     assert units == "Forces and areas are per unit thickness."
     assert title == f"Increment {step.increment}, load 2"
     shown = dict(zip(header, row, strict=True))

@@ -1,4 +1,4 @@
-"""Forces on Γc by another route than the solver's: as DOLFINx assembles the boundary form."""
+"""Cross-check of the contact forces with those that DOLFINx assembles from the boundary form."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the work of the loads goes: elastic energy, contact springs, friction."""
+"""Energy balance of an increment: work of loads, elastic energy, contact springs, friction."""
 
 from __future__ import annotations
 
@@ -23,32 +23,30 @@ _NOTHING = 1e-8
 
 @dataclass(frozen=True)
 class Energy:
-    """Energies of one increment (force times length; in 2D per thickness), equal on every rank.
+    """Energy balance of an increment (force times length; in 2D per thickness), on every rank.
 
-    Works are means of the forces at both ends of the increment times the way between them. The
-    loads are F at u = 0, internal forces the rest of F. In a form with inertia both have a part of
-    the inertial forces, and ``work`` and ``elastic`` are neither the work of the loads nor the
-    elastic energy; their difference, and all other attributes, mean what they say.
+    Works are products of the mean force at both ends of the increment and the displacement between
+    them. The loads are F at u = 0, and internal forces the rest of F. In a form with inertia both
+    contain a part of the inertial forces, so that ``work`` and ``elastic`` are neither the work of
+    the loads nor the elastic energy; their difference and all other attributes remain valid.
 
     Attributes:
         work: Work of the loads, of Dirichlet values and of moving obstacles.
         elastic: Work of the internal forces: the change of elastic energy, exact for a linear bulk.
-        springs: Change of the energy in the contact's springs, r_n²/2k_n + |τ|²/2k_t.
-        dissipation: Work of friction on the slip, ≥ 0.
-        remainder: What of the work is in none of them: contact that changes within the increment
-            (gets less with smaller increments), and springs let go where contact opens.
-        friction: Work of friction on the body by the mean of the tractions at both ends, on the
-            slip: negative where it brakes. Positive in one long increment where the slip turns
-            round within it, or where the state is none that smaller increments lead to.
-        sliding: The most that friction could have taken, by the sizes of tractions and slip.
-        imbalance: Work minus elastic minus the work of all tractions on Γc: zero by equilibrium
-            at both ends, up to the solver's tolerance. Not between bodies with finite kinematics,
-            whose points have other partners at both ends: what they felt of the one before is not
-            what the force on it does. It gets less with smaller increments.
-        friction_energy_gain: Share of the energy exchanged that friction has given instead of
-            taken, the largest of the groups of bodies between which forces pass; 0 if none. Where
-            a sliding body is turned round in one increment works cancel: then by what friction
-                takes each way.
+        springs: Change of the energy in the contact springs, r_n²/2k_n + |τ|²/2k_t.
+        dissipation: Frictional dissipation, ≥ 0.
+        remainder: work - elastic - springs - dissipation: due to contact that changes within the
+            increment, which decreases with its size, and to springs released where contact opens.
+        friction: Work of friction on the body over the slip, by the mean of the tractions at both
+            ends: negative where friction brakes. It is positive if slip reverses within a long
+            increment, or if the state is not reached by smaller increments.
+        sliding: Upper bound of the frictional work, by magnitudes of tractions and slip.
+        imbalance: Work minus elastic minus the work of the tractions on Γc, which vanishes by
+            equilibrium at both ends up to the solver's tolerance. Between bodies with finite
+            kinematics, whose pairs change, it only decreases with the increment size.
+        friction_energy_gain: Energy that friction has supplied, relative to the energy exchanged,
+            the largest over groups of interacting bodies; 0 if none. Where works cancel in a
+            reversal within one increment, it is relative to ``sliding``.
     """
 
     work: float

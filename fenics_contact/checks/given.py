@@ -1,4 +1,4 @@
-"""Whether displacement, Dirichlet conditions and contacts of a problem go together."""
+"""Validation of displacement, Dirichlet conditions and contacts of a problem."""
 
 from __future__ import annotations
 
@@ -36,12 +36,10 @@ _SAME_PLACE = 1e-12
 _COORDINATE_ROUND_OFF = 2e-7
 # How parts of a mixed function are prescribed.
 _OF_A_PART = (
-    "; on a part of a mixed one it is dirichletbc(value, dofs, W.sub(0)), where dofs are those of "
+    "; for a part of a mixed function use dirichletbc(value, dofs, W.sub(0)), where dofs = "
     "locate_dofs_topological((W.sub(0), V), ...) and V, _ = W.sub(0).collapse()"
 )
-_OF_U = (
-    "; take V = u.function_space itself, or V.sub(i) for a component: dirichletbc(value, dofs, V)"
-)
+_OF_U = "; use V = u.function_space, or V.sub(i) for a component: dirichletbc(value, dofs, V)"
 
 
 def find_displacement(u: fem.Function, contacts: Sequence[Contact]) -> Displacement:
@@ -51,20 +49,20 @@ def find_displacement(u: fem.Function, contacts: Sequence[Contact]) -> Displacem
         ValueError: It is not.
     """
     if isinstance(u, ufl.Form):
-        raise ValueError("u is a Form; the order is ContactProblem(F, u): residual, function")
+        raise ValueError("u is a Form; the arguments are ContactProblem(F, u): residual, function")
     if isinstance(u, ufl.core.expr.Expr) and not isinstance(u, fem.Function):
         raise ValueError(
-            "problem: u is a part of a function, or another expression; give the function that "
-            "is solved for, the w of ufl.split(w)"
+            "problem: u is a part of a function or another expression; it must be the function "
+            "that is solved for, the w of ufl.split(w)"
         )
     for contact in contacts:
         found, first = contact.displacement, contacts[0].displacement
         if found.whole is not u:
-            raise ValueError(f"{contact.name}: its u is not the u of the problem")
+            raise ValueError(f"{contact.name}: its u is not the u of the problem; use the same")
         if not found.same_part(first):
             raise ValueError(
                 f"{contact.name}: its u is another part of the mixed function than that of "
-                f"{contacts[0].name}; give all contacts the same"
+                f"{contacts[0].name}; all contacts must have the same displacement"
             )
     if contacts:
         return contacts[0].displacement
@@ -100,8 +98,8 @@ def constrained_unknowns(
         if not unknowns.comm.allreduce(dofs.size):
             warn(
                 unknowns.comm,
-                f"bcs[{number}] holds nothing: it has no degree of freedom on any rank; check the "
-                "tag or the place by which they were located",
+                f"bcs[{number}] has no effect: it has no dof on any rank; check the tag or the "
+                "location by which its dofs were found",
             )
     return mask
 
@@ -116,7 +114,7 @@ def check_values(bcs: Sequence[fem.DirichletBC], u: fem.Function) -> None:
     for number, bc in enumerate(bcs):
         bc.set(values)
         if not all_finite(comm, values[bc.dof_indices()[0]]):
-            raise ValueError(f"Dirichlet condition number {number} has values that are not finite")
+            raise ValueError(f"bcs[{number}] has values that are not finite (NaN or inf)")
 
 
 def check_contacts(
@@ -134,7 +132,7 @@ def check_contacts(
     """
     names = [c.name for c in contacts]
     if len(set(names)) != len(names):
-        raise ValueError(f"contacts are named {names}; give every Contact a name of its own")
+        raise ValueError(f"contacts are named {names}; names must differ, Contact(name=...)")
     for one, other in combinations(contacts, 2):
         _check_shared(one, other)
     space = displacement.whole.function_space
@@ -148,8 +146,8 @@ def check_contacts(
         if n_held:
             raise ValueError(
                 f"{contact.name}: all displacements of {n_held} facets of Γc are prescribed by "
-                "Dirichlet conditions; contact has nothing to decide there: take these facets "
-                "out of Γc or out of the condition"
+                "Dirichlet conditions, so that contact has no unknowns there; remove these facets "
+                "from Γc or from the condition"
             )
 
 
@@ -158,14 +156,14 @@ def _check_shared(one: Contact, other: Contact) -> None:
     moved = one.obstacle.displacement, other.obstacle.displacement
     turned = one.obstacle.rotation, other.obstacle.rotation
     for free, (mine, theirs), what in (
-        (bool(one.free_motion), moved, "Motion, whose force"),
-        (one.free_angle is not None, turned, "Rotation, whose moment"),
+        (bool(one.free_motion), moved, "the same Motion, whose force"),
+        (one.free_angle is not None, turned, "the same Rotation, whose moment"),
     ):
         if free and mine is theirs:
             raise ValueError(
-                f"{one.name} and {other.name} have one {what} would act twice, on two obstacles "
-                "that move each on its own; of one obstacle make one Contact, on "
-                "ContactSurface(mesh, tags, [1, 2]), or give each its own"
+                f"{one.name} and {other.name} have {what} would act twice, on two independent "
+                "obstacles; for one obstacle use one Contact, on "
+                "ContactSurface(mesh, tags, [1, 2]), otherwise give each its own"
             )
 
 
@@ -199,8 +197,8 @@ def check_start(contacts: Sequence[Contact]) -> float:
         if not extent * np.finfo(np.float64).eps <= _COORDINATE_ROUND_OFF * smallest:
             raise ValueError(
                 f"{contact.name}: facets of Γc of size {smallest:.3g} have coordinates as large as "
-                f"{extent:.3g}, of which double precision keeps 16 digits; move mesh and obstacles "
-                "next to the origin"
+                f"{extent:.3g}, too large for double precision; translate mesh and obstacles to "
+                "the origin"
             )
         contact.check_input()
         contact.inputs.check_side(contact.values, gap_prescribed=contact.gap_prescribed)
@@ -209,7 +207,8 @@ def check_start(contacts: Sequence[Contact]) -> float:
             worst = max(worst, -gap)
             if comm.rank == 0:
                 logger.warning(
-                    "%s: the undeformed body penetrates its obstacle by up to %g",
+                    "%s: the undeformed body penetrates its obstacle by up to %g; prescribe an "
+                    "intended interference by Contact(gap=...), else correct the geometry",
                     contact.name,
                     -gap,
                 )
@@ -224,11 +223,11 @@ def _warn_of_few_points(contact: Contact) -> None:
     if sparse is not None:
         warn(
             contact.surface.mesh.comm,
-            f"{contact.name}: facets of Γc are {sparse.times} times as long as those opposite, "
-            "which pass between its points: the force will be too small, of blocks alike by 1 to "
-            "26 %, the most where few facets of Γc bear it. Swap the surfaces, so that the finer "
-            f"one is Γc, or give ContactSurface(quadrature_degree={sparse.degree}), as many "
-            "points as the opposite facets take",
+            f"{contact.name}: facets of Γc are {sparse.times} times as long as the opposite ones, "
+            "which its quadrature points do not resolve: the force will be too small (between "
+            "blocks by 1 to 26 %, most where few facets of Γc are loaded). Swap the surfaces, so "
+            "that the finer one is Γc, or use "
+            f"ContactSurface(quadrature_degree={sparse.degree})",
         )
 
 
@@ -242,10 +241,9 @@ def _warn_of_doubles(contacts: Sequence[Contact]) -> None:
         if n_facets:
             warn(
                 comm,
-                f"{one.name} and {other.name} press on one and the same obstacle at {n_facets} "
-                "facets of Γc: each bears its share of the force there, as springs side by side "
-                "do; make one Contact of them, or take these facets out of one, unless two laws "
-                "are meant to act together",
+                f"{one.name} and {other.name} have the same obstacle at {n_facets} facets of Γc, "
+                "where their tractions add up like those of parallel springs; use one Contact, or "
+                "remove these facets from one of them, unless both laws are meant to act together",
             )
 
 

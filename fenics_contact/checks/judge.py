@@ -1,4 +1,4 @@
-"""The judge: recomputes what a solution must satisfy, apart from the method that found it."""
+"""Verification of a solution, independent of the method that found it."""
 
 from __future__ import annotations
 
@@ -139,8 +139,9 @@ class Judge:
                 self._warned[name] = found.worst
                 warn(
                     self._comm,
-                    f"{name}: displacements are taken as small, with gap and normals of the "
-                    f"undeformed body; where it has moved to, {found.describe()}",
+                    f"{name}: displacements are assumed small, with gap and normals of the "
+                    f"undeformed body; at the deformed position {found.describe()}. With large "
+                    'displacements use Contact(kinematics="finite")',
                 )
 
     def warn_of_round_off(self, verdict: Verdict) -> None:
@@ -150,9 +151,10 @@ class Judge:
                 self._inexact.add(name)
                 warn(
                     self._comm,
-                    f"{name}: round-off of its displacements leaves {100 * share:.2g} % of the "
-                    "forces on it, by which its stresses and reactions may be wrong; contact "
-                    "forces are as exact as on the softer bodies that it touches",
+                    f"{name}: round-off of its displacements leaves a residual of "
+                    f"{100 * share:.2g} % of the forces on it, the possible error of its stresses "
+                    "and reactions; contact forces are as accurate as on the softer bodies in "
+                    "contact with it. A smaller stiffness of this body reduces it",
                 )
 
     def warn_of_few_points(self) -> None:

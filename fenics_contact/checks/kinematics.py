@@ -1,8 +1,8 @@
-"""What small displacements leave out: gap and normal where the body has moved to.
+"""Error of the small-displacement assumption: gap and normal at the deformed position.
 
-The gap is taken as s - u_n with s and n of the undeformed body. Where the body has moved by u both
-are others, by the curvature of the obstacle or because the bodies have turned. What that changes in
-the forces follows from one linear solve with the tangent at hand.
+The gap is s - u_n with s and n of the undeformed body, eq. (1). At X + u both differ, due to the
+curvature of the obstacle or rotations. The change of the contact forces follows from one linear
+solve with the present tangent.
 """
 
 from __future__ import annotations
@@ -83,14 +83,12 @@ class LinearSprings:
 
 @dataclass(frozen=True)
 class Linearisation:
-    """What the linearised kinematics change in a contact, relative, equal on every rank.
+    """Relative error of a contact due to the small-displacement assumption, on every rank.
 
     Attributes:
-        force: In the contact force, by the length of its change.
-        pressure: In the pressure, in the mean square over Γc: single points at an edge tell
-            nothing.
-        rough: Whether the pressure is told roughly: between two meshes, whose facets meet at
-            angles that are none of the surfaces'.
+        force: Error of the contact force, the magnitude of its change.
+        pressure: Error of the pressure, in the L² norm over Γc.
+        rough: Whether the estimate of the pressure is inaccurate, as between two meshes.
     """
 
     force: float = 0.0
@@ -99,17 +97,17 @@ class Linearisation:
 
     @property
     def worst(self) -> float:
-        """The larger of the two; infinite where one is not finite."""
+        """The larger of the errors of force and pressure; infinite if one is not finite."""
         worst = max(self.force, self.pressure)
         return worst if np.isfinite(self.force) and np.isfinite(self.pressure) else np.inf
 
     @property
     def is_notable(self) -> bool:
-        """Whether it is more than 1 % of force or pressure."""
+        """Whether the error of force or pressure exceeds 1 %."""
         return self.worst > _NOTABLE
 
     def describe(self) -> str:
-        """By how much, in words."""
+        """Return the errors in words."""
         return (
             f"the contact force would differ by {100 * self.force:.2g} % and the pressure by "
             f"{100 * self.pressure:.2g} %"
@@ -117,7 +115,7 @@ class Linearisation:
 
     @property
     def judged(self) -> float:
-        """What an increment fails by: the force alone where the pressure is told roughly."""
+        """The error that is compared with the tolerance: of the force only, if ``rough``."""
         return self.force if self.rough and np.isfinite(self.worst) else self.worst
 
 
@@ -231,14 +229,14 @@ def linearisation(
     moduli: Sequence[float],
     respond: Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]],
 ) -> dict[str, Linearisation]:
-    """What the linearised kinematics change in every contact, by name. Collective.
+    """Estimate the error of the small-displacement assumption, by contact. Collective.
 
     Args:
         contacts: Evaluated contacts, at a solution.
-        moduli: Of every contact that of its bodies, about (stress): to see whether there is
-            anything to solve for.
-        respond: The change of the relative displacements at the points of every contact, with
-            springs there, by tractions that are added on the bodies.
+        moduli: Approximate modulus of the bodies of every contact (stress), to decide whether the
+            linear solve is needed.
+        respond: Returns the change of the relative displacements at the points of every contact
+            due to tractions added on the bodies, with given contact stiffness.
     """
     deviations = [Deviation.of(c) for c in contacts]
     matters = False

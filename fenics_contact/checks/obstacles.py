@@ -1,4 +1,4 @@
-"""Whether an obstacle is what contact takes it for, where the body has moved to."""
+"""Verification of a rigid obstacle: distance gradient, depth and rotation per increment."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _TURN = np.pi / 2 + 1e-9
 
 @dataclass(frozen=True)
 class ObstacleCheck:
-    """Of one contact with a rigid obstacle; the same on every rank.
+    """Verification of a contact with a rigid obstacle, the same on every rank.
 
     Attributes:
         slope: Length of the gradient of the distance at closed points, where it is farthest from 1.
-        depth: With finite kinematics the largest penetration, by the distance from there to the
-            centre of curvature of the obstacle.
-        turn: By which the obstacle has turned in this increment where there is friction (radians).
+        depth: With finite kinematics, the largest penetration divided by the distance from there to
+            the centre of curvature of the obstacle.
+        turn: Rotation of the obstacle in this increment, with friction (radians).
     """
 
     slope: float
@@ -39,7 +39,7 @@ class ObstacleCheck:
 
     @classmethod
     def of(cls, contact: Contact) -> ObstacleCheck:
-        """At the evaluated state of a contact. Collective."""
+        """Evaluate the obstacle of a contact at its evaluated state. Collective."""
         comm, closed = contact.surface.mesh.comm, contact.status != Status.OPEN
         slopes = contact.opposite.slope(contact.values)[closed]
         ends = global_min(comm, slopes, empty=1.0), global_max(comm, slopes, empty=1.0)
@@ -53,23 +53,23 @@ class ObstacleCheck:
         return cls(slope, depth, turn)
 
     def failures(self, contact: str) -> list[str]:
-        """What does not hold, in words."""
+        """Return the conditions that are violated, in words."""
         found = []
         if not abs(self.slope - 1.0) <= _SLOPE:
             found.append(
-                f"{contact}: the gradient of the SignedDistance has length {self.slope:.3g} where "
-                "contact is; it must be 1: divide the function by the length of its gradient"
+                f"{contact}: the gradient of the SignedDistance has length {self.slope:.3g} in the "
+                "contact zone; it must be 1: divide the function by the length of its gradient"
             )
         if not self.depth <= _DEEP:
             found.append(
-                f"{contact}: the penetration of a point is half of the radius of curvature of the "
-                "obstacle, so that its closest point may be on the other side; increase k_n, or "
+                f"{contact}: the penetration exceeds half of the radius of curvature of the "
+                "obstacle, so that the closest point may be on its other side; increase k_n, or "
                 'use enforcement="augmented"'
             )
         if not self.turn <= _TURN:
             found.append(
-                f"{contact}: the obstacle turns by {self.turn:.3g} rad in one increment, in which "
-                "friction takes the straight way between both ends; turn it by no more than a "
-                "right angle in each"
+                f"{contact}: the obstacle rotates by {self.turn:.3g} rad in one increment, over "
+                "which slip is a straight line; rotate it by no more than a right angle per "
+                "increment"
             )
         return found

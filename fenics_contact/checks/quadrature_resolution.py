@@ -1,4 +1,4 @@
-"""Quadrature resolution: too few points for the curvature of an obstacle, or at an end of it."""
+"""Quadrature resolution: curvature of the obstacle, and the boundary of the opposite surface."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ _NOTABLE_ERROR = 0.08
 
 
 def warn_of_few_points(contact: Contact) -> bool:
-    """Warn of facets that are too long for the curvature of a rigid obstacle. Collective.
+    """Warn if facets are too long for the curvature of a rigid obstacle. Collective.
 
-    Where the radius is known when the contact is made `ContactSurface` takes as many points.
+    If the radius is known when the contact is created, `ContactSurface` uses enough points.
 
     Args:
-        contact: At an evaluated state.
+        contact: An evaluated contact.
 
     Returns:
-        Whether it was said.
+        Whether a warning was given.
     """
     quadrature, comm = contact.quadrature, contact.surface.mesh.comm
     curvature = contact.opposite.largest_curvature()
@@ -44,26 +44,24 @@ def warn_of_few_points(contact: Contact) -> bool:
     points = quadrature.default_degree(contact.displacement.degree) + 2
     warn(
         comm,
-        f"{contact.name}: facets of Γc that bear {100 * borne / whole:.2g} % of the normal force "
-        f"are {most:.2g} times as long as the radius of the obstacle there, whose shape passes "
-        "between their points: the force is wrong. Take smaller facets, or give "
-        f"ContactSurface(quadrature_degree={round(POINTS_PER_RADIUS * most) * points - 2}), as "
-        "many points as see it",
+        f"{contact.name}: facets of Γc with {100 * borne / whole:.2g} % of the normal force are "
+        f"{most:.2g} times as long as the radius of curvature of the obstacle, which their "
+        "quadrature points do not resolve: the force is inaccurate. Use smaller facets, or "
+        f"ContactSurface(quadrature_degree={round(POINTS_PER_RADIUS * most) * points - 2})",
     )
     return True
 
 
 def warn_of_divided_facets(contact: Contact) -> bool:
-    """Warn that an end of the opposite surface divides facets that bear. Collective.
+    """Warn if the boundary of the opposite surface divides loaded facets. Collective.
 
-    Points see whether it is there, and no more: where along a facet it ends is known to half of the
-    distance between two points.
+    Its position along a facet is resolved to half of the distance between two quadrature points.
 
     Args:
-        contact: At an evaluated state.
+        contact: An evaluated contact.
 
     Returns:
-        Whether it was said.
+        Whether a warning was given.
     """
     if not contact.opposite.follows:
         return False
@@ -78,10 +76,10 @@ def warn_of_divided_facets(contact: Contact) -> bool:
         return False
     warn(
         comm,
-        f"{contact.name}: facets of Γc over which the opposite surface ends bear "
-        f"{100 * borne / whole:.2g} % of the normal force. Points on them see that it ends, not "
-        f"where: the force may be wrong by {100 * doubtful / whole:.2g} %. Swap the surfaces, so "
-        "that all points of Γc lie opposite the other, or take smaller facets or a larger "
-        "ContactSurface(quadrature_degree=...)",
+        f"{contact.name}: facets of Γc over which the opposite surface ends carry "
+        f"{100 * borne / whole:.2g} % of the normal force. Their quadrature points do not resolve "
+        f"where it ends: the error of the force may be {100 * doubtful / whole:.2g} %. Swap the "
+        "surfaces, so that all points of Γc have an opposite point, or use smaller facets or a "
+        "larger ContactSurface(quadrature_degree=...)",
     )
     return True
