@@ -346,7 +346,7 @@ def test_a_hole_faces_itself_all_around(caplog: pytest.LogCaptureFixture) -> Non
     # Across the hole, from facet to facet: the diameter of the inscribed circle, at the middle.
     assert points.min() == pytest.approx(2 * np.cos(np.pi / 16))
     if COMM.rank == 0:
-        assert "all of them are on both sides" in caplog.text
+        assert "all facets are on both sides" in caplog.text
 
 
 # ---- which are found, and which side is Γc -------------------------------------------------------
@@ -488,7 +488,7 @@ def test_bad_arguments() -> None:
         ({"name": "joint"}, ["name is given"]),
         ({"self_contact": "yes"}, ["self_contact is 'yes'", "True"]),
         ({"self_contact": 1}, ["self_contact is 1", "True"]),
-        ({"obstacle": fc.HalfSpace((0, 0), (0, 1))}, ["obstacle given", "make a Contact"]),
+        ({"obstacle": fc.HalfSpace((0, 0), (0, 1))}, ["obstacle given", "create a Contact"]),
         ({"surface": None, "opposite": 2}, ["surface and opposite given"]),
         ({"kinematics": "large"}, ["'large'"]),
         ({"update_pairs": "often"}, ["'often'"]),

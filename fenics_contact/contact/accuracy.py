@@ -1,4 +1,4 @@
-"""What sets the accuracy: choices for an error wanted, and stiffness in units of E/h."""
+"""Accuracy: numerical parameters for a given relative error."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ _LEFT, _SHARE = 0.2, 0.01
 
 @dataclass(frozen=True)
 class Accuracy:
-    """What is chosen for a relative error in contact force and pressure.
+    """Numerical parameters for a given relative error in contact force and pressure.
 
-    The mesh is the caller's: what it would have to be is told by `estimate_errors`.
+    They do not include the mesh size, which `estimate_errors` recommends.
 
     Attributes:
-        error: The relative error wanted.
-        factor: k_n and k_t in units of E/h.
-        enforcement: See `Contact`.
-        tolerance: Of augmented enforcement.
-        rtol: Residual at which the solver stops, relative to the forces.
-        increments: Increments of a load history with friction; without friction one is exact.
+        error: The relative error.
+        factor: Contact stiffness k_n and k_t in units of E/h.
+        enforcement: "penalty" or "augmented".
+        tolerance: Tolerance of the augmented Lagrangian method.
+        rtol: Tolerance of the solver's residual relative to the forces.
+        increments: Number of increments of a load history with friction; without it, one suffices.
     """
 
     error: float
@@ -46,19 +46,20 @@ class Accuracy:
 
     @classmethod
     def of(cls, wanted: str | float) -> Accuracy:
-        """Choose.
+        """Return the parameters for a relative error.
 
         Args:
-            wanted: A word of `PRESETS`, or the relative error itself.
+            wanted: "draft" (5e-2), "standard" (1e-2), "fine" (1e-3), or the relative error, between
+                1e-8 and 0.5.
 
         Raises:
-            ValueError: Another word, or a number that is no relative error.
+            ValueError: ``wanted`` is neither.
         """
         error = PRESETS.get(wanted) if isinstance(wanted, str) else wanted
         if error is None or not (np.ndim(error) == 0 and 1e-8 <= error <= 0.5):
             raise ValueError(
-                f"accuracy is {wanted!r}; use one of {list(PRESETS)}, or the relative error wanted "
-                "in force and pressure, between 1e-8 and 0.5"
+                f"accuracy is {wanted!r}; use one of {list(PRESETS)}, or the relative error of "
+                "force and pressure, between 1e-8 and 0.5"
             )
         needed = _PENALTY_ERROR / error
         soft = needed <= _STIFFEST * (1 + 1e-12)
@@ -73,7 +74,7 @@ class Accuracy:
         )
 
     def __str__(self) -> str:
-        """What was chosen, in words."""
+        """Return the parameters in words."""
         how = f"to {self.tolerance:.0e}, " if self.enforcement == "augmented" else ""
         return (
             f"{self.error:.2g} in force and pressure: {self.enforcement} enforcement {how}k = "

@@ -1,4 +1,4 @@
-"""General contact: all contacts between bodies that may touch, found by their distance."""
+"""General contact: finds all pairs of bodies that may come into contact, by their distance."""
 
 from __future__ import annotations
 
@@ -48,51 +48,47 @@ def find_contact_pairs(
     max_initial_penetration: float | None = None,
     **options: Any,
 ) -> list[Contact]:
-    """Find which bodies of a mesh may touch, and make a contact of each two. Collective.
+    """Find all pairs of bodies that may come into contact, and create their contacts. Collective.
 
-    Facets of two bodies may touch if their normals face each other and they come within
-    ``distance``, in whatever direction, of each other in the undeformed bodies: give what is open
-    between bodies that are to meet, and add the way that they slide. What is found is logged
-    (``fenics_contact``, level INFO, first rank).
+    Facets of two bodies may come into contact if their normals face each other and they are within
+    ``distance`` of each other, in any direction, in the undeformed bodies: give the initial gap
+    plus the distance of sliding. The result is logged (logger ``fenics_contact``, level INFO, first
+    rank).
 
-    Γc is the side whose facets are smaller on the mean; of sides as fine (to 1 %) that with fewer
-    facets, of which no point looks past the other; or else that of the first body. A stiffness
-    cannot be known here: where the softer body is to have Γc, say so by ``slave_bodies``.
+    Γc is the side with the smaller mean facet size; if sizes differ by less than 1 %, the side
+    with fewer facets; otherwise that of the first body. Stiffness is not considered: use
+    ``slave_bodies`` to place Γc on the softer body.
 
-    Bodies are looked at once, undeformed; where they overlap from the start by more than half the
-    height of their cells no contact is found. Facets all of whose displacements are prescribed can
-    have no contact, and `ContactProblem` refuses them: leave them out by ``facet_tags`` and
-    ``tags``.
-
-    A facet that is near several bodies is part of several contacts: each of its points meets one
-    body at a time, and is open in the other contacts.
+    The search is made once, in the undeformed bodies. Bodies with an initial overlap of more than
+    half the height of their cells are not found. `ContactProblem` refuses facets whose
+    displacements are all prescribed: exclude them by ``facet_tags`` and ``tags``. A facet near
+    several bodies belongs to several contacts; each of its points is in contact with one body at a
+    time, and open in the other contacts.
 
     Args:
-        u: Displacement, as `Contact` takes it.
-        law: The reactions, of all contacts; or a function of the names of two bodies that gives
-            theirs.
-        distance: How near facets must come to count (length), greater than zero.
-        bodies: What the bodies are: joined meshes, or tags of all cells, a body each; by default
-            the connected parts of the mesh, which are called 1, 2, … by their places, lowest x
-            first.
-        facet_tags: With ``tags``: only facets with these tags may touch; by default all of the
-            boundary.
-        tags: The tag, or tags, meant.
-        slave_bodies: Names of bodies that are to have Γc, the first before the others.
+        u: Displacement, as for `Contact`.
+        law: The law of all contacts, or a function that returns the law for the names of two
+            bodies.
+        distance: Largest distance of facets (length), > 0.
+        bodies: The bodies: a `JoinedMesh`, or tags of all cells, one per body; by default the
+            connected parts of the mesh, named 1, 2, … in the order of their smallest x.
+        facet_tags: Together with ``tags``, the facets that may come into contact; by default the
+            whole boundary.
+        tags: Tag or tags of these facets.
+        slave_bodies: Names of bodies on which Γc is placed, in order of precedence.
         self_contact: Whether a body may touch itself, too. Its facets are divided into two sides
-            that face each other. Where that cannot be, as in a hole that closes, all of them are
-            Γc and all opposite: every two places are then two pairs, which share what they bear.
-        update_pairs: Of the `DeformableBody` opposite.
-        max_initial_penetration: Of the `DeformableBody` opposite.
-        **options: For every `Contact`, such as ``kinematics`` and ``enforcement``.
+            that face each other. If that is impossible, as in a closing hole, all of them are both
+            Γc and opposite, and every contact is carried by two pairs.
+        update_pairs: When pairs are updated, as for `DeformableBody`.
+        max_initial_penetration: Largest initial penetration, as for `DeformableBody` (length).
+        **options: Keyword arguments of every `Contact`, such as ``kinematics``.
 
     Returns:
-        The contacts in the order of the bodies, named by them, such as "1-2": empty if none are so
-        near, which gives a warning.
+        The contacts in the order of the bodies, named such as "1-2". If there are none, a warning
+        is given.
 
     Raises:
-        ValueError: An argument is none of these, a cell has no tag, or facets are no part of the
-            boundary; and what `Contact` refuses.
+        ValueError: An argument is invalid, a cell has no tag, or facets are not on the boundary.
     """
     _check(law, distance, bodies, facet_tags, tags, self_contact, options)
     space = Displacement(u, None, "find_contact_pairs").u.function_space
@@ -100,7 +96,7 @@ def find_contact_pairs(
     names, of_cell = _bodies(space, bodies)
     if isinstance(slave_bodies, str) or not isinstance(slave_bodies, Sequence):
         raise ValueError(
-            f"slave_bodies is {slave_bodies!r}; give a list of names of bodies, which are {names!r}"
+            f"slave_bodies is {slave_bodies!r}; it must be a list of bodies, of {names!r}"
         )
     unknown = [body for body in slave_bodies if body not in names]
     if unknown:
@@ -115,7 +111,7 @@ def find_contact_pairs(
         warn(
             comm,
             f"find_contact_pairs: no two of the bodies {names} are within {distance:g}. Check the "
-            "distance; bodies that overlap by more than half a cell are not found either",
+            "distance; bodies that overlap by more than half a cell are not found",
         )
 
     on = [agreed(comm, _side_of_surface(pair, names, slave_bodies)) for pair in found]
@@ -148,30 +144,31 @@ def _check(
     self_contact: Any,
     options: dict[str, Any],
 ) -> None:
-    """Refuse what has no sense."""
+    """Check the arguments."""
     if not callable(law) or isinstance(law, type):
         check_instance("law", law, Law, "or a function of the names of two bodies")
     if not (is_number(distance) and 0.0 < distance < np.inf):
         raise ValueError(f"distance is {distance!r}; it must be a length greater than zero")
     if bodies is not None and not isinstance(bodies, JoinedMesh | dolfinx.mesh.MeshTags):
         raise ValueError(
-            f"bodies is a {type(bodies).__name__}; give what join_meshes returned, tags of all "
-            "cells, or nothing for the connected parts of the mesh"
+            f"bodies is a {type(bodies).__name__}; it must be a JoinedMesh, tags of all cells, or "
+            "None for the connected parts of the mesh"
         )
     if (facet_tags is None) != (tags is None):
-        raise ValueError("facet_tags and tags belong together; give both, or none for all facets")
+        raise ValueError("facet_tags and tags belong together; give both, or neither")
     if not isinstance(self_contact, bool | np.bool_):
         raise ValueError(
-            f"self_contact is {self_contact!r}; give True where a body may touch itself, else False"
+            f"self_contact is {self_contact!r}; it must be True if a body may touch itself, or "
+            "False"
         )
     own = [name for name in ("surface", "obstacle", "opposite") if name in options]
     if own:
         raise ValueError(
             f"{' and '.join(own)} given; find_contact_pairs finds both sides of every "
-            "contact: leave it out, or make a Contact of these sides"
+            "contact: omit it, or create a Contact with these sides"
         )
     if "name" in options:
-        raise ValueError("name is given; contacts have the names of their bodies: leave it out")
+        raise ValueError("name is given; contacts are named after their bodies: omit it")
 
 
 def _bodies(
@@ -191,7 +188,7 @@ def _bodies(
         return list(range(1, n_bodies + 1)), of_node[space.dofmap.list[:n, 0]]
     if isinstance(bodies, JoinedMesh):
         if bodies.mesh is not mesh:
-            raise ValueError("bodies are joined in another mesh than that of u; make u on theirs")
+            raise ValueError("bodies are joined in another mesh than that of u; use bodies.mesh")
         number = np.zeros(n, dtype=np.int64)
         for i, body in enumerate(bodies.bodies):
             number[np.isin(bodies.cells.values, bodies.body(body))] = i
@@ -213,7 +210,7 @@ def _bodies(
     n_without = comm.allreduce(int(np.count_nonzero(number[: cells.size_local] < 0)))
     if n_without:
         raise ValueError(
-            f"{n_without} cells have no tag in bodies; tag all of them, by the body they are of"
+            f"{n_without} cells have no tag in bodies; every cell must have the tag of its body"
         )
     return list(known), number
 
@@ -259,7 +256,7 @@ def _marked(
 
 def _told(name: str, bodies: tuple[Hashable, Hashable], pair: Neighbours, side: int) -> str:
     """A line for the log."""
-    both = "" if pair.separate else "; all of them are on both sides"
+    both = "" if pair.separate else "; all facets are on both sides"
     return (
         f"{name}: Γc on {bodies[side]} with {pair.counts[side]} facets of mean size "
         f"{pair.sizes[side]:.3g}, opposite on {bodies[1 - side]} with {pair.counts[1 - side]} of "

@@ -1,4 +1,4 @@
-"""The results of a contact at the state that was evaluated last."""
+"""The results of a contact at the last evaluated state."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ _FUNCTIONS = ("pressure", "traction", "tangential_traction", "gap", "slip", "nor
 
 
 class PointResults(ABC):
-    """What is read off the points of Γc.
+    """The results of a contact at the quadrature points of Γc.
 
-    After `ContactProblem.solve` and `Contact.evaluate` these are arrays at hand. Where nothing has
-    been evaluated since the last change of the state (`Contact.forget`, `restore`), the first
-    of them evaluates the present displacement, which is collective.
+    After `ContactProblem.solve` and `Contact.evaluate` the results are available without
+    communication. After `Contact.forget` or a change of state, the first access evaluates the
+    present displacement, which is collective.
 
     Attributes:
-        name: In messages and files.
-        surface, law: What was given.
-        displacement: What u is in the function that is solved for.
-        quadrature: The points of Γc.
+        name: Name in messages and files.
+        surface, law: Contact surface and contact law.
+        displacement: The relation of u to the function that is solved for.
+        quadrature: The quadrature points of Γc.
         history: The committed state.
-        inputs: All that was given, as UFL.
+        inputs: Data of law, obstacle and contact, as UFL.
     """
 
     name: str
@@ -69,55 +69,61 @@ class PointResults(ABC):
 
     @property
     def gap(self) -> Array:
-        """Open distance s - u_n = δ₊ - δ₋ (eq. 6), shape (n_points,), in length.
+        """Normal gap g_N = s - u_n = δ₊ - δ₋, eq. (6), shape (n_points,), in length.
 
-        NaN at points without an opposite.
+        It is NaN at points without an opposite point.
         """
         return np.where(self.values.paired > 0, self.values.gap, np.nan)
 
     @property
     def pressure(self) -> Array:
-        """-r_n, shape (n_points,), in stress; negative only where the law bears tension."""
+        """Contact pressure p = -r_n, shape (n_points,), in stress; negative only in tension."""
         return -self.values.normal_traction
 
     @property
     def tangential_traction(self) -> Array:
-        """τ on the body, shape (n_points, gdim), in stress; zeros if the law gives none."""
+        """Tangential traction τ on the body, shape (n_points, gdim), in stress."""
         return self.values.traction
 
     @property
     def traction(self) -> Array:
-        """r_n n + τ on the body, shape (n_points, gdim), in stress."""
+        """Traction r_n n + τ on the body, shape (n_points, gdim), in stress."""
         return self.values.total_traction
 
     @property
     def normal_stiffness(self) -> Array:
-        """-∂r_n/∂u_n where closed, (n_points,), in stress/length; see `Law.normal_stiffness`."""
+        """-∂r_n/∂u_n where closed, shape (n_points,), in stress/length."""
         return self.values.normal_stiffness
 
     @property
     def tangential_stiffness(self) -> Array:
-        """K_t of the law, shape (n_points, gdim, gdim), in stress/length; zeros without any."""
+        """K_t of the law, shape (n_points, gdim, gdim), in stress/length."""
         return self.values.tangential_stiffness
 
     @property
     def tangential_displacement(self) -> Array:
-        """u_t (eq. 21), shape (n_points, gdim), in length; zeros if the law has no use for it."""
+        """Tangential displacement u_t, eq. (1), shape (n_points, gdim), in length.
+
+        It is zero if the law has no tangential traction.
+        """
         if not self.law.has_tangential:
             return np.zeros_like(self.points)
         return self.values.tangential(self.values.jump)
 
     def slip_vector(self) -> Array:
-        """Slip Δu_t + K_t⁻¹ Δτ of the increment, as a vector, (n_points, gdim), in length.
+        """Return the slip vector Δu_t + K_t⁻¹ Δτ of the increment, (n_points, gdim), in length.
 
-        Where the gap opens the way beyond what the springs give back counts, too. Collective.
+        Where the gap opens, it includes the displacement beyond the elastic one. Collective.
+
+        Raises:
+            numpy.linalg.LinAlgError: K_t is singular; raised on all ranks.
         """
         with collective_errors(self.surface.mesh.comm):  # singular, where k_t is next to nothing
             return self.values.slip_vector
 
     @property
     def slip_increment(self) -> Array:
-        """Δβ of every mode since the last commit, shape (n_points, n_modes), in length."""
+        """Slip increment Δβ of every mode since the last commit, (n_points, n_modes), in length."""
         return self.values.slip_increment
 
     @property
@@ -129,40 +135,42 @@ class PointResults(ABC):
 
     @property
     def status(self) -> npt.NDArray[np.int8]:
-        """`Status` in the last evaluated increment, shape (n_points,).
+        """`Status` of every point in the last evaluated increment, shape (n_points,).
 
-        Without tangential tractions a closed point counts as slip: nothing holds it. Where the law
-        bears tension no point with an opposite is open; one without is, always.
+        Without tangential tractions, closed points slip. If the law bears tension, only points
+        without an opposite point are open.
         """
         law = self.law
         return self.values.status(tension=law.has_tension, sticks=law.has_tangential)
 
     @property
     def measure(self) -> Array:
-        """Area that each point stands for, the contact's weight included, shape (n_points,).
+        """Quadrature weights times the contact's weight, shape (n_points,).
 
-        In the plane with a weight of 1, the default, it is per unit thickness, a length.
+        Its unit is area, or length in the plane with a weight of 1 (default), per unit thickness.
         """
         return self.quadrature.weights * self.values.weight
 
     @abstractmethod
     def places(self) -> Array:
-        """Where tractions act, (n_points, gdim) (length): X, or X + u with finite kinematics.
+        """Return the points where tractions act: X, or X + u with finite kinematics. Collective.
 
-        Collective.
+        Returns:
+            Array (n_points, gdim) (length).
         """
 
     def moment(self, about: Sequence[float]) -> Array:
-        """Moment of the contact forces on the body about a point. Collective.
+        """Return the moment of the contact forces on the body about a point. Collective.
 
-        They act on the undeformed Γc, or with finite kinematics at X + u. That on a rigid obstacle
-        is the opposite.
+        The forces act on the undeformed Γc, or at X + u with finite kinematics. The moment on a
+        rigid obstacle has the opposite sign.
 
         Args:
             about: The point, gdim numbers (length).
 
         Returns:
-            Its component out of the plane, (1,), or in space (3,) (force times length).
+            The moment (force times length): in the plane the component out of it, (1,), in space
+            (3,).
         """
         places = self.places()
         arm = places - as_vector(f"{self.name}: about", about, places.shape[1])
@@ -174,10 +182,10 @@ class PointResults(ABC):
         return global_sum(self.surface.mesh.comm, turn.sum(axis=0))
 
     def area_stretch(self) -> Array:
-        """Deformed area by undeformed, |J F⁻ᵀ N| with F = I + grad u, (n_points,). Collective.
+        """Return the area ratio |J F⁻ᵀ N| with F = I + grad u, (n_points,). Collective.
 
-        Tractions divided by it are true ones (Cauchy's), per deformed area; those of the contact
-        are nominal. Of axisymmetric bodies, whose hoops stretch too, by 1 + u_r/r more.
+        The tractions of the contact are nominal; divided by the ratio they are Cauchy tractions,
+        per deformed area. For axisymmetric bodies multiply it by the hoop stretch 1 + u_r/r.
         """
         self.displacement.follow()
         return self._stretch()["area"]
@@ -191,26 +199,27 @@ class PointResults(ABC):
         return PointEvaluator(self.quadrature, {"area": area})
 
     def function(self, name: str, into: fem.Function | None = None) -> fem.Function:
-        """A result as a function on Γc, for UFL, files and pictures. Collective.
+        """Return a result as a function on Γc, for UFL forms and files. Collective.
 
-        On every facet it is the linear function that fits the values at its quadrature points best
-        without leaving their range, as in the files of `Writer`; it jumps between facets. The
-        integral over a flat facet is that of the points. It lives on ``surface.submesh``: compile
-        forms of it over the body's mesh with ``entity_maps=contact.entity_maps``.
+        The function is discontinuous and linear on every facet: the least-squares fit of the values
+        at the quadrature points, limited to their range. Its integral over a flat facet is that of
+        the points. It is defined on ``surface.submesh``: compile forms on the body's mesh with
+        ``entity_maps=contact.entity_maps``.
 
         Args:
-            name: "pressure" (stress), "traction" (r_n n + τ on the body) and "tangential_traction"
-                (stress), "gap" (length, NaN on facets none of whose points has an opposite), "slip"
-                (accumulated and committed, the sum of the modes, in length) or "normal".
-            into: What an earlier call has returned for a result of this shape: it gets the present
-                values, so that forms of it need not be compiled anew. By default a new function.
+            name: "pressure", "traction" (r_n n + τ on the body), "tangential_traction" (stress),
+                "gap" (length; NaN on facets without opposite points), "slip" (committed, sum of the
+                modes, length) or "normal".
+            into: A function that an earlier call has returned for a result of this shape; its
+                values are updated, so that forms need not be compiled again. By default a new
+                function is created.
 
         Raises:
-            ValueError: There is no such result, or ``into`` is no such function.
+            ValueError: There is no such result, or ``into`` is another function.
         """
         if name not in _FUNCTIONS:
             raise ValueError(
-                f"{self.name}: there is no result {name!r} as a function; use one of "
+                f"{self.name}: there is no function of the result {name!r}; use one of "
                 f"{list(_FUNCTIONS)}"
             )
         values = self.values.normal if name == "normal" else getattr(self, name)
@@ -237,7 +246,7 @@ class PointResults(ABC):
         return into
 
     def resultants(self) -> Resultants:
-        """Forces, moment, counts and extents. Collective."""
+        """Return forces, moment, extents and numbers of points. Collective."""
         comm = self.surface.mesh.comm
         measure, status = self.measure, self.status
         tangential = np.linalg.norm(self.tangential_traction, axis=1)
@@ -265,7 +274,7 @@ class PointResults(ABC):
         )
 
     def _extents(self) -> dict[str, ZoneExtent]:
-        """Of the points that are closed, that stick and that slip. Collective."""
+        """Return the extents of the contact, stick and slip zones. Collective."""
         comm, x, status = self.surface.mesh.comm, self.points, self.status
         states = {
             "contact": status != Status.OPEN,
@@ -284,13 +293,13 @@ class PointResults(ABC):
         return {name: ZoneExtent(float(area), *each) for name, area, *each in rows}
 
     def gather(self) -> dict[str, Array]:
-        """All of Γc on every rank, for pictures and tables, ordered by coordinates. Collective.
+        """Gather the results of all ranks on every rank. Collective.
 
-        They are compared to 1e-9 of the largest: those of points in a row differ by round-off.
+        Points are sorted by their coordinates, which are rounded to 1e-9 of the largest one.
 
         Returns:
-            Arrays over all points: x, normal, gap, pressure, tangential_traction, slip (sum of the
-            modes), status, measure.
+            Arrays over all points of Γc by name: x, normal, gap, pressure, tangential_traction,
+            slip (sum of the modes), status, measure.
         """
         d = self.surface.mesh.geometry.dim
         rows = np.column_stack(

@@ -1,4 +1,4 @@
-"""What is known at the points of Γc at one state, and what follows from it."""
+"""Fields at the quadrature points of Γc, resultants and status."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["PointValues", "Resultants", "Status", "ZoneExtent"]
 
 
 class Status(IntEnum):
-    """State of a quadrature point of Γc."""
+    """Contact status of a quadrature point of Γc: open, stick or slip."""
 
     OPEN = 0
     STICK = 1
@@ -25,16 +25,16 @@ class Status(IntEnum):
 
 @dataclass(frozen=True)
 class ZoneExtent:
-    """Where the quadrature points of one state are on Γc, the same on every rank.
+    """Extent of a zone of Γc (contact, stick or slip), the same on every rank.
 
-    The state ends between the outermost of them and the next point: coordinates and half of a
-    length are known to within the distance of two points, which is less than a facet.
+    Coordinates are those of the outermost quadrature points: the zone ends between these and the
+    next points, less than one facet farther.
 
     Attributes:
-        area: That they stand for, the contact's weight included; in the plane with a weight of 1,
-            the default, per unit thickness.
-        low, high: Their least and largest coordinates on the undeformed Γc, (gdim,) (length); NaN
-            where there are no such points.
+        area: Area of the zone, including the contact's weight; in the plane with a weight of 1
+            (default), per unit thickness.
+        low, high: Smallest and largest coordinates of its points on the undeformed Γc, (gdim,)
+            (length); NaN if there are none.
     """
 
     area: float
@@ -43,29 +43,26 @@ class ZoneExtent:
 
     @property
     def size(self) -> Array:
-        """How far they reach along each axis, (gdim,) (length); NaN where there are none.
-
-        Of a strip about a line of contact in the plane half of it is the half-width.
-        """
+        """Size of the zone along each axis, high - low, (gdim,) (length); NaN if it is empty."""
         return self.high - self.low
 
 
 @dataclass(frozen=True)
 class Resultants:
-    """Integrals over Γc, counts and extents of its points, the same on every rank.
+    """Integrals over Γc, numbers of points and extents of zones, the same on every rank.
 
     Attributes:
-        per_thickness: Whether forces, moment and areas are per unit thickness: in the plane, where
-            the contact's weight is 1, the default.
-        force: Contact force on the body, ∫ (r_n n + τ), shape (gdim,).
-        normal_force: ∫ -r_n, tension counted negative.
-        tangential_force: ∫ |τ|.
-        moment: Of the force about the origin, as `Contact.moment` gives it, (1,) or (3,).
-        extents: `ZoneExtent` of "contact" (the closed part; all that has an obstacle where the law
-            bears tension), and in it of "stick" and of "slip".
-        open, stick, slip: Numbers of quadrature points.
+        per_thickness: Whether forces, moment and areas are per unit thickness: in the plane with
+            the contact's weight 1 (default).
+        force: Contact force on the body, ∫ (r_n n + τ), shape (gdim,) (force).
+        normal_force: ∫ -r_n, negative in tension (force).
+        tangential_force: ∫ |τ| (force).
+        moment: Moment of the contact forces on the body about the origin, (1,) or (3,) (force times
+            length).
+        extents: `ZoneExtent` of "contact" (the points that are not open), "stick" and "slip".
+        open, stick, slip: Numbers of quadrature points with this status.
         max_pressure: Largest -r_n at a point (stress).
-        max_penetration: Largest δ₋ (length).
+        max_penetration: Largest δ₋ at a point (length).
     """
 
     per_thickness: bool
@@ -82,7 +79,7 @@ class Resultants:
 
     @property
     def area(self) -> float:
-        """Area of the closed part, the contact's weight included; see `per_thickness`."""
+        """Area of the contact zone, including the contact's weight."""
         return self.extents["contact"].area
 
 
