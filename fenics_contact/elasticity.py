@@ -1,10 +1,10 @@
-"""Elastic bodies for those who need no form of their own: plane, axisymmetric, spatial.
+"""Elastic bodies as UFL residuals: plane strain, plane stress, axisymmetric, three-dimensional.
 
     body = elasticity.LinearElastic(u, E, nu, kind="plane stress", thickness=6.4)
     F = body.residual(v) + body.weight * pressure * v[1] * ds(TOP)
     contact = fc.Contact(u, surface, obstacle, law, weight=body.weight)
 
-Nothing else of the package knows this module: any residual in UFL does as well.
+The rest of the package is independent of this module: any UFL residual may be used.
 """
 
 from __future__ import annotations
@@ -24,39 +24,37 @@ KINDS = {"plane strain": 2, "plane stress": 2, "axisymmetric": 2, "3D": 3}
 
 
 class LinearElastic:
-    """An isotropic, linearly elastic body at small strains, by its residual in UFL.
+    """The residual of an isotropic, linearly elastic body at small strains, in UFL.
 
-    Strain and stress are 3 x 3 for every kind; their third axis is the one out of the plane, of
-    axisymmetric bodies (coordinates r, z) the circumferential one.
+    Strain and stress are 3 × 3 for every kind; the third axis is normal to the plane, and for
+    axisymmetric bodies (coordinates r, z) the circumferential one. Nothing is compiled.
+
+    Args:
+        u: Displacement, shape (gdim,); for axisymmetric bodies (u_r, u_z).
+        E: Young's modulus (stress): a number, constant, function or UFL expression.
+        nu: Poisson's ratio, given like E.
+        kind: "plane strain", "plane stress", "axisymmetric" or "3D".
+        thickness: Thickness of a plane body (length), 1 by default.
 
     Attributes:
         u: The displacement.
-        kind: One of `KINDS`.
+        kind: The kind of body.
         E, nu: Young's modulus (stress) and Poisson's ratio (UFL).
-        weight: What every integral over the body or its boundary carries: the thickness, or 2πr.
-            Multiply loads by it, and pass it on as ``Contact(weight=...)``.
-        stress: σ(u), shape (3, 3).
+        weight: Factor of all integrals over the body and its boundary: the thickness, or 2πr.
+            Multiply loads by it, and pass it to ``Contact(weight=...)``.
+        stress: Stress σ(u), shape (3, 3) (UFL).
+
+    Raises:
+        ValueError: The kind is unknown or for another dimension, or numbers are out of range.
     """
 
     def __init__(
         self, u: fem.Function, E: Any, nu: Any, kind: str, *, thickness: Any = None
     ) -> None:
-        """Make the body's expressions; nothing is compiled.
-
-        Args:
-            u: Displacement, shape (gdim,); axisymmetric (u_r, u_z).
-            E: Young's modulus (stress): a number, constant, function or UFL expression.
-            nu: Poisson's ratio, likewise.
-            kind: "plane strain", "plane stress", "axisymmetric" or "3D".
-            thickness: Length out of the plane, for the plane kinds; 1 by default.
-
-        Raises:
-            ValueError: An unknown kind, one for another dimension, or numbers out of range.
-        """
         _check_kind(u, kind, list(KINDS))
         mesh = _mesh(u)
         if thickness is not None and not kind.startswith("plane"):
-            raise ValueError(f"thickness is {thickness!r}; a body of kind {kind!r} has none")
+            raise ValueError(f"thickness is {thickness!r}; omit it for a body of kind {kind!r}")
         self.u, self.kind = u, kind
         self.E = _coefficient(mesh, "E", E, 0.0, np.inf)
         self.nu = _coefficient(mesh, "nu", nu, -1.0, 0.5 if kind != "plane stress" else 1.0)
@@ -68,7 +66,7 @@ class LinearElastic:
         self.stress = self.stress_of(u)
 
     def strain(self, w: Any) -> Any:
-        """ε(w), shape (3, 3) (UFL)."""
+        """Return the strain ε(w) of a displacement w, shape (3, 3) (UFL)."""
         epsilon = ufl.sym(ufl.grad(w))
         if self.kind == "3D":
             return epsilon
@@ -82,7 +80,7 @@ class LinearElastic:
         )
 
     def stress_of(self, w: Any) -> Any:
-        """σ(w), shape (3, 3) (UFL)."""
+        """Return the stress σ(w) of a displacement w, shape (3, 3) (UFL)."""
         epsilon, shear = self.strain(w), self.E / (2 * (1 + self.nu))
         in_plane = epsilon[0, 0] + epsilon[1, 1]
         if self.kind == "plane stress":
@@ -94,47 +92,62 @@ class LinearElastic:
         return 2 * shear * epsilon + lame * ufl.tr(epsilon) * ufl.Identity(3)
 
     def residual(self, v: Any, dx: ufl.Measure = ufl.dx) -> ufl.Form:
-        """Virtual work of the stresses, ∫ σ(u):ε(v) weight dx; subtract that of the loads.
+        """Return the virtual work of the stresses, ∫ σ(u):ε(v) weight dx.
 
         Args:
             v: Test function of ``u``'s space.
-            dx: Measure of the body; a part of the mesh, or a quadrature degree of one's own.
+            dx: Measure of the body, possibly of a part of the mesh or with a quadrature degree.
         """
         return self.weight * ufl.inner(self.stress, self.strain(v)) * dx
 
 
 class NeoHookean:
-    """A body of neo-Hookean rubber at strains of any size, by its residual in UFL.
+    """The residual of a compressible or incompressible neo-Hookean body at finite strains, in UFL.
 
-    W = G/2 (I₁ - 3 - 2 ln J) + λ/4 (J² - 1 - 2 ln J) per undeformed volume, or with ``isochoric``
-    W = G/2 (I₁/J^(2/3) - 3) + K/4 (J² - 1 - 2 ln J), where I₁ = F:F and J = det F. Both begin as
-    the linear body with E and ν. Tensors are 3 x 3 for every kind, as in `LinearElastic`.
+    The strain energy per undeformed volume is W = G/2 (I₁ - 3 - 2 ln J) + λ/4 (J² - 1 - 2 ln J), or
+    with ``isochoric`` W = G/2 (I₁/J^(2/3) - 3) + K/4 (J² - 1 - 2 ln J), where I₁ = F:F and
+    J = det F. Both agree with the linear body with E and ν at small strains. Tensors are 3 × 3 for
+    every kind, as in `LinearElastic`. Nothing is compiled.
 
-    A body that hardly changes its volume, or not at all (ν = 1/2), is given its ``pressure`` as a
-    second unknown: p = -∂U/∂J with U the last term of W, solved for J,
+    A nearly or fully incompressible body (ν up to 1/2) needs its ``pressure`` as a second unknown,
+    p = -∂U/∂J with U the last term of W, solved for J,
 
         J = √(1 + (p/m)²) - p/m,    m = λ or K,
 
-    which holds in the mean of the pressure's test functions, and is J = 1 at ν = 1/2. So the two
-    forms have the same solutions, and the residual is the derivative of a potential by (u, p).
+    in the weak sense with the pressure's test functions; J = 1 at ν = 1/2. The residual is the
+    derivative of a potential with respect to (u, p).
 
         u, p = ufl.split(w)
         v, q = ufl.TestFunctions(w.function_space)
         F = NeoHookean(u, E, 0.5, "plane strain", pressure=p).residual(v, q=q)
 
+    Args:
+        u: Displacement, shape (gdim,), a function or the part of a mixed one that ``ufl.split``
+            gives; for axisymmetric bodies (u_r, u_z).
+        E: Young's modulus (stress): a number, constant, function or UFL expression.
+        nu: Poisson's ratio, given like E: below 1/2, or with a pressure 0 < ν ≤ 1/2. Without a
+            pressure, use degree 2 and at most 0.49 to avoid locking.
+        kind: "plane strain", "axisymmetric" or "3D".
+        isochoric: Whether the second energy is used.
+        pressure: Pressure p of the same mixed function (UFL), in a stable pair of elements: one
+            degree less than u (Taylor and Hood), or degree 1 with u of degree 1 and bubbles (MINI).
+
     Attributes:
         u: The displacement.
-        pressure: p, positive where compressed (stress); None: it follows from u. With ``isochoric``
-            it is that of the true stress, -tr σ/3.
-        kind: "plane strain", "axisymmetric" or "3D".
-        E, nu: Young's modulus (stress) and Poisson's ratio of the undeformed body (UFL).
-        weight: What every integral over the body or its boundary carries: 1, or 2πr of the
-            undeformed body. Multiply loads by it, and pass it on as ``Contact(weight=...)``.
+        pressure: p, positive in compression (stress), or None. With ``isochoric`` it is the mean
+            Cauchy pressure, -tr σ/3.
+        kind: The kind of body.
+        E, nu: Young's modulus (stress) and Poisson's ratio at small strains (UFL).
+        weight: Factor of all integrals over the body and its boundary: 1, or 2πr of the undeformed
+            body. Multiply loads by it, and pass it to ``Contact(weight=...)``.
         F: Deformation gradient.
-        J: Change of the volume.
-        energy: W(F) (stress); with a pressure without its last term, U.
-        nominal: First Piola-Kirchhoff stress, ∂W/∂F, force per undeformed area.
+        J: Volume ratio det F.
+        energy: W(F) (stress), with a pressure without its last term U.
+        nominal: First Piola-Kirchhoff stress ∂W/∂F, force per undeformed area.
         stress: Cauchy stress, force per deformed area.
+
+    Raises:
+        ValueError: The kind is unknown or for another dimension, or numbers are out of range.
     """
 
     def __init__(
@@ -147,23 +160,6 @@ class NeoHookean:
         isochoric: bool = False,
         pressure: Any = None,
     ) -> None:
-        """Make the body's expressions; nothing is compiled.
-
-        Args:
-            u: Displacement, shape (gdim,), a function or the part of a mixed one that
-                ``ufl.split`` gives; axisymmetric (u_r, u_z).
-            E: Young's modulus (stress): a number, constant, function or UFL expression.
-            nu: Poisson's ratio, likewise; near 1/2 displacements alone lock: take degree 2 and
-                no more than 0.49, or a pressure, with which 0 < ν ≤ 1/2.
-            kind: "plane strain", "axisymmetric" or "3D".
-            isochoric: Which of the two energies.
-            pressure: p, of the same mixed function (UFL): see the class. Its elements should be
-                such that neither locks nor oscillates: of one degree less than u (Taylor and Hood),
-                or of degree 1 beside u of degree 1 with bubbles (MINI).
-
-        Raises:
-            ValueError: An unknown kind, one for another dimension, or numbers out of range.
-        """
         _check_kind(u, kind, [k for k in KINDS if k != "plane stress"])
         mesh = _mesh(u)
         self.u, self.kind, self.pressure = u, kind, pressure
@@ -198,7 +194,7 @@ class NeoHookean:
         self.stress = ufl.dot(self.nominal, ufl.transpose(self.F)) / self.J
 
     def gradient(self, w: Any) -> Any:
-        """Gradient of a displacement by the undeformed body, shape (3, 3) (UFL)."""
+        """Return the material gradient of a displacement w, shape (3, 3) (UFL)."""
         slope = ufl.grad(w)
         if self.kind == "3D":
             return slope
@@ -210,24 +206,24 @@ class NeoHookean:
         )
 
     def residual(self, v: Any, dx: ufl.Measure = ufl.dx, *, q: Any = None) -> ufl.Form:
-        """Virtual work of the stresses, ∫ P:grad v weight dx; subtract that of the loads.
+        """Return the virtual work of the stresses, ∫ P:grad v weight dx.
 
-        With a pressure minus ∫ q (J - J(p)) weight dx, too, by which the volume follows from it.
+        With a pressure the residual has the additional term -∫ q (J - J(p)) weight dx.
 
         Args:
             v: Test function of ``u``'s space.
-            dx: Measure of the undeformed body; a part of it, or a quadrature degree of one's own.
-            q: Test function of the pressure's space, where there is a pressure.
+            dx: Measure of the undeformed body, possibly of a part of it or with a quadrature
+                degree.
+            q: Test function of the pressure's space; None without a pressure.
 
         Raises:
-            ValueError: One of pressure and its test function is missing.
+            ValueError: Either the pressure or its test function is missing.
         """
         if (q is None) != (self.pressure is None):
             given = "no" if self.pressure is None else "a"
             raise ValueError(
-                f"q is {'None' if q is None else 'given'}, and the body has {given} pressure: "
-                "residual(v, q=q) is that of a body NeoHookean(..., pressure=p), residual(v) that "
-                "of one without"
+                f"q is {'None' if q is None else 'given'}, but the body has {given} pressure: use "
+                "residual(v, q=q) with NeoHookean(..., pressure=p), residual(v) without a pressure"
             )
         density = ufl.inner(self.nominal, self.gradient(v))
         if q is not None:
@@ -253,8 +249,7 @@ def _mesh(u: Any) -> Any:
     meshes = [f.function_space.mesh for f in functions if isinstance(f, fem.Function)]
     if not meshes:
         raise ValueError(
-            f"u is a {type(u).__name__}; it must be a Function, or a part of one as ufl.split "
-            "gives it"
+            f"u is a {type(u).__name__}; it must be a Function, or a part of one given by ufl.split"
         )
     return meshes[0]
 

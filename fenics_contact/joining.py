@@ -1,4 +1,4 @@
-"""Bodies that were meshed apart, in one mesh."""
+"""Joining of separate meshes of several bodies into one mesh."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ Numbers: TypeAlias = Mapping[Hashable, Mapping[int | None, int]]
 
 @dataclass(frozen=True)
 class JoinedMesh:
-    """One mesh of several bodies that share no node, and how their tags are numbered in it.
+    """A mesh of several bodies that share no nodes, with new tags.
 
-    Tags count from 1, body by body in the order given, in each by ascending tag: no two bodies have
-    one in common.
+    Tags are numbered from 1, body by body, in ascending order of the old tags, so that no two
+    bodies share a tag.
 
     Attributes:
-        mesh: All bodies.
-        cells: A tag for every cell of this rank, ghosts included.
-        facets: Tags of the facets that had one.
-        bodies: Names of the bodies, as given.
-        cell_numbers: New tags of cells by body and old tag; that of cells without is under None.
-        facet_numbers: New tags of facets by body and old tag.
+        mesh: The mesh of all bodies.
+        cells: Tags of all cells of this rank, including ghosts.
+        facets: Tags of the facets that had a tag.
+        bodies: Names of the bodies.
+        cell_numbers: New cell tags by body and old tag; key None for cells without a tag.
+        facet_numbers: New facet tags by body and old tag.
     """
 
     mesh: dolfinx.mesh.Mesh
@@ -49,7 +49,7 @@ class JoinedMesh:
     facet_numbers: Numbers
 
     def body(self, body: Hashable) -> tuple[int, ...]:
-        """All tags of the cells of a body, as ``ufl.Measure`` takes them.
+        """Return all cell tags of a body, for a ``ufl.Measure``.
 
         Raises:
             ValueError: There is no such body.
@@ -57,7 +57,7 @@ class JoinedMesh:
         return tuple(self._of(self.cell_numbers, body).values())
 
     def cell(self, body: Hashable, tag: int) -> int:
-        """The tag in ``cells`` of those that had ``tag`` in their body.
+        """Return the new tag of the cells that had ``tag`` in the mesh of a body.
 
         Raises:
             ValueError: There is no such body, or it has no such tag.
@@ -65,7 +65,7 @@ class JoinedMesh:
         return self._number("cell", self.cell_numbers, body, tag)
 
     def facet(self, body: Hashable, tag: int) -> int:
-        """The tag in ``facets`` of those that had ``tag`` in their body.
+        """Return the new tag of the facets that had ``tag`` in the mesh of a body.
 
         Raises:
             ValueError: There is no such body, or it has no such tag.
@@ -73,23 +73,25 @@ class JoinedMesh:
         return self._number("facet", self.facet_numbers, body, tag)
 
     def by_body(self, values: Mapping[Hashable, float]) -> fem.Function:
-        """A number for each body, such as its modulus, as a function of the cells. Collective.
+        """Return a piecewise constant function with one value per body, such as a modulus.
+
+        Collective.
 
         Args:
-            values: One for every body, in any unit.
+            values: A number for every body, by its name.
 
         Raises:
-            ValueError: A body has none, there is no such body, or a value is no number.
+            ValueError: A body has no value, there is no such body, or a value is not a number.
         """
         if not isinstance(values, Mapping) or set(values) != set(self.bodies):
             given = list(values) if isinstance(values, Mapping) else values
             raise ValueError(
-                f"values are given for {given!r}; give one number for each of the bodies "
-                f"{list(self.bodies)!r}, as a dict"
+                f"values are given for {given!r}; they must be a dict with one number for each of "
+                f"the bodies {list(self.bodies)!r}"
             )
         for body, value in values.items():
             if not is_number(value):
-                raise ValueError(f"the value of body {body!r} is {value!r}; give a number")
+                raise ValueError(f"the value of body {body!r} is {value!r}; it must be a number")
         space = fem.functionspace(self.mesh, ("Discontinuous Lagrange", 0))
         field = fem.Function(space)
         of_cell = space.dofmap.list[self.cells.indices, 0]
@@ -111,23 +113,23 @@ class JoinedMesh:
 
 
 def join_meshes(parts: Mapping[Hashable, Part] | Iterable[Part]) -> JoinedMesh:
-    """Put bodies that were meshed apart into one mesh. Collective.
+    """Join the meshes of several bodies into one mesh. Collective.
 
-    Nodes are never merged: bodies that touch stay apart, and a contact decides what happens between
-    them. DOLFINx distributes all cells anew, without ghost cells.
+    Nodes are not merged: bodies that touch remain separate, and interact by contact only. DOLFINx
+    redistributes all cells, without ghost cells.
 
     Args:
-        parts: Of every body its mesh, or (mesh, cell_tags, facet_tags), as `model_to_mesh` gives
-            them; tags may be None or left out. As a dict by the names of the bodies, or as a list:
-            then their names are 0, 1, …. The meshes have the same kind of cell, dimension and
-            geometric degree, and the same ranks.
+        parts: For every body its mesh, or (mesh, cell_tags, facet_tags) as returned by
+            `model_to_mesh`; tags may be None or omitted. Either a dict by name of the body, or a
+            list, for which the names are 0, 1, …. All meshes must have the same cell type,
+            dimension, geometric degree and communicator.
 
     Returns:
-        The mesh, its tags, and their new numbers.
+        The mesh with its tags and their new numbers.
 
     Raises:
-        ValueError: No part; a part of another form; meshes that do not go together, both named;
-            tags of another dimension, or no whole numbers.
+        ValueError: There are no parts, a part is invalid, meshes are incompatible, or tags have the
+            wrong dimension or are not integers.
     """
     if isinstance(parts, Mapping):
         names, given = tuple(parts), list(parts.values())
@@ -136,10 +138,10 @@ def join_meshes(parts: Mapping[Hashable, Part] | Iterable[Part]) -> JoinedMesh:
         names = tuple(range(len(given)))
     else:
         raise ValueError(
-            f"parts is a {type(parts).__name__}; give a list of bodies, or a dict by their names"
+            f"parts is a {type(parts).__name__}; it must be a list of bodies, or a dict by name"
         )
     if not given:
-        raise ValueError("parts is empty; give one body at least")
+        raise ValueError("parts is empty; give at least one body")
     bodies = [_body(name, part) for name, part in zip(names, given, strict=True)]
     _check_alike(names, [mesh for mesh, _, _ in bodies])
     first = bodies[0][0]
@@ -177,7 +179,7 @@ def _body(name: Hashable, part: Any) -> Body:
         if isinstance(values, Sequence):
             kinds += f" of ({', '.join(type(value).__name__ for value in values)})"
         raise ValueError(
-            f"body {name!r} is a {kinds}; give its mesh, or (mesh, cell_tags, facet_tags)"
+            f"body {name!r} is a {kinds}; it must be a mesh, or (mesh, cell_tags, facet_tags)"
         )
     mesh, cell_tags, facet_tags = [*values, None, None][:3]
     check_instance(f"the mesh of body {name!r}", mesh, dolfinx.mesh.Mesh)
@@ -190,12 +192,12 @@ def _body(name: Hashable, part: Any) -> Body:
         if tags.dim != dim:
             raise ValueError(
                 f"{what} of body {name!r} are on entities of dimension {tags.dim}, and must be on "
-                f"those of dimension {dim}: the order is (mesh, cell_tags, facet_tags)"
+                f"those of dimension {dim}: give (mesh, cell_tags, facet_tags)"
             )
         if tags.values.dtype.kind != "i":
             raise ValueError(
-                f"{what} of body {name!r} have values of type {tags.values.dtype}; give whole "
-                "numbers"
+                f"{what} of body {name!r} have values of type {tags.values.dtype}; they must be "
+                "integers"
             )
     return mesh, cell_tags, facet_tags
 
@@ -218,13 +220,13 @@ def _check_alike(names: Sequence[Hashable], meshes: Sequence[dolfinx.mesh.Mesh])
         if kind(mesh) != kind(meshes[0]):
             raise ValueError(
                 f"body {names[0]!r} has {kind(meshes[0])}, and body {name!r} has {kind(mesh)}: "
-                "mesh them with the same"
+                "all must be the same"
             )
         same = MPI.Comm.Compare(mesh.comm, meshes[0].comm)
         if same not in (MPI.IDENT, MPI.CONGRUENT):
             raise ValueError(
                 f"body {names[0]!r} is on {meshes[0].comm.size} ranks, and body {name!r} is on "
-                f"{mesh.comm.size}, or on others: make all meshes with the same communicator"
+                f"{mesh.comm.size}, or on others: create all meshes with the same communicator"
             )
 
 

@@ -1,4 +1,4 @@
-"""Meshes from gmsh models and from plain arrays."""
+"""Conversion of gmsh models to DOLFINx meshes."""
 
 from __future__ import annotations
 
@@ -38,26 +38,26 @@ _SHOWN_ROWS = 3
 def model_to_mesh(
     model: Any, comm: MPI.Comm, rank: int = 0, gdim: int = 3
 ) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags, dolfinx.mesh.MeshTags]:
-    """Make a mesh of a gmsh model, distributed over the ranks. Collective.
+    """Create a distributed mesh from a gmsh model. Collective.
 
-    The same call with the same results on every DOLFINx release from 0.9 on, whose own functions
-    differ in name, results and what they take without a word.
+    The function has the same result with every DOLFINx release from 0.9 on, and refuses models that
+    DOLFINx would convert incompletely.
 
     Args:
-        model: ``gmsh.model``, meshed, every cell in one physical group, and so every facet that is
-            to have a tag. Only ``rank`` looks at it; on the others it may be anything.
-        comm: The ranks that share the mesh.
+        model: A meshed ``gmsh.model``, in which every cell, and every facet that is to have a tag,
+            is in one physical group. It is used on ``rank`` only.
+        comm: Communicator of the mesh.
         rank: The rank that has the model.
-        gdim: Dimension of space and of the body, 2 or 3; in 2 dimensions z is dropped.
+        gdim: Dimension of space and of the body, 2 or 3; in 2D the coordinate z is dropped.
 
     Returns:
-        The mesh, with coordinates in ``gdim`` dimensions and cells of the order that gmsh gave
-        them; the tags of the cells, one for each; and the tags of the facets in physical groups,
-        none where there are none. A tag is the number of the group.
+        The mesh, with coordinates in ``gdim`` dimensions and the geometric degree of the model; the
+        tags of all cells; and the tags of the facets in physical groups, which may be empty. A tag
+        is the number of the physical group.
 
     Raises:
-        ValueError: Cells or facets without a mesh or a group, in two groups, or of several types;
-            nodes whose numbers have holes. On all ranks.
+        ValueError: Cells are missing, in no group, in two groups or of several types, or node
+            numbers are not contiguous; raised on all ranks.
     """
     with collective_errors(comm):
         if comm.rank == rank:
@@ -74,8 +74,8 @@ def _check(model: Any, gdim: int) -> None:
     dimensions = sorted({dim for dim, _ in model.getPhysicalGroups()})
     if not dimensions or dimensions[-1] != gdim:
         raise ValueError(
-            f"the physical groups of the gmsh model have the dimensions {dimensions}, and gdim is "
-            f"{gdim}: put its cells into one by gmsh.model.addPhysicalGroup({gdim}, [...])"
+            f"the physical groups of the gmsh model have the dimensions {dimensions}, but gdim is "
+            f"{gdim}: add its cells to a group by gmsh.model.addPhysicalGroup({gdim}, [...])"
         )
     for dim, what in ((gdim, "cells"), (gdim - 1, "facets")):
         types: set[int] = set()

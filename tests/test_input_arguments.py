@@ -246,7 +246,7 @@ def test_quadrature_degree(degree):
         lambda: fc.ContactSurface(scene.mesh, scene.tags, BOTTOM, quadrature_degree=degree),
         ValueError,
         f"quadrature_degree is {degree!r}",
-        "whole number",
+        "an integer",
     )
 
 

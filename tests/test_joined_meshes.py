@@ -262,9 +262,9 @@ def test_parts_that_are_none() -> None:
         ([None], ["body 0 is a NoneType", "facet_tags"]),
         ([(mesh, None, sides, 1)], ["tuple of (Mesh, NoneType, MeshTags, int)"]),
         ([(sides,)], ["mesh of body 0", "MeshTags"]),
-        ([(mesh, sides)], ["cell_tags", "dimension 1", "dimension 2", "order"]),
+        ([(mesh, sides)], ["cell_tags", "dimension 1", "dimension 2", "(mesh, cell_tags"]),
         ([(mesh, None, 4)], ["facet_tags of body 0", "int"]),
-        ([(mesh, halves)], ["float64", "whole numbers"]),
+        ([(mesh, halves)], ["float64", "integers"]),
     ):
         raised_everywhere(lambda parts=parts: fc.join_meshes(parts), ValueError, *words)
     with pytest.raises(ValueError, match=r"facet_tags of body 0 are on number .* of this mesh"):

@@ -1,7 +1,7 @@
-"""Meshes that are fine where the error is made: the ends of contact and of the stick zone.
+"""Adaptive mesh refinement by stress recovery, for meshes of straight-sided simplices.
 
-Solve, tell cell by cell by how much smooth stresses differ, split the cells that make most of it,
-and solve again from the start of the load history. For simplex meshes of straight cells.
+Each level solves the whole load history, estimates the error of every cell, and refines the cells
+with the largest errors.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _SIMPLICES = (dolfinx.mesh.CellType.triangle, dolfinx.mesh.CellType.tetrahedron)
 
 @dataclass(frozen=True)
 class AdaptationLevel:
-    """One solution on the way.
+    """The solution on one mesh of the adaptation.
 
     Attributes:
-        mesh, facet_tags: What it was found on.
-        problem: The problem, solved.
+        mesh, facet_tags: The mesh and its facet tags.
+        problem: The solved problem.
         budget: Its estimated errors.
-        dofs: Displacements, of all ranks.
+        dofs: Number of dofs on all ranks.
     """
 
     mesh: dolfinx.mesh.Mesh
@@ -53,36 +53,37 @@ def adapt(
     share: float = 0.5,
     snap: Mapping[int, Callable[[Array], Array]] | None = None,
 ) -> Iterator[AdaptationLevel]:
-    """Solve on finer and finer meshes. Collective.
+    """Solve on successively refined meshes. Collective.
 
     Args:
-        mesh: The first one: triangles or tetrahedra with straight edges, no
-            ghost cells.
-        facet_tags: Of its boundary; every mesh gets them.
-        solve: Makes the problem on a mesh with tags and leads it through its loads; returns the
-            problem, the stress σ(u) (UFL), and where that is (3, 3) the strain.
+        mesh: Initial mesh: triangles or tetrahedra with straight edges, without ghost cells.
+        facet_tags: Tags of its boundary facets, which are transferred to all meshes.
+        solve: Function of mesh and facet tags that creates the problem and solves its load history;
+            it returns the problem, the stress σ(u) (UFL), and optionally the strain if the stress
+            is (3, 3).
         levels: Number of solutions.
-        share: Of the squared error, which the cells that are split make together, 0 to 1; 1 splits
-            all cells.
-        snap: By tag, where new nodes of curved sides belong: a map of coordinates, (n, gdim).
+        share: Fraction of the squared error that the refined cells have together, > 0 and ≤ 1; 1
+            refines all cells.
+        snap: For tags of curved boundaries, a function that maps coordinates of new nodes (n, gdim)
+            onto the boundary.
 
     Yields:
-        A `AdaptationLevel` after every solution.
+        An `AdaptationLevel` after every solution.
 
     Raises:
-        ValueError: Cells that cannot be split, or arguments without sense.
-        NotConverged: As ``solve`` does.
+        ValueError: The cells cannot be refined, or arguments are invalid.
+        NotConverged: An increment in ``solve`` failed.
     """
     degree = compat.geometry_element(mesh).degree
     if mesh.topology.cell_type not in _SIMPLICES or degree != 1:
         raise ValueError(
             f"the mesh has cells {mesh.topology.cell_type.name} of degree "
             f"{degree}; only triangles and tetrahedra with straight edges "
-            "can be split: take such a mesh, and snap= for curved sides"
+            "can be refined: use such a mesh, and snap= for curved boundaries"
         )
     if mesh.comm.allreduce(mesh.topology.index_map(mesh.topology.dim).num_ghosts):
         raise ValueError(
-            "the mesh has ghost cells, through which DOLFINx hands down no tags: make it with "
+            "the mesh has ghost cells, with which DOLFINx does not transfer tags: create it with "
             "ghost_mode=dolfinx.mesh.GhostMode.none"
         )
     if not 0.0 < share <= 1.0 or levels < 1:

@@ -1,9 +1,8 @@
-"""How wrong a solution is, by parts: enforcement, mesh, increments, kinematics, solver.
+"""Error estimates of a solution by source: enforcement, mesh, increments, kinematics, solver.
 
-Each part is estimated apart, in the unit that a user looks at: contact force, peak pressure and
-displacement. Enforcement and solver are what one more step would change, from a linear solve with
-the tangent of the state; discretisation is told from the jump of the stresses between cells; the
-increments from halves of themselves (`increments`).
+Each error is estimated separately, for contact force, peak pressure and displacement. Those of
+enforcement, kinematics and solver follow from linear solves with the present tangent, that of the
+discretisation from stress recovery, and that of the increments from their halves (`increments`).
 """
 
 from __future__ import annotations
@@ -49,24 +48,26 @@ _FEW = 5
 
 @dataclass(frozen=True)
 class ErrorBudget:
-    """Estimated errors of a solution, the same on every rank.
+    """Estimated errors of a solution by source, the same on every rank.
 
     Attributes:
-        values: The quantities: of every contact "normal force" (force), "friction force" (force)
-            and "peak pressure" (stress), after the contact's name where there are several; and
-            "displacement", that of the loads along themselves (length), or without loads the
-            largest one.
-        parts: Estimates "enforcement", "discretisation", "increments", "kinematics" (what taking
-            displacements as small leaves out) and "solver": absolute errors by quantity, signed as
-            value minus truth where a sign is known. A part that could not be told has no entry.
-        wanted: The relative error that the contacts' ``accuracy`` stands for, if it was said.
-        h: Mean size of the facets of the contacts that bear pressure (length).
-        across: How many of these facets there are in a row, about: their number in two dimensions,
-            its root in three; 0 where none bears. Fewer than five make the estimate of
-            discretisation unreliable.
-        degree: Of the displacement.
-        energy: Error of discretisation in the energy norm, relative.
-        cells: Squares of that error, of every cell that this rank owns (force times length).
+        values: The quantities: for every contact "normal force" (force), "friction force" (force)
+            and "peak pressure" (stress), preceded by the contact's name if there are several; and
+            "displacement", the mean displacement in the direction of the loads, or without loads
+            the largest one (length).
+        parts: Absolute errors by source and quantity. The sources are "enforcement",
+            "discretisation", "increments", "kinematics" (the small-displacement assumption) and
+            "solver". The sign is that of value minus exact value, where it is known. A source that
+            could not be estimated has no entry.
+        wanted: The relative error of the contacts' `Accuracy`; None without one.
+        h: Mean size of the facets under pressure (length).
+        across: Approximate number of facets under pressure in a row: their number in two
+            dimensions, its square root in three. Below five the estimate of the discretisation
+            error is unreliable.
+        degree: Degree of the displacement element.
+        energy: Relative discretisation error in the energy norm.
+        cells: Squares of the discretisation error of the cells that this rank owns (force times
+            length).
     """
 
     values: dict[str, float]
@@ -79,16 +80,16 @@ class ErrorBudget:
     cells: Array | None = field(default=None, repr=False, compare=False)
 
     def numbers(self) -> dict[str, Any]:
-        """All but the cells, for files; ``ErrorBudget(**numbers)`` has them again."""
+        """Return all attributes except ``cells``, for files; invert it by ``ErrorBudget(**…)``."""
         names = ("values", "parts", "wanted", "h", "across", "degree", "energy")
         return {name: getattr(self, name) for name in names}
 
     @property
     def h_wanted(self) -> float:
-        """Size of facets that discretisation needs for the accuracy wanted; at most the present.
+        """Size of facets that the accuracy wanted requires, at most the present one (length).
 
-        The pressure ends like a square root: whatever the degree, energies, and forces with them,
-        come closer as h³ at most, and pressures as h^(3/2).
+        Since the pressure has a square-root singularity at the end of contact, forces converge at
+        most like h³ and pressures like h^(3/2), whatever the degree.
         """
         if self.wanted is None:
             return self.h
@@ -100,7 +101,7 @@ class ErrorBudget:
         return needed
 
     def relative(self, part: str) -> dict[str, float]:
-        """A part's errors without sign, relative to the quantities."""
+        """Return the relative errors of a source without sign, by quantity."""
         return {
             name: abs(error) / (abs(self.values[name]) or 1.0)
             for name, error in self.parts[part].items()
@@ -108,10 +109,9 @@ class ErrorBudget:
 
     @property
     def total(self) -> dict[str, float]:
-        """All parts together, relative to the quantities: the root of the sum of their squares.
+        """Relative errors of all sources together, by quantity: the root of the sum of squares.
 
-        The parts have causes of their own, and whether two of them add up or cancel is chance where
-        the sign of one is not known: their sum without signs is too large, with signs too small.
+        The sources are independent, and their signs are not all known.
         """
         squares = dict.fromkeys(self.values, 0.0)
         for part in self.parts:
@@ -121,11 +121,11 @@ class ErrorBudget:
 
     @property
     def dominant(self) -> str:
-        """The part with the largest relative error in any quantity."""
+        """The source with the largest relative error in any quantity."""
         return max(self.parts, key=lambda part: max(self.relative(part).values(), default=0.0))
 
     def __str__(self) -> str:
-        """The table of parts and quantities, in per cent, and what to change."""
+        """Return a table of the errors in per cent, and what to change."""
         width = max(14, *(len(name) + 2 for name in self.values))
         lines = ["error in %".ljust(16) + "".join(f"{name:>{width}}" for name in self.values)]
         for part, *cells in self._rows():
@@ -133,7 +133,7 @@ class ErrorBudget:
         return "\n".join([*lines, *self._remarks()])
 
     def _repr_html_(self) -> str:
-        """The same for notebooks, and all parts together."""
+        """Return a table of the errors in per cent for notebooks, with the total."""
         total = self.total
         together = ("together", *(f"{100 * total[name]:.2g}" for name in self.values))
         header = ("error in %", *self.values)
@@ -153,12 +153,12 @@ class ErrorBudget:
         lines = [f"{self.dominant} dominates: {_REMEDIES[self.dominant]} would help most"]
         if 0 < self.across < _FEW:
             lines.append(
-                f"only some {self.across:.0f} facets in a row bear pressure: discretisation is not "
-                f"told reliably by fewer than {_FEW}"
+                f"only about {self.across:.0f} facets in a row are under pressure: the estimate of "
+                f"discretisation is unreliable with fewer than {_FEW}"
             )
         if self.wanted is not None:
             size = f"facets of {self.h_wanted:.2g} at the contact, now {self.h:.2g}"
-            enough = "the mesh is fine enough" if self.h_wanted >= self.h else f"it takes {size}"
+            enough = "the mesh is fine enough" if self.h_wanted >= self.h else f"use {size}"
             lines.append(f"for the accuracy of {self.wanted:.2g} {enough}")
         return lines
 
@@ -181,22 +181,21 @@ def estimate_errors(
 ) -> ErrorBudget:
     """Estimate the errors of the last solution, before or after its commit. Collective.
 
-    Costs a factorisation of the tangent (a dense one where the problem is condensed) and a
-    smoothing of stress and strain.
+    The cost is a factorisation of the tangent (a dense one of a condensed problem) and a projection
+    of stress and strain.
 
     Args:
-        problem: A problem that has been solved; it stays as it is.
-        stress: σ(u) of the bulk (UFL), shape (d, d), or (3, 3) as ``elasticity.LinearElastic`` and
-            `NeoHookean` have it.
-        strain: ε(u), of the shape of the stress. By default the symmetric gradient; of a stress
-            (3, 3) in the plane with a strain across: u_r/r where the stress has the
-            displacement itself, not its gradient alone, as that of an axisymmetric body has; else
-            zero (in plane stress, where the strain across is not zero, the stress is).
-        increment_error: Errors by the size of the increments, ``Step.increment_error``.
+        problem: A problem that has been solved; its state does not change.
+        stress: Stress σ(u) of the bulk (UFL), shape (d, d), or (3, 3) as of
+            ``elasticity.LinearElastic`` and ``elasticity.NeoHookean``.
+        strain: Strain ε(u) of the same shape. By default sym(grad u); with a stress (3, 3) in the
+            plane, the strain out of the plane is u_r/r if the stress depends on u itself, as that
+            of an axisymmetric body, and otherwise zero.
+        increment_error: ``Step.increment_error``, the errors of the increment size.
 
     Raises:
-        ValueError: Shapes that do not fit; or a body, or an obstacle that moves freely, that
-            nothing holds at this state.
+        ValueError: The shapes of stress and strain differ; or a body or free obstacle is not
+            constrained at this state.
     """
     problem.complete()
     displacement = problem.displacement

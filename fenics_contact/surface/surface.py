@@ -74,18 +74,35 @@ _FACING = 0.5
 
 
 class ContactSurface:
-    """The potential contact surface Γc: exterior facets picked by their tags.
+    """The potential contact surface Γc: exterior facets with given tags.
 
-    Collective. Works on triangles, quadrilaterals, tetrahedra and hexahedra of any geometric
-    order; a rank may hold none of the facets.
+    Cells may be triangles, quadrilaterals, tetrahedra or hexahedra of any geometric degree; a rank
+    may own no facets of Γc. The constructor is collective.
+
+    Args:
+        mesh: Mesh of the body, topological dimension 2 or 3.
+        facet_tags: Tags on the facets of ``mesh``.
+        tags: Tag or tags of the facets of Γc.
+        quadrature_degree: Degree of the quadrature rule on Γc. By default twice the degree of the
+            displacement element. It is raised, up to degree 78 in the plane and 6 in space, on
+            facets longer than a quarter of the smallest radius of a `Ball`, `Cylinder` or
+            `RigidProfile`, and on facets longer than those of an opposing `DeformableBody` (with
+            small displacements: 6 times as long), to resolve their shape. If that is not enough,
+            `ContactProblem` warns.
+        quadrature_scheme: "default" (Gauss), or "vertex": one point per facet vertex. By default
+            Gauss; vertices for multipliers of linear elements on a rigid obstacle, if
+            ``quadrature_degree`` is not given, the facets are edges or triangles and the contact's
+            weight is constant.
 
     Attributes:
         mesh: The mesh of the body.
-        facets: Owned facets of Γc on this rank, shape (n_facets,).
-        submesh: The mesh of Γc alone; history lives on it, so that nothing of it is stored inside
-            the body.
-        entity_maps: What ``dolfinx.fem.form`` needs to put functions of ``submesh`` into integrals
-            over ``mesh``.
+        facets: Facets of Γc owned by this rank, shape (n_facets,).
+        submesh: Mesh of Γc, on which the history is defined.
+        entity_maps: Entity maps with which ``dolfinx.fem.form`` compiles functions of ``submesh``
+            in integrals over ``mesh``.
+
+    Raises:
+        ValueError: The dimension is wrong, no facet has a tag, or an interior facet has one.
     """
 
     def __init__(
@@ -97,33 +114,12 @@ class ContactSurface:
         quadrature_degree: int | None = None,
         quadrature_scheme: str | None = None,
     ) -> None:
-        """Collect the facets and make their submesh. Collective.
-
-        Args:
-            mesh: Mesh of the body, topological dimension 2 or 3.
-            facet_tags: Tags on the facets of ``mesh``.
-            tags: The tag, or tags, that make up Γc.
-            quadrature_degree: Degree of the rule on Γc. By default twice the degree of the
-                displacement element (`SurfaceQuadrature.default_degree`); up to degree 78 in the
-                plane and 6 in space on facets longer than a quarter of the smallest radius of a
-                `Ball`, `Cylinder` or `RigidProfile`, as many points as see its shape; and on
-                facets longer than those of a `DeformableBody` opposite, in small displacements 6
-                times as long, as many points for each of these; where that is too few with finite
-                ones, `ContactProblem` warns.
-            quadrature_scheme: "default" (Gauss) or "vertex" (one point per facet vertex, the
-                contact springs of the paper's section 4). By default Gauss, but the vertices for
-                multipliers of linear elements on a rigid obstacle, if no degree is given either,
-                the facets are edges or triangles and the contact's weight is the same everywhere.
-
-        Raises:
-            ValueError: Wrong dimension, a tag that no facet has, an interior facet with the tag.
-        """
         if quadrature_scheme is not None and quadrature_scheme not in _SCHEMES:
             raise ValueError(f"quadrature_scheme is {quadrature_scheme!r}; use one of {_SCHEMES}")
         whole = is_number(quadrature_degree) and isinstance(quadrature_degree, Integral)
         if quadrature_degree is not None and not (whole and quadrature_degree >= 1):
             raise ValueError(
-                f"quadrature_degree is {quadrature_degree!r}; it must be a whole number, at least 1"
+                f"quadrature_degree is {quadrature_degree!r}; it must be an integer, at least 1"
             )
         self.mesh = mesh
         self.facets = tagged_facets(mesh, facet_tags, tags)
@@ -147,17 +143,17 @@ class ContactSurface:
         pieces: bool = False,
         radius: float = np.inf,
     ) -> SurfaceQuadrature:
-        """The rule on Γc for a displacement element of this degree. Collective.
+        """Return the quadrature rule on Γc for a displacement element. Collective.
 
         Args:
-            element_degree: Of the displacement.
-            nodal: Whether the vertices are to be preferred, where the caller left the choice and
-                one on a facet is enough.
-            opposite: This rank's facets of the other body, on which Γc is to have as many points as
-                if its own were as small; none: there are none.
-            pieces: Whether points feel what the opposite facets cut Γc into, and not themselves
-                alone. Then they are more only from `_PIERCING` opposite facets to one on.
-            radius: Smallest radius of a rigid obstacle, of which facets are to see the shape
+            element_degree: Degree of the displacement element.
+            nodal: Whether vertices are preferred, if the user has not chosen a rule and one
+                point per node resolves the obstacle.
+            opposite: This rank's facets of the opposing body, which the rule has to resolve; None:
+                a rigid obstacle.
+            pieces: Whether pairs are integrated piece by piece over the opposite facets. The rule
+                is then refined only from `_PIERCING` opposite facets per facet of Γc on.
+            radius: Smallest radius of curvature of a rigid obstacle, which the rule has to resolve
                 (length).
         """
         degree = self.quadrature_degree or SurfaceQuadrature.default_degree(element_degree)
@@ -250,32 +246,32 @@ class ContactSurface:
         return np.hstack([middle, mesh.h(dim, facets)[:, None], spread.reshape(-1, 9)])
 
     def check_places(self, name: str) -> None:
-        """Refuse a mesh whose nodes have moved since. Collective.
+        """Check that the nodes of the mesh have not been moved. Collective.
 
-        Points, weights, gaps and the tangent of a linear bulk are of where they were.
+        Points, weights, gaps and the tangent of a linear bulk are computed once.
 
         Args:
-            name: Of the contact, in messages.
+            name: Name of the contact, in messages.
 
         Raises:
-            ValueError: They have, by how much. On all ranks.
+            ValueError: Nodes have been moved; raised on all ranks.
         """
         x, comm = self.mesh.geometry.x, self.mesh.comm
         if comm.allreduce(int(not np.array_equal(x, self._places))):
             way = global_max(comm, np.abs(x - self._places))
             raise ValueError(
                 f"{name}: nodes of the mesh have been moved, by up to {way:g}, since its "
-                "ContactSurface was made; leave the mesh as it is, displacements are in u (with "
-                'kinematics="finite" of any size), or make surface, contacts and problem anew'
+                "ContactSurface was created; do not move the mesh, displacements are in u (with "
+                'kinematics="finite" of any size), or create surface, contacts and problem again'
             )
 
     def parent_facets(self) -> npt.NDArray[np.int32]:
-        """The facet of the body that each of this rank's own cells of the submesh is."""
+        """Return the facet of the body of every cell of the submesh owned by this rank."""
         topology = self.submesh.topology
         return self._parent_facets[: topology.index_map(topology.dim).size_local]
 
     def measure(self, degree: int, scheme: str = "default") -> ufl.Measure:
-        """The surface measure of Γc with a quadrature rule (all of Γc, nothing else)."""
+        """Return the surface measure of Γc with a quadrature rule."""
         metadata = {"quadrature_degree": degree, "quadrature_rule": scheme}
         # The caller's own tags: forms on one mesh must agree in them to be added.
         return ufl.Measure(
@@ -300,13 +296,13 @@ def tagged_facets(
     check_instance("facet_tags", facet_tags, dolfinx.mesh.MeshTags)
     wanted = np.unique(np.asarray(tags))
     if wanted.size and wanted.dtype.kind not in "iu":
-        raise ValueError(f"tags is {tags!r}; it must be a whole number, or a list of them")
+        raise ValueError(f"tags is {tags!r}; it must be an integer, or a list of integers")
     wanted = wanted.astype(np.int32)
     tdim = mesh.topology.dim
     if tdim not in (2, 3) or mesh.geometry.dim != tdim:
         raise ValueError(
             f"mesh has topological dimension {tdim} in a space of dimension "
-            f"{mesh.geometry.dim}; contact needs a solid: 2 in 2 or 3 in 3 dimensions"
+            f"{mesh.geometry.dim}; both must be 2, or both 3"
         )
     check_cells("mesh", mesh.topology.cell_name())
     if facet_tags.dim != tdim - 1:
@@ -317,8 +313,8 @@ def tagged_facets(
 
     if not compat.entities_of(facet_tags, mesh):
         raise ValueError(
-            "facet_tags are of another mesh, whose facets have other numbers: take the tags that "
-            "were made on, or read with, the mesh of u"
+            "facet_tags are of another mesh, whose facets have other numbers: use tags that were "
+            "created on, or read with, the mesh of u"
         )
     mesh.topology.create_connectivity(tdim - 1, tdim)
     exterior = dolfinx.mesh.exterior_facet_indices(mesh.topology)
@@ -335,8 +331,8 @@ def tagged_facets(
     n_interior = mesh.comm.allreduce(interior.size)
     if n_interior:
         raise ValueError(
-            f"{n_interior} of the facets tagged {wanted.tolist()} lie inside the body; "
-            "Γc must be a part of its boundary: tag exterior facets only"
+            f"{n_interior} of the facets tagged {wanted.tolist()} are interior facets; Γc must be "
+            "a part of the boundary: tag exterior facets only"
         )
     if mesh.comm.allreduce(tagged.size) == 0:
         raise ValueError(f"Γc is empty: no exterior facet has a tag in {wanted.tolist()}")
@@ -345,11 +341,11 @@ def tagged_facets(
 
 @dataclass(frozen=True)
 class Sparse:
-    """That points of Γc are too few for the facets opposite, which pass between them.
+    """Insufficient resolution of the opposite facets by the quadrature points of Γc.
 
     Attributes:
-        times: How many of these are as long as one of Γc.
-        degree: Of the rule that has as many points as these would have.
+        times: Number of opposite facets along a facet of Γc.
+        degree: Degree of a rule that would resolve them.
     """
 
     times: int
@@ -361,8 +357,8 @@ class SurfaceQuadrature:
 
     Attributes:
         surface: The `ContactSurface`.
-        sparse: Whether, and by how much, there are too few points, where nobody asked for so few.
-        asked: Whether somebody has asked for that many.
+        sparse: The insufficient resolution of a rule that was chosen by default, or None.
+        asked: Whether the user has chosen the rule.
         degree: Polynomial degree of the rule.
         ds: The measure of Γc with this rule.
         at_vertices: Whether the points are those of the rule "vertex".
@@ -404,7 +400,7 @@ class SurfaceQuadrature:
 
     @staticmethod
     def default_degree(element_degree: int) -> int:
-        """Degree 2p: exact for the work of a contact traction of degree p on a facet all closed."""
+        """Return degree 2p, exact for the work of tractions of degree p on a closed facet."""
         return 2 * max(1, element_degree)
 
     def space(self, size: int | None = None) -> fem.FunctionSpace:
@@ -486,8 +482,8 @@ class VertexAreas:
         surface = quadrature.surface
         if surface.quadrature_scheme != "vertex":
             raise ValueError(
-                f"{name}: Springs stand at the vertices of Γc, and quadrature_scheme is "
-                f"{surface.quadrature_scheme or 'default'!r}; make the ContactSurface with "
+                f"{name}: NodalSprings act at the vertices of Γc, but quadrature_scheme is "
+                f"{surface.quadrature_scheme or 'default'!r}; create the ContactSurface with "
                 'quadrature_scheme="vertex", or give the stiffness per area'
             )
         self._name = name
@@ -509,8 +505,8 @@ class VertexAreas:
         smallest = global_min(self._comm, self.area.x.array, empty=1.0)
         if not smallest > 0.0:
             raise ValueError(
-                f"{self._name}: the area of a vertex of Γc is {smallest:g}, weight included; "
-                "Springs need one that is positive: check the weight (2πr is zero on the axis), "
+                f"{self._name}: the area of a vertex of Γc is {smallest:g}, including the weight; "
+                "NodalSprings need a positive one: check the weight (2πr is zero on the axis), "
                 "or give the stiffness per area"
             )
 
