@@ -219,7 +219,7 @@ FLOOR = fc.HalfSpace((0, 1), (0, -1))
     ("make", "error", "text"),
     [
         (_refused(FLOOR, kinematics="large"), ValueError, "'small', 'finite'"),
-        (_refused(FLOOR, gap=0.1), ValueError, "gap is prescribed"),
+        (_refused(FLOOR, gap=0.1), ValueError, "gap is given"),
         (_refused(FLOOR, law=fc.Foundation(K, K)), ValueError, "Foundation bonds"),
         (_refused(fc.PrescribedGap(0.1, (0, 1))), ValueError, "distance=lambda"),
         (
@@ -234,7 +234,7 @@ FLOOR = fc.HalfSpace((0, 1), (0, -1))
                 )
             ),
             ValueError,
-            "differs from point to point",
+            "varies over Γc",
         ),
         (
             _refused(fc.HalfSpace((0, 1), (0, -1), rotation=0.1)),

@@ -148,7 +148,7 @@ def test_a_turn_that_differs_from_point_to_point_is_refused():
     for angle in (0.1 * x[0], scene.u[0]):
         turn = fc.Rotation(angle, about=(0.0, 2.0))
         obstacle = roller(scene, 1.0, (0.0, 0.0), rotation=turn)
-        with pytest.raises(ValueError, match="Rotation differs from point to point"):
+        with pytest.raises(ValueError, match="Rotation varies over Γc"):
             scene.contact(obstacle, fc.Coulomb(0.2))
 
 

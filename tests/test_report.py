@@ -290,7 +290,7 @@ def test_bad_input(tmp_path):
         (("csv is 3",), (problem, step, page), {"csv": 3}),
         (("last increment is 1",), (problem, step, page), {"csv": folder / "short.csv"}),
         (("no column 'increment'",), (problem, step, page), {"csv": folder / "other.csv"}),
-        (("has no row",), (problem, step, page), {"csv": folder / "empty.csv"}),
+        (("or is empty",), (problem, step, page), {"csv": folder / "empty.csv"}),
         (("shape ()", "(3, 3)"), (problem, step, page), {"stress": made.scene.E}),
         (("budget is a float",), (problem, step, page), {"budget": 0.1}),
         (("title",), (problem, step, page), {"title": 1}),

@@ -352,7 +352,7 @@ def test_bodies_that_cover_one_another(tmp_path):
     problem = fc.ContactProblem(form, u, bcs=conditions, contacts=[contact])
     path = shared_folder(tmp_path) / "state.npz"
     call = lambda: fc.increments(problem, top, 0, 1, steps=2, checkpoint=path)  # noqa: E731
-    raised_everywhere(call, ValueError, "9 nodes", "cover one another")
+    raised_everywhere(call, ValueError, "9 nodes", "cells that coincide")
     raised_everywhere(lambda: checkpoint.save(problem, path), ValueError, "9 nodes")
     problem.solve()
     assert contact.resultants().normal_force > 0.0 and not path.exists()

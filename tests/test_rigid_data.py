@@ -378,4 +378,4 @@ def test_data_of_another_dimension_or_rank():
     raised_everywhere(lambda: scene.contact(flat, law), ValueError, "2 dimensions")
     own = fc.RigidSurface(*ball(1, 1.0 + COMM.rank))
     if COMM.size > 1:
-        raised_everywhere(lambda: scene.contact(own, law), ValueError, "differ from rank to rank")
+        raised_everywhere(lambda: scene.contact(own, law), ValueError, "differ between ranks")

@@ -238,7 +238,7 @@ def test_a_failed_write_leaves_the_old_file(said, tmp_path, monkeypatch):
         monkeypatch.setattr(np, "savez", full)
     else:
         monkeypatch.setattr(archive, "open", lossy, raising=False)
-    words = "No space left" if said else "not what was written"
+    words = "No space left" if said else "differs from what was written"
     raised_everywhere(lambda: next(history), (OSError, RuntimeError), words)
     assert path.read_bytes() == before
     assert COMM.allgather(os.listdir(path.parent)) == [["state.npz"]] * COMM.size

@@ -118,8 +118,8 @@ class BodyOpposite(Opposite):
             return None
         if not self.pairs_anew and self._mesh.comm.rank == 0:
             logger.info(
-                "%s: pairs are found anew at every increment from here on: points have moved along "
-                "the opposite by more than a facet",
+                "%s: pairs are updated at every increment from now on, because points have slid by "
+                "more than a facet",
                 self._parts.name,
             )
         # The traction stays with the points of Γc; what they slip over has moved on.

@@ -38,26 +38,26 @@ def is_finite(name: str, kinematics: str, obstacle: Obstacle, law: Law, gap: Any
     """
     if kinematics not in _KINEMATICS:
         raise ValueError(
-            f"{name}: kinematics is {kinematics!r}; use one of {_KINEMATICS} (the share that "
-            "passes in a verdict is the kinematics of the ContactProblem)"
+            f"{name}: kinematics is {kinematics!r}; use one of {_KINEMATICS} (a tolerance of small "
+            "displacements is ContactProblem(small_displacement_tolerance=...))"
         )
     if kinematics == "small":
         if obstacle.rotation is not None:
             raise ValueError(
-                f'{name}: an obstacle that turns needs Contact(kinematics="finite"); for turns '
-                "below 0.01 give its displacement as a UFL vector: forces are off by about as much "
-                "as the angle"
+                f'{name}: a Rotation of the obstacle needs Contact(kinematics="finite"); for '
+                "rotations below 0.01 rad you may give the displacement as a UFL vector instead, "
+                "with a relative error of the forces of about the angle"
             )
         return False
     if gap is not None:
         raise ValueError(
-            f"{name}: a gap is prescribed, and finite kinematics take it from the places of "
-            "body and obstacle; leave the gap out, and move the obstacle by its displacement"
+            f"{name}: gap is given, but with finite kinematics it follows from the positions of "
+            "body and obstacle; omit it, and move the obstacle by its displacement"
         )
     if law.has_tangential and not law.has_friction:
         raise ValueError(
-            f"{name}: {type(law).__name__} bonds points to places of the obstacle, and finite "
-            "kinematics know no such law; use one with friction, or leave k_t out"
+            f"{name}: {type(law).__name__} bonds points to fixed points of the obstacle, which is "
+            "not available with finite kinematics; use a law with friction, or omit k_t"
         )
     return True
 
@@ -97,9 +97,9 @@ def enforcement_of(
         springs = [n for n, v in law.parameters().items() if isinstance(v, NodalSprings)]
         what = f"{springs[0]} by NodalSprings" if springs else type(law).__name__
         raise ValueError(
-            f"{name}: {what} has the stiffness of something that is there; multipliers "
-            'would take it away; use enforcement="penalty", or a law and stiffness that stand '
-            "for rigid contact"
+            f"{name}: {what} has a physical stiffness, which the augmented Lagrangian method would "
+            'eliminate; use enforcement="penalty", or a law and stiffness that regularise rigid '
+            "contact"
         )
     return True, tolerance
 

@@ -319,13 +319,13 @@ def check_rigid(name: str, shift: Any, rotation: tuple[Any, Any] | None) -> None
     varies = (ufl.SpatialCoordinate, ufl.Coefficient)
     if rotation is not None and any(extract_type(ufl.as_ufl(e), varies) for e in rotation):
         raise ValueError(
-            f"{name}: the Rotation differs from point to point, or depends on u; an obstacle is "
-            "rigid: give numbers or constants"
+            f"{name}: the Rotation varies over Γc or depends on u, but the obstacle is rigid: give "
+            "numbers or constants"
         )
     if shift is not None and extract_type(shift, varies):
         raise ValueError(
-            f"{name}: the displacement of the obstacle differs from point to point, and finite "
-            "kinematics take a rigid obstacle: give numbers or constants, and turn it by a Rotation"
+            f"{name}: the displacement of the obstacle varies over Γc, but finite kinematics need "
+            "a rigid obstacle: give numbers or constants, and rotate it by a Rotation"
         )
 
 
@@ -337,9 +337,9 @@ def check_places(name: str, place: Callable[[Any], Placement], mesh: Any) -> Non
     """
     if not is_known_everywhere(place, mesh):
         raise ValueError(
-            f"{name}: the obstacle is given on the undeformed Γc, and finite kinematics need it at "
-            "every place: give a SignedDistance(lambda x: ...), with all coordinates taken "
-            "from its argument, or another rigid obstacle by numbers and constants"
+            f"{name}: the obstacle is given on the undeformed Γc, but finite kinematics need it at "
+            "every point: give a SignedDistance(lambda x: ...) that uses no coordinates but its "
+            "argument, or another rigid obstacle by numbers and constants"
         )
 
 

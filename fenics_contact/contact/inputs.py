@@ -140,8 +140,8 @@ class Inputs:
         self.weight = self.scalar("weight", 1.0 if weight is None else weight)
         for own in [n for n in _OWN if n in law.parameters()]:
             raise ValueError(
-                f"{name}: {type(law).__name__} has a parameter {own!r}, as the contact itself has "
-                "one; give it another name"
+                f"{name}: {type(law).__name__} has a parameter {own!r}, which is a name of the "
+                "contact's own data; rename it"
             )
         self.law = {n: self._parameter(n, v) for n, v in law.parameters().items()}
         self.stiffness_factor = fem.Constant(self._surface.mesh, 1.0)
@@ -194,8 +194,8 @@ class Inputs:
                 value = [type(v).__name__ if s else v for v, s in zip(value, symbols, strict=True)]
             of_components = ", such as ufl.as_vector([way, 0.0])" if rows else ""
             raise TypeError(
-                f"{self._name}: {name} is {value!r}; give numbers, a fem.Constant, a fem.Function "
-                f"or a UFL expression{of_components}"
+                f"{self._name}: {name} is {value!r}; it must be a number or numbers, a "
+                f"fem.Constant, a fem.Function or a UFL expression{of_components}"
             )
         constant = fem.Constant(self._surface.mesh, array.astype(np.float64))
         if name != "obstacle":
@@ -233,8 +233,8 @@ class Inputs:
         shift = self.to_ufl("displacement", displacement)
         if shift.ufl_shape != (self._gdim,):
             raise ValueError(
-                f"{self._name}: displacement of the obstacle has shape {shift.ufl_shape}; the mesh "
-                f"needs ({self._gdim},)"
+                f"{self._name}: displacement of the obstacle has shape {shift.ufl_shape}; on this "
+                f"mesh it must be ({self._gdim},)"
             )
         return shift
 
@@ -246,7 +246,7 @@ class Inputs:
         if (given[0] is None) == (given[1] is None):
             raise ValueError(
                 f"{self._name}: the Rotation has angle {given[0]!r} and moment {given[1]!r}; give "
-                "one of them, and None for the other, which is found"
+                "one of them, and None for the other"
             )
         about = as_vector(f"{self._name}: about of the Rotation", rotation.about, self._gdim)
         axis = rotation.unit_axis(self._gdim)
@@ -261,13 +261,13 @@ class Inputs:
         moment = rotation.moment
         if not (is_number(moment) or (isinstance(moment, fem.Constant) and not moment.ufl_shape)):
             raise TypeError(
-                f"{self._name}: moment of the Rotation is {moment!r}; give a number or a scalar "
-                "fem.Constant"
+                f"{self._name}: moment of the Rotation is {moment!r}; it must be a number or a "
+                "scalar fem.Constant"
             )
         if isinstance(about, ufl.core.expr.Expr):
             raise TypeError(
-                f"{self._name}: about of the Rotation is {about!r}; where the moment is given it "
-                f"must be {self._gdim} numbers: the displacement of the obstacle moves the axis"
+                f"{self._name}: about of the Rotation is {about!r}; with a given moment it must be "
+                f"{self._gdim} numbers: move the axis by the displacement of the obstacle"
             )
         self.applied_moment = self.to_ufl("moment", moment)
         self.free_angle = fem.Constant(self._surface.mesh, 0.0)
@@ -292,7 +292,7 @@ class Inputs:
         for i, value in forces.items():
             if not (is_number(value) or (isinstance(value, fem.Constant) and not value.ufl_shape)):
                 raise TypeError(
-                    f"{self._name}: force {i} of the Motion is {value!r}; give a number or a "
+                    f"{self._name}: force {i} of the Motion is {value!r}; it must be a number or a "
                     "scalar fem.Constant"
                 )
             self.applied_force[i] = value
@@ -353,7 +353,7 @@ class Inputs:
         if not shortest > 0.0:
             raise ValueError(
                 f"{self._name}: the normal of the obstacle has length {shortest:g} at a point of "
-                "Γc; it must point from the body to the obstacle everywhere"
+                "Γc; it must not vanish anywhere, and point from the body to the obstacle"
             )
         # Only what was given: what follows from u is checked with u.
         weight = data["weight"]
@@ -363,7 +363,7 @@ class Inputs:
             if not (np.isfinite(low) and np.isfinite(high)):
                 raise ValueError(
                     f"{self._name}: {name} is not finite at a point of Γc (values from {low:g} "
-                    f"to {high:g}); check the expression or function it was given by"
+                    f"to {high:g}); check its expression or function"
                 )
             if name in given or name == "direction":
                 continue
@@ -372,17 +372,19 @@ class Inputs:
                 raise ValueError(_range_error(self._name, name, low, positive))
         least = global_min(comm, weight)
         if least < 0:
-            raise ValueError(f"{self._name}: weight is negative at a point of Γc")
+            raise ValueError(
+                f"{self._name}: weight is {least:g} at a point of Γc; it must not be negative"
+            )
         if global_max(comm, weight) == 0.0:
             raise ValueError(
-                f"{self._name}: weight is zero at every point of Γc, which would bear nothing; it "
-                "is a thickness, or 2πr; leave the contact out where there is none"
+                f"{self._name}: weight is zero at every point of Γc, so that there is no contact "
+                "force; it must be the thickness, or 2πr"
             )
         if self._quadrature.at_vertices and least <= _NOTHING * global_max(comm, weight):
             raise ValueError(
-                f"{self._name}: weight is {least:g} at a vertex of Γc, as 2πr is on the axis, and "
-                'with quadrature_scheme="vertex" that is its area: whatever its pressure, it bears '
-                "nothing; take the default rule, whose points lie inside of the facets"
+                f"{self._name}: weight is {least:g} at a vertex of Γc, as 2πr is on the axis, so "
+                'that with quadrature_scheme="vertex" it has no contact force; use the default '
+                "rule, whose points are in the interior of the facets"
             )
         if "direction" in parameters:
             self._check_direction(parameters["direction"], data["normal"])
@@ -403,7 +405,7 @@ class Inputs:
         x, depth = self._surface.mesh.geometry.x, -global_min(comm, values.initial_gap)
         text = (
             f"{self._name}: the normal from the body to the obstacle points into the body at every "
-            "point of Γc: turn it round (a HalfSpace's points out of it, to the body: up for a "
+            "point of Γc: reverse it (that of a HalfSpace points out of it, to the body: up for a "
             "floor; a Ball or Cylinder around the body has inside=True)"
         )
         size = global_max(comm, x) - global_min(comm, x)
@@ -420,9 +422,9 @@ class Inputs:
         if not least > _PARALLEL:
             raise ValueError(
                 f"{self._name}: direction of friction is zero or parallel to the normal at a "
-                f"point of Γc (share across the normal: {least:.1g}); it must have a part in "
-                "the tangent plane everywhere: give another direction, or a UFL vector that "
-                "follows the surface"
+                f"point of Γc (tangential part: {least:.1g} of its length); it must have a "
+                "tangential part everywhere: give another direction, or a UFL vector that varies "
+                "along the surface"
             )
 
 
@@ -456,23 +458,23 @@ def check_given(
         for item in traverse_unique_terminals(ufl.as_ufl(expression)):
             if isinstance(item, ufl.Argument):
                 raise ValueError(
-                    f"{name}: {what} has a test or trial function; give what has a value at every "
+                    f"{name}: {what} has a test or trial function; it must have a value at every "
                     "point of Γc"
                 )
             if isinstance(item, fem.Constant | fem.Function) and item.dtype != np.float64:
                 raise ValueError(
-                    f"{name}: {what} has a {type(item).__name__} of type {item.dtype}; all of a "
-                    "problem is in double precision: make it of np.float64"
+                    f"{name}: {what} has a {type(item).__name__} of type {item.dtype}; it must be "
+                    "in double precision, np.float64"
                 )
             if not isinstance(item, fem.Function):
                 continue
             _check_space(f"{name}: {what}", item, quadrature)
             if any(np.shares_memory(item.x.array, array) for array in solved_for):
                 raise ValueError(
-                    f"{name}: {what} depends on what is solved for, {item.name!r}; data are "
-                    "numbers while an increment is solved: give a function of its own, whose "
-                    "values you set between increments, or a law of your own, whose response is a "
-                    "function of gap and slip"
+                    f"{name}: {what} depends on the unknown {item.name!r}, but data are constant "
+                    "within an increment: use another function, whose values you set between "
+                    "increments, or a user-defined law, whose contact_traction is a function of "
+                    "gap and slip"
                 )
 
 
@@ -482,15 +484,17 @@ def _check_space(what: str, function: fem.Function, quadrature: SurfaceQuadratur
     mesh, element = function.function_space.mesh, function.function_space.ufl_element()
     on_surface = mesh is surface.submesh or mesh == surface.submesh
     if not (on_surface or mesh is surface.mesh or mesh == surface.mesh):
-        raise ValueError(f"{what} has a function, {function.name!r}, on another mesh than Γc")
+        raise ValueError(
+            f"{what} has a function, {function.name!r}, on another mesh than Γc; use the mesh of u"
+        )
     if not element.has_custom_quadrature:
         return
     own = quadrature.space().ufl_element().custom_quadrature()[0]
     points = element.custom_quadrature()[0]
     if not (on_surface and points.shape == own.shape and np.array_equal(points, own)):
         raise ValueError(
-            f"{what} has a function, {function.name!r}, on a quadrature element, whose values are "
-            "at other points than those of Γc; give one of a Lagrange or DG space"
+            f"{what} has a function, {function.name!r}, on a quadrature element with other points "
+            "than those of Γc; use a function of a Lagrange or DG space"
         )
 
 

@@ -349,7 +349,7 @@ class Opposite(ABC):
         Raises:
             ValueError: It does not; see `carries`.
         """
-        raise ValueError(f"{self._parts.name}: what lies opposite carries nothing")
+        raise ValueError(f"{self._parts.name}: the obstacle has no displacement")
 
     def turning_rate(self) -> Array:
         """Way by a unit angle of the obstacle's points where those of Γc are now. Collective.
@@ -362,7 +362,7 @@ class Opposite(ABC):
         """
         rotation = self._parts.obstacle.rotation
         if rotation is None:
-            raise ValueError(f"{self._parts.name}: the obstacle does not turn")
+            raise ValueError(f"{self._parts.name}: the obstacle has no Rotation")
         jump = self.present_jump()
         self.update_data()
         data = self.data.values
@@ -384,7 +384,8 @@ class Opposite(ABC):
             ValueError: Displacements are taken as small, or it is no rigid obstacle.
         """
         raise ValueError(
-            f'{self._parts.name}: there is none without kinematics="finite" and a rigid obstacle'
+            f"{self._parts.name}: the curvature is available with a rigid obstacle and "
+            'kinematics="finite" only'
         )
 
     def rotation_in_increment(self, values: PointValues) -> Callable[[Array, Array | float], Array]:

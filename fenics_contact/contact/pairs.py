@@ -111,9 +111,9 @@ class Pairs:
             told = [f"{k}: {text}" for k, text in zip(counts, REASONS.values(), strict=True) if k]
             warn(
                 comm,
-                f"{self._name}: {self.n_unpaired} of the {total} points of Γc have no opposite and "
-                f"bear nothing ({'; '.join(told)}). Check the tags of Γc and of the opposite "
-                "surface, search_distance and release of the DeformableBody",
+                f"{self._name}: {self.n_unpaired} of the {total} points of Γc have no opposite "
+                f"point and are open ({'; '.join(told)}). Check the tags of Γc and of the opposite "
+                "surface, search_distance and max_initial_penetration of the DeformableBody",
             )
 
     def state(self) -> PairsState:

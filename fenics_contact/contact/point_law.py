@@ -358,9 +358,9 @@ class PointLaw:
             if not there:
                 what = getattr(item, "name", None) or f"a {type(item).__name__}"
                 raise ValueError(
-                    f"{type(self.law).__name__} uses {what} in its response or another method; a "
-                    "law knows of a point what its kinematics and parameters tell it: give it as a "
-                    'parameter, a field of the class, and take it from parameters["..."]'
+                    f"{type(self.law).__name__} uses {what} in contact_traction or another method; "
+                    "a law may depend on its kinematics and parameters only: make it a parameter, "
+                    'a field of the class, and use parameters["..."]'
                 )
 
 

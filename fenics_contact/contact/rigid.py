@@ -227,13 +227,13 @@ def _sampled_places(
     d = mesh.geometry.dim
     if obstacle.gdim != d:
         raise ValueError(
-            f"{parts.name}: the {kind} is given in {obstacle.gdim} dimensions, and the mesh has "
-            f"{d}; give it {d} coordinates a point"
+            f"{parts.name}: the {kind} is given in {obstacle.gdim} dimensions, but the mesh has "
+            f"{d}; its points must have {d} coordinates"
         )
     if len(set(mesh.comm.allgather(obstacle.fingerprint))) > 1:
         raise ValueError(
-            f"{parts.name}: the data of the {kind} differ from rank to rank; give every rank "
-            "the same (read the file on all of them, or broadcast its arrays)"
+            f"{parts.name}: the data of the {kind} differ between ranks; they must be the same "
+            "(read the file on all ranks, or broadcast its arrays)"
         )
     x = ufl.SpatialCoordinate(mesh)
     places = (frame.into(x), moved.into(x + jump))

@@ -20,17 +20,17 @@ __all__ = ["FORMAT", "Stored", "check_finite", "read_file", "refuse", "write_fil
 FORMAT = 5
 # The file's end: these words, and the digest of all before them.
 _MARK = b"\nfenics_contact checkpoint, sha256 "
-_REMEDY = "remove it to start anew"
+_REMEDY = "remove it to start again"
 
 
 @dataclass(frozen=True)
 class Stored:
-    """What a file holds, on every rank.
+    """The content of a checkpoint file, on every rank.
 
     Attributes:
         path: The file.
-        scene: The fingerprint in words, and what else is no array.
-        arrays: By name.
+        scene: The fingerprint of the problem in words, and other data that are no arrays.
+        arrays: Arrays by name.
     """
 
     path: Path
@@ -60,7 +60,7 @@ def write_file(path: Path, scene: dict[str, Any], arrays: dict[str, Array]) -> N
             file.write(content)
         # Whether it can be gone on from is better known now than when it is needed.
         if temporary.read_bytes() != content:
-            raise OSError(f"{path} is not what was written: is the disk full, or damaged?")
+            raise OSError(f"{path} differs from what was written: check the disk")
 
 
 def _pack(scene: dict[str, Any], arrays: dict[str, Array]) -> bytes:
@@ -84,12 +84,12 @@ def read_file(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
     end = len(content) - len(_MARK) - 64
     if end < 0 or content[end : end + len(_MARK)] != _MARK:
         raise ValueError(
-            f"{path} is no checkpoint of this version, or is cut short: its end is missing; put a "
-            f"copy in its place, or {_REMEDY}"
+            f"{path} is no checkpoint of this version, or truncated: its end is missing; replace "
+            f"it by a copy, or {_REMEDY}"
         )
     if hashlib.sha256(content[:end]).hexdigest().encode() != content[-64:]:
         raise ValueError(
-            f"{path} is damaged: it is not as it was written; put a copy in its place, or {_REMEDY}"
+            f"{path} is damaged: its checksum is wrong; replace it by a copy, or {_REMEDY}"
         )
     try:
         with np.load(io.BytesIO(content[:end]), allow_pickle=False) as archive:
@@ -100,18 +100,18 @@ def read_file(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
         raise ValueError(f"{path} is no checkpoint ({error}); {_REMEDY}") from error
     if found != FORMAT:
         raise ValueError(
-            f"{path} is a checkpoint of format {found!r}, and this version reads {FORMAT}; go on "
-            f"with the version that wrote it, or {_REMEDY}"
+            f"{path} is a checkpoint of format {found!r}, but this version reads {FORMAT}; use "
+            f"the version that wrote it, or {_REMEDY}"
         )
     missing = sorted({"notes", "contacts", "fixed", "data"} - set(scene))
     missing += ["numbers"] * ("numbers" not in arrays)
     if missing:
-        raise ValueError(f"{path} is no checkpoint, it has no {', '.join(missing)}; {_REMEDY}")
+        raise ValueError(f"{path} is no checkpoint, it lacks {', '.join(missing)}; {_REMEDY}")
     for name, array in arrays.items():
         if array.dtype != np.float64 or array.ndim not in (1, 2):
             raise ValueError(
-                f"{path}: {name!r} is of type {array.dtype}, with {array.ndim} axes; a checkpoint "
-                f"has tables of float64; {_REMEDY}"
+                f"{path}: {name!r} is of type {array.dtype}, with {array.ndim} axes; it must be of "
+                f"float64, with 1 or 2 axes; {_REMEDY}"
             )
         check_finite(name, array, f"{path}, {_REMEDY}")
     return scene, arrays

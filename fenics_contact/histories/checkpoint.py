@@ -1,9 +1,8 @@
-"""The committed state of a problem in a file, to go on from after whatever ended the run.
+"""Checkpoints: the committed state of a problem in a file, from which another run can continue.
 
-The file is an archive of NumPy arrays. DOLFINx's own writers (ADIOS2, HDF5) carry functions on the
-cells of a mesh; the history lives at quadrature points of facets, for which they have no format.
-Every value is stored with where it belongs (`places`), and with the state goes a fingerprint of the
-scene (`fingerprint`).
+The file is an archive of NumPy arrays. DOLFINx's own writers (ADIOS2, HDF5) store functions on the
+cells of a mesh, but the history is defined at quadrature points of facets. Every value is stored
+with its location (`places`), together with a fingerprint of the problem (`fingerprint`).
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ logger = logging.getLogger("fenics_contact")
 
 
 def exists(problem: ContactProblem, path: str | Path) -> bool:
-    """Whether there is something of that name, as rank 0 sees it. Collective."""
+    """Return whether a file of that name exists on rank 0. Collective."""
     comm = problem.u.function_space.mesh.comm
     found = None
     with collective_errors(comm):
@@ -83,24 +82,25 @@ def save(
     state_fields: Sequence[fem.Function] = (),
     notes: Any = None,
 ) -> None:
-    """Write the committed state, with the loads as they are now. Collective.
+    """Write the committed state, with the present loads. Collective.
 
-    The file is complete or as before, whenever the program is ended: it is written under another
-    name, and then renamed. What the solver knows from earlier increments is dropped, here as in a
-    program that starts from the file, so that both go on with the same digits (on several ranks
-    to the solver's tolerance: there MUMPS adds in the order in which messages come).
+    The file is written under another name and then renamed, so that it is always complete. Solver
+    data of earlier increments are discarded, so that this run and one that continues from the file
+    have identical results (on several ranks, to the solver's tolerance, because the order of
+    summation in MUMPS varies).
 
     Args:
-        problem: At a committed state.
-        path: The file (``.npz``).
-        numbers: The caller's own, to be found again: the load parameter, for instance.
-        state_fields: The caller's functions that belong to the state; see `check_fields`.
-        notes: More of the caller's, of what JSON can hold.
+        problem: A problem in its committed state.
+        path: Name of the file (``.npz``).
+        numbers: Numbers of the caller that `load` returns, such as the load parameter.
+        state_fields: Functions of the caller that belong to the state: real values at points, in
+            Lagrange or quadrature spaces on the mesh or a submesh of it.
+        notes: Additional data of the caller, serialisable as JSON.
 
     Raises:
-        ValueError: The problem has a solved increment that is not committed, or a state that is
-            not finite; or see `check_fields` and `check_places`.
-        OSError: It cannot be written; the problem is as before. On all ranks.
+        ValueError: An increment is solved but not committed, the state is not finite, a function
+            cannot be saved, or two nodes of the mesh coincide; raised on all ranks.
+        OSError: The file cannot be written; the problem is unchanged. Raised on all ranks.
     """
     comm = problem.u.function_space.mesh.comm
     check_fields(problem, state_fields)
@@ -129,7 +129,7 @@ def save(
     with collective_errors(comm):
         if comm.rank == 0:
             for name, array in arrays.items():
-                check_finite(name, array, "the committed state is none; nothing is saved")
+                check_finite(name, array, "the committed state is invalid and was not saved")
             write_file(Path(path), scene, arrays)
     problem.restart_solver()
 
@@ -141,25 +141,25 @@ def load(
     state_fields: Sequence[fem.Function] = (),
     on_mismatch: str = "refuse",
 ) -> list[float]:
-    """Make a saved state the committed one. Collective.
+    """Load a saved state as the committed one. Collective.
 
-    The loads, conditions and obstacles must be set as they were: they are compared.
+    Loads, conditions and obstacles must be set as they were when it was saved; they are compared.
 
     Args:
-        problem: That of the file, made anew.
-        path: The file.
-        state_fields: Those that were given to `save`, to be set; in the same order.
-        on_mismatch: "refuse" a file whose state is one of other data than the problem's (stiffness,
-            laws and their parameters, obstacles, conditions, loads), or "continue" from it with the
-            data of the problem.
+        problem: A new problem like the one that was saved.
+        path: Name of the file.
+        state_fields: The functions given to `save`, in the same order; their values are set.
+        on_mismatch: What to do if the file has other data (stiffness, laws and parameters,
+            obstacles, conditions, loads): "refuse" it with an error, or "continue" with the data of
+            the problem.
 
     Returns:
-        The caller's numbers.
+        The numbers given to `save`.
 
     Raises:
-        ValueError: The file is damaged, none of `save`, or that of another mesh, element, rule or
-            set of contacts, or of other data; the problem is as before. On all ranks.
-        OSError: It cannot be read. On all ranks.
+        ValueError: The file is damaged, no checkpoint, or of another mesh, element, quadrature
+            rule, set of contacts or data; the problem is unchanged. Raised on all ranks.
+        OSError: The file cannot be read; raised on all ranks.
     """
     check_mismatch(on_mismatch)
     stored = read(problem, path)
@@ -168,23 +168,23 @@ def load(
 
 
 def check_mismatch(on_mismatch: str) -> None:
-    """Refuse words that are none of the two.
+    """Check that ``on_mismatch`` is "refuse" or "continue".
 
     Raises:
-        ValueError: It says which there are.
+        ValueError: It is neither.
     """
     if on_mismatch not in ("refuse", "continue"):
         raise ValueError(f'on_mismatch is {on_mismatch!r}; it must be "refuse" or "continue"')
 
 
 def check_fields(problem: ContactProblem, state_fields: Sequence[fem.Function]) -> None:
-    """Refuse what cannot be saved with the state. Collective.
+    """Check that functions can be saved with the state. Collective.
 
-    That is every function but those of real values at points (Lagrange of any degree, continuous
-    or not, quadrature elements; scalar or blocked), on the mesh or a submesh of it.
+    Their dofs must be real values at points (Lagrange elements of any degree, continuous or not,
+    and quadrature elements; scalar or blocked), on the mesh or a submesh of it.
 
     Raises:
-        ValueError: It names the field. On all ranks.
+        ValueError: A function cannot be saved; raised on all ranks.
     """
     comm = problem.u.function_space.mesh.comm
     for number, field in enumerate(state_fields):
@@ -196,13 +196,11 @@ def check_fields(problem: ContactProblem, state_fields: Sequence[fem.Function]) 
         dofmap = space.dofmap
         n_nodes = dofmap.index_map.size_local + dofmap.index_map.num_ghosts
         if field is problem.u:
-            raise ValueError(
-                f"{what} is the function of the displacement, which is saved by itself"
-            )
+            raise ValueError(f"{what} is the displacement, which is always saved; omit it")
         if field.x.array.dtype != np.float64:
-            raise ValueError(f"{what} has values of type {field.x.array.dtype}; save float64")
+            raise ValueError(f"{what} has values of type {field.x.array.dtype}; use float64")
         if MPI.Comm.Compare(space.mesh.comm, comm) not in (MPI.IDENT, MPI.CONGRUENT):
-            raise ValueError(f"{what} is on a mesh of other ranks than the problem's")
+            raise ValueError(f"{what} is on a mesh with another communicator; use the problem's")
         try:
             space.tabulate_dof_coordinates()
             whole = field.x.array.size == n_nodes * dofmap.index_map_bs
@@ -212,9 +210,9 @@ def check_fields(problem: ContactProblem, state_fields: Sequence[fem.Function]) 
             pointwise = False
         if not pointwise:
             raise ValueError(
-                f"{what} is in {space.ufl_element()}, whose dofs are no values at points; "
-                "interpolate it to a Lagrange or quadrature space, parts of a mixed one each into "
-                "a function of its own"
+                f"{what} is in {space.ufl_element()}, whose dofs are not values at points; "
+                "interpolate it to a Lagrange or quadrature space, and parts of a mixed function "
+                "separately"
             )
 
 
@@ -222,10 +220,12 @@ _told_apart: weakref.WeakSet[ContactProblem] = weakref.WeakSet()
 
 
 def check_places(problem: ContactProblem) -> None:
-    """Refuse a mesh whose nodes cannot be told apart by their places. Collective.
+    """Check that the nodes of the mesh can be identified by their coordinates and cells.
+
+    Collective.
 
     Raises:
-        ValueError: There are two nodes at one place with the same cells around. On all ranks.
+        ValueError: Two nodes coincide, in cells that coincide; raised on all ranks.
     """
     if problem in _told_apart:
         return
@@ -233,19 +233,19 @@ def check_places(problem: ContactProblem) -> None:
     shared = n_shared(comm, node_places(parts_of(problem)[0].space), problem.full.scales.mesh_size)
     if shared:
         raise ValueError(
-            f"{shared} nodes of the mesh are where others are, in cells that cover one another, so "
-            "that a checkpoint could not tell their values apart; remove the cells that are there "
-            "twice, or go without a checkpoint"
+            f"{shared} nodes of the mesh coincide with others, in cells that coincide, so that a "
+            "checkpoint could not distinguish their values; remove the duplicate cells, or use no "
+            "checkpoint"
         )
     _told_apart.add(problem)
 
 
 def read(problem: ContactProblem, path: str | Path) -> Stored:
-    """Read and check a file by itself. Collective.
+    """Read a checkpoint file and check its integrity. Collective.
 
     Raises:
-        ValueError: It is damaged, or none of `save`. On all ranks.
-        OSError: It cannot be read. On all ranks.
+        ValueError: The file is damaged, or no checkpoint; raised on all ranks.
+        OSError: The file cannot be read; raised on all ranks.
     """
     comm, path = problem.u.function_space.mesh.comm, Path(path)
     found = None
@@ -264,20 +264,21 @@ def take_up(
     state_fields: Sequence[fem.Function] = (),
     on_mismatch: str = "refuse",
 ) -> None:
-    """Make what `read` gave the committed state. Collective.
+    """Make a state that `read` returned the committed one. Collective.
 
     Everything is checked before anything is set.
 
     Args:
-        problem: See `load`.
-        stored: What was read.
-        loads: Sets the loads as they were; called where the file may be that of the problem. If
-            what follows fails, it is the caller's to take them back.
-        state_fields: See `load`.
-        on_mismatch: See `load`.
+        problem: A new problem like the one that was saved.
+        stored: The state.
+        loads: Function that sets the loads of that state. It is called after the file has been
+            identified; if an error follows, the caller has to reset the loads.
+        state_fields: The functions given to `save`, in the same order; their values are set.
+        on_mismatch: "refuse" a file with other data, or "continue" with the data of the problem.
 
     Raises:
-        ValueError: See `load`.
+        ValueError: The file is of another mesh, element, quadrature rule, set of contacts or data;
+            the problem is unchanged. Raised on all ranks.
     """
     comm = problem.u.function_space.mesh.comm
     check_fields(problem, state_fields)
@@ -317,7 +318,9 @@ def take_up(
             differences = changed_data(stored, problem, committed, given)
         if on_mismatch == "refuse":
             refuse(
-                stored, differences, ', or give on_mismatch="continue" to go on with what is here'
+                stored,
+                differences,
+                ', or give on_mismatch="continue" to continue with the present data',
             )
     except BaseException as error:
         fail_together(comm, error)
@@ -326,6 +329,6 @@ def take_up(
         raise
     if differences and comm.rank == 0:
         logger.warning(
-            "going on from %s with changed data: %s", stored.path, "; ".join(differences)
+            "continuing from %s with changed data: %s", stored.path, "; ".join(differences)
         )
     problem.set_committed(committed, points)

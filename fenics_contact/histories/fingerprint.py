@@ -173,7 +173,7 @@ def probe(problem: ContactProblem) -> dict[str, Array]:
 
 def _compare_words(theirs: dict[str, str], ours: dict[str, str]) -> list[str]:
     return [
-        f"{name} is {theirs.get(name, 'not there')} in the file and {ours.get(name, 'not')} here"
+        f"{name} is {theirs.get(name, 'missing')} in the file and {ours.get(name, 'missing')} here"
         for name in dict.fromkeys([*theirs, *ours])
         if theirs.get(name) != ours.get(name)
     ]

@@ -158,8 +158,8 @@ def positions(space: fem.FunctionSpace) -> Array:
         return space.tabulate_dof_coordinates()[:n_owned, :gdim]
     if dofmap.dof_layout.num_dofs != 1:
         raise ValueError(
-            f"values in {space.ufl_element()} are at no points, and cannot be found again on other "
-            "ranks; take bubbles of one function a cell"
+            f"dofs of {space.ufl_element()} are not values at points, and cannot be identified on "
+            "other ranks; use bubble elements with one function per cell"
         )
     cells = dofmap.list[:, 0]
     places = np.zeros((n_owned + dofmap.index_map.num_ghosts, gdim))

@@ -37,7 +37,7 @@ class Bar(logging.Filter):
             from tqdm import tqdm
         except ImportError as error:
             raise ValueError(
-                "progress takes tqdm, which is not installed: install it, or leave progress out"
+                "progress needs tqdm, which is not installed: install it, or omit progress"
             ) from error
         self._make, self._words = tqdm, f"{words}: " if words else ""
         self._start, self._way = start, end - start

@@ -1,4 +1,4 @@
-"""A history and its last state as one page of HTML, for the screen and for paper."""
+"""Report of a load history and its last state as one HTML page, for screen and print."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ _ENERGIES = {
 _REMAINDER = (
     "The work of an increment is that of the mean of the forces at its two ends. The remainder is "
     "the part of it that is in none of the other sums: contact that changes within an increment, "
-    "and springs that are let go where contact opens. Smaller increments make it smaller; where it "
-    "is large beside the work, the increments are too large for the energies."
+    "and springs that are released where contact opens. It decreases with the increment size; if "
+    "it is large compared with the work, the increments are too large for accurate energies."
 )
 _STYLE = """
 body { font: 15px/1.5 sans-serif; color: #1a1a1a; max-width: 72rem; margin: 2rem auto;
@@ -88,37 +88,38 @@ def report(
     magnification: float | None = None,
     view: tuple[float, float] | None = None,
 ) -> Path:
-    """Write ``report.html``, which needs no other file. Collective.
+    """Write a self-contained report, ``report.html``. Collective.
 
-    It has the verdict in words, the deformed body, of every contact the tractions, gap, slip and
-    status with their extents, curves of forces, moments, areas and energies over the history, the
-    iterations of every increment, the error budget, what was chosen, and the versions of all that
-    computed it. The file is complete or as before.
+    It contains the verdict; the deformed body; tractions, gap, slip and status of every contact
+    with their extents; curves of forces, moments, areas and energies over the history; iterations;
+    the error budget; the numerical settings; and the versions of all software. The file is replaced
+    only when it is complete.
 
     Args:
-        problem: In the state of the last step, whether it is committed or not.
-        steps: What `increments` or `ContactProblem.solve` gave: the steps of the history in their
-            order, or the last one alone.
-        folder: Where to; it is made.
-        csv: Table that `increments` wrote for the same history: the curves are of its rows,
-            those of the runs before this one, too. By default they are of the steps.
-        stress: UFL tensor (3, 3) on the body, for the colours of the deformed body.
-        budget: What `estimate_errors` found of this state.
+        problem: The problem in the state of the last step, committed or not.
+        steps: The steps returned by `increments` or `ContactProblem.solve`, in their order, or the
+            last one.
+        folder: Folder of the file, created if necessary.
+        csv: Table that `increments` wrote for the same history, from which the curves are drawn, so
+            that they include earlier runs. By default they are drawn from ``steps``.
+        stress: UFL tensor (3, 3) on the body, whose von Mises stress colours the deformed body.
+        budget: Result of `estimate_errors` for this state.
         title: Heading.
-        units: Of length, force and stress, for what is shown; moments and energies are in force
-            times length. In the plane forces, moments, areas and energies are per unit thickness,
-            and the page says so, unless the contacts' weight has it.
-        magnification: Factor by which displacements are drawn; by default 1 with finite kinematics,
-            and else so that they can be seen.
-        view: In space where to look from: elevation and azimuth in degrees.
+        units: Units of length, force and stress; those of moments and energies are force times
+            length. In the plane without weight, forces, moments, areas and energies are per unit
+            thickness, and the report states it.
+        magnification: Factor of the displacements drawn; by default 1 with finite kinematics, and
+            otherwise large enough to be visible.
+        view: Elevation and azimuth of the camera in degrees, in space.
 
     Returns:
         The path of the file.
 
     Raises:
-        ValueError: An argument has no sense, the steps or the table are of another history. On all
+        ValueError: An argument is invalid, or steps or table are of another history; raised on all
             ranks.
-        OSError: The folder cannot be made or written to, or the table cannot be read. On all ranks.
+        OSError: The folder cannot be created or written to, or the table cannot be read; raised on
+            all ranks.
     """
     check_instance("problem", problem, ContactProblem)
     steps = [steps] if isinstance(steps, Step) else steps
@@ -180,8 +181,8 @@ def _check(
         )
     if not steps:
         raise ValueError(
-            "steps is empty: nothing was solved, and the problem has no state to report; where a "
-            "checkpoint says that all is done, remove it or lead the history further"
+            "steps is empty: nothing was solved, and there is no state to report; if the "
+            "checkpoint is complete, remove it or extend the load history"
         )
     names = [contact.name for contact in problem.contacts]
     numbers = [step.increment for step in steps]
@@ -193,8 +194,8 @@ def _check(
     ):
         raise ValueError(
             f"steps are of the increments {numbers} and of contacts {list(steps[-1].contacts)}, "
-            f"and the problem, of contacts {names}, is at increment {problem.increment}; give its "
-            "steps in their order, the last one at the end"
+            f"but the problem, of contacts {names}, is at increment {problem.increment}; give its "
+            "steps in their order up to the last one"
         )
     for name, value in (("folder", folder), ("csv", csv)):
         if not (isinstance(value, str | os.PathLike) or (name == "csv" and value is None)):
@@ -208,7 +209,9 @@ def _check(
         and len(units) == 3
         and all(isinstance(unit, str) for unit in units)
     ):
-        raise ValueError(f'units is {units!r}; it must be three words, such as ("mm", "N", "MPa")')
+        raise ValueError(
+            f'units is {units!r}; it must be three strings, such as ("mm", "N", "MPa")'
+        )
     if magnification is not None and not (
         is_number(magnification) and np.isfinite(magnification) and magnification > 0
     ):
@@ -300,7 +303,7 @@ def _rows(
     rows = table.read(Path(csv), problem)
     if int(rows[-1]["increment"]) != steps[-1].increment:
         raise ValueError(
-            f"csv is {csv}, whose last increment is {rows[-1]['increment']}, and the last "
+            f"csv is {csv}, whose last increment is {rows[-1]['increment']}, but the last "
             f"step is of increment {steps[-1].increment}; give the table of the same history"
         )
     return rows

@@ -71,7 +71,7 @@ class Table:
     def _check(self) -> None:
         if not self._path.parent.is_dir():
             raise ValueError(
-                f"history is {self._path}, and there is no folder {self._path.parent}; make it"
+                f"csv is {self._path}, but there is no folder {self._path.parent}; create it"
             )
         files.check_file(self._path)
         there = self._path.exists()
@@ -85,7 +85,7 @@ class Table:
             self._path.unlink()
         if first and first != _BEGINS:
             raise ValueError(
-                f"history is {self._path}, which is there and is no table of a history; it would "
+                f"csv is {self._path}, an existing file that is no table of increments and would "
                 "be overwritten: give another name, or remove it"
             )
 
@@ -205,9 +205,8 @@ def read(path: Path, problem: ContactProblem) -> list[dict[str, str]]:
     missing = [name for name in columns(problem) if not rows or rows[0].get(name) is None]
     if missing:
         raise ValueError(
-            f"history is {path}, and that is no table of a history of these contacts, or has no "
-            f"row: there is no column {missing[0]!r}; give the file that increments(history=...) "
-            "wrote"
+            f"csv is {path}, which is no table of increments of these contacts, or is empty: there "
+            f"is no column {missing[0]!r}; give the file written by increments(csv=...)"
         )
     if None in rows[-1].values():
         rows.pop()  # what ended the run ended it in the middle

@@ -92,7 +92,7 @@ class Displacement:
         if len(found) != 1:
             raise ValueError(
                 f"{name}: u is in {whole.function_space.ufl_element()}, of which {len(found)} "
-                f"parts can be a displacement; there must be one, as in {_MIXED}"
+                f"parts can be a displacement; it must be exactly one, as in {_MIXED}"
             )
         return found[0]
 
@@ -210,8 +210,8 @@ def _check_unmixed(u: fem.Function, name: str) -> None:
     """Refuse functions of several fields, and parts of them as DOLFINx gives them."""
     if u.function_space.component():
         raise ValueError(
-            f"{name}: u is a part of a mixed function as w.sub(i) gives it, which no derivative by "
-            f"w knows; give the part by UFL, {_SPLIT}"
+            f"{name}: u is a part of a mixed function given by w.sub(i), on which derivatives with "
+            f"respect to w do not depend; use {_SPLIT}"
         )
     if is_mixed(u.function_space):
         raise ValueError(
@@ -231,9 +231,8 @@ def _parts(u: ufl.core.expr.Expr, name: str) -> tuple[fem.Function, int]:
     wholes = {id(part[0]): part[0] for part in found if part is not None}
     if len(wholes) != 1 or None in found:
         raise ValueError(
-            f"{name}: u is a {type(u).__name__}; it must be a Function, or of a mixed function w "
-            f"the displacement as UFL has it, {_SPLIT}, to which parts that are bubbles may be "
-            "added"
+            f"{name}: u is a {type(u).__name__}; it must be a Function, or the displacement of a "
+            f"mixed function w, {_SPLIT}, to which bubble functions may be added"
         )
     (whole,) = wholes.values()
     element = whole.function_space.ufl_element()
@@ -242,7 +241,7 @@ def _parts(u: ufl.core.expr.Expr, name: str) -> tuple[fem.Function, int]:
     if len(traces) != 1:
         raise ValueError(
             f"{name}: u is a sum of {len(numbers)} parts of {element}, of which {len(traces)} are "
-            "no bubbles; it must be one, to which bubbles are added"
+            "no bubble functions; it must be exactly one"
         )
     return whole, traces[0]
 
@@ -278,7 +277,7 @@ def _degree(u: fem.Function, mesh: Any, name: str) -> int:
             f'make its space with functionspace(mesh, ("Lagrange", degree, ({gdim},)))'
         )
     if u.function_space.mesh is not mesh and u.function_space.mesh != mesh:
-        raise ValueError(f"{name}: u lives on another mesh than the contact surface")
+        raise ValueError(f"{name}: u is on another mesh than the contact surface; use the same")
     if u.x.array.dtype != np.float64:
         raise ValueError(
             f"{name}: u has values of type {u.x.array.dtype}; the mesh, its functions and PETSc "
@@ -293,8 +292,8 @@ def _degree(u: fem.Function, mesh: Any, name: str) -> int:
     basis = u.function_space.element.basix_element
     if basis.family == basix.ElementFamily.custom:
         raise ValueError(
-            f"{name}: u is in {element}, an element of your own or an enriched one; for bubbles "
-            "give them a part of their own, mixed_element([P1, bubbles, pressure]), and the sum of "
+            f"{name}: u is in {element}, a custom or enriched element; make bubble functions a "
+            "separate part, mixed_element([P1, bubbles, pressure]), and give the sum of "
             "both parts, u + b of u, b, p = ufl.split(w)"
         )
     if basis.family != basix.ElementFamily.P or basis.discontinuous or basis.degree < 1:

@@ -125,8 +125,9 @@ def modulus_over_height(
     smallest = global_min(mesh.comm, ratio, empty=1.0)
     if not smallest > 0.0:
         raise ValueError(
-            f"Young's modulus next to Γc is not positive (smallest E/h: {smallest:g}): check the "
-            "modulus, or the bulk form it was measured in; or give k_n and k_t in stress/length"
+            f"Young's modulus at Γc is not positive (smallest E/h: {smallest:g}): check the "
+            "modulus, or the bulk form from which it was measured; or give k_n and k_t in "
+            "stress/length"
         )
     facets = fem.functionspace(submesh, ("DG", 0))
     logarithm, length = fem.Function(facets), fem.Function(facets)
