@@ -98,7 +98,7 @@ class Waiting:
             return
         self._said = True
         text = (
-            "compiling forms, as every first run with new ones does; later runs find them in "
+            "compiling forms; later runs find them in the cache, "
             f"{dolfinx.jit.get_options()['cache_dir']}"
         )
         if logger.isEnabledFor(logging.INFO):

@@ -55,7 +55,7 @@ def fail_together(comm: MPI.Comm, error: BaseException) -> None:
     while not MPI.Request.Testall(requests):
         if time.monotonic() > end:
             logger.critical(
-                "rank %d failed alone, and the others wait for it: all are ended",
+                "rank %d failed while the others were waiting for it: aborting all ranks",
                 comm.rank,
                 exc_info=error,
             )

@@ -189,7 +189,7 @@ REFUSED = {
     too_soft: "times its size",
     slides_far: "too large for the small-displacement",
     held_inside: "augmented Lagrangian method has not converged",
-    not_held: "nothing will ever hold",
+    not_held: "neither Dirichlet conditions nor contact constrain",
     pulled_off: "no contact force can balance",
     pushed_aside: "no contact force can balance",
     without_number: "not finite",

@@ -335,7 +335,7 @@ def test_the_choice(caplog):
         problem, contact = scene.problem(law, scene.rollers())
     assert problem.solver.condensed
     if COMM.rank == 0:
-        said = "condensed onto 10 of 50"
+        said = "static condensation onto 10 of 50"
         assert any(said in record.getMessage() for record in caplog.records)
     assert not scene.problem(law, scene.rollers(), condensation=False)[0].solver.condensed
 

@@ -233,7 +233,7 @@ def test_a_state_that_holds_no_obstacle_is_refused_and_solved_from(bulk):
     """
     asked, twin = (Press(obstacle="force", wall=True, bulk=bulk) for _ in range(2))
     raised_everywhere(
-        lambda: budget(asked.scene, asked.problem), ValueError, "nothing holds", "obstacle"
+        lambda: budget(asked.scene, asked.problem), ValueError, "not constrained", "obstacle"
     )
     for made in (asked, twin):
         made.load(1.0)

@@ -326,7 +326,7 @@ def test_two_objects_of_tags(kind):
     F = s.plain()
     for data in (tags, copy):
         F += s.v[0] * ufl.Measure(kind, s.mesh, subdomain_data=data)(UPPER)
-    raised_everywhere(lambda: s.solved(F), ValueError, f"integrals over {kind} with two objects")
+    raised_everywhere(lambda: s.solved(F), ValueError, f"integrals over {kind} with two different")
 
 
 def test_tags_of_other_entities():

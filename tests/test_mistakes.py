@@ -114,7 +114,7 @@ def test_a_tag_of_nothing(pairs):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_measures(bulk(scene, ds, TOP), scene.mesh)
-    with pytest.warns(UserWarning, match=rf"over ds\({NOWHERE}\), and nothing"):
+    with pytest.warns(UserWarning, match=rf"over ds\({NOWHERE}\), but nothing"):
         check_measures(bulk(scene, ds, NOWHERE), scene.mesh)
 
 
@@ -122,7 +122,7 @@ def test_a_problem_with_a_tag_of_nothing():
     """It is told when the problem is made."""
     scene = pressed()
     ds = ufl.Measure("ds", scene.mesh, subdomain_data=scene.tags)
-    with pytest.warns(UserWarning, match=rf"over ds\({NOWHERE}\), and nothing"):
+    with pytest.warns(UserWarning, match=rf"over ds\({NOWHERE}\), but nothing"):
         problem_of(scene, bulk(scene, ds, NOWHERE))
 
 

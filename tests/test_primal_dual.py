@@ -218,5 +218,5 @@ def test_what_it_is_not_for_is_refused(case):
         obstacle = fc.HalfSpace((0, 0), (0, 1), displacement=fc.Motion(force=(None, 1.0)))
     contact = scene.contact(law, obstacle=obstacle)
     bcs = [scene.hold(TOP, i) for i in range(2)]
-    with pytest.raises(ValueError, match="method is 'primal_dual', which is for friction by"):
+    with pytest.raises(ValueError, match="method is 'primal_dual', which needs friction with"):
         fc.ContactProblem(form, scene.u, bcs=bcs, contacts=[contact], method="primal_dual")

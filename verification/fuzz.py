@@ -61,7 +61,7 @@ CATEGORIES = {
     "cells are inverted": "inverted",
     "rad in one increment": "turned too far",
     "no contact force can balance": "load not balanced",
-    "nothing will ever hold": "not held",
+    "neither Dirichlet conditions nor contact constrain": "not held",
     "did not converge": "not converged",
     "penetrat": "penetration",
     "no potential": "no potential",

@@ -79,6 +79,6 @@ class ActiveSetMonitor:
             worst = rows[np.lexsort(rows.T[::-1])][0, 1:]
             found.append(
                 f"{contact.name} chatters: {n} of {int(global_sum(comm, n_points))} points keep "
-                f"changing between {names}, most of all at ({', '.join(f'{x:.4g}' for x in worst)})"
+                f"changing between {names}, most often at ({', '.join(f'{x:.4g}' for x in worst)})"
             )
         return "; ".join(found)

@@ -153,17 +153,17 @@ class Alternation(OwnMethod):
         if self._equations.full.displacement.mixed:
             raise ValueError(
                 "method is 'alternating', but u is a part of a mixed function, whose equations are "
-                "those of a saddle point and not of a minimum; use another method"
+                "a saddle-point problem and no minimisation; use another method"
             )
         none = self._without_potential()
         if none:
             laws = ", ".join(type(c.law).__name__ for c in none)
-            why = "not even under a given friction bound"
+            why = "not even with a given friction bound"
             if all(c.finite for c in none):
-                why = "where displacements are finite, whose tangent planes turn"
+                why = "with finite kinematics, because the tangent planes rotate"
             raise ValueError(
-                f"method is 'alternating', but {laws} has no potential, {why}: there is nothing to "
-                "minimise; use another method"
+                f"method is 'alternating', but {laws} has no potential, {why}, so that there is "
+                "nothing to minimise; use another method"
             )
 
     @property

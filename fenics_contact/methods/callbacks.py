@@ -159,7 +159,7 @@ class Callbacks:
         linear.forget_failure(pc)
         if refused:
             raise MemoryError(
-                "the factorisation was refused its memory: use more ranks, an iterative solver, or "
+                "out of memory in a factorisation: use more ranks, linear_solver='multigrid', or "
                 "a coarser mesh; if options limit MUMPS, raise the limit (mat_mumps_icntl_14, "
                 "mat_mumps_icntl_23)"
             )

@@ -57,8 +57,8 @@ class Overload:
     def in_words(self) -> str:
         """What outdoes what."""
         return (
-            f"overload: along the {self.motion} the load is {self.load:.4g}, and friction under "
-            f"the pressures found bears at most {self.borne:.4g}"
+            f"overload: along the {self.motion} the load is {self.load:.4g}, but friction under "
+            f"the present pressures can balance at most {self.borne:.4g}"
         )
 
 

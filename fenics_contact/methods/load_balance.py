@@ -57,10 +57,10 @@ class LoadBalance:
         if loose.size:
             motions = "; ".join(modes.describe(row) for row in loose)
             finite = any(operator.contact.finite for operator in operators)
-            why = "nothing, to first order, holds" if finite else "nothing will ever hold"
+            order = " to first order" if finite else ""
             raise ValueError(
-                f"{why} the body against this rigid motion: {motions}. Add a Dirichlet condition "
-                "on it, or friction"
+                f"neither Dirichlet conditions nor contact constrain this rigid-body mode{order}: "
+                f"{motions}. Add a Dirichlet condition that constrains it, or friction"
             )
 
     def check(self, load: Array, operators: Sequence[ContactOperator]) -> None:
@@ -109,8 +109,8 @@ class LoadBalance:
         if beyond:
             raise ValueError(
                 "no contact force can balance the load: its resultant along the free motion "
-                f"{', and along '.join(beyond)}. Contact can only push along its normals and rub "
-                "within the friction cone. Check the sign and size of the load, and the normals, "
+                f"{', and along '.join(beyond)}. Contact forces are compressive and within the "
+                "friction cone. Check the sign and magnitude of the load, and the normals, "
                 "or add a Dirichlet condition"
             )
 
@@ -121,8 +121,8 @@ class LoadBalance:
         named = [self._modes.describe(self._modes.free[row]) for row in rows]
         # NaN: not even the other components can be borne.
         found = [
-            f"({name}) is {-largest * force:.6g}, of which contact can bear at most "
-            f"{largest * limit:.6g} with the rest as it is"
+            f"({name}) is {-largest * force:.6g}, of which contact can balance at most "
+            f"{largest * limit:.6g} with the other components unchanged"
             for name, force, limit in zip(named, wanted, limits, strict=True)
             if abs(force) > limit + allowed
         ]

@@ -62,13 +62,13 @@ def linearised(
         dense.raise_kept(ksp)
         if ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
             raise ValueError(
-                "the equations have no unique solution near this state: nothing holds a body or a "
-                "obstacle that moves freely there, as before anything was solved or where contact "
-                "is open; take a state in which contact bears"
+                "the linearised equations are singular at this state: a body or a free obstacle is "
+                "not constrained, as before the first solution or with open contact; use a state "
+                "with loaded contact"
             )
         if ksp.getConvergedReason() < 0:
             raise RuntimeError(
-                "the linearised problem at the solution was not solved (KSP reason "
+                "the linearised problem at the solution did not converge (KSP reason "
                 f"{ksp.getConvergedReason()}); use linear_solver='direct'"
             )
         return system.extended(left.array_r.copy())

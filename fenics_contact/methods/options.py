@@ -109,7 +109,7 @@ class Defaults:
         names = [f"-{name}" for name in sorted(unread) if not _READ_LATE.search(name, len(prefix))]
         if names:
             logger.warning(
-                "no solver has read %s: misspelt, or of a solver that is not in use",
+                "unused options: %s; check their spelling, or whether their solver is in use",
                 ", ".join(names),
             )
 
@@ -164,7 +164,7 @@ class Defaults:
                 told = [f"-{k} {v}" for k, v in sorted(mine.items()) if k.startswith(prefix)]
                 why = str(error).splitlines()[-1].split("] ", 1)[-1]
                 raise ValueError(
-                    f"PETSc refuses an option of prefix {prefix!r}: {why}; given are "
+                    f"PETSc refuses an option with prefix {prefix!r}: {why}; the options given are "
                     f"{', '.join(told) or 'none'}"
                 ) from error
 

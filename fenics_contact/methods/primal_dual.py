@@ -92,9 +92,9 @@ class PrimalDual(OwnMethod):
         """See `OwnMethod.check`: friction by springs, of a linear bulk."""
         if not self.suits:
             raise ValueError(
-                "method is 'primal_dual', which is for friction by the springs k_n and k_t in "
-                "small displacements, for a bulk that is linear, and obstacles that do not move "
-                "freely; use another method"
+                "method is 'primal_dual', which needs friction with stiffness k_n and k_t, small "
+                "displacements, a linear bulk, and obstacles without unknown motions; use another "
+                "method"
             )
 
     @property

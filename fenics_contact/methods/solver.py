@@ -54,7 +54,7 @@ _REASONS = PETSc.SNES.ConvergedReason
 _OUTCOMES = {
     int(_REASONS.DIVERGED_LINEAR_SOLVE): "the matrix is singular",
     compat.NOT_FINITE: "the residual is not finite",
-    int(_REASONS.DIVERGED_MAX_IT): "iterations used up",
+    int(_REASONS.DIVERGED_MAX_IT): "iteration limit reached",
     int(_REASONS.DIVERGED_LINE_SEARCH): "no progress",
     int(_REASONS.DIVERGED_DTOL): "no progress",
 }
@@ -117,11 +117,11 @@ class Settings:
         if self.linear_solver not in (None, *linear.KINDS):
             raise ValueError(
                 f"linear_solver is {self.linear_solver!r}; use one of {sorted(linear.KINDS)}, or "
-                "None for the one that suits the size of the problem"
+                "None to choose by the size of the problem"
             )
         for name, share in (("alpha", self.alpha), ("phi", self.phi)):
             if not (is_number(share) and 0.0 <= share <= 1.0):
-                raise ValueError(f"{name} is {share!r}; it must lie between 0 and 1")
+                raise ValueError(f"{name} is {share!r}; it must be a number between 0 and 1")
         check_instance("prefix", self.prefix, str)
         check_instance("petsc_options", self.petsc_options, Mapping)
 
@@ -202,8 +202,8 @@ class Solver:
         snes_type = options.get(prefix + "snes_type")
         if snes_type is not None and snes_type not in _SNES_TYPES:
             raise ValueError(
-                f"the option -{prefix}snes_type is {snes_type!r}, which needs more than residual "
-                f"and tangent, or is none of PETSc's; use one of {', '.join(_SNES_TYPES)}"
+                f"the option -{prefix}snes_type is {snes_type!r}, which is unknown or needs more "
+                f"than residual and tangent; use one of {', '.join(_SNES_TYPES)}"
             )
         quasi_newton = snes_type == PETSc.SNES.Type.QN
         solver = self.system.linear_kind
@@ -280,7 +280,7 @@ class Solver:
             n_kept=self._kept.count,
         )
         if obstacle and obstacle != self._obstacle and self._comm.rank == 0:
-            logger.info("iterating on all unknowns: %s", obstacle)
+            logger.info("no static condensation: %s", obstacle)
         self._obstacle = obstacle
         return obstacle is None
 
@@ -324,7 +324,7 @@ class Solver:
             system = CondensedSystem(self._full, selection, prefix=prefix)
             if self._comm.rank == 0:
                 n = self._full.unknowns.n_global
-                logger.info("condensed onto %d of %d unknowns", selection.n_global, n)
+                logger.info("static condensation onto %d of %d unknowns", selection.n_global, n)
         self._pairings = self._present_pairings()
         with self.options.present():
             self.equations.take(system)

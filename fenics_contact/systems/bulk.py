@@ -32,7 +32,7 @@ __all__ = ["Bulk"]
 # By the root of the stiffness of both, a coupling that is more than round-off.
 _COUPLED = 1e-8
 _OF_ONE = (
-    ": several fields are solved for as one function w of a mixed element, whose residual has the "
+    "; several fields must be one function w of a mixed element, whose residual has the "
     "test functions v, q = ufl.TestFunctions(W)"
 )
 
@@ -74,10 +74,10 @@ class Bulk:
             )
         arguments = form.arguments()
         if any(argument.part() is not None for argument in arguments):
-            raise ValueError(f"F is in parts, by the test functions of several spaces{_OF_ONE}")
+            raise ValueError(f"F has test functions of several spaces{_OF_ONE}")
         if not arguments:
             raise ValueError(
-                "F has no TestFunction; it must be a residual: of an energy take "
+                "F has no TestFunction; it must be a residual: for an energy use "
                 "ufl.derivative(energy, u, v)"
             )
         if len(arguments) != 1:
@@ -89,18 +89,18 @@ class Bulk:
         if space != u.function_space:
             raise ValueError(
                 "the TestFunction of F and u are of different function spaces"
-                + ("; take v, q = ufl.TestFunctions(W) of that of w" if displacement.mixed else "")
+                + ("; use v, q = ufl.TestFunctions(w.function_space)" if displacement.mixed else "")
             )
         if u not in form.coefficients():
             raise ValueError(
                 "F does not depend on u: write the residual with the Function u itself"
-                + (", by its parts of ufl.split(w)" if displacement.mixed else "")
+                + (", with the parts of ufl.split(w)" if displacement.mixed else "")
             )
         for other in form.coefficients():
             if other is not u and np.shares_memory(other.x.array, u.x.array):
                 raise ValueError(
-                    f"F has {other.name!r}, a part of u as w.sub(i) gives it, which its derivative "
-                    "by u does not know; take the parts of ufl.split(w)"
+                    f"F has {other.name!r}, a part of u given by w.sub(i), which the derivative "
+                    "with respect to u ignores; use the parts of ufl.split(w)"
                 )
         check_measures(form, u.function_space.mesh)
         form = share_subdomain_data(form)
@@ -151,7 +151,7 @@ class Bulk:
                     name = "u" if item is self._u else getattr(item, "name", f"number {position}")
                     raise ValueError(
                         f"the {kind} {name!r} in F has values that are not finite (NaN or inf); "
-                        "check what set it"
+                        "check its definition"
                     )
 
     def is_current(self) -> bool:

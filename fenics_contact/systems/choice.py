@@ -41,32 +41,32 @@ def reason_not_to_condense(
     elif not full.bulk.linear:
         obstacle = "the bulk is not linear in u"
     elif full.displacement.mixed:
-        obstacle = "displacements are a part of what is solved for"
+        obstacle = "the displacement is a part of a mixed function"
     elif full.follows and not full.scales.held.all():
-        obstacle = "pairs follow bodies that nothing else holds"
+        obstacle = "bodies with finite kinematics are constrained by contact only"
     elif full.follows and not all_kept(unknowns.n_global, _n_touched(full), gdim):
-        obstacle = "pairs follow the bodies to more of them than can be kept"
+        obstacle = "finite kinematics couple more dofs than can be retained"
     elif named:
         obstacle = f"the options name a linear solver ({', '.join(named)})"
     elif linear_solver == "multigrid":
-        obstacle = "linear_solver is 'multigrid', and it takes a factorisation"
+        obstacle = "linear_solver is 'multigrid', and condensation needs a factorisation"
     if wanted and obstacle:
         raise ValueError(
-            f"condensation is True, but {obstacle}; leave it out, or give condensation=False"
+            f"condensation is True, but {obstacle}; omit it, or give condensation=False"
         )
     if wanted is False:
-        return "the caller wants none"
+        return "condensation is False"
     if wanted or obstacle:
         return obstacle
     n = unknowns.n_global
     if n_kept == n or not worthwhile(n, n_kept, gdim):
-        return f"contact touches {n_kept} of {n} unknowns, too many to gain by it"
+        return f"contact couples {n_kept} of {n} unknowns, too many for it to save time"
     if unknowns.n_motions or linear_solver is not None:
         return None
     n_bytes = linear.factor_bytes(n, gdim, symmetric=full.bulk.symmetric)
     obstacle = linear.too_large(n_bytes, unknowns.comm)
     if not obstacle and linear.quicker(full.size_to_factor, gdim, condensed_for=increments):
-        obstacle = f"multigrid is quicker for {n} unknowns"
+        obstacle = f"multigrid is faster for {n} unknowns"
     return obstacle or None
 
 
@@ -97,15 +97,15 @@ def linear_kind(
     Raises:
         ValueError: The caller wants what cannot work.
     """
-    kind, reason = wanted, "the caller's choice"
+    kind, reason = wanted, "chosen by linear_solver"
     if full.displacement.mixed:
         if kind == "multigrid":
             raise ValueError(
                 "linear_solver is 'multigrid', but u is a part of a mixed function, whose "
-                "equations are those of a saddle point, which multigrid of displacements does not "
-                "solve; use 'direct', or leave it out"
+                "equations are a saddle-point problem, which multigrid for displacements does not "
+                "solve; use 'direct', or omit it"
             )
-        return "direct", "displacements are a part of what is solved for"
+        return "direct", "the displacement is a part of a mixed function"
     if kind is None:
         n, gdim = full.unknowns.first_motion, full.gdim
         n_bytes = linear.factor_bytes(n, gdim, symmetric=symmetric)
@@ -113,8 +113,8 @@ def linear_kind(
             n_bytes += linear.factor_bytes(n, gdim, symmetric=False)
         reason = linear.too_large(n_bytes, full.unknowns.comm) or ""
         if not reason and linear.quicker(full.size_to_factor, gdim):
-            reason = "it is quicker for as many"
+            reason = "it is faster for this size"
         kind = "multigrid" if reason and not condensed and not named else "direct"
     if kind == "multigrid" and full.unknowns.n_motions:
-        return "direct", "obstacles that move freely are no nodes with rigid motions"
+        return "direct", "multigrid does not treat unknown motions of obstacles"
     return kind, reason

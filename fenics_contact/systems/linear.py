@@ -179,8 +179,8 @@ def warn_of_slow_blas() -> None:
         return  # no Linux: nothing to tell from
     if "/blas/libblas.so" in libraries:
         logger.warning(
-            "the reference BLAS is in use: factorisations take up to eight times longer than with "
-            "OpenBLAS (Debian: apt install libopenblas0-pthread)"
+            "the reference BLAS is in use: factorisations take up to eight times as long as with "
+            "OpenBLAS; install it (Debian: apt install libopenblas0-pthread)"
         )
 
 

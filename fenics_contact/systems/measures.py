@@ -38,10 +38,10 @@ def check_measures(form: ufl.Form, mesh: dolfinx.mesh.Mesh) -> None:
         measure = _MEASURES.get(kind, kind)
         if data is not None and data is not shared[kind]:
             raise ValueError(
-                f"F has integrals over {measure} with two objects of tags, and DOLFINx takes one "
-                "for each kind of measure: put the tags of both into one MeshTags (or list), and "
-                f'make all of them by {measure} = ufl.Measure("{measure}", domain=mesh, '
-                "subdomain_data=tags)"
+                f"F has integrals over {measure} with two different subdomain_data, but DOLFINx "
+                "accepts one per kind of measure: merge the tags into one MeshTags (or list), and "
+                f'use {measure} = ufl.Measure("{measure}", domain=mesh, subdomain_data=tags) for '
+                "all of them"
             )
         dim, what = (tdim, "cells") if kind == "cell" else (tdim - 1, "facets")
         tags: Any = data
@@ -49,21 +49,21 @@ def check_measures(form: ufl.Form, mesh: dolfinx.mesh.Mesh) -> None:
             raise ValueError(
                 f"F has an integral over {measure}({tag}) whose tags are on entities of dimension "
                 f"{tags.dim} of {'this' if compat.entities_of(tags, mesh) else 'another'} mesh; "
-                f"give it tags of the {what} of the mesh of u"
+                f"they must be on the {what} of the mesh of u"
             )
         if tag == _EVERYWHERE:
             continue
         if data is None:
             raise ValueError(
                 f"F has an integral over {measure}({tag}) whose measure has no tags, so that "
-                f'it is zero; make it by {measure} = ufl.Measure("{measure}", domain=mesh, '
+                f'it is zero; use {measure} = ufl.Measure("{measure}", domain=mesh, '
                 "subdomain_data=tags)"
             )
         if not comm.allreduce(_n_tagged(data, int(tag))):
             warn(
                 comm,
-                f"F has an integral over {measure}({tag}), and nothing on the mesh has this "
-                "tag: it is zero",
+                f"F has an integral over {measure}({tag}), but nothing on the mesh has this "
+                "tag, so that it is zero; check the tag",
             )
 
 

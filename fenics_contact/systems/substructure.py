@@ -18,9 +18,8 @@ from fenics_contact.types import Array, Indices
 __all__ = ["SINGULAR", "Substructure"]
 
 SINGULAR = (
-    "the bulk stiffness cannot be condensed onto the unknowns that contact touches: with these "
-    "held it is still singular. A part of the body may be held by nothing; or use "
-    "condensation=False"
+    "static condensation failed: the bulk stiffness is singular even with the contact dofs fixed. "
+    "Check that every part of the body is constrained, or use condensation=False"
 )
 
 
@@ -75,8 +74,8 @@ class Substructure:
         error = self._factor.getMumpsInfog(1)
         if linear.refused_memory(self._pc):
             raise MemoryError(
-                "the factorisation that condenses onto the unknowns that contact touches was "
-                f"refused its memory (MUMPS error {error}): use condensation=False, or more ranks"
+                "out of memory in the factorisation for static condensation (MUMPS error "
+                f"{error}): use condensation=False, or more ranks"
             )
         self.schur = self._schur_complement() if boundary.size else np.zeros((0, 0), order="F")
         if error < 0 or not np.all(np.isfinite(self.schur)):
