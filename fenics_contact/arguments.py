@@ -23,7 +23,7 @@ def check_cells(name: str, kind: str) -> None:
         ValueError: It says which cells are taken.
     """
     if kind not in _CELLS:
-        raise ValueError(f"{name} has cells of type {kind}; mesh with one of {_CELLS}")
+        raise ValueError(f"{name} has cells of type {kind}; use one of {_CELLS}")
 
 
 def is_number(value: Any) -> bool:
@@ -50,9 +50,11 @@ def check_instance(name: str, value: Any, kind: type, advice: str = "") -> None:
     advice = f"; {advice}" if advice else ""
     if isinstance(value, type) and issubclass(value, kind):
         made = value.__name__
-        raise ValueError(f"{name} is the class {made}; give an object of it, {made}(...){advice}")
-    expected = f"{'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"
-    raise ValueError(f"{name} is a {type(value).__name__}; it must be {expected}{advice}")
+        raise ValueError(f"{name} is the class {made}; give an instance, {made}(...){advice}")
+    article = "an" if kind.__name__[0] in "AEIOU" else "a"
+    raise ValueError(
+        f"{name} is a {type(value).__name__}; it must be {article} {kind.__name__}{advice}"
+    )
 
 
 def listed(name: str, values: Iterable[Any], kind: type) -> list[Any]:

@@ -70,7 +70,7 @@ def model_to_mesh(
 
 
 def _check(model: Any, gdim: int) -> None:
-    """Refuse what DOLFINx would take in part, or stop at on this rank alone."""
+    """Check for models that DOLFINx would convert incompletely, or fail at on one rank only."""
     dimensions = sorted({dim for dim, _ in model.getPhysicalGroups()})
     if not dimensions or dimensions[-1] != gdim:
         raise ValueError(
@@ -91,33 +91,33 @@ def _check(model: Any, gdim: int) -> None:
         n_all = sum(len(some) for some in model.mesh.getElements(dim)[1])
         if dim == gdim and n_all == 0:
             raise ValueError(
-                f"the gmsh model has no cells: call gmsh.model.mesh.generate({gdim}) before"
+                f"the gmsh model has no cells: call gmsh.model.mesh.generate({gdim}) first"
             )
         shared = next((some for some in groups.values() if len(some) > 1), None)
         if shared:
             names = [f"{group} {model.getPhysicalName(dim, group)!r}" for group in shared]
             raise ValueError(
                 f"some {what} of the gmsh model are in two physical groups, "
-                f"{' and '.join(names)}, and they have one tag only: leave them in one of these, "
-                f"and name both where both are meant, as ContactSurface(mesh, tags, {shared}) and "
-                f"dx({tuple(shared)}) do"
+                f"{' and '.join(names)}, but can have one tag only: put them into one group, and "
+                f"give both tags where both are meant, ContactSurface(mesh, tags, {shared}) or "
+                f"dx({tuple(shared)})"
             )
         if dim == gdim and n_grouped < n_all:
             raise ValueError(
                 f"{n_all - n_grouped} of the {n_all} cells of the gmsh model are in no physical "
-                f"group, and would be missing: add gmsh.model.addPhysicalGroup({gdim}, [...])"
+                f"group and would be lost: add gmsh.model.addPhysicalGroup({gdim}, [...])"
             )
         if len(types) > 1:
             names = [model.mesh.getElementProperties(kind)[0] for kind in sorted(types)]
             raise ValueError(
-                f"the {what} of the gmsh model are of several types, {', '.join(names)}; the mesh "
-                "must have one"
+                f"the {what} of the gmsh model are of several types, {', '.join(names)}; all must "
+                "be of one type"
             )
     nodes = model.mesh.getNodes()[0]
     if len(nodes) != nodes.max():
         raise ValueError(
             f"the gmsh model has {len(nodes)} nodes with numbers up to {nodes.max()}: call "
-            "gmsh.model.mesh.renumberNodes() before"
+            "gmsh.model.mesh.renumberNodes() first"
         )
 
 
