@@ -288,7 +288,7 @@ def test_wrong_input(tmp_path):
     for state in (None, "1", float("nan"), True):
         raised_everywhere(lambda state=state: writer.write(state), ValueError, "time")
     writer.write(1)
-    raised_everywhere(lambda: writer.write(1.0), ValueError, "must rise")
+    raised_everywhere(lambda: writer.write(1.0), ValueError, "must increase")
     if COMM.rank == 0:
         (folder / "contact.pvd").write_text("<broken")
     COMM.barrier()
@@ -306,7 +306,7 @@ def test_two_writers_in_a_folder(tmp_path):
     assert files(folder) == before
     first.write(2)
     fc.Writer(folder, made.problem).write(3)  # takes over
-    raised_everywhere(lambda: first.write(4), ValueError, "folder of its own")
+    raised_everywhere(lambda: first.write(4), ValueError, "one Writer per folder")
     assert [time for time, _ in vtu.series(folder / "body.pvd")] == [1, 2, 3]
 
 

@@ -1,4 +1,4 @@
-"""A history as a film: the deforming body, state by state, in a GIF. Needs matplotlib."""
+"""Animation of a load history: the deforming body in a GIF. Needs matplotlib."""
 
 from __future__ import annotations
 
@@ -28,14 +28,31 @@ _BODY, _EDGES = "#e3ebf5", "#11111180"
 
 
 class Animation:
-    """A film of a problem's states, one frame a call of `add`, written by `save`.
+    """An animation of a problem's states, one frame per call of `add`, written by `save`.
 
-    The body is drawn as it is deformed, coloured by its von Mises stress where one is given; in the
-    plane Γc, too: grey where it is open, blue where it sticks, red where it slips. Rigid obstacles
-    are drawn where they are. A legend says so, and how many times the displacement is drawn. All
-    frames have the same axes and the same colours, those of all states together. So they are drawn
-    at the end; until then what is to be drawn is in temporary files beside the film, and in memory
-    nothing of it. While they are drawn a frame takes one byte for each of its pixels.
+    It shows the deformed body, coloured by its von Mises stress if ``stress`` is given, rigid
+    obstacles, and in the plane the status of Γc: grey where open, blue where sticking, red where
+    slipping. All frames have the same axes and colour scale, and are therefore drawn by `save`;
+    until then their data are in temporary files in the folder of the animation. The constructor is
+    collective.
+
+    Args:
+        path: GIF file to write; its folder is created if necessary.
+        problem: The problem.
+        stress: UFL tensor (3, 3) on the body.
+        magnification: Factor of the displacements drawn.
+        unit: Unit of length, for the axes.
+        stress_unit: Unit of stress, for the colour bar.
+        title: Title of every frame, before its own text.
+        view: Elevation and azimuth of the camera in degrees, in space.
+        rate: Frames per second.
+
+    Attributes:
+        path: The GIF file.
+
+    Raises:
+        ValueError: An argument is invalid; raised on all ranks.
+        OSError: The folder cannot be created or written to; raised on all ranks.
     """
 
     def __init__(
@@ -51,23 +68,6 @@ class Animation:
         view: tuple[float, float] | None = None,
         rate: float = 5.0,
     ) -> None:
-        """See that the file can be written, and compile. Collective.
-
-        Args:
-            path: GIF to write; its folder is made.
-            problem: Whose states.
-            stress: UFL tensor (3, 3) on the body.
-            magnification: Factor by which the displacement is drawn.
-            unit: Unit of length, for the axes.
-            stress_unit: Unit of stress, for the colours.
-            title: Above every frame, before what the frame is of.
-            view: In space where to look from: elevation and azimuth in degrees.
-            rate: Frames a second.
-
-        Raises:
-            ValueError: An argument has no sense. On all ranks.
-            OSError: The folder cannot be made or written to. On all ranks.
-        """
         check_instance("problem", problem, ContactProblem)
         if not isinstance(path, str | os.PathLike) or Path(path).suffix.lower() != ".gif":
             raise ValueError(f"path is {path!r}; it must be the name of a file that ends with .gif")
@@ -95,17 +95,16 @@ class Animation:
                 weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
 
     def add(self, state: Step | str) -> None:
-        """Take the present state as the next frame. Collective.
+        """Add the present state as the next frame. Collective.
 
-        If u is behind it is completed first (`ContactProblem.complete`).
+        The interior displacement is recovered first, if it is out of date.
 
         Args:
-            state: The step that was made: increment and load are told above the frame. Or what is
-                to stand there.
+            state: The `Step`, whose increment and load are the title of the frame; or a title.
 
         Raises:
-            ValueError: It is neither.
-            OSError: The disk is full; the frame is left out. On all ranks.
+            ValueError: ``state`` is neither.
+            OSError: The disk is full; the frame is omitted. Raised on all ranks.
         """
         if isinstance(state, Step):
             words = f"increment {state.increment}"
@@ -113,7 +112,7 @@ class Animation:
         elif isinstance(state, str):
             words = state
         else:
-            raise ValueError(f"state is {state!r}; it must be a Step, or words for the title")
+            raise ValueError(f"state is {state!r}; it must be a Step, or a title (str)")
         self._problem.complete()
         self._problem.displacement.follow()
         shape, ends, status = self._shape(), [], []
@@ -135,11 +134,11 @@ class Animation:
         self._n_frames += 1
 
     def save(self) -> None:
-        """Write the film of all states so far; more may be added and saved after it. Collective.
+        """Write the animation of all states so far; more may be added later. Collective.
 
         Raises:
-            ValueError: There is none.
-            OSError: It cannot be written; the file is as before. On all ranks.
+            ValueError: There are no frames.
+            OSError: The file cannot be written and is unchanged; raised on all ranks.
         """
         if not self._n_frames:
             raise ValueError(f"{self.path} would have no frame; call add(step) first")

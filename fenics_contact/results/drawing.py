@@ -135,16 +135,16 @@ class ShapeOf:
         self._u, mesh = u, u.function_space.mesh
         if u.ufl_shape != (mesh.geometry.dim,):
             raise ValueError(
-                f"u has shape {u.ufl_shape}; give a displacement of {mesh.geometry.dim} "
-                "components, of a mixed function that of its Contact, contact.u"
+                f"u has shape {u.ufl_shape}; it must be a displacement of {mesh.geometry.dim} "
+                "components; for a mixed function use contact.u"
             )
         self._dim, self._stress = mesh.topology.dim, None
         if stress is not None:
             tensor = ufl.as_ufl(stress)
             if tensor.ufl_shape != (3, 3):
                 raise ValueError(
-                    f"stress has shape {tensor.ufl_shape}; colours are of the von Mises stress, "
-                    "which takes a tensor (3, 3), such as that of elasticity.LinearElastic"
+                    f"stress has shape {tensor.ufl_shape}; the von Mises stress needs a tensor "
+                    "(3, 3), such as that of elasticity.LinearElastic"
                 )
             middle = basix.geometry(basix.CellType[mesh.topology.cell_name()]).mean(axis=0)
             self._stress = compile_expression(tensor, middle[None])

@@ -21,8 +21,8 @@ def check_file(path: Path) -> None:
     """
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise ValueError(
-            f"{path} is a device, a pipe or a socket, and a file would take its place; give the "
-            "name of a file"
+            f"{path} is a device, a pipe or a socket, which a file would replace; give the name of "
+            "a file"
         )
 
 
@@ -36,7 +36,7 @@ def make_folder(path: Path) -> None:
     there = next((p for p in (path, *path.parents) if p.exists()), None)
     if there is not None and not there.is_dir():
         raise NotADirectoryError(
-            f"{path} is to be a folder, and {there} is a file; give another name, or remove it"
+            f"{path} must be a folder, but {there} is a file; give another name, or remove it"
         )
     path.mkdir(parents=True, exist_ok=True)
 
@@ -54,7 +54,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     path = Path(path)
     check_file(path)
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path} is to be written, and there is no folder {path.parent}")
+        raise FileNotFoundError(
+            f"{path} cannot be written, because there is no folder {path.parent}; create it"
+        )
     # The ending stays: it may tell the format.
     temporary = path.with_name(f".{os.getpid()}.part.{path.name}")
     try:

@@ -1,4 +1,4 @@
-"""Values at nodes and in cells, tables of references met, and JSON."""
+"""Values at nodes and in cells, comparison with references, and JSON files."""
 
 from __future__ import annotations
 
@@ -30,10 +30,14 @@ __all__ = [
 
 
 def at_node(u: fem.Function, point: Sequence[float]) -> Array:
-    """Displacement of the node at ``point`` (before any displacement), shape (gdim,). Collective.
+    """Return the displacement of the node at an undeformed point, shape (gdim,). Collective.
+
+    Args:
+        u: Displacement.
+        point: Coordinates of the node, gdim numbers (length).
 
     Raises:
-        ValueError: No node is nearer than 1e-6 of the mesh's size. On all ranks.
+        ValueError: No node is within 1e-6 of the mesh size of the point; raised on all ranks.
     """
     space = u.function_space
     gdim, n_owned = space.mesh.geometry.dim, space.dofmap.index_map.size_local
@@ -46,20 +50,22 @@ def at_node(u: fem.Function, point: Sequence[float]) -> Array:
     row = rows[np.argmin(rows[:, 0])]
     comm, x = space.mesh.comm, space.mesh.geometry.x
     if row[0] > 1e-6 * (global_max(comm, x) - global_min(comm, x)):
-        raise ValueError(f"no node at {list(point)}; the nearest is {row[0]:g} away")
+        raise ValueError(
+            f"no node at {list(point)}; the nearest is {row[0]:g} away: give coordinates of a node"
+        )
     return row[1:]
 
 
 def sample(expression: Any, mesh: dolfinx.mesh.Mesh, degree: int = 1) -> tuple[Array, Array]:
-    """Values of a UFL expression inside every cell, for curves and tables. Collective.
+    """Evaluate a UFL expression at quadrature points of all cells. Collective.
 
     Args:
         expression: A scalar, vector or tensor on ``mesh``.
         mesh: The mesh.
-        degree: Of the quadrature rule whose points are taken.
+        degree: Degree of the quadrature rule.
 
     Returns:
-        On all ranks, points (n, gdim) and values (n, …), ordered by coordinates.
+        Points (n, gdim) and values (n, …) of all ranks, sorted by coordinates, on every rank.
     """
     expression = ufl.as_ufl(expression)
     points, _ = basix.make_quadrature(mesh.basix_cell(), degree)
@@ -78,12 +84,15 @@ def sample(expression: Any, mesh: dolfinx.mesh.Mesh, degree: int = 1) -> tuple[A
 def compare(
     values: Mapping[str, float], references: Mapping[str, tuple[float, float]]
 ) -> dict[str, dict[str, Any]]:
-    """Put results beside their references: value, reference, error, tolerance, passed, by name.
+    """Compare results with references.
 
     Args:
         values: Results by name.
-        references: By name, the reference and the tolerance relative to it (absolute where the
-            reference is zero).
+        references: Reference and relative tolerance by name; the tolerance is absolute if the
+            reference is zero.
+
+    Returns:
+        A dict with value, reference, error, tolerance and passed, by name.
     """
     entries = {}
     for name, (reference, tolerance) in references.items():
@@ -99,7 +108,7 @@ def compare(
 
 
 def table(entries: Mapping[str, Mapping[str, Any]]) -> str:
-    """What `compare` returns, one line an entry."""
+    """Format the result of `compare` as a table, one line per entry."""
     lines = [f"{'':32}{'result':>14}{'reference':>14}{'error':>10}{'allowed':>10}"]
     for name, e in entries.items():
         line = f"{name:32}{e['value']:14.6g}{e['reference']:14.6g}"
@@ -109,11 +118,13 @@ def table(entries: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def write_json(path: str | os.PathLike[str], data: Mapping[str, Any], comm: MPI.Comm) -> None:
-    """Write ``data`` on the first rank; the file is complete or as before. Collective.
+    """Write data as JSON on the first rank. Collective.
+
+    The file is replaced only when it is complete.
 
     Raises:
-        OSError: It cannot be written (on the other ranks RuntimeError).
-        ValueError: ``data`` holds numbers that are not finite.
+        OSError: The file cannot be written (on the other ranks RuntimeError).
+        ValueError: ``data`` has numbers that are not finite.
     """
     with collective_errors(comm):
         if comm.rank == 0:

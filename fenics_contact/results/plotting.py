@@ -1,4 +1,4 @@
-"""Pictures, drawn on the first rank, without a screen. Needs matplotlib."""
+"""Figures of results, drawn on the first rank without a display. Needs matplotlib."""
 
 from __future__ import annotations
 
@@ -51,26 +51,26 @@ def plot_deformation(
     contacts: Sequence[Contact] = (),
     view: tuple[float, float] | None = None,
 ) -> None:
-    """Draw the original and the deformed mesh over each other. Collective.
+    """Plot the undeformed and the deformed mesh. Collective.
 
-    In the plane all cells, in space the facets of the boundary; edges are drawn straight.
+    In the plane all cells are drawn, in space the boundary facets, with straight edges.
 
     Args:
-        path: PNG or PDF to write.
+        path: PNG or PDF file to write.
         u: Displacement.
-        stress: UFL tensor (3, 3) on the body: cells have the colour of its von Mises stress in
-            their middle, in space facets that of their cell.
+        stress: UFL tensor (3, 3) on the body, whose von Mises stress at the midpoint of each cell
+            is its colour.
         unit: Unit of length, for the axes.
-        stress_unit: Unit of stress, for the colours.
+        stress_unit: Unit of stress, for the colour bar.
         title: Title.
-        magnification: Factor by which the displacement is drawn.
-        contacts: Whose rigid obstacles are drawn, where they are now; their displacements are
-            magnified as that of the body.
-        view: In space where to look from: elevation and azimuth in degrees.
+        magnification: Factor of the displacements drawn.
+        contacts: Contacts whose rigid obstacles are drawn at their present positions, with
+            magnified displacements.
+        view: Elevation and azimuth of the camera in degrees, in space.
 
     Raises:
-        ValueError: u is no displacement, or the stress has another shape. On all ranks.
-        OSError: The file cannot be written; it is as before. On all ranks.
+        ValueError: u is no displacement, or the stress has another shape; raised on all ranks.
+        OSError: The file cannot be written and is unchanged; raised on all ranks.
     """
     shape = drawing.ShapeOf(u, stress)()
     contacts = listed("contacts", contacts, Contact)
@@ -93,28 +93,27 @@ def plot_field(
     near: float | None = None,
     view: tuple[float, float] | None = None,
 ) -> None:
-    """Draw values on the facets of Γc, and the deformed body about it. Collective.
+    """Plot a field on the facets of Γc, with the deformed body. Collective.
 
-    Every facet has the mean of its points. Where pressure, friction and slip are zero, and where
-    the gap of none of the points is known, it is grey.
+    The value of a facet is the mean over its quadrature points. Facets are grey where pressure,
+    friction or slip is zero, or the gap is unknown.
 
     Args:
-        path: PNG or PDF to write.
-        contact: Evaluated.
-        field: "pressure" (nominal with finite kinematics), "friction" (the size of the tangential
-            traction), "gap", or "slip" (accumulated and committed, the sum of the modes).
-        length: Unit of length, for the axes, and the colours of gap and slip.
-        stress: Unit of stress, for the colours.
+        path: PNG or PDF file to write.
+        contact: An evaluated contact.
+        field: "pressure" (nominal with finite kinematics), "friction" (magnitude of the tangential
+            traction), "gap", or "slip" (committed, sum of the modes).
+        length: Unit of length, for the axes, gap and slip.
+        stress: Unit of stress, for the colour bar.
         title: Title.
-        magnification: Factor by which the displacement is drawn.
-        near: Draw no more than what is within this distance (length) of the facets that bear; by
-            default all of the body.
-        view: In space where to look from, elevation and azimuth in degrees; by default so that Γc
-            is in front.
+        magnification: Factor of the displacements drawn.
+        near: Largest distance from loaded facets of what is drawn (length); by default everything
+            is drawn.
+        view: Elevation and azimuth of the camera in degrees, in space; by default Γc is in front.
 
     Raises:
-        ValueError: There is no such field, or `near` is no distance. On all ranks.
-        OSError: The file cannot be written; it is as before. On all ranks.
+        ValueError: There is no such field, or ``near`` is no length; raised on all ranks.
+        OSError: The file cannot be written and is unchanged; raised on all ranks.
     """
     if field not in _FIELDS:
         raise ValueError(f"field is {field!r}; use one of {list(_FIELDS)}")
@@ -164,12 +163,12 @@ def _field(contact: Contact, name: str) -> Array:
 
 
 def plot_pressure(path: str | os.PathLike[str], contact: Contact, **options: Any) -> None:
-    """`plot_field` of the pressure. Collective.
+    """Plot the contact pressure on the facets of Γc. Collective.
 
     Args:
-        path: PNG or PDF to write.
-        contact: Evaluated.
-        **options: Those of `plot_field`.
+        path: PNG or PDF file to write.
+        contact: An evaluated contact.
+        **options: Keyword arguments of `plot_field`.
     """
     plot_field(path, contact, "pressure", **options)
 
@@ -184,21 +183,22 @@ def plot_status(
     near: float | None = None,
     view: tuple[float, float] | None = None,
 ) -> None:
-    """Draw where Γc is open, sticks and slips, and the deformed body about it. Collective.
+    """Plot the contact status (open, stick, slip) of the facets of Γc. Collective.
 
-    Every facet has the status of most of its points.
+    The status of a facet is that of most of its points.
 
     Args:
-        path: PNG or PDF to write.
-        contact: Evaluated.
+        path: PNG or PDF file to write.
+        contact: An evaluated contact.
         length: Unit of length, for the axes.
         title: Title.
-        magnification: Factor by which the displacement is drawn.
-        near: As for `plot_field`.
-        view: As for `plot_field`.
+        magnification: Factor of the displacements drawn.
+        near: Largest distance from loaded facets of what is drawn (length); by default everything
+            is drawn.
+        view: Elevation and azimuth of the camera in degrees, in space; by default Γc is in front.
 
     Raises:
-        ValueError: `near` is no distance. On all ranks.
+        ValueError: ``near`` is no length; raised on all ranks.
     """
     drawing.check_near(near)
     drawn = drawing.surface_of(contact, facet_status(contact), magnification)
@@ -225,11 +225,11 @@ def plot_tractions(
     stress: str = "MPa",
     title: str = "",
 ) -> None:
-    """Draw pressure and tangential traction over x. On the calling rank only.
+    """Plot pressure and tangential traction over x. On the calling rank only.
 
     Args:
-        path: PNG or PDF to write.
-        points: What `Contact.gather` returns.
+        path: PNG or PDF file to write.
+        points: Result of `Contact.gather`.
         curves: Reference curves (x, stress) by label.
         lines: Reference values of stress, horizontal, by label.
         marks: Reference positions, vertical, by label.
@@ -270,28 +270,25 @@ def plot_along(
     stress: str = "MPa",
     title: str = "",
 ) -> None:
-    """Draw tractions, gap and slip at the points of Γc in the plane. Collective.
+    """Plot tractions, gap and slip along Γc of a plane body. Collective.
 
-    Over the coordinate along which the contact reaches farthest where Γc does not turn back about
-    the contact, else over the angle about its middle where Γc is round, such as a hole or a ring,
-    else over the arc length; on the undeformed Γc, and somewhat beyond the contact. Each connected
-    curve of Γc has a line of its own.
+    The abscissa is the coordinate of largest extent of the contact if Γc is monotonic in it, the
+    angle if Γc is circular, and otherwise the arc length, all on the undeformed Γc. The range is
+    somewhat larger than the contact. Each connected curve of Γc has its own line.
 
     Args:
-        path: PNG or PDF to write.
-        contact: Evaluated, of a plane body.
+        path: PNG or PDF file to write.
+        contact: An evaluated contact of a plane body.
         length: Unit of length, for the axes.
         stress: Unit of stress, for the axes.
         title: Title.
 
     Raises:
-        ValueError: The body is none of the plane. On all ranks.
-        OSError: The file cannot be written; it is as before. On all ranks.
+        ValueError: The body is not plane; raised on all ranks.
+        OSError: The file cannot be written and is unchanged; raised on all ranks.
     """
     if contact.points.shape[1] != 2:
-        raise ValueError(
-            f"{contact.name}: curves along Γc are drawn in the plane; in space use plot_field"
-        )
+        raise ValueError(f"{contact.name}: plot_along needs a plane body; in space use plot_field")
     found = along(contact, length)
     with collective_errors(contact.surface.mesh.comm):
         if found is None:
@@ -352,15 +349,15 @@ def _draw_tractions(
 def figure(
     path: str | os.PathLike[str], columns: int = 1, size: tuple[float, float] = (6.4, 4.8)
 ) -> Iterator[Any]:
-    """Axes of a picture of one's own, written at the end of the block. On the calling rank only.
+    """Create a figure that is written at the end of the ``with`` block. On the calling rank only.
 
     Args:
-        path: PNG or PDF to write.
-        columns: Number of axes beside each other.
+        path: PNG or PDF file to write.
+        columns: Number of axes in a row.
         size: Width and height of each, in inches.
 
     Yields:
-        The axes, or an array of them if there are several.
+        The axes, or an array of axes if there are several.
     """
     plt = drawing.pyplot()
     drawn, axes = plt.subplots(

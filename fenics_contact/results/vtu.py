@@ -151,7 +151,7 @@ def read_series(path: Path) -> list[tuple[float, str]]:
         return [(float(each.attrib["timestep"]), each.attrib["file"]) for each in sets]
     except (ElementTree.ParseError, KeyError, ValueError):
         raise ValueError(
-            f"{path} is no series of this package, or is damaged; remove it to begin a new one"
+            f"{path} is no series of this package, or damaged; remove it to start a new one"
         ) from None
 
 

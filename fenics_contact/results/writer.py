@@ -1,4 +1,4 @@
-"""Time series for ParaView: the body, Γc, and the quadrature points of Γc."""
+"""Time series for ParaView: body, contact surface, quadrature points and rigid obstacles."""
 
 from __future__ import annotations
 
@@ -38,44 +38,46 @@ _ABOUT = 0.1
 
 
 class Writer:
-    """Results of a problem as time series for ParaView, one state a call of `write`.
+    """Writes results of a problem as time series for ParaView, one state per call of `write`.
 
-    In a folder there are, for all ranks together,
+    The folder contains, for all ranks together,
 
     - ``body.pvd``: displacement and, if given, stress and von_mises;
-    - ``CONTACT.pvd`` for every contact, by its name: Γc, whose facets have what `facet_values`
-      makes of the values at their points; the status is that of most of them;
-    - ``CONTACT_points.pvd``: the quadrature points of Γc, with the values themselves;
-    - ``CONTACT_obstacle.pvd``, where it is rigid and has a place of its own: its surface about the
-      body, where it is at that time.
+    - ``CONTACT.pvd`` for every contact, by its name: Γc, with linear fits of the values at the
+      quadrature points of each facet, and the status of most of its points;
+    - ``CONTACT_points.pvd``: the quadrature points of Γc with their values;
+    - ``CONTACT_obstacle.pvd``: the surface of a rigid obstacle near the body, at its present
+      position, unless it is given by a gap only.
 
-    The first two of a contact have displacement, pressure, tangential_traction (on the body), gap,
-    slip (accumulated and committed, the sum of the modes), status (`Status`), normal (from body to
-    obstacle); with finite kinematics true_pressure, per deformed area, the others being nominal;
-    and if the obstacle is deformable paired, the share of points with an opposite. Where nothing is
-    opposite the gap is NaN. Body, Γc and points are on the undeformed body: "Warp By Vector" with
-    the displacement moves them alike; obstacles are where they have moved to.
+    The first two files of a contact have displacement, pressure, tangential_traction (on the body),
+    gap (NaN without an opposite point), slip (committed, sum of the modes), status (`Status`) and
+    normal (from body to obstacle); with finite kinematics also true_pressure, per deformed area,
+    while the others are nominal; and with a deformable obstacle also paired, the fraction of points
+    that have an opposite point. Body, Γc and points are written in the undeformed configuration:
+    deform them by "Warp By Vector" with the displacement.
 
-    Every file is complete or as before, whenever writing ends, and nothing has to be closed.
+    Files are replaced only when they are complete, and need not be closed. The constructor is
+    collective.
+
+    Args:
+        folder: Folder of the files, created if necessary. Existing series are continued.
+        problem: The problem.
+        stress: UFL tensor (d, d) or (3, 3) on the body. It is interpolated one degree below the
+            displacement, from points in the interior of the cells. The von Mises stress is written
+            with (3, 3) only, because it depends on the stress normal to the plane.
+
+    Attributes:
+        folder: Folder of the files.
+
+    Raises:
+        ValueError: The stress has another shape, a contact's name cannot be used in a file name, or
+            an existing series cannot be read; raised on all ranks.
+        OSError: The folder cannot be created or written to; raised on all ranks.
     """
 
     def __init__(
         self, folder: str | os.PathLike[str], problem: ContactProblem, *, stress: Any = None
     ) -> None:
-        """Make the folder, and read what series it has. Collective.
-
-        Args:
-            folder: Where to. A series that is there is gone on with: see `write`.
-            problem: Whose results.
-            stress: UFL tensor (d, d) or (3, 3) on the body. It is interpolated one degree below the
-                displacement, from points inside the cells. The von Mises stress comes with (3, 3)
-                alone: without the stress across a plane body it is not known.
-
-        Raises:
-            ValueError: The stress has another shape, a contact's name is none of a file, or there
-                is a series that cannot be read. On all ranks.
-            OSError: The folder cannot be made or written to. On all ranks.
-        """
         check_instance("problem", problem, ContactProblem)
         self.folder, self._problem = Path(folder), problem
         self._mesh = problem.u.function_space.mesh
@@ -88,8 +90,8 @@ class Writer:
         for name in names:
             if not re.fullmatch(r"[\w. +-]+", name) or [*names, "body"].count(name) > 1:
                 raise ValueError(
-                    f"a contact's files would be called {name}.pvd: no name of a file, or one that "
-                    "another series has; give the contact another name, Contact(name=...)"
+                    f"a contact's file would be named {name}.pvd, which is no valid file name, or "
+                    "that of another series; give the contact another name, Contact(name=...)"
                 )
         self._series: dict[str, list[tuple[float, str]]] = {}
         self._obstacles: dict[str, ObstacleShape] = {}  # on the first rank
@@ -105,19 +107,19 @@ class Writer:
     def write(self, state: Step | float) -> None:
         """Add the present state to the series. Collective.
 
-        States that the folder has of this time and of later ones are replaced, the earlier ones
-        stay: a history that goes on from a checkpoint goes on with its series, on any number of
-        ranks, and one that starts anew replaces them. If u is behind it is completed first
-        (`ContactProblem.complete`).
+        Existing states of this and later times are replaced, and earlier ones remain: a history
+        that continues from a checkpoint continues its series, on any number of ranks, and one that
+        starts again replaces them. The interior displacement is recovered first, if it is out of
+        date.
 
         Args:
-            state: The step that was made: its time is the number of the increment, which rises
-                where the load returns, and the load is the number "load" of the file. Or a time.
+            state: The `Step`, whose time is the number of the increment, and whose load parameter
+                is the field "load" of the file; or a time.
 
         Raises:
-            ValueError: It is neither, or a time that is not later than the last one written; or
-                something else has written to the folder since. On all ranks.
-            OSError: A file cannot be written; what was written before is as it was. On all ranks.
+            ValueError: ``state`` is neither, or a time that is not later than the last one written,
+                or another program has written to the folder; raised on all ranks.
+            OSError: A file cannot be written; existing files are unchanged. Raised on all ranks.
         """
         numbers = {}
         if isinstance(state, Step):
@@ -130,8 +132,8 @@ class Writer:
             raise ValueError(f"state is {state!r}; it must be a Step, or a time (a finite number)")
         if not time > self._last:
             raise ValueError(
-                f"the time is {time:g}, and the last one written is {self._last:g}; times must "
-                "rise: give the step, or a number of your own that does"
+                f"the time is {time:g}, but the last one written is {self._last:g}; times must "
+                "increase: give the step, or another number"
             )
         self._problem.complete()
         grids = {"body": self._body.grid()}
@@ -161,8 +163,7 @@ class Writer:
             if vtu.read_series(self._path(name)) != self._series[name]:
                 raise ValueError(
                     f"{self._path(name)} has changed since this Writer wrote or read it: another "
-                    "one writes to this folder; give each problem a folder of its own, and one "
-                    "Writer"
+                    "one writes to this folder; use one Writer per folder"
                 )
         states, dropped = {}, []
         with contextlib.ExitStack() as stack:  # in place when all are written, the lists at last

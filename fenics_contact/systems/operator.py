@@ -1,11 +1,12 @@
-"""Contact over the unknowns of a system: a sparse map from these to the points of Γc, and back.
+"""Contact operator: the sparse matrix D from the unknowns to the jump at the points of Γc.
 
-All of contact acts at points: the map D takes unknowns to the displacement that a point feels
-relative to its obstacle, the law makes tractions of it there, and -Dᵀ takes these, times the area
-of their points, to forces. The law is evaluated on Γc alone, whatever the element of the bulk.
+D maps the unknowns to the jump of the displacement at the quadrature points, the contact law maps
+the jump to tractions, and -Dᵀ, weighted by the quadrature weights, maps tractions to nodal forces,
+eq. (10). The law is evaluated on Γc only, whatever the element of the bulk.
 
-D is constant, but for one column: by the angle of an obstacle that is turned by a moment points
-feel -ω × r, where they are now. As the unknown is a length, L times the angle, so is this by L.
+D is constant except for one column: the derivative of the jump with respect to the angle of an
+obstacle that is rotated by a moment is -ω × r at the present position. The unknown is the length L
+times the angle, so that this column is divided by L.
 """
 
 from __future__ import annotations
@@ -27,30 +28,27 @@ __all__ = ["ContactOperator"]
 
 
 class ContactOperator:
-    """How the points of a contact feel unknowns, and act on them.
+    """Residual and tangent of a contact over the unknowns, assembled with the matrix D, eq. (10).
 
-    It does not change, but for what they feel of an angle. Pairs found anew, or other unknowns,
-    take another one.
+    Use it to add a contact to a nonlinear solver of your own. It remains valid as long as the pairs
+    and the unknowns do not change. The constructor is collective.
+
+    Args:
+        contact: The contact, whose present state is used.
+        unknowns: Unknowns of a problem, or a selection of them; by default the dofs of the
+            displacement function.
+        first_motion: Number of this contact's first unknown motion among all unknown motions.
 
     Attributes:
-        contact: The contact; what acts at its points is that of its present state.
-        unknowns: What the vectors and matrices are over.
-        within: Mask of this rank's points that feel none of the unknowns left out of a selection,
-            (n_points,). The others feel nothing here, and nothing acts at them. None: there are no
-            others, on any rank.
+        contact: The contact.
+        unknowns: The unknowns of all vectors and matrices.
+        within: Mask of this rank's points that depend on selected unknowns only, (n_points,). The
+            other points have no jump and no tractions here. None: there are no others on any rank.
     """
 
     def __init__(
         self, contact: Contact, unknowns: Unknowns | None = None, first_motion: int = 0
     ) -> None:
-        """Take the pairs as they are. Collective.
-
-        Args:
-            contact: The contact.
-            unknowns: Those of a problem, or a selection of them; none: the dofs that are solved
-                for alone.
-            first_motion: Number of this contact's first free motion among all of the unknowns.
-        """
         self.contact = contact
         displacement = contact.displacement
         self.unknowns = unknowns or Unknowns(displacement.whole.function_space)
@@ -77,10 +75,10 @@ class ContactOperator:
         self._at_points = self._map.createVecLeft()
 
     def _find_within(self) -> Mask | None:
-        """See the attribute. Collective.
+        """Return the mask ``within``. Collective.
 
-        Of pairs that follow the bodies all that they may couple is selected, but for the round-off
-        of functions that are zero on facets.
+        With finite kinematics all unknowns that pairs may couple are selected, except round-off of
+        functions that are zero on facets.
         """
         if not isinstance(self.unknowns, Selection) or self.contact.opposite.follows:
             return None
@@ -117,12 +115,12 @@ class ContactOperator:
 
     @cached_property
     def touched(self) -> Indices:
-        """This rank's unknowns that the points feel or act on, ascending. Collective."""
+        """This rank's unknowns that the contact couples, ascending. Collective."""
         return self.touched_by(np.ones(self.contact.quadrature.n_points, dtype=np.bool_))
 
     @property
     def reachable(self) -> Indices:
-        """Those that they may feel or act on with later pairs, too, ascending. Collective."""
+        """This rank's unknowns that the contact may couple with later pairs, ascending. Collective."""
         pairs, displacement = self.contact.pairs, self.contact.displacement
         if not self.contact.opposite.follows:
             return self.touched
@@ -130,7 +128,7 @@ class ContactOperator:
         return self._coupled(reach, np.ones(reach.getLocalSize()[0]))
 
     def touched_by(self, chosen: Mask) -> Indices:
-        """Those that some of this rank's points feel or act on, ascending. Collective."""
+        """Return this rank's unknowns that some of its points couple, ascending. Collective."""
         return self._coupled(self._map, np.repeat(chosen, self._gdim))
 
     def _coupled(self, matrix: PETSc.Mat, rows: Array | Mask) -> Indices:
@@ -149,9 +147,13 @@ class ContactOperator:
         return np.flatnonzero(felt).astype(np.int32)
 
     def jump(self, values: Array) -> Array:
-        """Displacement relative to the obstacle: of unknowns (n_local,), (n_points, gdim).
+        """Return the displacement relative to the obstacle at the points, D u. Collective.
 
-        Collective.
+        Args:
+            values: This rank's unknowns, (n_local,) (length).
+
+        Returns:
+            Array (n_points, gdim) (length).
         """
         vector = self._map.createVecRight()
         vector.array[:] = values
@@ -164,12 +166,12 @@ class ContactOperator:
         return found
 
     def add_force(self, residual: PETSc.Vec, traction: Array | None = None) -> None:
-        """Add what tractions do to a residual, minus their forces. Collective.
+        """Add minus the nodal forces of the contact tractions to a residual. Collective.
 
         Args:
-            residual: Over the unknowns, added to (force).
-            traction: On the body, (n_points, gdim) (stress); by default the law's at the present
-                ``u``: then `Contact.form` is added, assembled.
+            residual: Vector over the unknowns, to which the forces are added (force).
+            traction: Tractions on the body, (n_points, gdim) (stress); by default those of the law
+                at the present ``u``, which adds the assembled `Contact.form`.
         """
         if traction is None:
             traction = self.contact.acting.traction()
@@ -182,7 +184,10 @@ class ContactOperator:
                 residual.array[self._turn - self.unknowns.first] += moment
 
     def springs(self, stiffness: Array) -> PETSc.Mat:
-        """Stiffness of springs at the points, (n_points, gdim, gdim) (stress/length). Collective.
+        """Assemble a stiffness at the points, Dᵀ W k D. Collective.
+
+        Args:
+            stiffness: Stiffness k at the points, (n_points, gdim, gdim) (stress/length).
 
         Returns:
             A new matrix over the unknowns (force/length).
@@ -199,10 +204,10 @@ class ContactOperator:
         return product
 
     def tangent(self, tangent: PointTangent | None = None) -> PETSc.Mat:
-        """The derivative of what `add_force` adds. Collective.
+        """Assemble the consistent tangent, the derivative of `add_force`. Collective.
 
         Args:
-            tangent: Derivatives of the tractions; by default the law's at the present ``u``.
+            tangent: Derivatives of the tractions; by default those of the law at the present ``u``.
 
         Returns:
             A new matrix over the unknowns (force/length).
@@ -246,14 +251,14 @@ class ContactOperator:
         return arms if self.within is None else np.where(self.within[:, None], arms, 0.0)
 
     def steadied(self, tangent: PETSc.Mat) -> PETSc.Mat:
-        """A tangent that is not singular by the angle where all points slip. Collective.
+        """Regularise the rotation dof of a tangent where all points slip. Collective.
 
-        No friction changes then with the angle. It gets a stiffness by which a step of Newton's
-        method takes away the slip of those points that the moment left over turns back; where there
-        are none, that of all that bear if they stuck.
+        Friction does not depend on the angle then, and the tangent is singular. The dof gets the
+        stiffness with which a Newton step removes the slip of those points that the residual moment
+        rotates back; if there are none, the stiffness of all loaded points if they stuck.
 
         Args:
-            tangent: What `tangent` gave, at the evaluated state; it is changed.
+            tangent: Result of `tangent` at the evaluated state, which is modified.
         """
         contact, comm = self.contact, self.unknowns.comm
         if self._turn is None or not contact.law.has_friction:
@@ -281,12 +286,12 @@ class ContactOperator:
         return tangent
 
     def rolling(self) -> float:
-        """By how much the angle's unknown has to change for the least slip. Collective.
+        """Return the change of the rotation unknown for the least slip. Collective.
 
-        At the evaluated state, in the mean over the points that bear.
+        It is that of the evaluated state, in the mean over the loaded points: rolling.
 
         Returns:
-            The change (length); 0 where nothing turns freely, or nothing rubs.
+            The change (length); 0 without an unknown rotation or friction.
         """
         contact, values = self.contact, self.contact.values
         if self._turn is None or not contact.law.has_friction:
