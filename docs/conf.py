@@ -36,7 +36,7 @@ myst_enable_extensions = ["colon_fence", "dollarmath"]
 default_role = "py:obj"
 smartquotes = False
 napoleon_numpy_docstring = False
-napoleon_custom_sections = [("Attributes", "params_style"), ("Args to the constructor", "Args")]
+napoleon_custom_sections = [("Attributes", "params_style")]
 # What stands before the colon of Returns is a description.
 napoleon_use_rtype = False
 python_use_unqualified_type_names = True

@@ -62,17 +62,17 @@ class Energy:
 
 @dataclass(frozen=True)
 class EnergyState:
-    """Forces and places at one state, on this rank; what lies between two is an `Energy`.
+    """Forces and displacements of a state on this rank; two states determine an `Energy`.
 
     Attributes:
-        forces: At the unknowns, by the mark of the coordinates they are in.
-        contacts: Of each contact the tractions on the body, its displacement relative to the
-            obstacle, and that of the obstacle as far as it is prescribed: (3, n_points, gdim).
-            Where the obstacle turns, the displacement relative to it in its frame, that of the
-            body less the free motion of the obstacle, and the axes of the frame: (3 + gdim,
-                n_points, gdim).
-            Where a moment turns it two more: `Contact.turning_rate`, and the angle.
-        springs: Of each contact the energy in the springs at the points, (n_points,).
+        forces: Forces at the unknowns, by the mark of their coordinates.
+        contacts: For each contact, tractions on the body, displacement relative to the obstacle,
+            and prescribed displacement of the obstacle, (3, n_points, gdim). If the obstacle
+            rotates: tractions, displacement relative to the obstacle in its frame, displacement of
+            the body minus the unknown motion of the obstacle, and the axes of the frame,
+            (3 + gdim, n_points, gdim); with a given moment also `Opposite.turning_rate` and the
+            angle.
+        springs: For each contact, the energy in the contact springs at the points, (n_points,).
     """
 
     forces: dict[Any, Forces]
@@ -81,18 +81,18 @@ class EnergyState:
 
     @classmethod
     def unloaded(cls, forces: dict[Any, Forces], contacts: Sequence[Contact]) -> EnergyState:
-        """No forces on Γc."""
+        """Return the state of contacts without tractions."""
         springs: list[Array] = [np.zeros(len(c.points)) for c in contacts]
         return cls(forces, [_ways(c, 0 * c.points) for c in contacts], springs)
 
     @classmethod
     def at(cls, forces: dict[Any, Forces], contacts: Sequence[Contact]) -> EnergyState:
-        """The state that ``contacts`` have evaluated."""
+        """Return the evaluated state of contacts."""
         springs = [np.asarray(c.measure * c.values.stored) for c in contacts]
         return cls(forces, [_ways(c, c.traction) for c in contacts], springs)
 
     def between(self, jumps: Sequence[Array]) -> EnergyState:
-        """The same state with the displacements relative to obstacles taken between new pairs."""
+        """Return this state with relative displacements of new pairs."""
         ways = [
             np.stack([w[0], jump, *w[2:]]) for w, jump in zip(self.contacts, jumps, strict=True)
         ]
@@ -101,7 +101,7 @@ class EnergyState:
     def since(
         self, before: EnergyState, contacts: Sequence[Contact], scales: ReferenceScales
     ) -> Energy:
-        """Energies on the way from ``before`` to here, in coordinates both have. Collective."""
+        """Return the energies between the state ``before`` and this one. Collective."""
         mark = next(mark for mark in self.forces if mark in before.forces)
         old, new = before.forces[mark], self.forces[mark]
         way = new.unknowns - old.unknowns

@@ -286,19 +286,19 @@ def check_laws(contact: Contact) -> dict[str, float]:
         contact: An evaluated contact.
 
     Returns:
-        Largest violations, relative to the largest value concerned, or to the tolerance times
-        which it is the round-off of the places of points (16 eps times the size of the mesh), where
-        that is larger: displacements below it are none, and neither are tractions that they make,
-        such as what is left when a load has gone. "complementarity"
-        (eq. 6-11: r_n ≤ 0, δ± ≥ 0, δ₊δ₋ = 0, r_n δ₊ = 0, s - u_n = δ₊ - δ₋, r_n = -k_n δ₋;
-        with multipliers r_n = -k_n (u_n - s) - λ_n where that is < 0; of a law with its own
-        `normal_potential` r_n is minus the derivative of it by u_n instead), or
-        where the law bears tension "stiffness" (r_n = -k_n (u_n - s)). With friction "friction
-        bound" (it is `Law.friction_bound` at the pressure) and, by the law's yield functions g_j,
-        "cone" (g_j ≤ 0), "slip" (eq. 44: Δβ ≥ 0, the change of the traction is that of adherence
-        and associated slip, Δτ = -K_t (Δu_t + Σ Δβ_j ∂g_j/∂τ)) and "dissipation" (Δβ_j g_j = 0,
-        slip against τ). With tangential tractions but no friction "stiffness" holds τ = -K_t u_t
-        too, or τ = 0 where open. NaN where something is not finite.
+        The largest violation of each condition, relative to the largest value concerned; NaN if
+        something is not finite. The scale is at least the round-off of the coordinates (16 eps
+        times the size of the mesh) divided by the tolerance, so that residual displacements and
+        tractions below round-off do not count. The conditions are
+
+        - "complementarity", eq. (6): r_n ≤ 0, δ± ≥ 0, δ₊δ₋ = 0, r_n δ₊ = 0, s - u_n = δ₊ - δ₋ and
+          r_n = -k_n δ₋; with multipliers r_n = -k_n (u_n - s) - λ_n where that is negative; with a
+          `normal_potential` of the law, r_n is minus its derivative by u_n;
+        - "stiffness" instead if the law bears tension, r_n = -k_n (u_n - s); with tangential
+          tractions but no friction also τ = -K_t u_t, or τ = 0 where open;
+        - with friction, "friction bound": it is `Law.friction_bound` at the pressure; "cone":
+          g_j ≤ 0 for the law's yield functions; "slip": Δβ ≥ 0 and
+          Δτ = -K_t (Δu_t + Σ Δβ_j ∂g_j/∂τ) [44]; "dissipation": Δβ_j g_j = 0, slip against τ.
     """
     comm = contact.surface.mesh.comm
     # Points without an opposite bear nothing, whatever they do.

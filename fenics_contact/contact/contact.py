@@ -744,7 +744,7 @@ class Contact(PointResults):
         Args:
             history: `PointFields.rows` of that run.
             values: The arrays of its `values`, which become the results.
-            anew: Whether its pairs are updated at every commit.
+            anew: Whether pairs are found again at every commit of that run.
         """
         self.history.set_rows(history)
         self._aloft = None

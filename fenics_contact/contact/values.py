@@ -225,7 +225,7 @@ class PointValues:
 
     @property
     def gap(self) -> Array:
-        """Open distance s - u_n = δ₊ - δ₋ (eq. 6)."""
+        """Normal gap g_N = s - u_n = δ₊ - δ₋, eq. (6)."""
         return self.opening - self.penetration
 
     @property

@@ -53,7 +53,7 @@ class Curve:
         self._tree = cKDTree(self._place(self._starts))
 
     def sample(self, x: Array) -> Sample:
-        """See `SampledObstacle.sample`."""
+        """Return signed distance, normal and curvature at points (n, 2)."""
         t = self._closest(x)
         arm, along, bend = x - self._place(t), self._slope(t), self._bend(t)
         speed = np.linalg.norm(along, axis=1)

@@ -115,7 +115,7 @@ class Facets:
         return whole, np.concatenate([borders, at_border[self.facets]], axis=1)
 
     def sample(self, x: Array) -> Sample:
-        """See `SampledObstacle.sample`."""
+        """Return signed distance, normal and curvature at points (n, gdim)."""
         d = x.shape[1]
         # From afar all facets are as far away as round-off can tell: the rest of the way is added.
         reach = np.linalg.norm(x, axis=1)

@@ -120,7 +120,7 @@ class ContactOperator:
 
     @property
     def reachable(self) -> Indices:
-        """This rank's unknowns that the contact may couple with later pairs, ascending. Collective."""
+        """This rank's unknowns that the contact may couple, now or later. Collective."""
         pairs, displacement = self.contact.pairs, self.contact.displacement
         if not self.contact.opposite.follows:
             return self.touched
