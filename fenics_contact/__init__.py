@@ -1,4 +1,4 @@
-"""Frictional contact for FEniCSx: contact as a boundary form, an answer that is checked."""
+"""Frictional contact for FEniCSx: contact laws, boundary forms, and a solver with verification."""
 
 import fenics_contact.compat  # noqa: F401  # first: it refuses releases that are too old
 from fenics_contact import elasticity

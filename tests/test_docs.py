@@ -293,5 +293,5 @@ def test_scripts_run(path: Path, tmp_path: Path) -> None:
     assert written >= {"body.pvd", "contact.pvd", "contact_points.pvd", "history.csv"}
     assert written >= {"pressure.png", "status.png", "deformation.png", "film.gif", "report.html"}
     assert len((tmp_path / "output" / "history.csv").read_text().splitlines()) >= 1 + 5
-    assert "INFO:fenics_contact:condensed onto" in done.stderr
+    assert "INFO:fenics_contact:static condensation onto" in done.stderr
     assert done.stdout.count("increment ") == 5

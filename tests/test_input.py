@@ -235,9 +235,9 @@ def test_no_friction_against_a_free_motion(cell):
     scene = block(cell, up=-1.0, side=0.1)
     words = ["translation along x"] + (["translation along y"] if scene.dim == 3 else [])
     frictionless = fc.Frictionless(k_n=1e4)
-    raised_everywhere(lambda: scene.problem(frictionless, []), ValueError, "hold", *words)
+    raised_everywhere(lambda: scene.problem(frictionless, []), ValueError, "constrain", *words)
     # μ = 0 is no friction either.
-    raised_everywhere(lambda: scene.problem(coulomb(0.0), []), ValueError, "hold", *words)
+    raised_everywhere(lambda: scene.problem(coulomb(0.0), []), ValueError, "constrain", *words)
     problem, _ = scene.problem(coulomb(0.3), [])
     problem.solve()
 

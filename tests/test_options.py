@@ -146,4 +146,4 @@ def test_options_that_nothing_reads(command_line, method, condensation, caplog) 
     assert len(said) == (COMM.rank == 0)
     if said:
         (said,) = said
-        assert "-mine_ksp_typ, -mine_snes_maxit, -mine_snes_monitr:" in said
+        assert "-mine_ksp_typ, -mine_snes_maxit, -mine_snes_monitr;" in said

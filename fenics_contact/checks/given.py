@@ -114,7 +114,9 @@ def check_values(bcs: Sequence[fem.DirichletBC], u: fem.Function) -> None:
     for number, bc in enumerate(bcs):
         bc.set(values)
         if not all_finite(comm, values[bc.dof_indices()[0]]):
-            raise ValueError(f"bcs[{number}] has values that are not finite (NaN or inf)")
+            raise ValueError(
+                f"the Dirichlet condition bcs[{number}] has values that are not finite (NaN or inf)"
+            )
 
 
 def check_contacts(

@@ -89,7 +89,7 @@ class Bulk:
         if space != u.function_space:
             raise ValueError(
                 "the TestFunction of F and u are of different function spaces"
-                + ("; use v, q = ufl.TestFunctions(w.function_space)" if displacement.mixed else "")
+                + ("; use v, q = ufl.TestFunctions(W) of its space W" if displacement.mixed else "")
             )
         if u not in form.coefficients():
             raise ValueError(
