@@ -574,9 +574,7 @@ def _simpler(scene: Scene) -> Iterator[Scene]:
             yield from changed(lambda s, i=i, p=plain: s["contacts"][i].update(obstacle=p))
             yield from changed(lambda s, i=i: s["contacts"][i]["obstacle"].update(clearance=0.0))
         else:
-            yield from changed(
-                lambda s, i=i: s["contacts"][i]["obstacle"].update(update="never")
-            )
+            yield from changed(lambda s, i=i: s["contacts"][i]["obstacle"].update(update="never"))
     for b, body in enumerate(scene["bodies"]):
         yield from changed(lambda s, b=b: s["bodies"][b].update(jitter=0))
         yield from changed(lambda s, b=b: s["bodies"][b].update(E=1000.0))
