@@ -336,6 +336,19 @@ def test_collapsed_cells_excuse_nothing_afterwards():
     assert close(*found, 1e-8)
 
 
+def test_a_corner_turned_inside_out_is_seen_by_any_rule_of_the_form():
+    """One bilinear cell, the unit square, whose corner moves by a (1, 1).
+
+    det(I + grad u) = 1 + a (x + y) is 1 + 2a at that corner and larger at the points of any Gauss
+    rule. Reference: its sign, at 5 % of the size of the cell on either side of a = -1/2.
+    """
+    scene = rubber("quadrilateral", degree=1, n=(1, 1), size=[1.0, 1.0])
+    problem, _ = scene.problem(fc.HalfSpace((0, 2.0), (0, -1.0)), fc.Frictionless(1e4))
+    for a, inverted in ((-0.45, False), (-0.55, True)):
+        scene.u.interpolate(lambda x, a=a: a * (x[0] + 0.5) * x[1] * np.ones((2, 1)))
+        assert problem.bulk.is_inverted() is inverted
+
+
 def test_unsymmetric_bulk():
     """A bulk whose tangent is not symmetric is seen as such and solved: equilibrium.
 
