@@ -11,6 +11,7 @@ from typing import Any
 
 import basix
 import numpy as np
+from numpy.polynomial import legendre
 
 __all__ = ["Body", "Surface", "pair", "penetration", "smooth_modulus"]
 
@@ -341,10 +342,10 @@ def penetration(here: Surface, there: Surface, u: Array, weight: float) -> float
 
 
 def _polynomials(surface: Surface, n_points: int) -> Any:
-    """Monomials of the largest complete space of polynomials that so many points carry."""
+    """Legendre polynomials that span the largest complete space that so many points carry."""
     d = surface.d
     if d == 2:
-        return lambda s: s[:, :1] ** np.arange(n_points)
+        return lambda s: legendre.legvander(2 * s[:, 0] - 1, n_points - 1)
     k = 0
     if surface.simplex:
         while (k + 2) * (k + 3) // 2 <= n_points:
@@ -354,7 +355,13 @@ def _polynomials(surface: Surface, n_points: int) -> Any:
         while (k + 2) ** 2 <= n_points:
             k += 1
         powers = [(i, j) for i in range(k + 1) for j in range(k + 1)]
-    return lambda s: np.stack([s[:, 0] ** i * s[:, 1] ** j for i, j in powers], axis=1)
+    i, j = np.array(powers).T
+
+    def basis(s: Array) -> Array:
+        x, y = (legendre.legvander(2 * along - 1, k) for along in s.T)
+        return x[:, i] * y[:, j]
+
+    return basis
 
 
 def _pieces(here: Surface, there: Surface, f: int, u: Array | None) -> tuple[Array, Array]:
