@@ -519,7 +519,9 @@ class ContactProblem:
         self._judge.warn_of_large_motion(verdict)
         self._judge.warn_of_round_off(verdict)
         self._judge.warn_of_few_points()
-        self._solved = _Solved(self.full.state(), [c.found() for c in self.contacts])
+        loaded = [verdict.equations[contact.name].is_loaded for contact in self.contacts]
+        found = [c.found(is_loaded=some) for c, some in zip(self.contacts, loaded, strict=True)]
+        self._solved = _Solved(self.full.state(), found)
         return Step(
             increment=self.increment + 1,
             reason=reason,

@@ -38,9 +38,8 @@ _CURVED = 5.0
 _SMOOTHED, _K = 1e-7, ("k_n", "k_t")
 # Penetration that multipliers may leave, by the size of Γc.
 _INSIDE = 1e-2
-# How well bodies are set down, by their size, and how rigidly, by their way; and contact forces, by
-# the load, that are round-off of a body that was let go.
-_DOWN, _LEFT, _ROUND_OFF = 1e-6, 1e-7, 1e-13
+# How well bodies are set down, by their size, and how rigidly, by their way.
+_DOWN, _ROUND_OFF = 1e-6, 1e-13
 # Penetration between points, beyond what these resist, by the length of a facet. The package allows
 # 15 % where tangent planes explain it, and 2 % for the rule.
 UNRESISTED = 0.2
@@ -221,12 +220,12 @@ class Judge:
         """Count slip from set-down or first touch, at points that bore nothing before.
 
         The package tells where that is. Asked of it is what the reference knows of it: contact just
-        touches; and bodies that were set down went there as rigid ones, no deeper into anything.
+        touches; bodies that were set down went there as rigid ones, no deeper into anything; and
+        where slip is counted anew nothing was borne.
         """
         problem, old = self.problem, list(self._old)
         size = np.ptp(problem.body.places, axis=0).max()
         before = self._u
-        borne = None if self._before is None else [c["size"] for c in self._before["contacts"]]
         for i, record_of in enumerate(record["contacts"]):
             told, model = record_of["set_down"], problem.contacts[i]
             if told is None:
@@ -236,23 +235,26 @@ class Judge:
                 then, now = (problem.respond(v, self._motion, load, old) for v in (before, u))
                 deep, deeper = (
                     max(
-                        f["closing"][c.paired].max()
+                        f["closing"][c.paired].max(initial=-np.inf)
                         for c, f in zip(problem.contacts, at, strict=True)
                     )
                     for at in (then, now)
                 )
                 found = now[i]
                 strain, way = self._strain(u - before, before, load), np.abs(u - before).max()
-                self._check(name, "set down rigid", strain, _DOWN * way + _ROUND_OFF * size)
+                allowed = _DOWN * way + _ROUND_OFF * size
+                self._check(name, "set down rigid", strain, allowed)
                 self._check(name, "set down inside", deeper - max(deep, 0.0), _DOWN * size)
                 self._check(name, "set down aloft", -deeper, _DOWN * size)
             else:
                 found = self._touching(model, record_of, u, old[i])
                 miss = abs(found["closing"][model.paired].max())
                 self._check(name, "first touch", miss, _DOWN * size)
-            idle = np.ones(len(found["r_n"]), dtype=bool)
-            if borne is not None and sum(borne) > _LEFT * np.linalg.norm(load.force):
-                idle = self._before["found"][i]["r_n"] == 0.0
+            idle = told["idle"][self._rows(model, record_of)]
+            if self._before is not None:
+                borne = np.abs(self._before["found"][i]["r_n"])
+                rounding = sum(b["rounding"] for b in self._before["bodies"])
+                self._check(name, "set down loaded", model.weights @ (borne * idle), rounding)
             self._old[i] = model.counted_from(found, old[i], idle)
             own, own_old = self._apart.contacts[i], self._own_old[i]
             if told["rigid"]:

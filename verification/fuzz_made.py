@@ -100,8 +100,9 @@ class Made:
         F: The residual with coefficients by cell and plain measures; the package gets it as the
             scene says that it is written (`fuzz_forms.written`).
         set_down: Where slip is counted from anew in this increment, by the names of contacts:
-            "rigid", whether bodies were set down, "u" (see `_displacement`), and "jump", the
-            displacement relative to the obstacle at the points, (n_points, d).
+            "rigid", whether bodies were set down, "u" (see `_displacement`), "jump", the
+            displacement relative to the obstacle at the points, (n_points, d), and "idle", at which
+            of them slip is counted from there, (n_points,).
     """
 
     def __init__(self, scene: Scene, comm: MPI.Comm) -> None:
@@ -524,11 +525,15 @@ def _note_set_down(made: Made, contact: fc.Contact) -> None:
             if rigid and not any(made.comm.allgather(bool(given[0].any()))):
                 method(*given, **options)  # of other bodies
                 return
-            jump = gathered(made.comm, np.column_stack([contact.points, contact.values.jump]))
+            idle = given[0] & (contact.history.values("normal_traction") == 0.0) if rigid else True
+            idle = np.broadcast_to(idle, len(contact.points))
+            columns = [contact.points, contact.values.jump, idle]
+            rows = gathered(made.comm, np.column_stack(columns))
             made.set_down[contact.name] = {
                 "rigid": rigid,
                 "u": _displacement(made),
-                "jump": jump[:, made.d :],
+                "jump": rows[:, made.d : 2 * made.d],
+                "idle": rows[:, -1] > 0,
             }
             method(*given, **options)
 

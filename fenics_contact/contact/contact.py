@@ -635,10 +635,17 @@ class Contact(PointResults):
             )
         return self.multipliers
 
-    def found(self) -> Found:
-        """Return a copy of the evaluated state, for `commit`."""
+    def found(self, *, is_loaded: bool = True) -> Found:
+        """Return a copy of the evaluated state, for `commit`.
+
+        Args:
+            is_loaded: Whether there is a contact force (`ForceBalance.is_loaded`). Without one all
+                normal tractions are smaller than the accepted residual, and zero is committed.
+        """
         points = self.values
         values = {n: points.arrays[n] for n in ("opening", "penetration", "normal_traction")}
+        if not is_loaded:
+            values["normal_traction"] = np.zeros_like(values["normal_traction"])
         if self.law.has_friction:
             values |= {
                 "traction": points.framed_traction,
@@ -651,18 +658,15 @@ class Contact(PointResults):
         counted = None if self._aloft is None else self.history.rows()
         return Found(points, self.opposite.committed_fields(values), counted)
 
-    def set_down(self, moved: Mask, released: Mask) -> None:
+    def set_down(self, moved: Mask) -> None:
         """Measure slip from the state evaluated last at points that were unloaded. Collective.
 
         It is called after the initial positioning of bodies. `restore` undoes it.
 
         Args:
             moved: Mask of the points that the positioning moved, (n_points,).
-            released: Mask of the points of bodies that had no contact force before, (n_points,),
-                whose committed tractions are round-off.
         """
-        bore = self.history.values("normal_traction") != 0.0
-        self._count_from_here(released | (moved & ~bore))
+        self._count_from_here(moved & (self.history.values("normal_traction") == 0.0))
 
     def count_slip_from_here(self) -> None:
         """Measure slip from the state evaluated last, at which surfaces first touch. Collective.

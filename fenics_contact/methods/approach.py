@@ -18,8 +18,6 @@ __all__ = ["Approach"]
 
 # Contact forces that sum up to less than this share of the load on a free motion are none yet.
 _IDLE = 1e-3
-# Less than this share of it is round-off of a body that was let go.
-_LEFT = 1e-8
 # The share of what a load drives that counts as most of it.
 _MOST = 0.5
 # The share of a motion at Γc that may go along a Γc that grips: of a body tilted by up to 0.2.
@@ -116,9 +114,7 @@ class Approach:
                 return False
             self._go(here)
         if len(which):
-            # Those that bore no more than round-off were let go.
-            released = (borne < _LEFT * load_size)[groups[which]]
-            self._set_down(load, before, which, released)
+            self._set_down(load, before, which)
         return first or bool(idle.any())
 
     def _carried(self, chosen: Mask) -> Array | None:
@@ -170,7 +166,7 @@ class Approach:
         for contact in self._full.contacts:
             contact.evaluate()
 
-    def _set_down(self, load: Array, before: Array, which: Index, released: Mask) -> None:
+    def _set_down(self, load: Array, before: Array, which: Index) -> None:
         """Move bodies that touch nothing to where they rest, or to first touch. Collective.
 
         Slip is counted from there, for until then nothing is touched. Prescribed displacements
@@ -180,7 +176,6 @@ class Approach:
             load: As in `lead`.
             before: As in `lead`.
             which: Numbers of their free motions.
-            released: Which of these are of bodies that were let go, (n_which,).
         """
         full = self._full
         aloft = full.state()
@@ -200,11 +195,10 @@ class Approach:
         of_bodies = self._motions.of_any_body()[which]
         if not of_bodies.any():
             return
-        which, released = which[of_bodies], released[of_bodies]
-        landed, felt = full.state(), self._felt(which)[1]
+        landed, felt = full.state(), self._felt(which[of_bodies])[1]
         self._go(np.where(full.constrained, before, landed))
         for contact, jumps in zip(full.contacts, felt, strict=True):
-            contact.set_down(_feeling(jumps), _feeling(jumps[released]))
+            contact.set_down(_feeling(jumps))
         self._go(landed)
 
     def _follow_stiffness(self) -> None:
