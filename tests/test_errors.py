@@ -166,7 +166,7 @@ def test_the_table():
     total = found.total["normal force"]
     squares = [found.relative(p)["normal force"] ** 2 for p in found.parts]
     assert close(total, np.sqrt(sum(squares)), 1e-14)
-    assert "not told" in str(budget(made.scene, made.problem))
+    assert "not estimated" in str(budget(made.scene, made.problem))
 
     scene = block("quadrilateral", 1, n=4, up=-1.0)
     contacts = [scene.contact(fc.Frictionless(k_n=1e3), name=name) for name in ("one", "other")]

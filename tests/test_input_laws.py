@@ -398,7 +398,7 @@ def test_data_that_depend_on_the_displacement(what):
         "normal": {"obstacle": fc.PrescribedGap(0.0, ufl.as_vector([scene.u[0], -1.0]))},
     }[what]
     law = coulomb(friction=grows if what == "friction" else 0.3)
-    raised_everywhere(lambda: scene.contact(law, **contact), ValueError, what, "solved for", "u")
+    raised_everywhere(lambda: scene.contact(law, **contact), ValueError, what, "the unknown", "u")
 
 
 def test_data_of_another_mesh_or_form():

@@ -77,7 +77,7 @@ def test_increments_that_numbers_cannot_tell_apart(start, end):
     """Three were asked for; fewer would be solved, by another way of the load."""
     made = Rub()
     call = lambda: fc.increments(made.problem, made.load, start, end, steps=3)  # noqa: E731
-    raised_everywhere(call, ValueError, "steps is 3", "told apart")
+    raised_everywhere(call, ValueError, "steps is 3", "distinguished")
 
 
 def test_one_file_for_checkpoint_and_table(tmp_path):

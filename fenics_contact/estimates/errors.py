@@ -144,7 +144,9 @@ class ErrorBudget:
         rows = []
         for part in _REMEDIES:
             found = self.relative(part) if part in self.parts else {}
-            cells = (f"{100 * found[n]:.2g}" if n in found else "not told" for n in self.values)
+            cells = (
+                f"{100 * found[n]:.2g}" if n in found else "not estimated" for n in self.values
+            )
             rows.append((part, *cells))
         return rows
 
