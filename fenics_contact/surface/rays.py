@@ -34,10 +34,10 @@ _TOUCHING = 1e-9
 # Why a point has no opposite, the likeliest last.
 _NOTHING, _FAR, BEHIND, _ITSELF = range(4)
 REASONS = {
-    _NOTHING: "their normals meet nothing",
-    _FAR: "what they meet is out of reach",
-    BEHIND: "what they meet lies behind them, deeper than release",
-    _ITSELF: "what they meet is the back of their own body",
+    _NOTHING: "their normals do not meet the opposite surface",
+    _FAR: "the opposite point is farther than search_distance",
+    BEHIND: "the opposite point is behind them, deeper than max_initial_penetration",
+    _ITSELF: "the opposite point is on the back of their own body",
 }
 
 
