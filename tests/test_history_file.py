@@ -184,7 +184,7 @@ def test_wrong_input(tmp_path):
         )
 
     raised_everywhere(call(3), ValueError, "csv", "name of a file")
-    raised_everywhere(call(folder / "no" / "h.csv"), ValueError, "no folder", "make it")
+    raised_everywhere(call(folder / "no" / "h.csv"), ValueError, "no folder", "create it")
     raised_everywhere(call(folder / "letter.txt"), ValueError, "letter.txt", "overwritten")
     raised_everywhere(call(folder), OSError, str(folder.name))
     assert sorted(os.listdir(folder)) == ["letter.txt"] and made.problem.increment == 0

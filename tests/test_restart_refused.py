@@ -121,7 +121,7 @@ def test_what_cannot_be_taken_over_is_refused_in_any_case(other, saved):
     for changed in ("refuse", "continue"):
         made = Press(**({"wall": True} | options))
         call = lambda made=made, changed=changed: next(  # noqa: E731
-            made.increments(checkpoint=saved, changed=changed)
+            made.increments(checkpoint=saved, on_mismatch=changed)
         )
         raised_everywhere(call, ValueError, *words)
         assert made.problem.increment == 0

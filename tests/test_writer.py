@@ -269,7 +269,7 @@ def test_wrong_input(tmp_path):
     made = Rub()
     (folder / "file").touch()
     COMM.barrier()
-    named = f"and {folder / 'file'} is a file; give another name"
+    named = f"but {folder / 'file'} is a file; give another name"
     for taken in (folder / "file", folder / "file" / "in"):
         raised_everywhere(
             lambda taken=taken: fc.Writer(taken, made.problem), (OSError, NotADirectoryError), named
