@@ -194,7 +194,7 @@ REFUSED = {
     pushed_aside: "no contact force can balance",
     without_number: "not finite",
     out_of_range: "friction",
-    half_as_steep: "changes by 2 per length",
+    half_as_steep: "has length 2",
     through_a_plate: "has crossed",
     beyond_its_limit: "overload",
 }
