@@ -230,7 +230,7 @@ def test_an_obstacle_that_says_nothing():
         lambda: scene.contact(fc.Frictionless(), obstacle=obstacle),
         ValueError,
         "Nowhere is no obstacle",
-        "must say its place",
+        "must define place",
     )
 
 

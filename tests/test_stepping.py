@@ -85,7 +85,7 @@ def test_one_file_for_checkpoint_and_table(tmp_path):
     made, path = Rub(), shared_folder(tmp_path) / "state"
     names = {"checkpoint": path, "csv": path.parent / ".." / path.parent.name / "state"}
     call = lambda: fc.increments(made.problem, made.load, **names)  # noqa: E731
-    raised_everywhere(call, ValueError, "checkpoint and history are both")
+    raised_everywhere(call, ValueError, "checkpoint and csv are both")
     assert not path.exists()
 
 
