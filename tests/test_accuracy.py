@@ -114,7 +114,7 @@ def test_the_mesh_it_takes():
     assert budget.wanted == wanted
     assert budget.h == pytest.approx(1 / 8, rel=1e-12)
     assert 0 < budget.h_wanted < budget.h
-    assert "takes facets" in str(budget)
+    assert "use facets" in str(budget)
     worst = max(budget.relative("discretisation").values())
     n = int(np.ceil(1 / budget.h_wanted))
     finer = block("quadrilateral", 2, n=n)

@@ -477,7 +477,7 @@ def test_bad_arguments() -> None:
         ({"law": 3}, ["law is a int", "Law"]),
         ({"law": fc.Frictionless}, ["law is the class Frictionless"]),
         ({"law": lambda a, b: None}, ["1-2", "law", "NoneType"]),
-        ({"bodies": 2}, ["bodies is a int", "join_meshes"]),
+        ({"bodies": 2}, ["bodies is a int", "JoinedMesh"]),
         ({"bodies": fc.join_meshes([mesh])}, ["another mesh"]),
         ({"bodies": joined.facets}, ["dimension 1", "dimension 2"]),
         ({"bodies": some}, ["8 cells have no tag"]),

@@ -238,7 +238,7 @@ def test_an_obstacle_in_numbers_of_wrong_shape():
     """It is told what is expected, where the contact is first evaluated."""
     given = {"obstacle": Faulty("shape"), "kinematics": "finite"}
     scene = block("triangle", 1)
-    words = "Faulty: distance of its sample has shape", "need"
+    words = "Faulty: distance of its sample has shape", "must be"
     raised_everywhere(scene.contact(fc.Frictionless(), **given).evaluate, ValueError, *words)
 
 
