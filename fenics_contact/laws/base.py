@@ -29,15 +29,17 @@ class PointKinematics:
     """The local kinematics at a point of Γc, the input of a contact law (UFL).
 
     Attributes:
-        gap: Normal gap g_N = s - u_n (length): open where positive, penetrated where negative; the
-            motion of the obstacle is included.
-        normal: Unit normal n from body to obstacle, shape (gdim,).
-        tangential_displacement: u_t of eq. (1), relative to the obstacle, shape (gdim,); None if
-            the law has no tangential traction.
-        tangential_increment: Δu_t since the last commit, shape (gdim,); None without friction.
-        traction: Tangential traction τ at the last commit, or the multiplier λ_t that replaces it,
-            shape (gdim,); None without friction.
-        multiplier: Multiplier λ_n ≥ 0 of the augmented Lagrangian, eq. (8); None with a penalty.
+        gap: Present normal gap g_N (length), s - u_n with small displacements, eq. (1) and (2). It
+            is negative where the body penetrates, and includes the motion of the obstacle.
+        normal: Unit normal n from the body to the obstacle, shape (gdim,).
+        tangential_displacement: Tangential displacement u_t relative to the obstacle, eq. (1)
+            (length), shape (gdim,); None if the law has no tangential traction.
+        tangential_increment: Increment Δu_t of it since the last commit (length), shape (gdim,);
+            None without friction.
+        traction: Tangential traction τ_old at the last commit, eq. (7), or the multiplier λ_t,
+            eq. (8) (stress), shape (gdim,); None without friction.
+        multiplier: Multiplier λ_n ≥ 0 of the augmented Lagrangian, eq. (8) (stress); None with a
+            penalty.
     """
 
     gap: Expr
@@ -50,15 +52,17 @@ class PointKinematics:
 
 @dataclass(frozen=True)
 class ContactTraction:
-    """The tractions at a point of Γc, the result of a contact law (UFL).
+    """The tractions on the body at a point of Γc, the result of a contact law (UFL).
+
+    The total traction is r_n n + τ, with the normal n from the body to the obstacle.
 
     Attributes:
-        normal_traction: r_n (stress).
-        opening: δ₊ ≥ 0 (length), eq. (6).
-        penetration: δ₋ ≥ 0 (length), eq. (6).
-        traction: τ (stress), shape (gdim,); None if the law has no tangential traction.
-        friction_bound: Size of the yield surface, μ p of Coulomb's law (stress); None without
-            friction.
+        normal_traction: Normal traction r_n, negative in compression (stress).
+        opening: Positive part δ₊ of the gap (length), eq. (6).
+        penetration: Negative part δ₋ ≥ 0 of the gap (length), eq. (6).
+        traction: Tangential traction τ (stress), shape (gdim,); None if the law has none.
+        friction_bound: Friction bound, the size of the yield surface: μ p of Coulomb's law
+            (stress); None without friction.
         slip: Slip increment Δβ ≥ 0 of each slip mode (length), eq. (7).
     """
 
@@ -71,9 +75,11 @@ class ContactTraction:
 
 
 class Law:
-    """Base class of contact laws; its defaults are those of frictionless unilateral contact.
+    """Base class of contact laws: tractions as a function of the local kinematics, in UFL.
 
-    A subclass is a dataclass of the law's parameters and defines at least `contact_traction`.
+    A subclass is a dataclass whose fields are the law's parameters. It defines `contact_traction`,
+    and `normal_potential` unless r_n = -k_n δ₋ with a parameter ``k_n``. The defaults of all other
+    members are those of frictionless unilateral contact.
     """
 
     @property
@@ -83,7 +89,7 @@ class Law:
 
     @property
     def has_friction(self) -> bool:
-        """Whether points can slip, so that the history has tangential state."""
+        """Whether points can slip, so that there are tangential history variables."""
         return False
 
     @property
@@ -104,7 +110,7 @@ class Law:
 
     @property
     def has_tension(self) -> bool:
-        """Whether r_n is tensile where the gap is open; then no point has the status open."""
+        """Whether r_n may be tensile where the gap is open; then no point has the status open."""
         return False
 
     @property
@@ -176,7 +182,7 @@ class Law:
         return ufl.diff(ufl.diff(density, gap), gap)
 
     def potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
-        """Return the energy per area whose derivative by the displacement is minus the traction.
+        """Return the energy per area whose derivative by the jump ⟦u⟧ is minus the traction.
 
         Raises:
             ValueError: The law has no potential.
@@ -233,7 +239,7 @@ class Law:
     def elastic_displacement(
         self, kinematics: PointKinematics, traction: Expr, parameters: Mapping[str, Expr]
     ) -> Expr:
-        """Return K_t⁻¹ τ (length), shape (gdim,): minus the elastic displacement v_e [24]."""
+        """Return K_t⁻¹ τ = -v_e (length), shape (gdim,), with the elastic displacement v_e [24]."""
         return traction / parameters["k_t"]
 
     def yield_functions(
@@ -245,8 +251,8 @@ class Law:
     ) -> tuple[Expr, ...]:
         """Return the yield functions g_j(τ, bound) ≤ 0 of the slip modes (stress) [29].
 
-        Slip is associated: K_t⁻¹ Δτ = -(Δu_t + Σ Δβ_j ∂g_j/∂τ) [44]. The verification evaluates
-        them, independently of the return map.
+        Slip is associated at a given bound: K_t⁻¹ Δτ = -(Δu_t + Σ Δβ_j ∂g_j/∂τ) [44]. The
+        verification evaluates these functions, independently of the return map.
         """
         return ()
 

@@ -283,19 +283,19 @@ def perpendicular(normal: Expr) -> Expr:
 
 @dataclass(frozen=True)
 class Coulomb(FrictionLaw):
-    """Unilateral contact with Coulomb friction |τ| ≤ μ p, eq. (5) to (7).
+    """Unilateral contact with Coulomb friction, |τ| ≤ μ p, regularised by eq. (6) and (7).
 
     Args:
         friction: Friction coefficient μ ≥ 0: a number, constant or UFL expression over Γc.
         k_n: Normal stiffness (stress/length): a number, constant or UFL expression,
-            `RelativeStiffness` or `NodalSprings`.
-        k_t: Tangential stiffness (stress/length), given like k_n.
-        modes: Number of sides of a polygonal friction cone around the circular one, at least 3, in
-            space only; by default the cone is circular.
+            `RelativeStiffness`, by default 10 E/h, or `NodalSprings`.
+        k_t: Tangential stiffness (stress/length), given like k_n; by default 10 E/h.
+        modes: Number of sides, at least 3, of a polygonal friction cone circumscribed about the
+            circular one, in space only; by default the cone is circular.
         transverse_friction: Friction coefficient μ₂ > 0 across ``direction``, in space only;
-            ``friction`` is then μ₁ > 0 along it: (τ₁/μ₁)² + (τ₂/μ₂)² ≤ p², with associated slip.
-            The tangential stiffness is k_t along and k_t (μ₂/μ₁)² across, for which the return map
-            has a closed form.
+            ``friction`` is then μ₁ > 0 along it: (τ₁/μ₁)² + (τ₂/μ₂)² ≤ p², with slip normal to
+            this ellipse. The tangential stiffness is k_t along ``direction`` and k_t (μ₂/μ₁)²
+            across it, for which the return map has a closed form.
         direction: First principal direction of anisotropic friction, or the normal of the
             polygon's first side: three numbers or UFL, projected onto the tangent plane.
 

@@ -176,19 +176,20 @@ class Rotation:
 
 
 class Obstacle:
-    """Base class of obstacles; subclasses define gap and normal at a point by `place`.
+    """Base class of obstacles, which define the gap and the normal at a point of Γc.
 
-    All rigid obstacles have the arguments ``displacement`` and ``rotation``. Move an obstacle by
-    these only. If its position or gap is changed instead (a constant in ``point``, ``center`` or
-    ``gap``), contact opens and closes correctly, but the tangential part causes no slip and the
-    energies contain no work of it, because it cannot be distinguished from a change of shape.
+    Rigid obstacles define both by `place`; the opposing surface of a `DeformableBody` is found by a
+    search. Move a rigid obstacle by ``displacement`` and ``rotation`` only. If a constant in its
+    ``point``, ``center`` or ``gap`` is changed instead, contact opens and closes correctly, but the
+    tangential part of the motion causes no slip, and the energies do not contain its work: it
+    cannot be distinguished from a change of shape.
 
     Attributes:
         displacement: Prescribed rigid translation: gdim numbers, a ``fem.Constant`` that may be
             changed between increments, or a UFL vector; or a `Motion`, if the force on the obstacle
-            is given; None: fixed. One that varies along Γc rotates the obstacle but not its
-            normals, with an error of the forces of about the angle, which is estimated after
-            every increment.
+            is given; None: fixed. A displacement that varies along Γc rotates the obstacle but
+            not its normals; the relative error of the forces is about the angle (radians), and
+            is estimated after every increment.
         rotation: A `Rotation`, with finite kinematics only; None: no rotation.
     """
 

@@ -19,23 +19,25 @@ __all__ = ["DeformableBody"]
 class DeformableBody(Obstacle):
     """An opposing deformable body: another part of the same mesh and displacement space.
 
-    Γc should be on the softer or more finely meshed body. Contact forces on both bodies are equal
-    and opposite up to round-off.
+    Γc is the slave side, on which the contact law is integrated, and should be on the softer or
+    more finely meshed body; the surface of this body is the master side. The contact forces on both
+    bodies are equal and opposite up to round-off.
 
     Args:
         facet_tags: Tags on the facets of the mesh.
-        tags: Tag or tags of the opposite surface.
-        search_distance: Largest distance of an opposite point (length), infinite by default.
-        update_pairs: When pairs of points are found again. "never": the pairs are those of the
+        tags: Tag or tags of the opposing surface.
+        search_distance: Largest distance of a point of Γc from its opposite point (length),
+            infinite by default.
+        update_pairs: When the opposite points are searched again. "never": they are those of the
             undeformed bodies. "increment": at every commit, in the deformed bodies. "auto": at
-            every commit from the first one at which a closed point has moved along the opposite
-            surface by more than its facet (any point, if none is closed). Normals remain those of
-            the undeformed Γc. With `Contact(kinematics="finite")` pairs and normals are always
+            every commit, once a point in contact (any point, if none is in contact) has moved
+            along the opposing surface by more than the facet there. Normals remain those of the
+            undeformed Γc. With `Contact(kinematics="finite")` pairs and normals are always
             those of the deformed bodies.
-        max_initial_penetration: Largest depth of a point of Γc behind its opposite point in the
-            undeformed bodies (length). By default the penetration of the two bodies; within one
-            body, half the height of the point's cell. In deformed bodies it is twice the present
-            penetration.
+        max_initial_penetration: Largest depth (length) at which a point of Γc behind the opposing
+            surface is paired in the undeformed bodies. By default the penetration of the two
+            bodies; in self-contact half the height of the point's cell. In deformed bodies the
+            limit is twice the present penetration.
 
     Raises:
         ValueError: A distance is negative or no number, or ``update_pairs`` is unknown.

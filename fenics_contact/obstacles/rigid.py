@@ -160,12 +160,14 @@ def _round(arm: Any, shift: Any, radius: Any, inside: bool) -> Placement:
 class SignedDistance(Obstacle):
     """A rigid obstacle of any shape, given by its signed distance at every point.
 
+    The gap of a point is g_N = d(x) and the normal n = -∇d(x), eq. (2): at the undeformed position
+    with small displacements, at x = X + u with finite kinematics. For example,
     ``SignedDistance(lambda x: ufl.sqrt(x[0] ** 2 + x[1] ** 2) - 1)`` is a disc of radius 1.
 
     Args:
-        distance: Function of the point x, a UFL vector, that returns its signed distance from the
-            obstacle (UFL scalar, length), positive outside. Its gradient must have length 1
-            near the contact: the contact normal is minus the gradient.
+        distance: Function of the position x, a UFL vector, that returns the signed distance d from
+            the obstacle (UFL scalar, length), positive outside. Its gradient must have length 1
+            near the contact.
         displacement: Rigid translation, as for `Obstacle`.
         rotation: Rotation, as for `Obstacle`.
 
