@@ -84,42 +84,49 @@ class _Balance:
 class ContactProblem:
     """The nonlinear problem of one or several bodies with contacts, solved increment by increment.
 
-    PETSc's SNES solves the weak form (9) in dimensionless unknowns: displacements are divided by
-    the size of the mesh, stiffness by the largest diagonal entry of the bulk. Options are read
-    under ``prefix``, for example ``-contact_snes_monitor`` or ``-contact_snes_type newtonls``;
-    the command line takes precedence over ``petsc_options``, and these over the settings of
-    ``method``. The constructor is collective: it compiles the forms and checks the input.
+    The residual is F(u; v) plus the virtual work of the contacts, eq. (9)::
+
+        problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
+        step = problem.solve()  # with the present loads; verified
+        problem.commit()  # the solution becomes the history
+
+    `increments` does this for a load history. PETSc's SNES solves in dimensionless unknowns:
+    displacements are divided by the size of the mesh, stiffness by the largest diagonal entry of
+    the bulk. Options are read under ``prefix``, for example ``-contact_snes_monitor`` or
+    ``-contact_snes_type newtonls``; the command line takes precedence over ``petsc_options``, and
+    these over the settings of ``method``. The constructor is collective: it compiles the forms and
+    checks the input.
 
     Args:
         F: Residual F(u; v) of the bulk with all loads, without contact.
-        u: Displacement, or a mixed function w of which it is a part, beside a pressure for
+        u: Displacement, or a mixed function w of which it is a part, with a pressure for
             instance; its values are the initial state. The contacts of a mixed function have the
             displacement of ``ufl.split(w)``.
         bcs: Dirichlet conditions on ``u`` or its components, or on parts of w.
         contacts: Contacts of ``u``.
         method: "newton": Newton's method with the consistent tangent. "lbfgs": quasi-Newton with
             H₀ = (K + αK_n + φK_t)⁻¹. "continuation": Newton's method with contact stiffness
-            increased step by step, and alternation where it stagnates. "primal_dual": primal-dual
-            active set method with the tractions as additional unknowns, for stiff frictional
-            contact of a linear bulk. "alternating": Signorini and Tresca problems in turn, each a
-            minimisation by Newton's method with a line search on the energy; not for mixed
-            functions, whose equations are those of a saddle point. By default "newton"; "lbfgs" for
-            a linear bulk on all unknowns that is solved by multigrid, or in three dimensions if
-            Dirichlet conditions constrain all bodies and pairs do not change. Where contact with
-            friction is 50 to 1e5 times as stiff as the bulk, "primal_dual" is tried first if
-            nothing was in contact before, and otherwise after a failure; "continuation" is tried
-            last.
+            increased step by step, and "alternating" where it stagnates. "primal_dual":
+            primal-dual active set method with the tractions as additional unknowns, for stiff
+            frictional contact of a linear bulk. "alternating": fixed-point iteration on the
+            friction bound; each step is a problem with Tresca friction, solved as a minimisation by
+            Newton's method with a line search on the energy. It is not for mixed functions, whose
+            solutions are saddle points. By default "newton"; "lbfgs" for a linear bulk on all
+            unknowns that is solved by multigrid, or in three dimensions if Dirichlet conditions
+            constrain all bodies and pairs do not change. Where contact with friction is 50 to 1e5
+            times as stiff as the bulk, "primal_dual" is tried first if nothing was in contact
+            before, and otherwise after a failure; "continuation" is tried last.
         alpha: Factor α of the normal contact stiffness in H₀, 0 to 1 (source paper: 1).
         phi: Factor φ of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
             source paper has 0; with 1 a third of the iterations suffices once points stick.
-        fallback: Whether other methods are tried after a failure. They are not tried if the limit
-            on iterations was set below its default.
-        condensation: Whether to eliminate the unknowns away from the contact of a linear bulk by
-            static condensation, eq. (11). Of a large Γc, the dofs near the active contact zone are
-            retained, and chosen again when it moves or grows. By default if it is possible and
-            saves time, unless an option names a linear solver.
+        fallback: Whether other methods are tried after a failure. They are not tried if an option
+            sets the limit on iterations below its default.
+        condensation: Whether to eliminate the unknowns of a linear bulk that are away from the
+            contact by static condensation, eq. (11). If Γc is large, only the dofs near the active
+            contact zone are retained; they are selected again when it moves or grows. By default
+            it is used if possible and faster, unless an option names a linear solver.
         linear_solver: "direct" (MUMPS) or "multigrid" (GAMG: one V-cycle as H₀ of L-BFGS, or the
-            preconditioner of CG and GMRES in Newton's method), for systems over all unknowns. By
+            preconditioner of CG and GMRES in Newton's method), without condensation. By
             default multigrid for three-dimensional problems that it solves faster, and where the
             factors would not fit in half of the memory. Obstacles with unknown motions need
             "direct". The log reports the choice.
@@ -127,15 +134,15 @@ class ContactProblem:
         prefix: Prefix of the PETSc options.
         small_displacement_tolerance: Largest relative error of the contact force and pressure
             (between two bodies: of the force) due to the assumption of small displacements. An
-            increment with a larger estimate fails; from 1 % on there is a warning. With
-            infinity no increment fails for this reason.
+            increment with a larger estimate fails; from 1 % on there is a warning. With infinity
+            no increment fails for this reason.
         cross_check: Whether every solution's contact forces are compared with those that DOLFINx
             assembles from the boundary form. It costs one compiled form per contact, and one
             assembly per increment.
 
     Attributes:
         u: The function that is solved for: the displacement, or a mixed function.
-        displacement: The displacement in it.
+        displacement: The relation of the displacement to u.
         contacts: The contacts.
         bulk: The bulk form.
         motions: The rigid-body modes of the bodies, and which of them are free.

@@ -76,28 +76,30 @@ class ForceBalance:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The verification of a solution, the same on every rank.
+    """The verification of a solution: residuals and errors, the same on every rank.
+
+    `failures` is empty for a verified solution.
 
     Attributes:
-        equations: Residuals of the free dofs, recomputed by assembly, by body, free obstacle and
-            contact; each is compared with the forces of the present increment on it.
+        equations: By body, free obstacle and contact, the residual of the free dofs, recomputed by
+            assembly, with the forces of the present increment and the tolerance.
         sums: By body, the resultant of loads, contact tractions and reactions, and their moment
-            about the centre of the body, divided by its size. Contact enters by the tractions at
-            the quadrature points, not by nodal forces.
-        laws: Largest relative violations of the contact laws, by contact and condition.
-        enforcement: `Contact.enforcement_error` of the contacts with multipliers, by name.
-        enforcement_tolerance: Largest error accepted, by name.
-        obstacles: Distance gradient, depth and rotation of rigid obstacles, by contact.
-        tunnelling: Penetration between the quadrature points, and points that have crossed the
-            obstacle, by contact.
-        kinematics: Relative error of the small-displacement assumption, by contact.
+            about the centre of the body divided by its size (force). Contact enters by the
+            tractions at the quadrature points, not by nodal forces.
+        laws: By contact and condition, the largest relative violation of the contact law.
+        enforcement: By contact with multipliers, its `Contact.enforcement_error`.
+        enforcement_tolerance: By contact with multipliers, the largest such error accepted.
+        obstacles: By contact with a rigid obstacle, distance gradient, depth and rotation.
+        tunnelling: By contact, the penetration between the quadrature points, and the points that
+            have crossed the obstacle.
+        kinematics: By contact, the relative error due to the small-displacement assumption.
         small_displacement_tolerance: Largest such error accepted. If it is finite, no body may
             deform by more than five times its size.
         deformation: By body, the largest displacement without rigid-body motion, divided by the
             size of the body or the range of its Dirichlet values, whichever is larger.
-        ejected_bodies: By name of bodies without contact force that have moved much farther than
-            anything else: their displacement, and the largest other one (length).
-        friction_energy_gain: Energy that friction has supplied, relative to the energy exchanged.
+        ejected_bodies: By body without contact force that has moved much farther than all others:
+            its displacement, and the largest other one (length).
+        friction_energy_gain: Energy supplied by friction, relative to the energy exchanged.
         inverted: Whether cells of a nonlinear bulk are inverted, det(I + grad u) ≤ 0.
         cross_check: By contact, the largest difference of its nodal forces from those that DOLFINx
             assembles from the boundary form; empty without ``ContactProblem(cross_check=True)``.
@@ -120,7 +122,7 @@ class Verdict:
 
     @property
     def inexact(self) -> dict[str, float]:
-        """Relative residual, by body, where round-off makes it more than 1e-5."""
+        """By body, the relative residual due to round-off, where it is above 1e-5."""
         return {
             name: balance.residual / balance.force
             for name, balance in self.equations.items()

@@ -72,43 +72,48 @@ class Committed:
 
 
 class Contact(PointResults):
-    """Frictional contact of the surface Γc with an obstacle.
+    """Contact of the surface Γc with a rigid obstacle or an opposing body.
 
-    A Contact has the boundary form -∫ (r_n v_n + τ·v_t) of eq. (9), the history at the quadrature
-    points of Γc, and the results. The constructor is collective and compiles the expressions that
-    are evaluated at the points.
+    A block on a rigid floor, with Γc the facets tagged 1::
+
+        surface = fc.ContactSurface(msh, tags, 1)
+        floor = fc.HalfSpace(point=(0, 0), normal=(0, 1))
+        contact = fc.Contact(u, surface, floor, fc.Coulomb(friction=0.3))
+
+    A Contact adds the virtual work -∫ (r_n v_n + τ·v_t) on Γc to the residual, eq. (9); it has the
+    history variables at the quadrature points of Γc, and the results. The constructor is
+    collective, and compiles the expressions that are evaluated at the points.
 
     Args:
         u: Displacement, a vector-valued Lagrange function of any degree on the surface's mesh. If
-            it is a part of a mixed function w, beside a pressure for instance, pass the part that
+            it is a part of a mixed function w, with a pressure for instance, pass the part that
             ``u, p = ufl.split(w)`` gives. Bubble functions, which vanish on Γc, may be added to it.
         surface: The potential contact surface Γc.
         obstacle: The rigid obstacle or the opposing `DeformableBody`.
         law: The contact law.
-        gap: Initial gap s (length), independent of the obstacle's geometry: a number, constant or
-            UFL expression; by default s follows from the geometry. 0 is right for surfaces that
-            coincide initially, between whose facets there are gaps. The motion of the obstacle is
-            added, and belongs in its ``displacement``: a change of ``gap`` itself, such as a
-            growing interference, opens and closes the contact, but causes no slip, and friction
-            does no work on it.
+        gap: Initial gap s (length) that replaces that of the geometry: a number, constant or UFL
+            expression; with small displacements only. Use 0 for conforming surfaces that coincide
+            initially, whose facets leave gaps between them. The displacement of the obstacle is
+            taken into account in addition. A change of ``gap`` itself, such as a growing
+            interference, opens and closes the contact, but causes no slip and no work of friction.
         weight: Factor of the surface measure, as in the bulk form: a thickness, or 2πr for
             axisymmetric problems; 1 by default.
         modulus: Young's modulus near Γc (stress), a number or a function with one value per cell,
-            for `RelativeStiffness`. By default `ContactProblem` measures it from the bulk form.
+            for `RelativeStiffness`. By default `ContactProblem` evaluates it from the bulk form.
         accuracy: "draft", "standard", "fine", or the relative error wanted in contact force and
-            pressure: the default of enforcement, tolerance and stiffness, of the solver's tolerance
-            and of the number of increments. `Accuracy` has the values.
-        enforcement: "penalty" (default): the body penetrates by p/k_n and creeps by τ/k_t before it
-            slips. "augmented": augmented Lagrangian method, eq. (8), in which k_n and k_t
-            determine only the rate of convergence.
+            pressure. It sets the defaults of enforcement, its tolerance, stiffness, the solver's
+            tolerance and the number of increments. `Accuracy` has the values.
+        enforcement: "penalty" (default): the body penetrates by p/k_n, and sticking points are
+            displaced by τ/k_t. "augmented": augmented Lagrangian method, eq. (8), in which k_n
+            and k_t determine only the rate of convergence.
         tolerance: Tolerance of the augmented Lagrangian method, between 0 and 1, 1e-5 by default:
-            the largest `enforcement_error`, the traction left to the penalty relative to the
-            largest traction.
-        kinematics: "small" (default): gap and normals are those of the undeformed body, eq. (1),
-            and the error of that is estimated after every increment. "finite": displacements,
-            rotations and slip of any size, eq. (2) and (3), on a rigid obstacle whose geometry is
-            known everywhere or on a `DeformableBody`; the bulk form should admit them, too.
-            Tractions and stiffness are per undeformed area.
+            the largest `enforcement_error` accepted, that is, the penalty part of the traction
+            relative to the largest traction.
+        kinematics: "small" (default): gap and normals are those of the undeformed body, eq. (1);
+            the error of this assumption is estimated after every increment. "finite":
+            displacements, rotations and slip of any size, eq. (2) and (3), on a rigid obstacle
+            whose geometry is known everywhere or on a `DeformableBody`; the bulk form must then be
+            valid for them, too. Tractions and stiffness are per undeformed area.
         name: Name in messages and files.
 
     Attributes:
@@ -117,7 +122,7 @@ class Contact(PointResults):
         displacement: The relation of u to the function that is solved for.
         surface, obstacle, law: The arguments.
         quadrature: The quadrature points of Γc.
-        history: The committed state.
+        history: The history variables of the last commit.
         multipliers: λ_n and λ_t of the augmented Lagrangian method; None with a penalty.
         accuracy: The `Accuracy` chosen; None if the argument was not given.
         tolerance: Largest `enforcement_error` accepted, with multipliers.
@@ -131,7 +136,7 @@ class Contact(PointResults):
         commits: Number of commits.
 
     Raises:
-        ValueError: ``u`` is no displacement of this mesh, or data of obstacle or law are invalid.
+        ValueError: ``u`` is not a displacement on this mesh; data of obstacle or law are invalid.
         TypeError: A parameter is of a type that cannot be a coefficient.
     """
 

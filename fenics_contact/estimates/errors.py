@@ -181,10 +181,12 @@ def estimate_errors(
     strain: Any = None,
     increment_error: Mapping[str, float] | None = None,
 ) -> ErrorBudget:
-    """Estimate the errors of the last solution, before or after its commit. Collective.
+    """Estimate the errors of the last solution by source, before or after its commit. Collective.
 
-    The cost is a factorisation of the tangent (a dense one of a condensed problem) and a projection
-    of stress and strain.
+    Errors of contact forces, peak pressures and displacement are estimated: by linearisation for
+    enforcement, small displacements and solver, and by stress recovery for the discretisation. The
+    estimates are not bounds. The cost is a factorisation of the tangent (a dense one of a condensed
+    problem) and a projection of stress and strain.
 
     Args:
         problem: A problem that has been solved; its state does not change.
@@ -193,7 +195,11 @@ def estimate_errors(
         strain: Strain ε(u) of the same shape. By default sym(grad u); with a stress (3, 3) in the
             plane, the strain out of the plane is u_r/r if the stress depends on u itself, as that
             of an axisymmetric body, and otherwise zero.
-        increment_error: ``Step.increment_error``, the errors of the increment size.
+        increment_error: ``Step.increment_error``, the errors due to the increment size; without
+            it they are not part of the result.
+
+    Returns:
+        The `ErrorBudget`. Printed, it is a table in per cent that names the dominant source.
 
     Raises:
         ValueError: The shapes of stress and strain differ; or a body or free obstacle is not

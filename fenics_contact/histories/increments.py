@@ -52,38 +52,43 @@ def increments(
     csv: str | Path | None = None,
     progress: bool | str = False,
 ) -> Iterator[Step]:
-    """Increase the load parameter from ``start`` to ``end`` in committed increments. Collective.
+    """Solve a load history: vary a load parameter from ``start`` to ``end``. Collective.
 
-    The function returns an iterator; each increment is solved and committed when the iterator is
-    advanced. An increment that does not converge is halved repeatedly; after two converged
-    increments its size is doubled again, up to the original size. The load parameter takes all
-    requested values.
+    The function returns an iterator; each increment is solved, verified and committed when the
+    iterator is advanced, and nothing is solved before::
+
+        for step in fc.increments(problem, pull, 0, 2.5, steps=5):
+            print(step.summary())
+
+    An increment that fails is halved repeatedly; after two successful increments the size is
+    doubled again, up to the original one. All requested values of the load parameter are reached.
 
     Args:
         problem: The problem.
         load: A scalar constant in the bulk form, a boundary condition or an obstacle, which takes
             the value of the load parameter; or a function of the load parameter that sets
             everything that depends on it: constants, functions, forces on obstacles.
-        start: The present load parameter, which is not solved for.
+        start: The load parameter of the present state, for which nothing is solved.
         end: Load parameter of the last increment.
         steps: Number of equal increments, or the load parameters at the ends of the increments,
             monotonic up to ``end``. By default the number that the contacts' `Accuracy` sets, or 1.
         max_cuts: Largest number of successive halvings of an increment.
         estimate: Whether to estimate the error of the increment size: every increment is solved in
-            one step, which is discarded, and in two halves, which are committed. The second of two
-            halves has ``Step.increment_error``.
+            one step, which is discarded, and in two halves, which are committed. The step of the
+            second half has ``Step.increment_error``.
         checkpoint: File of the last committed state (``.npz``). If it exists when the history
             starts, the history continues after it. Several successive calls, such as loading and
-            unloading, may share a file: a restarted program makes the same calls, and those that
-            are done set their last load without solving. The last call may be extended, or continue
-            with other increments; what is done must agree with the arguments.
+            unloading, may share a file: a restarted program makes the same calls, and calls that
+            are complete only set their last load. The last call may be extended or continue with
+            other increments, but its arguments must agree with the increments already solved.
         checkpoint_every: Number of increments between checkpoints; the last increment is always
             saved.
         recover_interior: When the interior displacement is recovered after static condensation:
-            "every" increment, at the "last" one, or a number n: at every n-th and the last. The
-            increments between cost much less; their contact results are complete, but u away
-            from Γc is not up to date (``Step.complete`` is False) until `ContactProblem.complete`.
-            It is also recovered for every checkpoint, and in the increment after it.
+            "every" increment, at the "last" one, or a number n: at every n-th and the last.
+            Increments without recovery cost much less. Their contact results are complete, but u
+            away from Γc is not up to date (``Step.complete`` is False) until
+            `ContactProblem.complete` is called. The interior is also recovered for every
+            checkpoint, and in the increment after it.
         state_fields: Functions that belong to the state, such as plastic strains, and are saved in
             the checkpoint. The checkpoint is then written when the iterator is advanced, with the
             values that the loop body has assigned, and after the last increment when the loop ends
