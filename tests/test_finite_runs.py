@@ -89,7 +89,7 @@ def test_nothing_is_left_out_by_finite_kinematics():
     """The error budget's line "kinematics" is 0, to round-off, and so is the verdict's."""
     tool = Tool(n=(8, 4))
     for step in tool.increments(2.0):
-        assert all(k.worst == 0.0 for k in step.verdict.kinematics.values())
+        assert all(k.worst == 0.0 for k in step.verdict.small_displacement_error.values())
     body = tool.scene.body
     budget = fc.estimate_errors(tool.problem, body.nominal, strain=body.gradient(tool.scene.u))
     assert all(abs(value) < 1e-12 for value in budget.parts["kinematics"].values())
@@ -116,7 +116,7 @@ def test_the_budget_of_small_displacements_predicts_the_difference():
             problem.commit()
         found[kinematics] = contact.resultants().force
         if kinematics == "small":
-            told = step.verdict.kinematics["contact"].force
+            told = step.verdict.small_displacement_error["contact"].force
     difference = np.linalg.norm(found["finite"] - found["small"])
     share = difference / np.linalg.norm(found["small"])
     assert share > 0.01

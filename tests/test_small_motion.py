@@ -53,7 +53,7 @@ def solved(**scene):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         step = problem.solve()
-    return step.verdict.kinematics["contact"], contact.resultants().force
+    return step.verdict.small_displacement_error["contact"], contact.resultants().force
 
 
 @pytest.mark.parametrize("options", [{}, {"condensation": False, "method": "lbfgs"}])
@@ -73,7 +73,7 @@ def test_a_flat_obstacle_leaves_nothing_out():
     scene = block("quadrilateral", n=4, up=-10.0)
     problem, contact = scene.problem(fc.Coulomb(0.1), [scene.hold(TOP, 0, 30.0)])
     step = problem.solve()
-    assert step.verdict.kinematics["contact"].worst <= 1e-12
+    assert step.verdict.small_displacement_error["contact"].worst <= 1e-12
     _, normal = contact.true_placement()
     assert close(at_points(contact, normal), at_points(contact, contact.values.normal), 1e-14)
 
@@ -133,7 +133,7 @@ def test_motion_that_is_hardly_small_is_warned_of_as_it_grows():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         problem.solve()
-    first = step.verdict.kinematics["contact"].worst
+    first = step.verdict.small_displacement_error["contact"].worst
     moved, said, shares = fem.Constant(problem.u.function_space.mesh, 0.0), [], []
     problem, _ = pressed(body=moved, small_displacement_tolerance=np.inf)
     for way in np.linspace(0.0, -0.4, 9):
@@ -143,7 +143,7 @@ def test_motion_that_is_hardly_small_is_warned_of_as_it_grows():
             step = problem.solve()
         problem.commit()
         said.append(any("assumed small" in str(w.message) for w in caught))
-        shares.append(step.verdict.kinematics["contact"].worst)
+        shares.append(step.verdict.small_displacement_error["contact"].worst)
         assert ("assumed small" in step.summary()) == (shares[-1] > 0.01)
     warned = [share for share, told in zip(shares, said, strict=True) if told]
     assert len(warned) > 2 and warned[-1] > first
@@ -187,7 +187,7 @@ def test_the_verdict_is_that_of_the_turned_scene(angle):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             step = problem.solve()
-        told = step.verdict.kinematics["contact"]
+        told = step.verdict.small_displacement_error["contact"]
         budget = fc.estimate_errors(problem, stress(scene.u, scene.E, scene.nu))
         found.append([told.force, told.pressure])
         found[-1] += [budget.values["displacement"], budget.parts["kinematics"]["displacement"]]
@@ -223,7 +223,7 @@ def tilted(angle, how):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         step = problem.solve()
-    return step.verdict.kinematics["contact"], contact.resultants().force
+    return step.verdict.small_displacement_error["contact"], contact.resultants().force
 
 
 @pytest.mark.parametrize("how", ["expression", "function", "function on Γc", "profile"])
@@ -249,7 +249,7 @@ def test_small_motion_is_no_matter():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         step = problem.solve()
-    assert step.verdict.kinematics["contact"].worst < 0.01
+    assert step.verdict.small_displacement_error["contact"].worst < 0.01
 
 
 def test_an_obstacle_that_tells_no_distance():
@@ -259,7 +259,7 @@ def test_an_obstacle_that_tells_no_distance():
     problem, contact = scene.problem(
         fc.Frictionless(), scene.rollers(), contact={"obstacle": obstacle}
     )
-    assert problem.solve().verdict.kinematics["contact"].worst == 0.0
+    assert problem.solve().verdict.small_displacement_error["contact"].worst == 0.0
     gap, _ = contact.true_placement()
     assert np.all(np.isinf(gap))
 

@@ -121,7 +121,7 @@ class Judge:
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
             obstacles={c.name: ObstacleCheck.of(c) for c in self._contacts if laws and c.rigid},
             tunnelling=tunnelling,
-            kinematics=self._linearisation(respond) if respond else {},
+            small_displacement_error=self._linearisation(respond) if respond else {},
             small_displacement_tolerance=self.small_displacement_tolerance,
             deformation=self._deformation(),
             ejected_bodies=find_ejected_bodies(self._full, self._motions, contacts, began)
@@ -134,7 +134,7 @@ class Judge:
 
     def warn_of_large_motion(self, verdict: Verdict) -> None:
         """Say that displacements are not small, and again where twice as much. Collective."""
-        for name, found in verdict.kinematics.items():
+        for name, found in verdict.small_displacement_error.items():
             if found.is_notable and found.worst > _AGAIN * self._warned.get(name, 0.0):
                 self._warned[name] = found.worst
                 warn(

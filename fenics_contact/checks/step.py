@@ -85,7 +85,7 @@ class Step:
 
     def _left_out(self) -> list[str]:
         """Return the small-displacement error of every contact in words, if it is notable."""
-        found = self.verdict.kinematics.items()
+        found = self.verdict.small_displacement_error.items()
         return [
             f"{name}: displacements are assumed small; otherwise {left_out.describe()}"
             for name, left_out in found

@@ -92,7 +92,8 @@ class Verdict:
         obstacles: By contact with a rigid obstacle, distance gradient, depth and rotation.
         tunnelling: By contact, the penetration between the quadrature points, and the points that
             have crossed the obstacle.
-        kinematics: By contact, the relative error due to the small-displacement assumption.
+        small_displacement_error: By contact, the relative error due to the small-displacement
+            assumption.
         small_displacement_tolerance: Largest such error accepted. If it is finite, no body may
             deform by more than five times its size.
         deformation: By body, the largest displacement without rigid-body motion, divided by the
@@ -112,7 +113,7 @@ class Verdict:
     enforcement_tolerance: dict[str, float] = field(default_factory=dict)
     obstacles: dict[str, ObstacleCheck] = field(default_factory=dict)
     tunnelling: dict[str, Tunnelling] = field(default_factory=dict)
-    kinematics: dict[str, Linearisation] = field(default_factory=dict)
+    small_displacement_error: dict[str, Linearisation] = field(default_factory=dict)
     small_displacement_tolerance: float = np.inf
     deformation: dict[str, float] = field(default_factory=dict)
     ejected_bodies: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -230,7 +231,7 @@ class Verdict:
                 "have several solutions, and this one is not reached by a continuous load path. "
                 "Use smaller increments (increments() halves them where needed)"
             )
-        for contact, change in self.kinematics.items():
+        for contact, change in self.small_displacement_error.items():
             if self.small_displacement_tolerance == np.inf:
                 continue
             if not np.isfinite(change.judged):

@@ -337,7 +337,7 @@ def _state(
         checked += ["the penetration left by multipliers"] if step.verdict.enforcement else []
         checked += ["the rigid obstacles"] if step.verdict.obstacles else []
         small = [c.name for c in problem.contacts if not c.finite]
-        known = step.verdict.kinematics
+        known = step.verdict.small_displacement_error
         checked += ["that displacements are small"] if any(n in known for n in small) else []
         residual = f"The residual is {step.verdict.relative_residual:.1e} of the forces."
         if not step.verdict.is_loaded:

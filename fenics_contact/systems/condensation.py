@@ -24,7 +24,7 @@ from fenics_contact.systems.dissection import Dissection, Eliminated
 from fenics_contact.systems.unknowns import Selection
 from fenics_contact.types import Array, Index, Indices, Mask
 
-__all__ = ["Condensation", "ContactTraction"]
+__all__ = ["Condensation", "ParticularSolution"]
 
 
 # Directions of loads whose particular solutions are kept, and the remainder, relative to the load
@@ -78,7 +78,7 @@ class Condensation:
         self._labels = label, unknowns.gathered(label[unknowns.kept].astype(np.float64)).astype(int)
         self._n_bodies = 1 + self._comm.allreduce(int(label.max(initial=0)), op=MPI.MAX)
         self._right, self._left = stiffness.createVecs()
-        self.directions: list[tuple[Array, ContactTraction]] = []
+        self.directions: list[tuple[Array, ParticularSolution]] = []
         self._scale = bulk.scale
         own_stiffness = bulk.own_stiffness()
         own = self._piece = _Piece.of(own_stiffness, bulk.space, unknowns, constrained)
@@ -93,7 +93,7 @@ class Condensation:
             )
         self._interface = _Interface(own, unknowns)
         self.schur = self._interface.merge(self._dissection.release(), symmetric=bulk.symmetric)
-        self.response = ContactTraction.none(constrained.size, unknowns.n_local)
+        self.response = ParticularSolution.none(constrained.size, unknowns.n_local)
 
     def _product(self, state: Array) -> Array:
         self._right.array[:] = state
@@ -148,9 +148,9 @@ class Condensation:
                 self.directions.append((scaled, responses[-1]))
                 del self.directions[:-_DIRECTIONS]
         if responses:
-            self.response = ContactTraction.combined(shares, responses, *self._labels)
+            self.response = ParticularSolution.combined(shares, responses, *self._labels)
         else:
-            self.response = ContactTraction.none(force.size, self._unknowns.n_local)
+            self.response = ParticularSolution.none(force.size, self._unknowns.n_local)
 
     def _sums(self, values: Array) -> Array:
         """By body, (n_bodies,). Collective."""
@@ -160,7 +160,7 @@ class Condensation:
         """Of forces, and values held, on every body, (n_bodies,). Collective."""
         return by_body(self._comm, [values], self._label, self._n_bodies)[0]
 
-    def _respond(self, given: Array) -> ContactTraction:
+    def _respond(self, given: Array) -> ParticularSolution:
         """By one back-substitution, and one more if values are prescribed and the force is none."""
         force, values = np.split(given, [self._right.getLocalSize()])
         has_values, has_force = global_sum(self._comm, [values.any(), force.any()]) > 0
@@ -179,7 +179,7 @@ class Condensation:
         at_field = force.copy()
         at_field[self._held] = image[self._held]
         at_field[kept] = 0.0
-        return ContactTraction(field, at_field, load, by_values)
+        return ParticularSolution(field, at_field, load, by_values)
 
     def forget(self) -> None:
         """Drop the solutions for earlier loads."""
@@ -190,7 +190,7 @@ class Condensation:
 
         Args:
             kept: Those kept, on the first rank, (n_kept,).
-            particular: The displacement with these at rest, (n_local,); see `ContactTraction`.
+            particular: The displacement with these at rest, (n_local,); see `ParticularSolution`.
         """
         return particular + self.extended(kept)
 
@@ -404,7 +404,7 @@ class _Interface:
 
 
 @dataclass
-class ContactTraction:
+class ParticularSolution:
     """Of a body to its loads and prescribed values, linear in them; the unknowns kept at rest.
 
     Attributes:
@@ -420,7 +420,7 @@ class ContactTraction:
     by_values: Array
 
     @classmethod
-    def none(cls, n: int, n_kept: int) -> ContactTraction:
+    def none(cls, n: int, n_kept: int) -> ParticularSolution:
         """To nothing."""
         return cls(np.zeros(n), np.zeros(n), np.zeros(n_kept), np.zeros(n_kept))
 
@@ -428,10 +428,10 @@ class ContactTraction:
     def combined(
         cls,
         shares: Sequence[Array],
-        responses: Sequence[ContactTraction],
+        responses: Sequence[ParticularSolution],
         label: Labels,
         kept: Labels,
-    ) -> ContactTraction:
+    ) -> ParticularSolution:
         """The sum of shares of some, at least one.
 
         Args:
