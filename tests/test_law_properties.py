@@ -68,15 +68,14 @@ class Point:
         mesh, tags = block_mesh(
             "quadrilateral" if d == 2 else "hexahedron", n=1, comm=MPI.COMM_SELF
         )
-        quadrature = fc.ContactSurface(mesh, tags, BOTTOM, quadrature_degree=1).quadrature(1)
-        assert quadrature.n_points == 1
+        quadrature = fc.ContactSurface(mesh, tags, BOTTOM, quadrature_degree=2).quadrature(1)
         shapes = {"gap": 0, "u_n": 0, "n": d, "u_t": d, "moved": d, "old": d}
         shapes |= {name: 3 if name == "direction" else 0 for name in law.parameters()}
         self.slices, size = {}, 0
         for name, shape in shapes.items():
             self.slices[name] = slice(size, size + max(shape, 1))
             size += max(shape, 1)
-        self.arguments = fem.Function(quadrature.space(size))
+        self.arguments, self.size = fem.Function(quadrature.space(size)), size
 
         def argument(name: str):
             entries = [self.arguments[i] for i in range(size)[self.slices[name]]]
@@ -113,7 +112,7 @@ class Point:
     def __call__(self, arguments: dict) -> dict:
         """The law's fields by name, for arguments by name."""
         for name, place in self.slices.items():
-            self.arguments.x.array[place] = arguments[name]
+            self.arguments.x.array.reshape(-1, self.size)[:, place] = arguments[name]
         fields = {name: value[0] for name, value in self.evaluate().items()}
         for name, keys in (
             ("gradients", [f"gradient {j}" for j in range(self.modes)]),

@@ -1,7 +1,7 @@
 """Where the contact ends inside a facet: quadrature on Γc against a closed form.
 
 python docs/scripts/quadrature.py             # two degrees
-python docs/scripts/quadrature.py 1 2 4 8 16 32    # these degrees
+python docs/scripts/quadrature.py 2 4 8 16 32    # these degrees
 """
 
 import sys

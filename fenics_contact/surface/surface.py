@@ -83,8 +83,8 @@ class ContactSurface:
         mesh: Mesh of the body, topological dimension 2 or 3.
         facet_tags: Tags on the facets of ``mesh``.
         tags: Tag or tags of the facets of Γc.
-        quadrature_degree: Degree of the quadrature rule on Γc. By default twice the degree of the
-            displacement element. It is raised, up to degree 78 in the plane and 6 in space, on
+        quadrature_degree: Degree of the quadrature rule on Γc, at least 2. By default twice the
+            degree of the displacement element. It is raised, up to degree 78 in the plane and 6 in space, on
             facets longer than a quarter of the smallest radius of a `Ball`, `Cylinder` or
             `RigidProfile`, and on facets longer than those of an opposing `DeformableBody` (with
             small displacements: 6 times as long), to resolve their shape. If that is not enough,
@@ -117,9 +117,10 @@ class ContactSurface:
         if quadrature_scheme is not None and quadrature_scheme not in _SCHEMES:
             raise ValueError(f"quadrature_scheme is {quadrature_scheme!r}; use one of {_SCHEMES}")
         whole = is_number(quadrature_degree) and isinstance(quadrature_degree, Integral)
-        if quadrature_degree is not None and not (whole and quadrature_degree >= 1):
+        if quadrature_degree is not None and not (whole and quadrature_degree >= 2):
             raise ValueError(
-                f"quadrature_degree is {quadrature_degree!r}; it must be an integer, at least 1"
+                f"quadrature_degree is {quadrature_degree!r}; it must be an integer, at least 2: "
+                "a facet with one point can tilt about it into the obstacle without resistance"
             )
         self.mesh = mesh
         self.facets = tagged_facets(mesh, facet_tags, tags)
