@@ -12,7 +12,7 @@ import ufl
 import fenics_contact as fc
 from scenes.bodies import Bodies, boxes
 from scenes.comparing import raised_everywhere
-from scenes.tags import between, near
+from scenes.tags import between, either, near
 
 pytestmark = pytest.mark.two_ranks
 E = 1000.0
@@ -306,6 +306,50 @@ def test_a_blade_is_not_turned_through_a_body(steps):
         for angle.value in np.linspace(0.0, 1.0, steps + 1)[1:]:
             problem.solve()
             problem.commit()
+
+
+@pytest.mark.parametrize("angle", [1.5 * np.pi, 2 * np.pi, -4 * np.pi])
+@pytest.mark.parametrize("length", [1.2, 0.45])
+def test_a_blade_is_not_turned_around_through_a_body(length, angle):
+    """Pivoted 0.5 beside a block on soft springs, in one increment: its place is clear at the end.
+
+    The longer blade passes through the block. The shorter one does not reach it: no force.
+    """
+    all_around = either(*(near(i, value) for i in (0, 1) for value in (0.0, 1.0)))
+    body = Bodies(boxes([[np.linspace(0.0, 1.0, 5)] * 2], {SIDES: all_around}), E, 0.3)
+    body.F += 0.01 * E * ufl.dot(body.u, body.v) * ufl.dx
+    turned = body.constant()
+
+    def blade(x):
+        along = ufl.max_value(0.5 - length, ufl.min_value(0.5, x[1]))
+        return ufl.sqrt((x[0] + 0.5) ** 2 + (x[1] - along) ** 2) - 0.01
+
+    obstacle = fc.SignedDistance(blade, rotation=fc.Rotation(turned, (-0.5, 0.5)))
+    contact = body.contact(SIDES, obstacle, fc.Frictionless(), kinematics="finite")
+    problem = body.problem(contact)
+    turned.value = angle
+    if length > 0.5:
+        fails(problem, "has crossed")
+    else:
+        assert problem.solve().verdict.failures == []
+        assert contact.resultants().normal_force == 0.0
+
+
+def test_a_ball_turns_around_in_place():
+    """Pressed in by 0.005 and turned twice about its centre: without friction nothing changes."""
+    body = block()
+    body.hold(TOP, 0, 1)
+    turned = body.constant()
+    ball = fc.Ball((0.5, -0.295), 0.3, rotation=fc.Rotation(turned, (0.5, -0.295)))
+    contact = body.contact(BOTTOM, ball, fc.Frictionless(), kinematics="finite")
+    problem = body.problem(contact)
+    problem.solve()
+    problem.commit()
+    force = contact.resultants().normal_force
+    turned.value = 4 * np.pi
+    problem.solve()
+    assert contact.resultants().normal_force == pytest.approx(force, rel=1e-9)
+    assert force > 0
 
 
 @KINEMATICS

@@ -39,8 +39,8 @@ _PREDICTED_DEPTH, _PREDICTED_UNRESISTED = 0.15, 0.05
 _DEPTH_RESOLUTION = 0.02
 # Cosine of the angle between the normals of opposite sides of an obstacle: 120 degrees and more.
 _OPPOSITE_SIDES = -0.5
-# Parts into which the rotation in an increment is divided at most.
-_MOST_TURNS = 64
+# Rotation (radians), and round-off, over which the displacement is taken as linear in time.
+_LINEAR_ROTATION = np.pi / 2 + 1e-9
 # Bisections of a path at the place where the normal turns to the opposite side.
 _BISECTIONS = 20
 # Steps along a facet towards the place that is deepest in an obstacle.
@@ -271,7 +271,7 @@ class RigidObstacleProbe:
         self._start = values.x + opposite.committed_jump
         if known is not None and not opposite.turns:
             self._start = known.points
-        self._rotate = opposite.rotation_in_increment(values)
+        self._rotation = opposite.rotation_in_increment(values)
         self._facet, self._reference, self._distance, self._toward = self._deepest(self.points)
         self.x, _ = places.facets.positions(self._facet, self._reference)
         self._z = self._at(self.points)
@@ -407,58 +407,87 @@ class RigidObstacleProbe:
     def crossed(self, allowed: Array) -> Array:
         """Find the places of Γc that have crossed the obstacle in the increment. Collective.
 
-        In the frame of the obstacle a place of Γc moves along a straight line, while the obstacle
-        rotates at a constant rate. Points of the obstacle are at rest there: those nearest to
-        places of Γc at either end of the increment. A place has crossed the obstacle
+        In the increment Γc moves along straight lines, while the obstacle rotates at a constant
+        rate. Rotations by more than a right angle are divided into equal parts, as an obstacle may
+        have passed through the body and be outside of it again at the end.
+        """
+        n = max(1, int(np.ceil(abs(self._rotation.angle) / _LINEAR_ROTATION)))
+        found = np.zeros(len(self.x), dtype=np.bool_)
+        for k in range(n):
+            found |= self._crossed_between(k / n, (k + 1) / n, allowed)
+        return self.x[found]
+
+    def _points_at(self, time: float) -> Array:
+        """The points of Γc at a time from 0 to 1 in the increment, in the frame of the obstacle."""
+        if time in (0.0, 1.0):
+            return self.points if time else self._start
+        end = self._rotation.turned(self.points, 1.0)
+        return self._rotation.turned(self._start + time * (end - self._start), -time)
+
+    def _crossed_between(self, since: float, until: float, allowed: Array) -> Mask:
+        """Whether places of Γc have crossed the obstacle between two times. Collective.
+
+        In the frame of the obstacle its points are at rest: those nearest to places of Γc at either
+        time. A place has crossed the obstacle
 
         - if its point enters the body through a facet and ends deeper below Γc than is allowed;
         - if it ends on the opposite side of the obstacle, and its point has been inside of the body
           or what is below the place, by the largest depth that is explained, has passed through it.
         """
-        comm = self._comm
-        start, end = self._at(self._start), self._rotate(self._z, 1.0)
-        turn = np.linalg.norm(end - self._z, axis=1)
+        comm, crossed = self._comm, np.zeros(len(self.x), dtype=np.bool_)
+        field, field_end = self._points_at(since), self._points_at(until)
+        start, end, distance_end, toward = self._at(field), self._z, self._distance, self._toward
+        if until < 1.0:
+            end = self._at(field_end)
+            distance_end, toward = self._sampler.sample(end)
+        angle = abs(self._rotation.angle) * (until - since)
+        way = np.linalg.norm(self._rotation.turned(end, until - since) - start, axis=1)
+        radius = np.maximum(self._rotation.radius(start), self._rotation.radius(end))
         # A distance changes by no more than the path: what is farther away was not touched.
-        near = np.flatnonzero(~(self._distance > np.linalg.norm(end - start, axis=1) + turn))
+        near = np.flatnonzero(~(distance_end > way + angle * radius))
         if not comm.allreduce(len(near)):
-            return self.x[:0]
-        start, end, facet = start[near], self._z[near], self._facet[near]
+            return crossed
+        start, end, facet = start[near], end[near], self._facet[near]
         distance, normal = self._sampler.sample(start)
-        normal, toward = np.nan_to_num(normal), np.nan_to_num(self._toward[near])
-        feet = start + distance[:, None] * normal, end + self._distance[near, None] * toward
+        normal, toward = np.nan_to_num(normal), np.nan_to_num(toward[near])
+        feet = start + distance[:, None] * normal, end + distance_end[near, None] * toward
         points = np.concatenate(feet)
-        inward, inward_end = (-self._outward(facet, p) for p in (self._start, self.points))
+        inward, inward_end = (-self._outward(facet, p) for p in (field, field_end))
         entered = np.zeros(len(points), dtype=np.bool_)
         entered[: len(near)] = (distance < 0) & (_dot(normal, inward) < 0)
-        last = self._enter(points, entered, global_max(comm, turn / self._places.size[self._facet]))
+        # Between times dt apart a path leaves its chord by no more than |x''| dt² / 8.
+        bend = (angle**2 * radius + 2 * angle * way)[near] / self._places.size[facet]
+        n = int(np.ceil(np.sqrt(global_max(comm, bend) / (8 * _DEPTH_RESOLUTION))))
+        times: Array = np.linspace(since, until, max(n, 1) + 1)
+        last = self._enter(points, entered, times)
         most = np.zeros(len(self._places.size))
         np.maximum.at(most, self._facet, allowed)
-        found: Any = self._is_deeper(points, last, most).reshape(2, -1).any(axis=0)
+        found: Any = self._is_deeper(points, field_end, last, most).reshape(2, -1).any(axis=0)
         opposite = np.flatnonzero(_dot(normal, toward) < _OPPOSITE_SIDES)
         # On the way the tangent planes are not known.
         depth = (allowed[near] + _PREDICTED_DEPTH * self._places.size[facet])[:, None]
         start, end = start + depth * inward, end + depth * inward_end
-        passed = self._pass_through(start[opposite], end[opposite])
+        passed = self._pass_through(start[opposite], end[opposite], until - since)
         found[opposite] |= entered[opposite] | passed
-        return self.x[near[found]]
+        crossed[near] = found
+        return crossed
 
-    def _enter(self, points: Array, entered: Mask, turns: float) -> Index:
+    def _enter(self, points: Array, entered: Mask, times: Array) -> Index:
         """Follow points of the obstacle through the facets of Γc. Collective.
 
         Args:
             points: In the frame of the obstacle, (n, gdim) (length).
             entered: Which points are inside of the body at first, and have been at last, (n,).
-            turns: Largest path due to rotation (size of its facet).
+            times: In the increment, between which Γc goes straight on in the obstacle's frame.
 
         Returns:
             The flat piece of Γc, of those of all ranks, through which each point has entered the
             body; -1 for those outside of it at the end, or inside from the start, (n,).
         """
-        n = int(np.ceil(np.clip(turns, 1, _MOST_TURNS)))
-        change = self._rotate(self.points, 1.0) - self._start
-        path = [self._rotate(self._start + t * change, -t) for t in np.arange(n) / n]
         vertices, last = np.full((len(points), 1), -1), np.full(len(points), -1)
-        for before, after in zip(path, [*path[1:], self.points], strict=True):
+        after = self._points_at(times[0])
+        for time in times[1:]:
+            before, after = after, self._points_at(time)
             facets = self._places.moving_facets(before, after)
             met = find_crossings(self._comm, points, points, vertices, facets)
             entered[met.place[met.inward]] = True
@@ -466,14 +495,15 @@ class RigidObstacleProbe:
             last[met.place[final]] = np.where(met.inward, met.facet, -1)[final]
         return last
 
-    def _pass_through(self, start: Array, end: Array) -> Mask:
+    def _pass_through(self, start: Array, end: Array, share: float) -> Mask:
         """Whether places pass through the obstacle, by bisection of their paths. Collective.
 
         Args:
-            start: In the frame of the obstacle at the start of the increment, (n, gdim) (length).
-            end: In that at its end, (n, gdim) (length).
+            start: In the frame of the obstacle at first, (n, gdim) (length).
+            end: In that at last, (n, gdim) (length).
+            share: Of the rotation in the increment that is between them.
         """
-        found, end = np.zeros(len(start), dtype=np.bool_), self._rotate(end, 1.0)
+        found, end = np.zeros(len(start), dtype=np.bool_), self._rotation.turned(end, share)
         if not self._comm.allreduce(len(start)):
             return found
         first = self._sampler.sample(start)[1]
@@ -482,26 +512,27 @@ class RigidObstacleProbe:
         high: Array = np.ones(len(start))
         for _ in range(_BISECTIONS):
             middle = (low + high) / 2
-            place = self._rotate(start + middle[:, None] * (end - start), -middle)
-            distance, normal = self._sampler.sample(place)
+            place = start + middle[:, None] * (end - start)
+            distance, normal = self._sampler.sample(self._rotation.turned(place, -middle * share))
             # Into the half in which the obstacle is entered, or its normal turns.
             before = (distance >= 0) & (_dot(first, normal) > _OPPOSITE_SIDES)
             low, high = np.where(before, middle, low), np.where(before, high, middle)
             found |= distance <= resolution
         return found
 
-    def _is_deeper(self, points: Array, facet: Index, allowed: Array) -> Mask:
-        """Whether points are deeper below Γc at the end than is allowed, (n,). Collective.
+    def _is_deeper(self, points: Array, field: Array, facet: Index, allowed: Array) -> Mask:
+        """Whether points are deeper below Γc than is allowed, (n,). Collective.
 
         Args:
             points: In the frame of the obstacle, (n, gdim) (length).
+            field: The points of Γc in that frame, (n_points, gdim) (length).
             facet: Flat piece of Γc through which each point has entered the body, or -1, (n,).
             allowed: Allowed depth at every facet of this rank, (n_facets,) (length).
         """
         comm, found = self._comm, np.zeros(len(points), dtype=np.bool_)
         if not comm.allreduce(int((facet >= 0).any())):
             return found
-        facets = self._places.moving_facets(self.points, self.points)
+        facets = self._places.moving_facets(field, field)
         each = np.repeat(allowed, len(facets.start) // max(len(allowed), 1))
         table = gather_rows(comm, np.column_stack([each, facets.start[:, 0], facets.normals()]))
         (through, normal), allowed = np.split(table[:, 1:], 2, axis=1), table[:, 0]

@@ -31,14 +31,14 @@ from fenics_contact.contact.point_law import AnyKinematics, PointLaw, PointTange
 from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law
-from fenics_contact.obstacles.base import Obstacle, Placement
+from fenics_contact.obstacles.base import Obstacle, Placement, Rotation
 from fenics_contact.parallel import global_max
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.types import Array
 
-__all__ = ["Opposite", "OppositeState", "Parts"]
+__all__ = ["IncrementalRotation", "Opposite", "OppositeState", "Parts"]
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,33 @@ class OppositeState:
     jump: Array
     angle: float
     pairs: PairsState
+
+
+@dataclass(frozen=True)
+class IncrementalRotation:
+    """Rotation of an obstacle in an increment, about an axis that does not move in it.
+
+    Attributes:
+        angle: By which the obstacle has turned (radians).
+        about: A point of the axis, (gdim,) (length).
+        rotation: Of the obstacle; None: it does not turn.
+    """
+
+    angle: float = 0.0
+    about: Array | float = 0.0
+    rotation: Rotation | None = None
+
+    def turned(self, places: Array, share: Array | float) -> Array:
+        """Places turned by shares of the angle, one for all or (n,): (n, gdim) (length)."""
+        if self.rotation is None:
+            return places
+        return self.about + self.rotation.turned(places - self.about, share * self.angle)
+
+    def radius(self, places: Array) -> Array:
+        """Distance of places from the axis, (n,) (length); 0 if the obstacle does not turn."""
+        if self.rotation is None:
+            return np.zeros(len(places))
+        return np.asarray(np.linalg.norm(self.rotation.rate(places - self.about), axis=1))
 
 
 class Opposite(ABC):
@@ -388,18 +415,13 @@ class Opposite(ABC):
             'kinematics="finite" only'
         )
 
-    def rotation_in_increment(self, values: PointValues) -> Callable[[Array, Array | float], Array]:
-        """Turns places by shares of the rotation of the obstacle since the last commit.
-
-        Collective; what it returns is not.
+    def rotation_in_increment(self, values: PointValues) -> IncrementalRotation:
+        """Rotation of the obstacle since the last commit. Collective.
 
         Args:
             values: Of the last evaluation.
-
-        Returns:
-            A function of places, (n, gdim) (length), and shares, (n,) or one for all.
         """
-        return lambda places, share: places
+        return IncrementalRotation()
 
     def largest_curvature(self) -> Array | None:
         """Largest principal curvature of a rigid obstacle at X + u, (n_points,) (1/length).

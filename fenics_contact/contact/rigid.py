@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +21,7 @@ from fenics_contact.contact.finite import (
 )
 from fenics_contact.contact.inputs import varies
 from fenics_contact.contact.obstacle_sampler import ObstacleSampler
-from fenics_contact.contact.opposite import Opposite, Parts
+from fenics_contact.contact.opposite import IncrementalRotation, Opposite, Parts
 from fenics_contact.contact.point_law import PointLaw, PointTangent
 from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues
@@ -176,13 +175,13 @@ class MovingOpposite(Opposite):
         largest[known] = np.linalg.eigvalsh(curvature[known]).max(axis=1, initial=0.0)
         return largest
 
-    def rotation_in_increment(self, values: PointValues) -> Callable[[Array, Array | float], Array]:
+    def rotation_in_increment(self, values: PointValues) -> IncrementalRotation:
         """See `Opposite`."""
         rotation, angle = self._parts.obstacle.rotation, self.turned_by(values)
         if rotation is None:
             return super().rotation_in_increment(values)
         about = values.arrays["about"][:1]  # the same at all points
-        return lambda places, share: about + rotation.turned(places - about, share * angle)
+        return IncrementalRotation(angle, about, rotation)
 
     def feet(self, values: PointValues) -> dict[str, Array]:
         """See `Opposite`."""
