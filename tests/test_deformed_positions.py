@@ -134,6 +134,56 @@ def test_a_ball_is_not_crossed_where_u_is_found_later(kinematics):
     assert contact.resultants().normal_force == 0.0
 
 
+def ball_below(moved_by, kinematics, radius=0.2, gap=0.03):
+    """A led block, its displacement, and a ball below it that a constant moves: problem and all."""
+    body = block(n=(4, 2))
+    shift, center = body.constant(np.zeros(2)), body.constant((0.3, -gap - radius))
+    lead = body.constant()
+    body.hold(TOP, 0)
+    body.hold(TOP, 1, value=lead)
+    if moved_by == "distance":
+        ball = fc.SignedDistance(lambda x: ufl.sqrt(ufl.dot(x - center, x - center)) - radius)
+    else:
+        ball = fc.Ball(center, radius, displacement=shift)
+    contact = body.contact(BOTTOM, ball, fc.Frictionless(), kinematics=kinematics)
+    moved = shift if moved_by == "displacement" else center
+    return body.problem(contact), contact, lead, moved.value
+
+
+@KINEMATICS
+@pytest.mark.parametrize("moved_by", ["center", "distance"])
+@pytest.mark.parametrize("radius", [0.01, 0.2])
+def test_an_obstacle_moved_by_its_constants_does_not_cross(radius, moved_by, kinematics):
+    """All of a ball is in the block at the end, or beyond it; in its own frame Γc does not move.
+
+    A refused state is not where the next path starts.
+    """
+    problem, _, _, place = ball_below(moved_by, kinematics, radius)
+    start = place.copy()
+    for way in (0.47, 0.47, 1.2):
+        place[:] = start[0], start[1] + way
+        fails(problem, "has crossed")
+    place[:] = start[0] + 0.3, start[1] + 0.02  # below it still
+    assert problem.solve().verdict.failures == []
+
+
+def test_a_ball_moved_by_its_center_bears():
+    """As much as one moved by its displacement, to 1e-9: pressed, led aside, and with the block."""
+    forces = []
+    for moved_by in ("displacement", "center"):
+        problem, contact, lead, place = ball_below(moved_by, "finite", gap=0.0)
+        found = []
+        for way in ((0.0, 0.01), (0.4, 0.0), (0.0, -0.5)):
+            place[:] += way
+            lead.value = min(way[1], 0.0)
+            problem.solve()
+            problem.commit()
+            found.append(contact.resultants().normal_force)
+        forces.append(found)
+    assert forces[1] == pytest.approx(forces[0], rel=1e-9)
+    assert min(forces[1]) > 0
+
+
 @KINEMATICS
 @pytest.mark.parametrize("at", [0.07, 0.3, 0.55])
 @pytest.mark.parametrize("steps", [1, 2, 4])

@@ -267,7 +267,7 @@ class RigidObstacleProbe:
         self.points = values.x + values.jump
         self._law_normal = values.normal.copy()
         self._gap, self._normal = self._sampler.sample(self.points)
-        self._data = self._sampler.data()
+        self._shape = self._sampler.shape
         self._start = values.x + opposite.committed_jump
         if known is not None and not opposite.turns:
             self._start = known.points
@@ -347,13 +347,12 @@ class RigidObstacleProbe:
     def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
         """See `Probe`: by where the points are in the frame of the obstacle."""
         committed = contact.values.x + contact.opposite.committed_jump
-        return bool(np.array_equal(self.points, committed))
+        is_shape = np.array_equal(self._shape, self._sampler.committed_shape)
+        return bool(is_shape and np.array_equal(self.points, committed))
 
     def is_valid_for(self, contact: Contact) -> bool:
         """See `Probe`: of an obstacle that neither turns nor changes its shape."""
-        data, then = self._sampler.data(), self._data
-        known = data is not None and then is not None and not contact.opposite.turns
-        known = known and np.array_equal(data, then)  # type: ignore[arg-type]
+        known = np.array_equal(self._shape, self._sampler.shape) and not contact.opposite.turns
         moved = self._at(contact.values.x + contact.values.jump) - self._z
         clear = _DEPTH_RESOLUTION * self._places.size[self._facet] + self._distance
         known = known and bool(np.all(np.linalg.norm(moved, axis=1) <= clear))
@@ -407,9 +406,10 @@ class RigidObstacleProbe:
     def crossed(self, allowed: Array) -> Array:
         """Find the places of Γc that have crossed the obstacle in the increment. Collective.
 
-        In the increment Γc moves along straight lines, while the obstacle rotates at a constant
-        rate. Rotations by more than a right angle are divided into equal parts, as an obstacle may
-        have passed through the body and be outside of it again at the end.
+        In the increment Γc moves along straight lines, while the obstacle rotates, and the
+        constants in its distance change, at constant rates. Rotations by more than a right angle
+        are divided into equal parts, as an obstacle may have passed through the body and be outside
+        of it again at the end.
         """
         n = max(1, int(np.ceil(abs(self._rotation.angle) / _LINEAR_ROTATION)))
         found = np.zeros(len(self.x), dtype=np.bool_)
@@ -427,8 +427,9 @@ class RigidObstacleProbe:
     def _crossed_between(self, since: float, until: float, allowed: Array) -> Mask:
         """Whether places of Γc have crossed the obstacle between two times. Collective.
 
-        In the frame of the obstacle its points are at rest: those nearest to places of Γc at either
-        time. A place has crossed the obstacle
+        Points of the obstacle are followed, those nearest to places of Γc at either time. In the
+        frame of the obstacle they are at rest; where its shape changes they go straight between the
+        old surface and the new one. A place has crossed the obstacle
 
         - if its point enters the body through a facet and ends deeper below Γc than is allowed;
         - if it ends on the opposite side of the obstacle, and its point has been inside of the body
@@ -444,39 +445,50 @@ class RigidObstacleProbe:
         way = np.linalg.norm(self._rotation.turned(end, until - since) - start, axis=1)
         radius = np.maximum(self._rotation.radius(start), self._rotation.radius(end))
         # A distance changes by no more than the path: what is farther away was not touched.
-        near = np.flatnonzero(~(distance_end > way + angle * radius))
+        changed = not np.array_equal(self._sampler.committed_shape, self._shape)
+        near = np.flatnonzero(changed | ~(distance_end > way + angle * radius))
         if not comm.allreduce(len(near)):
             return crossed
         start, end, facet = start[near], end[near], self._facet[near]
-        distance, normal = self._sampler.sample(start)
+        distance, normal = self._sampler.sample(start, since)
         normal, toward = np.nan_to_num(normal), np.nan_to_num(toward[near])
         feet = start + distance[:, None] * normal, end + distance_end[near, None] * toward
-        points = np.concatenate(feet)
+        points = points_end = np.concatenate(feet)
+        if changed:
+            points = np.concatenate([feet[0], self._nearest(feet[1], since)])
+            points_end = np.concatenate([self._nearest(feet[0], until), feet[1]])
         inward, inward_end = (-self._outward(facet, p) for p in (field, field_end))
         entered = np.zeros(len(points), dtype=np.bool_)
         entered[: len(near)] = (distance < 0) & (_dot(normal, inward) < 0)
         # Between times dt apart a path leaves its chord by no more than |x''| dt² / 8.
         bend = (angle**2 * radius + 2 * angle * way)[near] / self._places.size[facet]
         n = int(np.ceil(np.sqrt(global_max(comm, bend) / (8 * _DEPTH_RESOLUTION))))
-        times: Array = np.linspace(since, until, max(n, 1) + 1)
-        last = self._enter(points, entered, times)
+        times: Any = np.linspace(since, until, max(n, 1) + 1)
+        last = self._enter(points, points_end, entered, times)
         most = np.zeros(len(self._places.size))
         np.maximum.at(most, self._facet, allowed)
-        found: Any = self._is_deeper(points, field_end, last, most).reshape(2, -1).any(axis=0)
+        found: Any = self._is_deeper(points_end, field_end, last, most)
+        found = found.reshape(2, -1).any(axis=0)
         opposite = np.flatnonzero(_dot(normal, toward) < _OPPOSITE_SIDES)
         # On the way the tangent planes are not known.
         depth = (allowed[near] + _PREDICTED_DEPTH * self._places.size[facet])[:, None]
         start, end = start + depth * inward, end + depth * inward_end
-        passed = self._pass_through(start[opposite], end[opposite], until - since)
+        passed = self._pass_through(start[opposite], end[opposite], since, until)
         found[opposite] |= entered[opposite] | passed
         crossed[near] = found
         return crossed
 
-    def _enter(self, points: Array, entered: Mask, times: Array) -> Index:
+    def _nearest(self, points: Array, time: float) -> Array:
+        """The nearest points of the obstacle at a time in the increment, (n, gdim). Collective."""
+        distance, normal = self._sampler.sample(points, time)
+        return points + distance[:, None] * np.nan_to_num(normal)
+
+    def _enter(self, start: Array, end: Array, entered: Mask, times: Array) -> Index:
         """Follow points of the obstacle through the facets of Γc. Collective.
 
         Args:
-            points: In the frame of the obstacle, (n, gdim) (length).
+            start: In the frame of the obstacle at first, (n, gdim) (length).
+            end: In that at last, (n, gdim) (length).
             entered: Which points are inside of the body at first, and have been at last, (n,).
             times: In the increment, between which Γc goes straight on in the obstacle's frame.
 
@@ -484,36 +496,42 @@ class RigidObstacleProbe:
             The flat piece of Γc, of those of all ranks, through which each point has entered the
             body; -1 for those outside of it at the end, or inside from the start, (n,).
         """
-        vertices, last = np.full((len(points), 1), -1), np.full(len(points), -1)
-        after = self._points_at(times[0])
-        for time in times[1:]:
-            before, after = after, self._points_at(time)
-            facets = self._places.moving_facets(before, after)
-            met = find_crossings(self._comm, points, points, vertices, facets)
+        vertices, last = np.full((len(start), 1), -1), np.full(len(start), -1)
+        shares = np.linspace(0.0, 1.0, len(times))[:, None, None]
+        points, fields = start + shares * (end - start), [self._points_at(t) for t in times]
+        for k in range(len(times) - 1):
+            facets = self._places.moving_facets(fields[k], fields[k + 1])
+            met = find_crossings(self._comm, points[k], points[k + 1], vertices, facets)
             entered[met.place[met.inward]] = True
             final = np.append(np.diff(met.place) > 0, True)[: len(met.place)]
             last[met.place[final]] = np.where(met.inward, met.facet, -1)[final]
         return last
 
-    def _pass_through(self, start: Array, end: Array, share: float) -> Mask:
+    def _pass_through(self, start: Array, end: Array, since: float, until: float) -> Mask:
         """Whether places pass through the obstacle, by bisection of their paths. Collective.
 
         Args:
             start: In the frame of the obstacle at first, (n, gdim) (length).
             end: In that at last, (n, gdim) (length).
-            share: Of the rotation in the increment that is between them.
+            since: First time in the increment, from 0 to 1.
+            until: Last time in the increment, from 0 to 1.
         """
-        found, end = np.zeros(len(start), dtype=np.bool_), self._rotation.turned(end, share)
+        found = np.zeros(len(start), dtype=np.bool_)
         if not self._comm.allreduce(len(start)):
             return found
-        first = self._sampler.sample(start)[1]
-        resolution = np.linalg.norm(end - start, axis=1) * 2.0 ** (2 - _BISECTIONS)
+        share = until - since
+        distance, first = self._sampler.sample(start, since)
+        distance_end, _ = self._sampler.sample(end, until)
+        end = self._rotation.turned(end, share)
+        length = np.linalg.norm(end - start, axis=1) + np.abs(distance) + np.abs(distance_end)
+        resolution = length * 2.0 ** (2 - _BISECTIONS)
         low: Array = np.zeros(len(start))
         high: Array = np.ones(len(start))
         for _ in range(_BISECTIONS):
             middle = (low + high) / 2
             place = start + middle[:, None] * (end - start)
-            distance, normal = self._sampler.sample(self._rotation.turned(place, -middle * share))
+            place = self._rotation.turned(place, -middle * share)
+            distance, normal = self._sampler.sample(place, since + middle * share)
             # Into the half in which the obstacle is entered, or its normal turns.
             before = (distance >= 0) & (_dot(first, normal) > _OPPOSITE_SIDES)
             low, high = np.where(before, middle, low), np.where(before, high, middle)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+import ufl
 from dolfinx import fem
-from ufl.algorithms import extract_coefficients
 from ufl.algorithms.analysis import extract_constants
 
 from fenics_contact.obstacles.base import Placement, SampledObstacle
@@ -19,14 +19,18 @@ __all__ = ["ObstacleSampler"]
 
 
 class ObstacleSampler:
-    """Evaluates a rigid obstacle at places in its own frame; compiled at the first evaluation."""
+    """Evaluates a rigid obstacle at places in its own frame; compiled at the first evaluation.
+
+    The obstacle's shape depends on the constants in its distance, which may change from one
+    increment to the next; between the committed shape and the present one they go straight on.
+    """
 
     def __init__(
         self,
         quadrature: SurfaceQuadrature,
         obstacle: Callable[[Any], Placement] | SampledObstacle,
     ) -> None:
-        """Bind the obstacle.
+        """Bind the obstacle, and commit its shape.
 
         Args:
             quadrature: The points of Γc, whose function space the compiled form uses.
@@ -35,24 +39,48 @@ class ObstacleSampler:
         """
         self._quadrature, self._obstacle = quadrature, obstacle
         self._comm = quadrature.surface.mesh.comm
-        self._place: fem.Function | None = None
-        self._data: list[Any] | None = []
+        self._constants: list[Any] = []
+        self._committed: list[Any] = []
         self._evaluate: PointEvaluator | None = None
+        if isinstance(obstacle, SampledObstacle):
+            return
+        mesh = quadrature.surface.mesh
+        self._place = fem.Function(quadrature.space(mesh.geometry.dim), name="place")
+        self._time = fem.Function(quadrature.space(1), name="time")
+        placement = obstacle(self._place)
+        parts = {"gap": ufl.as_ufl(placement.gap), "normal": ufl.as_ufl(placement.normal)}
+        constants = {c for part in parts.values() for c in extract_constants(part)}
+        self._constants = sorted(constants, key=lambda c: c.count())
+        self._committed = [fem.Constant(mesh, c.value.copy()) for c in self._constants]
+        pairs = zip(self._constants, self._committed, strict=True)
+        time = self._time[0]
+        between = {c: (1 - time) * then + time * c for c, then in pairs}
+        self._expressions = {name: ufl.replace(part, between) for name, part in parts.items()}
 
-    def data(self) -> Array | None:
-        """What the obstacle's shape depends on as it is now; None where it varies in space.
+    @property
+    def shape(self) -> Array:
+        """The numbers that the obstacle's shape depends on, as they are now, (n,)."""
+        return _values(self._constants)
 
-        Known once it has been sampled: numbers, (n,).
-        """
-        if self._data is None:
-            return None
-        return np.concatenate([np.zeros(0), *(np.ravel(c.value) for c in self._data)])
+    @property
+    def committed_shape(self) -> Array:
+        """The numbers that the obstacle's shape depended on at the last commit, (n,)."""
+        return _values(self._committed)
 
-    def sample(self, place: Array) -> tuple[Array, Array]:
+    @committed_shape.setter
+    def committed_shape(self, shape: Array) -> None:
+        first = 0
+        for constant in self._committed:
+            last = first + constant.value.size
+            constant.value[...] = shape[first:last].reshape(constant.value.shape)
+            first = last
+
+    def sample(self, place: Array, time: Array | float = 1.0) -> tuple[Array, Array]:
         """Signed distances, and unit normals from body to obstacle. Collective.
 
         Args:
             place: In the obstacle's frame, (n, gdim) (length); n may differ from rank to rank.
+            time: From 0, the committed shape, to 1, the present one: (n,) or one for all.
 
         Returns:
             (n,) (length) and (n, gdim).
@@ -62,25 +90,23 @@ class ObstacleSampler:
                 found = self._obstacle.sample_checked(place)
             return found.distance, found.normal
         n, d = place.shape
-        if self._place is None or self._evaluate is None:
-            self._place = fem.Function(self._quadrature.space(d), name="place")
-            placement = self._obstacle(self._place)
-            parts = placement.gap, placement.normal
-            fields = {f for part in parts for f in extract_coefficients(part)} - {self._place}
-            constants = {c for part in parts for c in extract_constants(part)}
-            self._data = None if fields else sorted(constants, key=lambda c: c.count())
-            self._evaluate = PointEvaluator(
-                self._quadrature, {"gap": placement.gap, "normal": placement.normal}
-            )
+        if self._evaluate is None:
+            self._evaluate = PointEvaluator(self._quadrature, self._expressions)
+        time = np.broadcast_to(time, n)
         # The form has as many slots as Γc has points: the places go through it in batches.
         size = max(self._quadrature.n_points, 1)
         batches = max(self._comm.allgather(-(-n // size) if self._quadrature.n_points else 0))
         distance, normal = np.zeros(n), np.zeros((n, d))
         for k in range(batches):
-            some = place[k * size : (k + 1) * size]
-            self._place.x.array[: some.size] = some.ravel()
-            self._place.x.scatter_forward()
-            values = self._evaluate()
-            distance[k * size : (k + 1) * size] = values["gap"][: len(some)]
-            normal[k * size : (k + 1) * size] = values["normal"][: len(some)]
+            some = slice(k * size, (k + 1) * size)
+            for field, rows in ((self._place, place[some]), (self._time, time[some])):
+                field.x.array[: rows.size] = rows.ravel()
+                field.x.scatter_forward()
+            values, m = self._evaluate(), len(place[some])
+            distance[some], normal[some] = values["gap"][:m], values["normal"][:m]
         return distance, normal
+
+
+def _values(constants: Sequence[fem.Constant]) -> Array:
+    """The values of constants one after the other, (n,)."""
+    return np.concatenate([np.zeros(0), *(np.ravel(c.value) for c in constants)])

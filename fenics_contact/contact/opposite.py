@@ -72,6 +72,7 @@ class OppositeState:
     jump: Array
     angle: float
     pairs: PairsState
+    shape: Array | None
 
 
 @dataclass(frozen=True)
@@ -510,6 +511,8 @@ class Opposite(ABC):
         """Let ways and angles be counted from an evaluated state. Collective."""
         self.committed_jump = values.jump
         self.committed_angle = self.angle(values)
+        if self.sampler is not None:
+            self.sampler.committed_shape = self.sampler.shape
 
     def resume(self, depth: Array, evaluate: Callable[[], PointValues], *, anew: bool) -> None:
         """Take the present ``u`` for the committed one, of another run. Collective.
@@ -523,9 +526,12 @@ class Opposite(ABC):
 
     def state(self) -> OppositeState:
         """What was committed, for `set_state`."""
-        return OppositeState(self.committed_jump, self.committed_angle, self.pairs.state())
+        shape = None if self.sampler is None else self.sampler.committed_shape
+        return OppositeState(self.committed_jump, self.committed_angle, self.pairs.state(), shape)
 
     def set_state(self, state: OppositeState) -> None:
         """Make a state the committed one again. Collective."""
         self.committed_jump, self.committed_angle = state.jump, state.angle
+        if self.sampler is not None and state.shape is not None:
+            self.sampler.committed_shape = state.shape
         self.pairs.set_state(state.pairs)
