@@ -525,6 +525,43 @@ def test_what_slides_off_the_other_body_does_not_bear(enforcement):
     assert forces[0] == pytest.approx(forces[1], rel=0.1)
 
 
+def test_the_end_face_of_a_slab_is_not_taken_for_deep():
+    """A softer block is led over the end of a slab, with its end face tagged or not: one force.
+
+    The corner of the slab is less deep than the block is pressed by, 0.01, but 0.1 along the end
+    face's normal, which grazes the underside. To 1e-9: no point of Γc meets the end face.
+    """
+    forces = []
+    for tags in ((FLOOR,), (FLOOR, SIDES)):
+        axes = [
+            [np.linspace(0.0, 2.0, 9), np.linspace(0.0, 1.0, 5)],
+            [np.linspace(0.5, 1.5, 8), 1.0 + np.linspace(0.0, 1.0, 8)],
+        ]
+        sides = {
+            HELD: near(1, 0.0),
+            FLOOR: between(1, 1.0, above=False),
+            SIDES: near(0, 2.0),
+            BOTTOM: between(1, 1.0, above=True),
+            TOP: near(1, 2.0),
+        }
+        mesh, facets = boxes(axes, sides)
+        softer = ufl.conditional(ufl.SpatialCoordinate(mesh)[1] > 1.0, 0.5 * E, E)
+        body = Bodies((mesh, facets), softer, 0.3)
+        along = body.constant()
+        body.hold(HELD, 0, 1)
+        body.hold(TOP, 1, value=-0.01)
+        body.hold(TOP, 0, value=along)
+        contact = body.contact(BOTTOM, tags, fc.Coulomb(0.2), kinematics="finite")
+        problem = body.problem(contact)
+        found = []
+        for along.value in (0.0, 0.48, 0.97):
+            problem.solve()
+            problem.commit()
+            found.append(contact.resultants().normal_force)
+        forces.append(found)
+    assert forces[1] == pytest.approx(forces[0], rel=1e-9)
+
+
 @KINEMATICS
 def test_a_pin_is_seen_beside_what_closes_the_next_facet(kinematics):
     """A slab holds the facets around up, and a narrow pin enters between the points of one."""

@@ -652,7 +652,10 @@ class OpposingBodyProbe:
         planes[on < 0] = -np.inf
         smaller = np.where(met, np.minimum(size, other), np.where(on >= 0, size, other))
         allowed = _allowed(deep, planes, size, smaller) + np.where(met, slack, 0.0)
-        return np.where(met, -distance, 0.0), allowed
+        # A ray that grazes what it meets is longer than the place is deep below that.
+        pairs = (hits, here), (back, there)
+        steepness = np.concatenate([abs(_dot(_normals(h), s.normal)) for h, s in pairs])
+        return np.where(met, -distance * steepness, 0.0), allowed
 
     def _planes(self) -> tuple[Array, Array]:
         """The tangent planes that the points of every facet of all ranks see. Collective.
@@ -662,12 +665,9 @@ class OpposingBodyProbe:
             and outward unit normals there.
         """
         n, here = self._rows.size, self._here
-        ray, tangents = here.normal[:n], self._hits.partner.tangents[:n]
+        ray, normal = here.normal[:n], _normals(self._hits)[:n]
         through = here.place[:n] + self._hits.distance[:n, None] * ray
-        normal = across(tangents)
-        normal *= -np.sign(_dot(normal, ray))[:, None]
-        length = np.linalg.norm(normal, axis=1, keepdims=True)
-        normal /= np.where(length > 0, length, 1.0)
+        normal = normal * -np.sign(_dot(normal, ray))[:, None]
         through, normal = (gather_rows(self._comm, v[self._rows]) for v in (through, normal))
         return through, normal
 
@@ -734,6 +734,7 @@ class _Side:
             np.full(len(self.side.body), deepest),
             back=True,
             undeformed=self.side.facets.normals(self.facet, self.reference),
+            before=self._u,  # for the tangents
         )
 
     def moving(self, before: fem.Function, shift: Array) -> MovingFacets:
@@ -759,6 +760,13 @@ class _Side:
         through = leaves & (_dot(entry, met.normal[last]) < _OPPOSITE_SIDES)
         found[place] = through | (~leaves & (met.depth[last] > allowed[place]))
         return found
+
+
+def _normals(hits: Hits) -> Array:
+    """Unit normals, of any sign, where rays have met a surface, (n, d); 0 where they have not."""
+    normal = across(hits.partner.tangents)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.asarray(normal / np.where(length > 0, length, 1.0))
 
 
 def _below(place: Array, through: Array, normal: Array) -> Array:
