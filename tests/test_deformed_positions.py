@@ -37,6 +37,25 @@ def plate(half):
     return fc.SignedDistance(lambda x: abs(x[1]) - half)
 
 
+@KINEMATICS
+@pytest.mark.parametrize("body_of_ball", [0, 1])
+def test_a_body_that_encloses_its_obstacle_is_refused(body_of_ball, kinematics):
+    """A ball inside of one of two blocks, all of whose boundary is Γc; between them it is taken."""
+    lines = np.linspace(0.0, 1.0, 5)
+    axes = [[lines, lines], [2.0 + lines, lines]]
+    around = either(*(near(0, x) for x in (0.0, 1.0, 2.0, 3.0)), near(1, 0.0))
+    body = Bodies(boxes(axes, {SIDES: around, TOP: near(1, 1.0)}), E, 0.3)
+    body.hold(TOP, 0, 1)
+
+    def problem(x):
+        ball = fc.Ball((x, 0.5), 0.2)
+        return body.problem(body.contact(SIDES, ball, fc.Frictionless(), kinematics=kinematics))
+
+    x = 0.5 + 2 * body_of_ball
+    raised_everywhere(lambda: problem(x), ValueError, "the obstacle is inside of the undeformed")
+    assert problem(1.5).solve().verdict.failures == []
+
+
 @pytest.mark.parametrize("half", [0.01, 1e-4])
 @pytest.mark.parametrize("steps", [1, 2])
 def test_a_thin_plate_is_not_crossed(half, steps):

@@ -6,13 +6,16 @@ import logging
 from collections.abc import Sequence
 from itertools import combinations
 
+import dolfinx
 import numpy as np
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
 
 from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
-from fenics_contact.parallel import all_finite, global_max, global_min, warn
+from fenics_contact.parallel import all_finite, gather_rows, global_max, global_min, warn
+from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_nodes
 from fenics_contact.systems.unknowns import Unknowns
@@ -203,6 +206,7 @@ def check_start(contacts: Sequence[Contact]) -> float:
                 "the origin"
             )
         contact.check_input()
+        _refuse_enclosed(contact)
         contact.inputs.check_side(contact.values, gap_prescribed=contact.gap_prescribed)
         gap = global_min(comm, contact.opposite.undeformed_gap(contact.values))
         if gap < -_SAME_PLACE * extent and not contact.gap_prescribed:
@@ -217,6 +221,50 @@ def check_start(contacts: Sequence[Contact]) -> float:
         _warn_of_few_points(contact)
     _warn_of_doubles(contacts)
     return worst
+
+
+def _refuse_enclosed(contact: Contact) -> None:
+    """Refuse a rigid obstacle inside of an undeformed body whose Γc all faces away. Collective.
+
+    Raises:
+        ValueError: On all ranks.
+    """
+    if contact.opposite.sampler is None:
+        return
+    mesh, values, places = contact.surface.mesh, contact.values, contact.facet_places
+    comm, facets, gap = mesh.comm, places.facets, contact.opposite.undeformed_gap(values)
+    # Points of the obstacle's surface, and by round-off inside of it.
+    smallest = global_min(comm, contact.quadrature.facet_sizes, empty=np.inf)
+    inside = _COORDINATE_ROUND_OFF * smallest
+    away = (values.facing < 0) & (gap > inside)
+    if not comm.allreduce(int(away.any())):
+        return
+    n_bodies, of_node = connected_bodies(facets.space)
+    nodes = facets.space.dofmap.list
+    body = np.empty(len(values.x), dtype=np.int64)
+    body[places.rows] = of_node[nodes[facets.cells, 0]][:, None]
+    facing = np.full(n_bodies, -np.inf)
+    np.maximum.at(facing, body, values.facing)
+    comm.Allreduce(MPI.IN_PLACE, facing, op=MPI.MAX)
+    away &= facing[body] < 0
+    feet = values.x + (gap + inside)[:, None] * contact.opposite.data.values["normal"]
+    of_foot, feet = np.concatenate(comm.allgather(body[away])), gather_rows(comm, feet[away])
+    points = np.zeros((len(feet), 3))
+    points[:, : feet.shape[1]] = feet
+    enclosed = []
+    if len(points) and len(nodes):
+        tree = dolfinx.geometry.bb_tree(mesh, mesh.topology.dim)
+        near = dolfinx.geometry.compute_collisions_points(tree, points)
+        cells = dolfinx.geometry.compute_colliding_cells(mesh, near, points)
+        met = (of_node[nodes[cells.links(k), 0]] for k in range(len(points)))
+        enclosed = [k for k, bodies in enumerate(met) if of_foot[k] in bodies]
+    first = comm.allreduce(min(enclosed, default=len(feet)), op=MPI.MIN)
+    if first < len(feet):
+        raise ValueError(
+            f"{contact.name}: the obstacle is inside of the undeformed body, as at "
+            f"{np.round(feet[first], 6).tolist()}, and all of the body's Γc faces away from it: "
+            "check its place, its units and the direction of its normal"
+        )
 
 
 def _warn_of_few_points(contact: Contact) -> None:
