@@ -232,7 +232,9 @@ def _refuse_enclosed(contact: Contact) -> None:
     if contact.opposite.sampler is None:
         return
     mesh, values, places = contact.surface.mesh, contact.values, contact.facet_places
-    comm, facets, gap = mesh.comm, places.facets, contact.opposite.undeformed_gap(values)
+    comm, facets = mesh.comm, places.facets
+    # Paths are followed from where the obstacle has not been displaced.
+    gap, normal = contact.opposite.sampler.sample(values.x)
     # Points of the obstacle's surface, and by round-off inside of it.
     smallest = global_min(comm, contact.quadrature.facet_sizes, empty=np.inf)
     inside = _COORDINATE_ROUND_OFF * smallest
@@ -247,7 +249,7 @@ def _refuse_enclosed(contact: Contact) -> None:
     np.maximum.at(facing, body, values.facing)
     comm.Allreduce(MPI.IN_PLACE, facing, op=MPI.MAX)
     away &= facing[body] < 0
-    feet = values.x + (gap + inside)[:, None] * contact.opposite.data.values["normal"]
+    feet = values.x + (gap + inside)[:, None] * normal
     of_foot, feet = np.concatenate(comm.allgather(body[away])), gather_rows(comm, feet[away])
     points = np.zeros((len(feet), 3))
     points[:, : feet.shape[1]] = feet
