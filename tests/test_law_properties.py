@@ -308,7 +308,10 @@ def test_foundation(name, d, data):
     normal = a["k_n"] * (a["gap"] - a["u_n"]) if acts else 0.0
     tangential = -a["k_t"] * a["u_t"] if acts else 0 * a["u_t"]
     assert abs(r["r_n"] - normal) <= EXACT * abs(normal)
-    assert np.all(np.abs(r["tau"] - tangential) <= EXACT * np.abs(tangential))
+    # Products below the smallest normal number are rounded by more.
+    assert np.all(
+        np.abs(r["tau"] - tangential) <= EXACT * np.abs(tangential) + np.finfo(float).tiny
+    )
 
 
 # ---- the tangential law --------------------------------------------------------------------------

@@ -318,7 +318,7 @@ class Made:
                 self.mesh,
                 self.tags,
                 11 + i,
-                quadrature_degree=max(2, c["quadrature"]) if "quadrature" in c else None,
+                quadrature_degree=c.get("quadrature"),
                 quadrature_scheme=c.get("scheme"),
             )
             for i, c in enumerate(self.scene["contacts"])

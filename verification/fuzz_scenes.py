@@ -206,7 +206,7 @@ def draw(
         elif chance(0.15):
             made["scheme"] = "vertex"
         elif chance(0.15):
-            made["quadrature"] = pick(1, 3, 5)
+            made["quadrature"] = pick(2, 3, 5)
         if chance(0.15, "gap"):
             made["gap"] = float(f"{rng.uniform(-2, 2) * strain:.3g}")
         if chance(0.2, "multipliers") and made["law"]["kind"] not in ("foundation", "tension"):

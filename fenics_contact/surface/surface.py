@@ -84,8 +84,8 @@ class ContactSurface:
         facet_tags: Tags on the facets of ``mesh``.
         tags: Tag or tags of the facets of Γc.
         quadrature_degree: Degree of the quadrature rule on Γc, at least 2. By default twice the
-            degree of the displacement element. It is raised, up to degree 78 in the plane and 6 in space, on
-            facets longer than a quarter of the smallest radius of a `Ball`, `Cylinder` or
+            degree of the displacement element. It is raised, up to degree 78 in the plane and 6 in
+            space, on facets longer than a quarter of the smallest radius of a `Ball`, `Cylinder` or
             `RigidProfile`, and on facets longer than those of an opposing `DeformableBody` (with
             small displacements: 6 times as long), to resolve their shape. If that is not enough,
             `ContactProblem` warns.
