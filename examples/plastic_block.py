@@ -39,9 +39,7 @@ bcs = [fem.dirichletbc(0.0, ends[0], V.sub(0)), fem.dirichletbc(depth, ends[1], 
 floor = fc.HalfSpace((0, 0), (0, 1))
 contact = fc.Contact(u, fc.ContactSurface(msh, tags, BOTTOM), floor, fc.Frictionless())
 problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
-kept = (
-    {"checkpoint": sys.argv[1], "state_fields": [plastic]} if sys.argv[1:] else {}
-)  # to go on from
+kept = {"checkpoint": sys.argv[1], "state_fields": [plastic]} if sys.argv[1:] else {}
 for _ in fc.increments(problem, depth, 0, -DEPTH, steps=10, **kept):
     plastic.interpolate(grown)
 force, limit = contact.resultants().normal_force, 2 / np.sqrt(3) * YIELD * WIDTH

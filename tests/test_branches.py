@@ -122,4 +122,4 @@ def test_friction_takes_energy():
             scene.load(up=-PRESS * share)
             step = problem.solve()
             problem.commit()
-            assert step.energy.created == step.verdict.created <= 0.01
+            assert step.energy.friction_energy_gain == step.verdict.friction_energy_gain <= 0.01

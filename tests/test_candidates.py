@@ -257,7 +257,7 @@ def test_contact_everywhere(caplog):
         assert not made.problem.solver.condensed
         if COMM.rank == 0:
             said = [record.getMessage() for record in caplog.records]
-            assert any("contact touches 1042 of" in text for text in said)
+            assert any("contact couples 1042 of" in text for text in said)
         forced = Pressed(law, contact=contact, condensation=True)
         assert kept(forced) == 2 * (CELLS["quadrilateral"][0] + 1)
 

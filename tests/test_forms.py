@@ -333,9 +333,7 @@ def test_tags_of_other_entities():
     """Those of facets for cells, and those of another mesh: DOLFINx says a number, or nothing."""
     s, other = Layers(), Layers()
     F = s.plain() + s.v[0] * ufl.Measure("dx", s.mesh, subdomain_data=s.facets)(TOP)
-    raised_everywhere(
-        lambda: s.solved(F), ValueError, f"dx({TOP})", "dimension 1", "tags of the cells"
-    )
+    raised_everywhere(lambda: s.solved(F), ValueError, f"dx({TOP})", "dimension 1", "on the cells")
     F = s.plain() + s.v[0] * ufl.Measure("dx", s.mesh, subdomain_data=other.cells)(UPPER)
     raised_everywhere(lambda: s.solved(F), ValueError, f"dx({UPPER})", "another mesh")
 

@@ -124,7 +124,7 @@ def test_a_step_across_the_residual_is_no_solution():
     scene = next(e["scene"] for e in SCENES["regressions"] if e["name"] == name)
     outcome = played(scene | {"method": "newton"})
     assert outcome.outcome == "refused"
-    assert "Tried: newton: no progress (0 iterations). " in outcome.detail[0]
+    assert "Tried: newton: no progress" in outcome.detail[0]
     outcome = played(scene)
     assert outcome.outcome == "refused"
     assert "converged (" not in outcome.detail[0]
@@ -355,7 +355,7 @@ LOOSE = copy.deepcopy(TURNING) | {
     ],
 }
 LOOSE["contacts"][0]["obstacle"]["kind"] = "cylinder inside"
-LOOSE["contacts"][0]["quadrature"] = 1
+LOOSE["contacts"][0]["quadrature"] = 2
 
 
 @serial
@@ -526,7 +526,7 @@ def test_a_body_that_is_passed_through_unseen_is_found(monkeypatch):
     scene = copy.deepcopy(TWO)
     scene["contacts"][0]["obstacle"] |= {"body": 1, "side": "bottom"}
     scene["contacts"][0] |= {"body": 0, "side": "top"}
-    scene["bodies"][0]["n"], scene["contacts"][0]["quadrature"] = [2, 2], 1
+    scene["bodies"][0]["n"] = [1, 2]
     scene["stages"] = [dict(scene["stages"][0], normal=5.0)]
     outcome = played(scene)
     assert outcome.outcome == "wrong"

@@ -86,7 +86,7 @@ class Blocks:
         )
         options = {"petsc_options": TIGHT} | options
         if kinematics == "small":  # of any size, to compare with closed forms
-            options["kinematics"] = np.inf
+            options["small_displacement_tolerance"] = np.inf
         self.problem = fc.ContactProblem(
             self.F, self.w, bcs=bcs, contacts=[self.contact], **options
         )

@@ -161,8 +161,8 @@ def test_a_tight_fit_held_by_soft_multipliers_is_none(by, share, stiffness, meth
 
 # Body forces on an area of 2, and what the error must say of their resultant and of the contact.
 NOT_HELD = {
-    "falls": ((0.0, -1.0), "translation along y) is -2, of which contact can bear at most 0 "),
-    "pushed": ((2.0, 5.0), "translation along x) is 4, of which contact can bear at most 3 "),
+    "falls": ((0.0, -1.0), "translation along y) is -2, of which contact can balance at most 0 "),
+    "pushed": ((2.0, 5.0), "translation along x) is 4, of which contact can balance at most 3 "),
 }
 
 

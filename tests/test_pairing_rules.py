@@ -353,7 +353,7 @@ def test_the_warning_says_how_many_and_why():
     for here, there, options, word in (
         (UPPER, LOWER, {"search_distance": 0.05}, "search_distance"),
         (UPPER, ROOF, {}, "own body"),
-        (LOWER, ROOF, {}, "nothing"),
+        (LOWER, ROOF, {}, "do not meet"),
         (ROOF, FLOOR, {}, "behind"),
     ):
         with _told(True, "16 of the 16 points", word):

@@ -252,7 +252,7 @@ def test_interior_facets_are_refused(cell, ghost_mode):
     facets = dolfinx.mesh.locate_entities(mesh, d - 1, lambda x: np.isclose(x[d - 1], 0.5))
     values = np.full(facets.size, 7, dtype=np.int32)
     tags = dolfinx.mesh.meshtags(mesh, d - 1, np.sort(facets), values)
-    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, 7), ValueError, "inside", "7")
+    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, 7), ValueError, "interior facets", "7")
 
 
 def test_one_interior_facet_on_one_rank_only():
@@ -265,7 +265,7 @@ def test_one_interior_facet_on_one_rank_only():
     facets = np.concatenate([tags.find(BOTTOM), inside]).astype(np.int32)
     assert COMM.allreduce(inside.size) == 1
     tags = dolfinx.mesh.meshtags(mesh, 1, np.sort(facets), np.full(facets.size, 7, dtype=np.int32))
-    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, 7), ValueError, "inside")
+    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, 7), ValueError, "interior facets")
 
 
 def test_wrong_surface_arguments():

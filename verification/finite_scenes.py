@@ -88,7 +88,7 @@ def draw(
         if chance(0.15):
             made["scheme"] = "vertex"
         elif chance(0.15):
-            made["quadrature"] = pick(1, 3, 5)
+            made["quadrature"] = pick(2, 3, 5)
         if chance(0.2, "multipliers") and law_kind != "tension":
             made["enforcement"] = "augmented"
         elif chance(0.1, "accuracy") and law_kind != "tension":

@@ -84,7 +84,7 @@ def draw(
     own, other = (upper, lower) if chance(0.6) else (lower, upper)
     contact: Scene = own | {"obstacle": {"kind": "body", "update": "never"} | other, "law": law}
     if chance(0.2):
-        contact["quadrature"] = pick(1, 3, 5)
+        contact["quadrature"] = pick(2, 3, 5)
     if chance(0.2, "multipliers"):
         contact["enforcement"] = "augmented"
 
