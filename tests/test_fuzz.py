@@ -355,7 +355,7 @@ LOOSE = copy.deepcopy(TURNING) | {
     ],
 }
 LOOSE["contacts"][0]["obstacle"]["kind"] = "cylinder inside"
-LOOSE["contacts"][0]["quadrature"] = 2
+LOOSE["contacts"][0]["quadrature"] = 5
 
 
 @serial
@@ -521,13 +521,13 @@ def test_a_plate_that_passes_unseen_is_found(kinematics, monkeypatch):
 
 @serial
 def test_a_body_that_is_passed_through_unseen_is_found(monkeypatch):
-    """The block goes 0.3 deep into the slab, between the two points of its top."""
+    """The block goes 0.5 deep into the slab, between the two points of its top."""
     monkeypatch.setattr(TunnellingCheck, "evaluate", lambda self, before: {})
     scene = copy.deepcopy(TWO)
     scene["contacts"][0]["obstacle"] |= {"body": 1, "side": "bottom"}
     scene["contacts"][0] |= {"body": 0, "side": "top"}
-    scene["bodies"][0]["n"] = [1, 2]
-    scene["stages"] = [dict(scene["stages"][0], normal=5.0)]
+    scene["bodies"][0]["n"], scene["contacts"][0]["quadrature"] = [1, 2], 2
+    scene["stages"] = [dict(scene["stages"][0], normal=9.0)]
     outcome = played(scene)
     assert outcome.outcome == "wrong"
     assert "penetration" in outcome.kind
