@@ -70,6 +70,7 @@ def test_a_history_of_pressing_takes_few_iterations() -> None:
     assert case.package(0.2, 40)["iterations"] <= 55
 
 
+@pytest.mark.slow
 def test_contact_at_large_strains_costs_few_newton_steps(tmp_path: Path) -> None:
     """Steps are counts, the same on every machine: over SNES on the bulk alone, a third more.
 

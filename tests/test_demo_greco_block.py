@@ -42,6 +42,7 @@ def test_increments_do_not_matter(tmp_path: Path) -> None:
     assert often["tangential_force"] == pytest.approx(once["tangential_force"], rel=1e-7)
 
 
+@pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
     """The same on two ranks, to 1e-7 for the same reason."""
     serial = run_demo("greco_block", tmp_path / "1", "--cells", "20")

@@ -15,6 +15,7 @@ pytestmark = [
 ]
 
 
+@pytest.mark.slow
 def test_pressed_and_begun_to_slide(tmp_path: Path) -> None:
     """V(1) between the published ones; all points slip soon, at up to 8 steps an increment."""
     options = ("--increments", "250", "--until", "1.06")

@@ -35,6 +35,7 @@ def test_hertz(tmp_path: Path) -> None:
             assert (tmp_path / case / f"{name}.pvd").exists()
 
 
+@pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
     """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
     options = ("--cases", "ball", "--cells", "6")

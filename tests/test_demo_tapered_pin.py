@@ -15,6 +15,7 @@ pytestmark = [
 ]
 
 
+@pytest.mark.slow
 def test_pushed_in_released_and_pulled_out(tmp_path: Path) -> None:
     """205.4 MPa between pin and hub, Q = 514 kN: 82.6 kN in and, dry, 71.2 kN out.
 

@@ -44,6 +44,7 @@ def test_increments_do_not_matter_here(tmp_path: Path) -> None:
     assert values(once) == pytest.approx(values(often), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
     """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
     options = ("--cells", "20", "--increments", "1")
