@@ -29,9 +29,9 @@ def pytest_configure() -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the cases of parametrized tests that do not run by default as slow.
 
-    One case in six runs, at least two, and all with ``@pytest.mark.whole``: those that together
-    have the most values of the parameters, in the order of the file; of one parameter those at
-    equal distances. What runs on all kinds of cells is slow on hexahedra, whose forms take longest
+    One case in six runs, at least two, on several ranks half as many, and all with
+    ``@pytest.mark.whole``: those that together have the most values of the parameters, in the order
+    of the file; of one parameter those at equal distances. What runs on all kinds of cells is slow on hexahedra, whose forms take longest
     to compile, except in modules marked ``hexahedra``.
     """
     cases = defaultdict(list)
@@ -44,7 +44,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         elif not item.get_closest_marker("slow"):
             cases[item.nodeid.partition("[")[0]].append(item)
     for those in cases.values():
-        kept = _most_varied(those, max(2, ceil(len(those) / 6)))
+        number = max(2, ceil(len(those) / 6))
+        if MPI.COMM_WORLD.size > 1:
+            number = ceil(number / 2)
+        kept = _most_varied(those, number)
         for item in those:
             if item not in kept:
                 item.add_marker(pytest.mark.slow)
