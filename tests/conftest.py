@@ -31,8 +31,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     One case in six runs, at least two, on several ranks half as many, and all with
     ``@pytest.mark.whole``: those that together have the most values of the parameters, in the order
-    of the file; of one parameter those at equal distances. What runs on all kinds of cells is slow on hexahedra, whose forms take longest
-    to compile, except in modules marked ``hexahedra``.
+    of the file; of one parameter those at equal distances. What runs on all kinds of cells is slow
+    on hexahedra, whose forms take longest to compile, except in modules marked ``hexahedra``.
     """
     cases = defaultdict(list)
     for item in items:
