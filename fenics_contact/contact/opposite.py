@@ -112,7 +112,7 @@ class Opposite(ABC):
             not in it.
         felt: What laws are functions of there: the jump, or what follows from it.
         given, sampled: What else laws see, as expressions on Γc, and as numbers at the points.
-        in_form, at_points: PointKinematics of laws in the form on Γc, and at numbers at the points.
+        in_form, at_points: Kinematics of laws in the form on Γc, and at numbers at the points.
         committed_jump: The jump at the last commit, that of the obstacle taken away, (n_points,
             gdim), between the places that are opposite each other from then on; zero before the
             first.

@@ -40,9 +40,7 @@ class MovingFacets:
     def normals(self) -> Array:
         """Outward unit normals at the end of the increment, (m, d)."""
         edges = self.end[:, 1 : self.end.shape[2]] - self.end[:, :1]
-        normal = self.sign[:, None] * across(np.swapaxes(edges, 1, 2))
-        length = np.linalg.norm(normal, axis=1, keepdims=True)
-        return np.asarray(normal / np.maximum(length, np.finfo(float).tiny))
+        return _unit(self.sign[:, None] * across(np.swapaxes(edges, 1, 2)))
 
 
 @dataclass(frozen=True)
@@ -164,9 +162,7 @@ class _Pairs:
 
     def normal(self, rows: Index, time: Array) -> Array:
         """Outward unit normals, (n, d)."""
-        across = self._across(self._at(time, rows)[1], rows)
-        length = np.linalg.norm(across, axis=1, keepdims=True)
-        return np.asarray(across / np.maximum(length, np.finfo(float).tiny))
+        return _unit(self._across(self._at(time, rows)[1], rows))
 
     def distance(self, rows: Index) -> Array:
         """From the plane of the facet at the end, (n,) (length)."""
@@ -216,3 +212,9 @@ def _ball(points: Array) -> tuple[Array, Array]:
     """Centres, (n, d), and radii, (n,), of balls around points, (n, k, d)."""
     centre = (points.min(axis=1) + points.max(axis=1)) / 2
     return centre, np.linalg.norm(points - centre[:, None], axis=2).max(axis=1)
+
+
+def _unit(vectors: Array) -> Array:
+    """Vectors (n, d) at unit length; those of length zero, of degenerate facets, stay zero."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, np.finfo(float).tiny))
