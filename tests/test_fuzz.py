@@ -124,7 +124,7 @@ def test_a_step_across_the_residual_is_no_solution():
     scene = next(e["scene"] for e in SCENES["regressions"] if e["name"] == name)
     outcome = played(scene | {"method": "newton"})
     assert outcome.outcome == "refused"
-    assert "Tried: newton: no progress" in outcome.detail[0]
+    assert "Tried: newton: no progress (0 iterations). " in outcome.detail[0]
     outcome = played(scene)
     assert outcome.outcome == "refused"
     assert "converged (" not in outcome.detail[0]
