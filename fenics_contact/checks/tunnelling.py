@@ -412,10 +412,8 @@ class RigidObstacleProbe:
         of it again at the end.
         """
         n = max(1, int(np.ceil(abs(self._rotation.angle) / _LINEAR_ROTATION)))
-        found = np.zeros(len(self.x), dtype=np.bool_)
-        for k in range(n):
-            found |= self._crossed_between(k / n, (k + 1) / n, allowed)
-        return self.x[found]
+        parts = [self._crossed_between(k / n, (k + 1) / n, allowed) for k in range(n)]
+        return np.concatenate(parts)
 
     def _points_at(self, time: float) -> Array:
         """The points of Γc at a time from 0 to 1 in the increment, in the frame of the obstacle."""
@@ -424,79 +422,109 @@ class RigidObstacleProbe:
         end = self._rotation.turned(self.points, 1.0)
         return self._rotation.turned(self._start + time * (end - self._start), -time)
 
-    def _crossed_between(self, since: float, until: float, allowed: Array) -> Mask:
-        """Whether places of Γc have crossed the obstacle between two times. Collective.
+    def _crossed_between(self, since: float, until: float, allowed: Array) -> Array:
+        """Find the undeformed places that cross the obstacle between two times. Collective.
 
         Points of the obstacle are followed, those nearest to places of Γc at either time. In the
         frame of the obstacle they are at rest; where its shape changes they go straight between the
-        old surface and the new one. A place has crossed the obstacle
+        old surface and the new one. It has crossed
 
-        - if its point enters the body through a facet and ends deeper below Γc than is allowed;
-        - if it ends on the opposite side of the obstacle, and its point has been inside of the body
-          or what is below the place, by the largest depth that is explained, has passed through it.
+        - a facet, if a point enters the body, or has entered it before by what was allowed then,
+          and ends deeper below the facet than is allowed; its middle is returned;
+        - a place that ends on the opposite side of the obstacle, if its point has been inside of
+          the body, or what is below the place, by the largest depth that is explained, has passed
+          through the obstacle.
         """
-        comm, crossed = self._comm, np.zeros(len(self.x), dtype=np.bool_)
+        comm, size = self._comm, self._places.size[self._facet]
         field, field_end = self._points_at(since), self._points_at(until)
         start, end, distance_end, toward = self._at(field), self._z, self._distance, self._toward
         if until < 1.0:
             end = self._at(field_end)
             distance_end, toward = self._sampler.sample(end)
+        toward = np.nan_to_num(toward)
         angle = abs(self._rotation.angle) * (until - since)
         way = np.linalg.norm(self._rotation.turned(end, until - since) - start, axis=1)
         radius = np.maximum(self._rotation.radius(start), self._rotation.radius(end))
-        # A distance changes by no more than the path: what is farther away was not touched.
+        # A distance changes by no more than the path: what is farther away was not touched, and
+        # what is inside of the body was outside, or inside by what was allowed.
         changed = not np.array_equal(self._sampler.committed_shape, self._shape)
-        near = np.flatnonzero(changed | ~(distance_end > way + angle * radius))
+        inside = _dot(toward, self._outward(self._facet, field_end)) < 0
+        before = np.where(inside, (_PREDICTED_DEPTH + _DEPTH_RESOLUTION) * size, 0.0)
+        near = np.flatnonzero(changed | ~(distance_end > way + angle * radius + before))
         if not comm.allreduce(len(near)):
-            return crossed
-        start, end, facet = start[near], end[near], self._facet[near]
+            return self.x[:0]
+        start, end, toward = start[near], end[near], toward[near]
         distance, normal = self._sampler.sample(start, since)
-        normal, toward = np.nan_to_num(normal), np.nan_to_num(toward[near])
+        normal = np.nan_to_num(normal)
         feet = start + distance[:, None] * normal, end + distance_end[near, None] * toward
         points = points_end = np.concatenate(feet)
         if changed:
             points = np.concatenate([feet[0], self._nearest(feet[1], since)])
             points_end = np.concatenate([self._nearest(feet[0], until), feet[1]])
+        facet, size = self._facet[near], size[near]
         inward, inward_end = (-self._outward(facet, p) for p in (field, field_end))
-        entered = np.zeros(len(points), dtype=np.bool_)
-        entered[: len(near)] = (distance < 0) & (_dot(normal, inward) < 0)
+        inside = _dot(normal, inward) * distance > 0
+        entered = np.append(inside & (distance < 0), np.zeros(len(near), dtype=np.bool_))
+        through = np.full(len(points), -1)
+        through[: len(near)] = self._entered_before(
+            feet[0], facet, -inward, inside & (distance >= 0), field
+        )
         # Between times dt apart a path leaves its chord by no more than |x''| dt² / 8.
-        bend = (angle**2 * radius + 2 * angle * way)[near] / self._places.size[facet]
+        bend = (angle**2 * radius + 2 * angle * way)[near] / size
         n = int(np.ceil(np.sqrt(global_max(comm, bend) / (8 * _DEPTH_RESOLUTION))))
         times: Any = np.linspace(since, until, max(n, 1) + 1)
-        last = self._enter(points, points_end, entered, times)
-        most = np.zeros(len(self._places.size))
-        np.maximum.at(most, self._facet, allowed)
-        found: Any = self._is_deeper(points_end, field_end, last, most)
-        found = found.reshape(2, -1).any(axis=0)
+        self._enter(points, points_end, entered, through, times)
+        middles = self._too_deep(points_end, field_end, through, allowed)
         opposite = np.flatnonzero(_dot(normal, toward) < _OPPOSITE_SIDES)
         # On the way the tangent planes are not known.
-        depth = (allowed[near] + _PREDICTED_DEPTH * self._places.size[facet])[:, None]
+        depth = (allowed[near] + _PREDICTED_DEPTH * size)[:, None]
         start, end = start + depth * inward, end + depth * inward_end
         passed = self._pass_through(start[opposite], end[opposite], since, until)
-        found[opposite] |= entered[opposite] | passed
-        crossed[near] = found
-        return crossed
+        passed |= entered[opposite]
+        return np.concatenate([middles, self.x[near[opposite[passed]]]])
 
     def _nearest(self, points: Array, time: float) -> Array:
         """The nearest points of the obstacle at a time in the increment, (n, gdim). Collective."""
         distance, normal = self._sampler.sample(points, time)
         return points + distance[:, None] * np.nan_to_num(normal)
 
-    def _enter(self, start: Array, end: Array, entered: Mask, times: Array) -> Index:
+    def _entered_before(
+        self, points: Array, facet: Index, outward: Array, some: Mask, field: Array
+    ) -> Index:
+        """Through which flat piece of Γc, of those of all ranks, points entered before. Collective.
+
+        Args:
+            points: Of the obstacle, in its frame, (n, gdim) (length).
+            facet: Facet of this rank that each is nearest to, (n,).
+            outward: Its outward unit normal, (n, gdim).
+            some: Which of the points are looked at, (n,).
+            field: The points of Γc in that frame, (n_points, gdim) (length).
+
+        Returns:
+            (n,), -1 for points that are outside, or below another surface of a thin body.
+        """
+        found = np.full(len(points), -1)
+        if self._comm.allreduce(int(some.any())):
+            size, height = self._places.size[facet[some]], self._places.facets.heights()
+            reach = (_PREDICTED_DEPTH + _DEPTH_RESOLUTION) * size
+            reach = np.minimum(reach, height[facet[some]] / 2)
+            facets = self._places.moving_facets(field, field)
+            _, found[some] = self._below(points[some], outward[some], reach, facets)
+        return found
+
+    def _enter(self, start: Array, end: Array, entered: Mask, through: Index, times: Array) -> None:
         """Follow points of the obstacle through the facets of Γc. Collective.
 
         Args:
             start: In the frame of the obstacle at first, (n, gdim) (length).
             end: In that at last, (n, gdim) (length).
-            entered: Which points are inside of the body at first, and have been at last, (n,).
+            entered: Which points are inside of the body at first, (n,); afterwards, which have
+                been.
+            through: The flat piece of Γc, of those of all ranks, through which each has entered the
+                body, (n,); afterwards, too, and -1 for those that have left it.
             times: In the increment, between which Γc goes straight on in the obstacle's frame.
-
-        Returns:
-            The flat piece of Γc, of those of all ranks, through which each point has entered the
-            body; -1 for those outside of it at the end, or inside from the start, (n,).
         """
-        vertices, last = np.full((len(start), 1), -1), np.full(len(start), -1)
+        vertices = np.full((len(start), 1), -1)
         shares = np.linspace(0.0, 1.0, len(times))[:, None, None]
         points, fields = start + shares * (end - start), [self._points_at(t) for t in times]
         for k in range(len(times) - 1):
@@ -504,8 +532,7 @@ class RigidObstacleProbe:
             met = find_crossings(self._comm, points[k], points[k + 1], vertices, facets)
             entered[met.place[met.inward]] = True
             final = np.append(np.diff(met.place) > 0, True)[: len(met.place)]
-            last[met.place[final]] = np.where(met.inward, met.facet, -1)[final]
-        return last
+            through[met.place[final]] = np.where(met.inward, met.facet, -1)[final]
 
     def _pass_through(self, start: Array, end: Array, since: float, until: float) -> Mask:
         """Whether places pass through the obstacle, by bisection of their paths. Collective.
@@ -538,32 +565,55 @@ class RigidObstacleProbe:
             found |= distance <= resolution
         return found
 
-    def _is_deeper(self, points: Array, field: Array, facet: Index, allowed: Array) -> Mask:
-        """Whether points are deeper below Γc than is allowed, (n,). Collective.
+    def _too_deep(self, points: Array, field: Array, through: Index, allowed: Array) -> Array:
+        """Find the facets below which points are deeper than is allowed there. Collective.
 
         Args:
-            points: In the frame of the obstacle, (n, gdim) (length).
+            points: Of the obstacle, in its frame, (n, gdim) (length).
             field: The points of Γc in that frame, (n_points, gdim) (length).
-            facet: Flat piece of Γc through which each point has entered the body, or -1, (n,).
-            allowed: Allowed depth at every facet of this rank, (n_facets,) (length).
+            through: See `_enter`.
+            allowed: Allowed depth at the places of this rank, (n_places,) (length).
+
+        Returns:
+            Their middles on the undeformed Γc, (m, gdim) (length).
         """
-        comm, found = self._comm, np.zeros(len(points), dtype=np.bool_)
-        if not comm.allreduce(int((facet >= 0).any())):
-            return found
-        facets = self._places.moving_facets(field, field)
-        each = np.repeat(allowed, len(facets.start) // max(len(allowed), 1))
-        table = gather_rows(comm, np.column_stack([each, facets.start[:, 0], facets.normals()]))
-        (through, normal), allowed = np.split(table[:, 1:], 2, axis=1), table[:, 0]
-        depth = -_dot(points - through[facet], normal[facet])
-        rows = np.flatnonzero((facet >= 0) & (depth > allowed[facet]))
-        # Beside Γc a point is below none of its facets.
-        reach, start, vertices = 2 * depth[rows], points[rows], np.full((len(rows), 1), -1)
-        end = start + reach[:, None] * normal[facet[rows]]
-        met = find_crossings(comm, start, end, vertices, facets)
+        if not self._comm.allreduce(int((through >= 0).any())):
+            return self.x[:0]
+        most: Array = np.zeros(len(self._places.size))
+        np.maximum.at(most, self._facet, allowed)
+        facets, middles = self._places.moving_facets(field, field), self._places.piece_middles()
+        most = np.repeat(most, len(middles) // max(len(most), 1))
+        table = np.column_stack([most, facets.start[:, 0], facets.normals(), middles])
+        table = gather_rows(self._comm, table)
+        most, (corner, normal, middles) = table[:, 0], np.split(table[:, 1:], 3, axis=1)
+        depth = -_dot(points - corner[through], normal[through])
+        rows = np.flatnonzero((through >= 0) & (depth > most[through]))
+        depth, facet = self._below(points[rows], normal[through[rows]], 2 * depth[rows], facets)
+        return np.asarray(middles[np.unique(facet[(facet >= 0) & (depth > most[facet])])])
+
+    def _below(
+        self, points: Array, outward: Array, reach: Array, facets: MovingFacets
+    ) -> tuple[Array, Index]:
+        """How deep points are below Γc, along outward directions. Collective.
+
+        Beside Γc a point is below none of its facets.
+
+        Args:
+            points: (n, gdim) (length).
+            outward: Unit vectors, (n, gdim).
+            reach: How far Γc is looked for, (n,) (length).
+            facets: Γc, at rest.
+
+        Returns:
+            The depth, (n,) (length), and the number of the facet among those of all ranks, (n,), -1
+            for points that are not below Γc.
+        """
+        vertices, end = np.full((len(points), 1), -1), points + reach[:, None] * outward
+        met = find_crossings(self._comm, points, end, vertices, facets)
         first = np.append(True, np.diff(met.place) > 0)[: len(met.place)] & ~met.inward
-        place = met.place[first]
-        found[rows[place]] = met.time[first] * reach[place] > allowed[met.facet[first]]
-        return found
+        place, depth, facet = met.place[first], np.zeros(len(points)), np.full(len(points), -1)
+        depth[place], facet[place] = met.time[first] * reach[place], met.facet[first]
+        return depth, facet
 
 
 class OpposingBodyProbe:

@@ -91,3 +91,9 @@ class FacetPlaces:
         vertices = np.repeat(self.facets.vertices(), n_pieces, axis=0)
         sign = np.repeat(self.facets.outward, n_pieces)
         return MovingFacets(first, last, sign, vertices)
+
+    def piece_middles(self) -> Array:
+        """Where the middles of the facets' flat pieces are on the undeformed Γc, (n, gdim)."""
+        n, middles = len(self.rows), self._pieces.mean(axis=1)
+        facet = np.repeat(np.arange(n), len(middles))
+        return self.facets.positions(facet, np.tile(middles, (n, 1)))[0]
