@@ -224,6 +224,8 @@ class Judge:
         where slip is counted anew nothing was borne.
         """
         problem, old = self.problem, list(self._old)
+        # Bodies are set down on obstacles where these were before.
+        load = self._before["load"] if self._before else self._load(0, 0.0)
         size = np.ptp(problem.body.places, axis=0).max()
         before = self._u
         for i, record_of in enumerate(record["contacts"]):

@@ -341,6 +341,16 @@ class Opposite(ABC):
         """Directions in the frame of the history, as they are in space: (n_points, gdim)."""
         return vectors
 
+    def way_back(self, values: PointValues) -> Array:
+        """From where points are to where they were, as seen from the obstacle, (n_points, gdim).
+
+        At the committed ``u`` it is the displacement of a rigid obstacle since the last commit.
+
+        Args:
+            values: Of the last evaluation.
+        """
+        return self.turned(self.committed_jump - values.jump)
+
     def angle(self, values: PointValues) -> float:
         """By which the obstacle has turned since it began, 0 where it cannot (radians). Collective.
 

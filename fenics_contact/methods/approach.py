@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -169,37 +170,57 @@ class Approach:
     def _set_down(self, load: Array, before: Array, which: Index) -> None:
         """Move bodies that touch nothing to where they rest, or to first touch. Collective.
 
-        Slip is counted from there, for until then nothing is touched. Prescribed displacements
-        change after that, at their nodes as in the rest of the body.
+        Slip is counted from where they rest as the increment begins: before prescribed
+        displacements, those of obstacles among them, change.
 
         Args:
             load: As in `lead`.
             before: As in `lead`.
             which: Numbers of their free motions.
         """
-        full = self._full
+        full, motions = self._full, self._motions
         aloft = full.state()
-        for along in (_ALONG, np.inf):
-            if self._lands(load, which, along):
-                break
-            self._go(aloft)
-        else:
-            free = self._free(load, which)
-            way = None if free is None else self._to_first_touch(free)
-            if way is None:
-                return
-            self._move(which, way)
-        self._follow_stiffness()
+        if not self._rest(load, which):
+            return
+        landed = full.state()
         # An obstacle pressed by a force comes to a body as one that is led there does, and may be
         # led along by then: slip is counted from where its increment starts.
-        of_bodies = self._motions.of_any_body()[which]
-        if not of_bodies.any():
-            return
-        landed, felt = full.state(), self._felt(which[of_bodies])[1]
-        self._go(np.where(full.constrained, before, landed))
-        for contact, jumps in zip(full.contacts, felt, strict=True):
-            contact.set_down(_feeling(jumps))
-        self._go(landed)
+        of_bodies = motions.of_any_body()[which]
+        if of_bodies.any() and any(contact.law.has_friction for contact in full.contacts):
+            self._go(before)
+            ways = [contact.opposite.way_back(contact.values) for contact in full.contacts]
+            with contextlib.ExitStack() as back:
+                for contact, way in zip(full.contacts, ways, strict=True):
+                    back.enter_context(contact.opposite.displaced(way))
+                self._go(np.where(full.constrained, before, aloft))
+                if self._rest(load, which):
+                    for contact, jumps in zip(
+                        full.contacts, self._felt(which[of_bodies])[1], strict=True
+                    ):
+                        contact.set_down(_feeling(jumps))
+            self._go(landed)
+        self._follow_stiffness()
+
+    def _rest(self, load: Array, which: Index) -> bool:
+        """Move bodies from here to where they rest, or to first touch. Collective.
+
+        Args:
+            load: As in `lead`.
+            which: Numbers of their free motions.
+
+        Returns:
+            Whether there is such a place.
+        """
+        here = self._full.state()
+        for along in (_ALONG, np.inf):
+            if self._lands(load, which, along):
+                return True
+            self._go(here)
+        free = self._free(load, which)
+        way = None if free is None else self._to_first_touch(free)
+        if way is not None:
+            self._move(which, way)
+        return way is not None
 
     def _follow_stiffness(self) -> None:
         """Take that of a nonlinear bulk which has turned. Collective."""

@@ -57,7 +57,9 @@ class FirstTouch:
         present = full.state()
         contacts = [full.contacts[n] for n in idle]
         full.set_state(start)
-        ways = [self._obstacle_way(contact) for contact in contacts]
+        for contact in contacts:
+            contact.evaluate()
+        ways = [contact.opposite.way_back(contact.values) for contact in contacts]
         apart = [
             n for n, given in enumerate(zip(contacts, ways, strict=True)) if self._is_apart(*given)
         ]
@@ -84,12 +86,6 @@ class FirstTouch:
             return False
         borne = np.abs(contact.history.values("normal_traction"))
         return not global_max(self._full.unknowns.comm, borne) > 0.0
-
-    def _obstacle_way(self, contact: Contact) -> Array:
-        """Displacement of the obstacle since the last commit, (n_points, gdim). Collective."""
-        contact.evaluate()
-        opposite = contact.opposite
-        return opposite.turned(opposite.committed_jump - contact.values.jump)
 
     def _is_apart(self, contact: Contact, way: Array) -> bool:
         """Whether a contact neither acts nor touches, displaced by a way. Collective.
