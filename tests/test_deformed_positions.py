@@ -660,3 +660,26 @@ def test_crossed_ridges_are_seen(kinematics, both):
     problem.commit()
     down.value = -0.05
     fails(problem, "penetrates")
+
+
+def test_the_undeformed_body_may_be_where_an_obstacle_has_no_normal():
+    """A ball and a block go up together until the ball's centre is where a vertex was at first.
+
+    Reference: the force before, to 1e-9.
+    """
+    body = block()
+    lead, shift = body.constant(), body.constant((0.0, -0.25))
+    body.hold(TOP, 0)
+    body.hold(TOP, 1, value=lead)
+    ball = fc.SignedDistance(lambda x: ufl.sqrt(x[1] ** 2 + (x[0] - 0.5) ** 2) - 0.2, shift)
+    surface = fc.ContactSurface(body.mesh, body.tags, BOTTOM, quadrature_scheme="vertex")
+    contact = fc.Contact(body.u, surface, ball, fc.Frictionless(), kinematics="finite")
+    problem = body.problem(contact)
+    forces = []
+    for up in (-0.25, 0.0):
+        lead.value, shift.value[1] = up + 0.19, up
+        problem.solve()
+        problem.commit()
+        forces.append(contact.resultants().normal_force)
+    assert forces[0] > 1.0
+    assert forces[1] == pytest.approx(forces[0], rel=1e-9)

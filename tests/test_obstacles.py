@@ -13,7 +13,7 @@ import fenics_contact as fc
 from fenics_contact.checks.tunnelling import RigidObstacleProbe, TunnellingCheck
 from fenics_contact.elasticity import NeoHookean
 from scenes.blocks import BOTTOM, TOP, block, kirchhoff
-from scenes.comparing import close, gathered
+from scenes.comparing import close, gathered, raised_everywhere
 from scenes.elasticity import hold
 from scenes.rubber import Tool, rubber
 from scenes.two_blocks import LOWER, UPPER, two_blocks
@@ -101,6 +101,18 @@ def test_an_obstacle_that_goes_through_in_one_increment_is_refused():
     assert np.abs(gone).max() < radius + 1 / 32
     with pytest.raises(fc.NotConverged, match=r"has crossed|half of the radius"):
         problem.solve()
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize(
+    "distance", [lambda z: ufl.ln(z - 2.0), lambda z: ufl.sqrt(z**2) - 0.1], ids=["gap", "slope"]
+)
+def test_a_distance_that_is_no_number_is_refused(distance):
+    """Its points are neither open nor closed; or they are closed, and have no normal."""
+    scene = rubber(n=(4, 2), E=10.0)
+    obstacle = fc.SignedDistance(lambda x: distance(scene.height - x[1]))
+    problem, _ = scene.problem(obstacle, fc.Frictionless(1e3))
+    raised_everywhere(problem.solve, fc.NotConverged, "is not a number")
 
 
 def test_sliding_round_an_obstacle_is_no_passage():

@@ -27,7 +27,8 @@ class ObstacleCheck:
     """Verification of a contact with a rigid obstacle, the same on every rank.
 
     Attributes:
-        slope: Length of the gradient of the distance at closed points, where it is farthest from 1.
+        slope: Length of the gradient of the distance at closed points, where it is farthest from 1;
+            NaN if gap or gradient are no numbers.
         depth: With finite kinematics, the largest penetration divided by the distance from there to
             the centre of curvature of the obstacle.
         turn: Rotation of the obstacle in this increment, with friction (radians).
@@ -41,7 +42,13 @@ class ObstacleCheck:
     def of(cls, contact: Contact) -> ObstacleCheck:
         """Evaluate the obstacle of a contact at its evaluated state. Collective."""
         comm, closed = contact.surface.mesh.comm, contact.status != Status.OPEN
-        slopes = contact.opposite.slope(contact.values)[closed]
+        slopes = contact.opposite.slope(contact.values)
+        if contact.finite:
+            # No law takes a gap for closed that is not a number, or has no normal.
+            gap, _ = contact.opposite.true_placement(contact.values)
+            slopes = np.where(np.isnan(gap), np.nan, slopes)
+            closed |= ~(gap > 0) & np.isnan(slopes)
+        slopes = slopes[closed]
         ends = global_min(comm, slopes, empty=1.0), global_max(comm, slopes, empty=1.0)
         slope = max(ends, key=lambda value: abs(value - 1.0))
         depth = 0.0
@@ -55,7 +62,12 @@ class ObstacleCheck:
     def failures(self, contact: str) -> list[str]:
         """Return the conditions that are violated, in words."""
         found = []
-        if not abs(self.slope - 1.0) <= _SLOPE:
+        if np.isnan(self.slope):
+            found.append(
+                f"{contact}: the distance of the obstacle, or its gradient, is not a number at a "
+                "point of Γc; check its expression"
+            )
+        elif not abs(self.slope - 1.0) <= _SLOPE:
             found.append(
                 f"{contact}: the gradient of the SignedDistance has length {self.slope:.3g} in the "
                 "contact zone; it must be 1: divide the function by the length of its gradient"

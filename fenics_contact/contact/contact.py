@@ -438,7 +438,7 @@ class Contact(PointResults):
         self.inputs.update()
         self.opposite.update()
         self.forget()
-        self.inputs.check(self.opposite.data.values)
+        self.inputs.check(self.opposite.data.values, undeformed=not self.finite)
 
     def given(self) -> dict[str, Array]:
         """Return the data of law, obstacle and contact at this rank's points, by name. Collective.

@@ -337,11 +337,12 @@ class Inputs:
 
     # ---- checks ----------------------------------------------------------------------------------
 
-    def check(self, data: Mapping[str, Array]) -> None:
+    def check(self, data: Mapping[str, Array], *, undeformed: bool) -> None:
         """Refuse what is out of range or not finite at some point of Γc. Collective.
 
         Args:
             data: As sampled at the points, by name; see `PointValues`.
+            undeformed: Whether gap and normal of the undeformed Γc are used.
 
         Raises:
             ValueError: On all ranks.
@@ -350,14 +351,17 @@ class Inputs:
         prefix = "parameter "
         parameters = {n.removeprefix(prefix): v for n, v in data.items() if n.startswith(prefix)}
         shortest = global_min(comm, data["direction_length"], empty=1.0)
-        if not shortest > 0.0:
+        if undeformed and not shortest > 0.0:
             raise ValueError(
                 f"{self._name}: the normal of the obstacle has length {shortest:g} at a point of "
                 "Γc; it must not vanish anywhere, and point from the body to the obstacle"
             )
         # Only what was given: what follows from u is checked with u.
         weight = data["weight"]
-        given = {"weight": weight, "gap": data["initial_gap"], "normal": data["normal"]}
+        given = {"weight": weight, "displacement of the obstacle": data["shift"]}
+        given |= {name: data[name] for name in ("angle", "about") if name in data}
+        if undeformed:
+            given |= {"gap": data["initial_gap"], "normal": data["normal"]}
         for name, array in {**given, **parameters}.items():
             low, high = global_min(comm, array), global_max(comm, array)
             if not (np.isfinite(low) and np.isfinite(high)):

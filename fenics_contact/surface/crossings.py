@@ -108,7 +108,9 @@ def _crossings(start: Array, end: Array, vertices: Index, facets: MovingFacets) 
     # Most paths are far from all facets: only those that come near are compared one by one.
     place: Any
     facet: Any
-    place, facet = near_pairs(tree, centre, radius + reach.max())
+    known = np.flatnonzero(np.isfinite(radius))  # not where an obstacle has no normal
+    place, facet = near_pairs(tree, centre[known], radius[known] + reach.max())
+    place = known[place]
     near = np.linalg.norm(centre[place] - middle[facet], axis=1) <= radius[place] + reach[facet]
     near &= ~(vertices[place][:, :, None] == facets.vertices[facet][:, None, :]).any(axis=(1, 2))
     place, facet = place[near], facet[near]
