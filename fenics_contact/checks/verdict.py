@@ -466,5 +466,7 @@ def _advice(
         return _OF_A_LAW
     if attempts and attempts[-1].outcome.startswith(_OVERLOAD):
         return _OF_OVERLOAD
+    if reason > 0:  # a lower stiffness would help the iteration, which has converged
+        return "Try what the failed checks say, or smaller increments"
     lower = [f"a lower {name}" for name in stiffnesses]
     return "Try " + ", then ".join([", ".join(["smaller increments", *lower[:-1]]), *lower[-1:]])
