@@ -253,6 +253,44 @@ def test_a_limit_of_another_law():
     assert "smaller increments" not in str(caught.value)
 
 
+@dataclass(frozen=True)
+class RootOfPenetration(fc.Law):
+    """A pressure c √δ₋, whose derivative is infinite at first contact and NaN where it is open."""
+
+    c: Any
+
+    def contact_traction(self, kinematics, parameters):
+        """The pressure, without friction."""
+        penetration = ufl.max_value(-kinematics.gap, 0)
+        opening = ufl.max_value(kinematics.gap, 0)
+        return ContactTraction(-parameters["c"] * penetration**0.5, opening, penetration)
+
+    def normal_potential(self, kinematics, parameters):
+        """∫ p dδ."""
+        return parameters["c"] * ufl.max_value(-kinematics.gap, 0) ** 1.5 / 1.5
+
+
+@pytest.mark.parametrize("condensation", [None, False])
+def test_a_derivative_that_is_not_finite(condensation):
+    """On a curved obstacle it makes a diverged state: refused as such, with u and loads restored.
+
+    The verification looks at that state, at points that are nowhere.
+    """
+    scene = block(E=E, nu=NU, n=3)
+    ball = fc.Ball((0.5, -2.0), 2.0)
+    problem, contact = scene.problem(
+        RootOfPenetration(5.0),
+        scene.rollers(),
+        contact={"obstacle": ball},
+        condensation=condensation,
+    )
+    scene.load(up=-0.2)
+    text = raised_everywhere(problem.solve, fc.NotConverged, "not finite", "user-defined law")
+    assert "its size" not in text  # NaN is no deformation
+    assert problem.increment == 0 and np.all(scene.u.x.array == 0.0)
+    assert np.isfinite(gathered(COMM, contact.gap)).all()
+
+
 def test_what_to_try_is_what_the_law_has():
     """No lower k_n of a law that has none; of the package's own there are both."""
     for law, words in (

@@ -450,7 +450,9 @@ class RigidObstacleProbe:
         changed = not np.array_equal(self._sampler.committed_shape, self._shape)
         inside = _dot(toward, self._outward(self._facet, field_end)) < 0
         before = np.where(inside, (_PREDICTED_DEPTH + _DEPTH_RESOLUTION) * size, 0.0)
-        near = np.flatnonzero(changed | ~(distance_end > way + angle * radius + before))
+        near = changed | ~(distance_end > way + angle * radius + before)
+        # A diverged state is not finite, and is refused for its residual.
+        near = np.flatnonzero(near & np.isfinite(way) & np.isfinite(distance_end))
         if not comm.allreduce(len(near)):
             return self.x[:0]
         start, end, toward = start[near], end[near], toward[near]

@@ -187,6 +187,11 @@ class Verdict:
         return shown(title, ("check", "error", "tolerance"), rows, failures)
 
     @property
+    def is_finite(self) -> bool:
+        """Whether all residuals, forces and tolerances of the equations are finite numbers."""
+        return all(balance.holds(np.inf) for balance in self.equations.values())
+
+    @property
     def only_laws_fail(self) -> bool:
         """Whether only contact laws are violated."""
         return bool(self.failures) and not replace(self, laws={}).failures
@@ -254,7 +259,7 @@ class Verdict:
                     "error: ContactProblem(small_displacement_tolerance=inf)"
                 )
         for name, deformation in self.deformation.items():
-            if self.small_displacement_tolerance == np.inf or deformation <= _MOST_DEFORMED:
+            if self.small_displacement_tolerance == np.inf or not deformation > _MOST_DEFORMED:
                 continue
             found.append(
                 f"{name} is deformed by {deformation:.2g} times its size: a part of it is not "
@@ -453,6 +458,11 @@ _OF_A_LAW = (
     "The equations hold, but the contact law does not: check that contact_traction, friction_bound "
     "and normal_potential of a user-defined law are consistent"
 )
+_OF_A_STATE_NOT_FINITE = (
+    "The last state is not finite (NaN or inf): tractions and their derivatives of a user-defined "
+    "law must be finite at every gap and slip; a root, or a power below 1, has no derivative at 0. "
+    "Otherwise try smaller increments"
+)
 _OF_OVERLOAD = (
     "Try a smaller load, more friction, or a Dirichlet condition that constrains this motion"
 )
@@ -468,5 +478,7 @@ def _advice(
         return _OF_OVERLOAD
     if reason > 0:  # a lower stiffness would help the iteration, which has converged
         return "Try what the failed checks say, or smaller increments"
+    if not verdict.is_finite:
+        return _OF_A_STATE_NOT_FINITE
     lower = [f"a lower {name}" for name in stiffnesses]
     return "Try " + ", then ".join([", ".join(["smaller increments", *lower[:-1]]), *lower[-1:]])
