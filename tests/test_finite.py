@@ -221,11 +221,11 @@ FLOOR = fc.HalfSpace((0, 1), (0, -1))
         (_refused(FLOOR, kinematics="large"), ValueError, "'small', 'finite'"),
         (_refused(FLOOR, gap=0.1), ValueError, "gap is given"),
         (_refused(FLOOR, law=fc.Foundation(K, K)), ValueError, "Foundation bonds"),
-        (_refused(fc.PrescribedGap(0.1, (0, 1))), ValueError, "distance=lambda"),
+        (_refused(fc.PrescribedGap(0.1, (0, 1))), ValueError, "SignedDistance(lambda x"),
         (
             _refused(lambda s: fc.SignedDistance(lambda x: ufl.SpatialCoordinate(s.mesh)[1])),
             ValueError,
-            "distance=lambda",
+            "SignedDistance(lambda x",
         ),
         (
             _refused(

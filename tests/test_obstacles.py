@@ -60,6 +60,45 @@ def test_what_is_no_distance_is_refused(kinematics):
     assert forces[0] == pytest.approx(forces[1], rel=1e-2)
 
 
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+@pytest.mark.parametrize(
+    ("distance", "words"),
+    [
+        (lambda x: x[2], ["2 components", "out of bounds"]),  # of a mesh in space, in the plane
+        (lambda x: np.hypot(*x), ["hypot"]),
+        (lambda x: None, ["None"]),
+        (lambda x: 0.1, ["does not depend on x"]),
+        (lambda x: ufl.as_ufl(1) + 2, ["does not depend on x"]),
+    ],
+    ids=["index", "numpy", "none", "number", "constant"],
+)
+def test_a_function_that_is_no_distance_is_named(distance, words, kinematics):
+    """UFL's own words for these, "Index out of bounds" or "Division by zero", name no obstacle."""
+    scene = block()
+    obstacle = fc.SignedDistance(distance)
+    raised_everywhere(
+        lambda: scene.contact(fc.Frictionless(), obstacle=obstacle, kinematics=kinematics),
+        ValueError,
+        "distance of the SignedDistance",
+        *words,
+    )
+
+
+@pytest.mark.parametrize("length", [1e-300, 1e-5, 1e200])
+def test_a_normal_of_any_length(length):
+    """The normal of a plane and the axis of a cylinder: their squares overflow, or are zero."""
+    scene = block("tetrahedron")
+    for made in (
+        lambda size: fc.HalfSpace((0, 0, -0.1), (0.0, -0.3 * size, 0.7 * size)),
+        lambda size: fc.Cylinder((0.4, 0.5, -1.1), 1.0, axis=(size, 0.2 * size, 0.0)),
+    ):
+        gaps = [
+            gathered(COMM, scene.contact(fc.Frictionless(), obstacle=made(size)).gap)
+            for size in (1.0, length)
+        ]
+        assert close(gaps[1], gaps[0], 1e-14, scale=1.0)
+
+
 def test_an_obstacle_that_sinks_in_is_refused():
     """Soft springs, a small roller: refused before it comes out on its other side.
 

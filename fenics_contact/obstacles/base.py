@@ -354,10 +354,11 @@ def nonzero_vector(name: str, value: Any, gdim: int) -> Any:
     """Check a direction given by numbers: not of length zero. Its length does not matter."""
     value = as_vector(name, value, gdim)
     if isinstance(value, np.ndarray):
-        length = np.linalg.norm(value)
-        if length == 0.0:
+        largest = np.abs(value).max()
+        if largest == 0.0:
             raise ValueError(f"{name} is {value.tolist()}; it must not have length zero")
-        return value / length
+        value = value / largest  # whose square neither overflows nor vanishes
+        return value / np.linalg.norm(value)
     return value
 
 

@@ -193,11 +193,29 @@ class SignedDistance(Obstacle):
         return True
 
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """Return the signed distance at x - shift and minus its gradient."""
+        """Return the signed distance at x - shift and minus its gradient.
+
+        Raises:
+            ValueError: The function fails, does not return a UFL scalar, or does not depend on x.
+        """
+        name = "distance of the SignedDistance"
         here = ufl.variable(x if shift is None else x - shift)
-        gap = ufl.as_ufl(self.distance(here))
-        _check_scalar("distance of the SignedDistance", gap)
-        return Placement(gap, -ufl.diff(gap, here))
+        try:
+            gap = ufl.as_ufl(self.distance(here))
+        except Exception as error:
+            raise ValueError(
+                f"{name} fails at a position x of {x.ufl_shape[0]} components: "
+                f"{type(error).__name__}: {error}; it must be a function of x that returns a UFL "
+                "scalar, such as lambda x: x[1]"
+            ) from error
+        _check_scalar(name, gap)
+        gradient = ufl.diff(gap, here)
+        if isinstance(gradient, ufl.constantvalue.Zero):
+            raise ValueError(
+                f"{name} is {gap}, which does not depend on x, so that there is no normal; use the "
+                "argument of the function, as in lambda x: x[1]"
+            )
+        return Placement(gap, -gradient)
 
 
 @dataclass(frozen=True)
