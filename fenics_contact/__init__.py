@@ -16,6 +16,7 @@ from fenics_contact.histories.increments import increments
 from fenics_contact.histories.report import report
 from fenics_contact.joining import JoinedMesh, join_meshes
 from fenics_contact.laws.base import ContactTraction, Law, PointKinematics
+from fenics_contact.laws.compliance import NormalCompliance
 from fenics_contact.laws.friction import Coulomb, FrictionLaw, Tresca
 from fenics_contact.laws.stiffness import NodalSprings, RelativeStiffness
 from fenics_contact.laws.unilateral import Foundation, Frictionless
@@ -62,6 +63,7 @@ __all__ = [
     "Law",
     "Motion",
     "NodalSprings",
+    "NormalCompliance",
     "NotConverged",
     "Obstacle",
     "Placement",

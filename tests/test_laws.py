@@ -36,6 +36,7 @@ LAWS = {
     "tresca": fc.Tresca(FRICTION, PRESSURE, k_n=K_N, k_t=K_T),
     "prescribed": fc.Tresca(FRICTION, PRESSURE, k_t=K_T, unilateral=False),
     "coulomb": fc.Coulomb(FRICTION, k_n=K_N, k_t=K_T),
+    "compliance": fc.NormalCompliance(FRICTION, PRESSURE, 0.08, 2.0, k_t=K_T),
     "foundation": fc.Foundation(K_N, K_T),
     "foundation, closed only": fc.Foundation(K_N, K_T, tension=False),
 }
@@ -158,7 +159,8 @@ def test_residual_and_tangent_are_derivatives(cell, degree, law):
     tangent_form = compiled(contact.tangent(v, du), contact)
     potential = None
     kind = type(contact.law).__name__
-    assert contact.law.has_potential == (kind != "Coulomb" and law != "foundation, closed only")
+    path_dependent = law.startswith(("coulomb", "compliance")) or law == "foundation, closed only"
+    assert contact.law.has_potential is not path_dependent
     if not contact.law.has_potential:
         raised_everywhere(contact.potential, ValueError, kind, "potential")
     else:
@@ -190,7 +192,8 @@ def check_shape(scene: Scene, state: State, law: str, r: np.ndarray, tangent: PE
     """What vanishes and what is symmetric: without this 0 = 0 would pass as a derivative."""
     kind = state.name.split()[0]
     size = tangent.norm(PETSc.NormType.FROBENIUS)
-    unilateral = law.startswith(("frictionless", "coulomb")) or law == "foundation, closed only"
+    unilateral = law.startswith(("frictionless", "coulomb", "compliance"))
+    unilateral = unilateral or law == "foundation, closed only"
     if kind == "open" and unilateral:
         assert np.all(r == 0.0) and size == 0.0, state.name
         return
@@ -204,7 +207,7 @@ def check_shape(scene: Scene, state: State, law: str, r: np.ndarray, tangent: PE
     transposed.axpy(-1.0, tangent)
     skew = transposed.norm(PETSc.NormType.FROBENIUS) / size
     transposed.destroy()
-    if law.startswith("coulomb") and kind == "slip":
+    if law.startswith(("coulomb", "compliance")) and kind == "slip":
         assert skew > 1e-2, state.name
     else:
         assert skew <= 1e-13, state.name

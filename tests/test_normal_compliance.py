@@ -1,0 +1,110 @@
+"""Normal compliance by a power law, p = p0 (δ/h)^m, with Coulomb friction."""
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from scenes.blocks import TOP, block
+from scenes.comparing import close, gathered, raised_everywhere, shared_folder
+from scenes.histories import Press, goes_on
+
+COMM = MPI.COMM_WORLD
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
+
+E, P0, H, MU = 1000.0, 5.0, 1e-2, 0.3
+# Forces are solved to 1e-9 of the load; δ has 1/m of the relative error of p.
+EXACT = 1e-7
+
+
+@pytest.mark.parametrize("m", [1.0, 2.0, 3.3])
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_approach_under_uniform_pressure(cell, m):
+    """δ = h (p/p0)^(1/m) at every point, loading and unloading, and W = p δ/(m+1) per area.
+
+    Without Poisson's effect the block does not move along the floor, so that friction is idle.
+    """
+    scene = block(cell, E=E, nu=0.0)
+    problem, contact = scene.problem(fc.NormalCompliance(MU, P0, H, m), scene.rollers())
+    stored = 0.0
+    for p in (0.2, 3.0, 20.0, 1.0):
+        scene.load(up=-p)
+        step = problem.solve()
+        assert step.verdict.failures == []
+        problem.commit()
+        delta = H * (p / P0) ** (1 / m)
+        assert close(-gathered(COMM, contact.gap), np.full(_n(contact), delta), EXACT, scale=delta)
+        assert close(gathered(COMM, contact.pressure), np.full(_n(contact), p), EXACT)
+        energy = p * delta / (m + 1)  # the floor has area 1
+        assert step.energy.springs == pytest.approx(energy - stored, rel=1e-6)
+        stored = energy
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_sliding(cell):
+    """Dragged until all points slip, and back: |τ| = μ p0 (δ/h)^m at every point, against slip."""
+    scene = block(cell, E=E, nu=0.3, n=3)
+    d = scene.dim
+    push, press = (scene.hold(TOP, i) for i in (0, d - 1))
+    held = [scene.hold(TOP, 1)] if d == 3 else []
+    problem, contact = scene.problem(fc.NormalCompliance(MU, P0, H, 2.0), [push, press, *held])
+    for side in (0.0, 2e-2, -2e-2):
+        push.g.value[...], press.g.value[...] = side, -1e-2
+        step = problem.solve()
+        assert step.verdict.failures == []
+        if side:
+            delta = np.maximum(-gathered(COMM, contact.gap), 0.0)
+            tau = gathered(COMM, contact.tangential_traction)
+            assert step.contacts["contact"].stick == 0
+            # Evaluated from the same displacement: round-off.
+            assert close(np.linalg.norm(tau, axis=1), MU * P0 * (delta / H) ** 2, 1e-10)
+            assert (tau[:, 0] * side < 0).all()
+        problem.commit()
+    assert step.energy.dissipation > 0
+
+
+def test_any_units():
+    """Approach and iterations are the same in N and mm, in N and µm, and with forces times 1e6."""
+    found = []
+    for force, length in ((1.0, 1.0), (1e6, 1.0), (1.0, 1e3)):
+        stress = force / length**2
+        scene = block(E=E * stress, nu=0.3, up=-3 * stress, size=[length, length])
+        law = fc.NormalCompliance(MU, P0 * stress, H * length, 2.5)
+        problem, contact = scene.problem(law, scene.rollers())
+        found.append((problem.solve().iterations, -gathered(COMM, contact.gap) / length))
+    for iterations, delta in found[1:]:
+        assert iterations == found[0][0] and close(delta, found[0][1], EXACT)
+
+
+def test_restart(tmp_path):
+    """On a ball, pressed, dragged and back: resumed from its checkpoint, the history is equal."""
+    law = fc.NormalCompliance(MU, P0, H, k_t=1e3)
+    goes_on(lambda: Press(law, cell="triangle"), shared_folder(tmp_path), stop=5, tolerance=1e-6)
+
+
+def test_what_is_refused():
+    """An exponent below 1, parameters that are not positive, and multipliers, with their names."""
+    scene = block()
+    for m in (0.5, 0.0, -1.0, float("nan")):
+        raised_everywhere(lambda m=m: fc.NormalCompliance(MU, P0, H, m), ValueError, "exponent")
+    given = {"friction": MU, "pressure": P0, "approach": H}
+    for name in ("pressure", "approach"):
+        for value in (0.0, -1.0):
+            law = fc.NormalCompliance(**given | {name: value})
+            raised_everywhere(lambda law=law: scene.contact(law), ValueError, "contact", name)
+        law = fc.NormalCompliance(**given | {name: fem.Constant(scene.mesh, -1.0)})
+        raised_everywhere(
+            lambda law=law: scene.problem(law, scene.rollers()), ValueError, "contact", name
+        )
+    law = fc.NormalCompliance(**given)
+    raised_everywhere(
+        lambda: scene.contact(law, enforcement="augmented"),
+        ValueError,
+        "NormalCompliance",
+        "penalty",
+    )
+
+
+def _n(contact):
+    return len(gathered(COMM, contact.gap))
