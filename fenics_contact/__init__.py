@@ -32,7 +32,14 @@ from fenics_contact.obstacles.base import (
 from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.obstacles.meshed import RigidSurface
 from fenics_contact.obstacles.profile import RigidProfile
-from fenics_contact.obstacles.rigid import Ball, Cylinder, HalfSpace, PrescribedGap, SignedDistance
+from fenics_contact.obstacles.rigid import (
+    Ball,
+    Cylinder,
+    HalfSpace,
+    PrescribedGap,
+    RoundedCone,
+    SignedDistance,
+)
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import output, plotting
 from fenics_contact.results.animation import Animation
@@ -74,6 +81,7 @@ __all__ = [
     "RigidProfile",
     "RigidSurface",
     "Rotation",
+    "RoundedCone",
     "Sample",
     "SampledObstacle",
     "SignedDistance",

@@ -1,4 +1,4 @@
-"""Rigid obstacles given by UFL: half-space, ball, cylinder, signed distance, prescribed gap."""
+"""Rigid obstacles given by UFL: half-space, ball, cylinder, cone, signed distance, given gap."""
 
 from __future__ import annotations
 
@@ -20,7 +20,15 @@ from fenics_contact.obstacles.base import (
     nonzero_vector,
 )
 
-__all__ = ["Ball", "Cylinder", "HalfSpace", "PrescribedGap", "SignedDistance", "ToUFL"]
+__all__ = [
+    "Ball",
+    "Cylinder",
+    "HalfSpace",
+    "PrescribedGap",
+    "RoundedCone",
+    "SignedDistance",
+    "ToUFL",
+]
 
 ToUFL = Callable[[Any], ufl.core.expr.Expr]
 
@@ -138,6 +146,74 @@ class Cylinder(Obstacle):
         return _round(
             arm, shift, to_ufl(as_positive("radius of the Cylinder", self.radius)), self.inside
         )
+
+
+@dataclass(frozen=True)
+class RoundedCone(Obstacle):
+    """A rigid cone with a spherical tip, in 2D a wedge with a round tip.
+
+    It is an indenter: Rockwell's has a half-angle of 60° and a tip radius of 0.2 mm. The flank is
+    tangent to the sphere, and has no end.
+
+    Args:
+        tip: Outermost point of the tip, gdim numbers (length).
+        axis: Direction from the tip into the cone, gdim numbers of any length.
+        half_angle: Angle between axis and flank (radians), between 0 and π/2.
+        radius: Radius of the tip, > 0 (length).
+        displacement: Rigid translation, as for `Obstacle`.
+        rotation: Rotation, as for `Obstacle`.
+    """
+
+    tip: Sequence[float]
+    axis: Sequence[float]
+    half_angle: float
+    radius: float
+    displacement: Any = None
+    rotation: Rotation | None = None
+
+    @property
+    def is_distance(self) -> bool:
+        """Whether the normal is minus the gradient of the gap: always True."""
+        return True
+
+    @property
+    def smallest_radius(self) -> float:
+        """Radius of the tip (length); infinite if it is not known as a number."""
+        return _convex_radius(self.radius, inside=False)
+
+    def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
+        """Return the signed distance and minus its gradient.
+
+        With the coordinates z along the axis and ρ across it, from the centre of the tip, the
+        distance is √(ρ² + z²) - r where the tip is closest, ρ sin α + z cos α < 0, and
+        ρ cos α - z sin α - r where the flank is.
+
+        Raises:
+            ValueError: ``half_angle`` is not between 0 and π/2, or data are out of range.
+        """
+        gdim, angle = x.ufl_shape[0], as_positive("half_angle of the RoundedCone", self.half_angle)
+        if is_number(angle) and not angle < np.pi / 2:
+            raise ValueError(
+                f"half_angle of the RoundedCone is {self.half_angle!r}; it must be less than π/2 "
+                "(radians), a right angle"
+            )
+        radius = to_ufl(as_positive("radius of the RoundedCone", self.radius))
+        axis = to_ufl(nonzero_vector("axis of the RoundedCone", self.axis, gdim))
+        axis = axis / ufl.sqrt(ufl.dot(axis, axis))
+        tip = to_ufl(as_vector("tip of the RoundedCone", self.tip, gdim))
+        c, s = ufl.cos(to_ufl(angle)), ufl.sin(to_ufl(angle))
+        here = ufl.variable(x if shift is None else x - shift)
+        arm = here - tip - radius * axis
+        z = ufl.dot(arm, axis)
+        across = arm - z * axis
+        # On the axis, where this root has no derivative, only the tip's distance is used.
+        rho = ufl.sqrt(ufl.dot(across, across))
+        gap = ufl.conditional(
+            ufl.lt(rho * s + z * c, 0),
+            ufl.sqrt(ufl.dot(arm, arm)) - radius,
+            rho * c - z * s - radius,
+        )
+        return Placement(gap, -ufl.diff(gap, here))
 
 
 def _convex_radius(radius: Any, inside: bool) -> float:
