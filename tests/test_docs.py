@@ -141,7 +141,7 @@ def test_every_picture_has_its_command(picture: Path) -> None:
     shown = [text for text in pages if picture.name in text]
     assert shown
     for text in shown:
-        assert re.search(r"(python (demos|benchmarks)|`docs/scripts)/\w+\.py", text)
+        assert re.search(r"(python (demos|benchmarks|verification)|`docs/scripts)/\w+\.py", text)
 
 
 def documented() -> list[str]:

@@ -8,9 +8,9 @@ import sys
 import pytest
 from mpi4py import MPI
 
-from verification import effectivity, report, statics
+from verification import effectivity, run, statics
 from verification.cases import Case, Outcome, Row
-from verification.report import CASES
+from verification.run import CASES
 
 pytestmark = pytest.mark.mpi
 
@@ -53,11 +53,11 @@ def test_misses_and_failures_are_shown(tmp_path, monkeypatch, capsys):
         Case(name, "none", lambda row=row: Outcome((row,), "a mesh", 7))
         for name, row in rows.items()
     ]
-    monkeypatch.setattr(report, "DEMOS", [])
-    monkeypatch.setattr(report, "CASES", cases)
-    monkeypatch.setattr(report, "PAGE", tmp_path / "page.md")
+    monkeypatch.setattr(run, "DEMOS", [])
+    monkeypatch.setattr(run, "CASES", cases)
+    monkeypatch.setattr(run, "PAGE", tmp_path / "page.md")
     monkeypatch.setattr(sys, "argv", ["run.py"])
-    assert report.main() == 1
+    assert run.main() == 1
     page = (tmp_path / "page.md").read_text()
     assert page == page.rstrip() + "\n"
     for text in (
@@ -68,17 +68,17 @@ def test_misses_and_failures_are_shown(tmp_path, monkeypatch, capsys):
     ):
         assert text in page
     assert page.count("| **MISSED** |") == 1 and page.count("| met |") == 1
-    monkeypatch.setattr(report, "CASES", cases[1:2])
-    assert report.main() == 0
+    monkeypatch.setattr(run, "CASES", cases[1:2])
+    assert run.main() == 0
     assert "MISSED" not in (tmp_path / "page.md").read_text()
 
 
 @ONE_PROCESS
 def test_the_page_has_all_cases():
     """The page that is kept is of these cases, and nothing on it is missed."""
-    page = report.PAGE.read_text()
+    page = run.PAGE.read_text()
     titles = [line.removeprefix("## ") for line in page.splitlines() if line.startswith("## ")]
-    assert titles == [case.name for case in [*report.DEMOS, *report.CASES]]
+    assert titles == [case.name for case in [*run.DEMOS, *run.CASES]]
     assert "MISSED" not in page and "FAILED" not in page
 
 
@@ -97,7 +97,7 @@ def test_the_page_of_estimates_has_all_cases():
     rows = [line for line in page.splitlines() if line.startswith("| ")]
     for case in CASES:
         assert any(row.startswith(f"| {case.name} | {case.budget}") for row in rows), case.name
-    for case in report.DEMOS:
+    for case in run.DEMOS:
         assert not case.budget or f"| {case.name} | {case.budget} |" in rows, case.name
     for name, *_ in effectivity.WHOLES:
         assert any(row.startswith(f"| {name} ") for row in rows), name

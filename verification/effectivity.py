@@ -29,7 +29,7 @@ from scenes.processes import ROOT
 from verification import half_planes
 from verification.cases import Case, Outcome
 from verification.demonstrations import DEMOS, run, runs
-from verification.report import CASES
+from verification.run import CASES
 
 PAGE = ROOT / "docs" / "effectivity.md"
 USEFUL = (0.3, 3.0)

@@ -565,7 +565,7 @@ def ranked(
     both = Pair(gap=1e-3, partitioner=lower_block_apart if apart and comm.size > 1 else None)
     both.drag()
     law = friction_law(mu, kappa * 6 * E)
-    if kind == "pair":
+    if kind == "two bodies":
         problem = both.problem(law, method=method)
     else:  # the upper block is pressed by nothing: it is held and stays
         both.body.bcs.clear()

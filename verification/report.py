@@ -1,109 +1,63 @@
-"""Compute the cases of the verification and write their page."""
+"""Pages of results: CSV files, Markdown tables and text wrapped at 100 columns.
+
+A page is written from its stored data alone: option ``--page`` of a script rewrites the page and
+its figures without computing anything.
+"""
 
 from __future__ import annotations
 
-import argparse
+import csv
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-import dolfinx
-from petsc4py import PETSc
-
-import fenics_contact as fc
-from scenes.processes import ROOT
-from verification import axisymmetric, half_planes, solids, statics
-from verification.cases import Case, Outcome, cases_of
-from verification.demonstrations import DEMOS
-
-CASES = cases_of(statics, half_planes, axisymmetric, solids)
-PAGE = ROOT / "docs" / "verification.md"
+__all__ = ["number", "read", "save", "table", "text"]
 
 
-def number(value: float) -> str:
-    """A number short enough for a table."""
-    return f"{value:.6g}"
+def read(path: Path) -> list[dict[str, str]]:
+    """Read the rows of a CSV file."""
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
 
 
-def section(case: Case, made: Outcome | str) -> list[str]:
-    """The lines of one case; a text is the error it failed with."""
-    lines = [f"## {case.name}", ""]
-    if isinstance(made, str):
-        return [*lines, f"**FAILED:** {made}", ""]
-    size = f"{made.dofs} dofs, " if made.dofs else ""
-    lines += [f"{made.mesh}; {size}{made.seconds:.1f} s. Tolerance: {case.reason}.", ""]
-    lines += [
-        "| quantity | reference | source | tolerance | obtained | error | |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for row in made.rows:
-        cells = [
-            row.quantity.replace("|", "\\|"),
-            number(row.reference),
-            row.source.replace("|", "\\|"),
-            f"{row.tolerance:.2g}",
-            number(row.obtained),
-            f"{row.error:.1e}",
-            "met" if row.passed else "**MISSED**",
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return [*lines, ""]
+def save(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows to a CSV file with all digits; the columns are those of any row."""
+    columns = list(dict.fromkeys(column for row in rows for column in row))
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
-def page(results: list[tuple[Case, Outcome | str]]) -> str:
-    """The whole page."""
-    rows = [row for _, made in results if isinstance(made, Outcome) for row in made.rows]
-    met = sum(row.passed for row in rows)
-    failed = [case.name for case, made in results if isinstance(made, str)]
-    seconds = sum(made.seconds for _, made in results if isinstance(made, Outcome))
-    versions = f"DOLFINx {dolfinx.__version__}, PETSc {'.'.join(map(str, PETSc.Sys.getVersion()))}"
-    lines = [
-        "# Verification",
-        "",
-        "Written by `python verification/run.py`. Tolerances and errors are relative to the "
-        "reference, and absolute where that is 0. *Exact complementarity* marks values of an "
-        "independent computation without penalty, on converged meshes.",
-        "",
-        f"**{met} of {len(rows)} quantities in {len(results)} cases meet their references**, in "
-        f"{seconds:.0f} s on one process (fenics_contact {fc.__version__}, {versions}).",
-    ]
-    if failed:
-        lines += ["", f"**Cases that failed: {', '.join(failed)}.**"]
-    missed = [
-        f"{case.name}: {row.quantity}"
-        for case, made in results
-        if isinstance(made, Outcome)
-        for row in made.rows
-        if not row.passed
-    ]
-    if missed:
-        lines += ["", f"**Missed: {'; '.join(missed)}.**"]
-    lines.append("")
-    for case, made in results:
-        lines += section(case, made)
-    return "\n".join(lines)
+def number(value: float | str, digits: int = 3) -> str:
+    """Format a number for a table; an empty text remains empty."""
+    return "" if value == "" else f"{float(value):.{digits}g}"
 
 
-def main() -> int:
-    """Run the cases; 0 if all references are met."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter
-    )
-    parser.add_argument("--only", nargs="+", metavar="WORD", help="cases with one of these words")
-    parser.add_argument("--output", type=Path, help=f"page to write (default: {PAGE.name} of docs)")
-    arguments = parser.parse_args()
-    words = [word.lower() for word in arguments.only or [""]]
-    chosen = [c for c in DEMOS + CASES if any(word in c.name.lower() for word in words)]
-    if not chosen:
-        parser.error(f"no case has one of the words {words}")
-    if arguments.only and not arguments.output:
-        parser.error("a page of some cases alone wants another --output")
-    results: list[tuple[Case, Outcome | str]] = []
-    for case in chosen:
-        try:
-            made: Outcome | str = case.run()
-        except Exception as error:
-            made = f"{type(error).__name__}: {error}"
-        results.append((case, made))
-        print("\n".join(section(case, made)), flush=True)
-    (arguments.output or PAGE).write_text(page(results).rstrip() + "\n")
-    good = all(isinstance(made, Outcome) and made.passed for _, made in results)
-    return 0 if good else 1
+def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:
+    """Return the lines of a Markdown table, followed by an empty line."""
+    cells = [[str(cell).replace("|", "\\|") for cell in row] for row in (header, *rows)]
+    lines = [f"| {' | '.join(row)} |" for row in cells]
+    return [lines[0], "|" + "---|" * len(header), *lines[1:], ""]
+
+
+def text(*paragraphs: str) -> list[str]:
+    """Return paragraphs wrapped at 100 columns, each followed by an empty line.
+
+    Items of a list are paragraphs that begin with "- "; no empty line is between them.
+    """
+    lines: list[str] = []
+    for paragraph in paragraphs:
+        item = paragraph.startswith("- ")
+        if item and len(lines) > 1 and lines[-2].startswith(("- ", "  ")):
+            lines.pop()
+        lines += textwrap.wrap(
+            " ".join(paragraph.split()),
+            100,
+            subsequent_indent="  " if item else "",
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        lines.append("")
+    return lines
