@@ -1,13 +1,13 @@
-"""A rigid ball on an elastic block, in space, with friction: what contact costs.
+"""Rigid ball on an elastic block, 3D, with friction: cost relative to one linear solve.
 
-A quarter of the block by symmetry, hexahedra that grow with the distance from the contact, the
-ball moved down in one increment: by this package as it chooses by itself, condensed, and on all
-unknowns by multigrid; by a penalty form by hand in DOLFINx with Newton's method, every step by
-MUMPS' LU or by GMRES with GAMG, told of the rigid motions; and one linear solve of the body, by
-factorisation and by multigrid. Residuals end below 1e-9 of the forces in all of them. Meshing is
-not counted, and the compiling of forms stands apart. Errors are those of force, peak pressure and
-the displacement at the end of Γc against a finer mesh, of ``--reference`` cells a side and thrice
-the stiffness, so that the error of a finite stiffness is among those that are seen.
+A quarter of the block by symmetry, hexahedra graded towards the contact, one increment. Compared
+are this package with its defaults, with static condensation, and on all dofs with multigrid; a
+hand-written penalty form in DOLFINx with Newton's method, each step solved by MUMPS' LU or by GMRES
+with GAMG and the rigid-body modes as near-nullspace; and one linear solve of the body, by
+factorisation and by multigrid. All residuals are below 1e-9 of the forces. Meshing is not included,
+the compilation of forms is separate. Errors of force, peak pressure and displacement at the end of
+Γc are relative to a finer mesh of ``--reference`` cells per side with three times the contact
+stiffness, so that the penalty error is included.
 
     OMP_NUM_THREADS=1 python benchmarks/ball.py              # ten minutes
     OMP_NUM_THREADS=1 python benchmarks/ball.py --short
@@ -26,13 +26,13 @@ from scenes import problems
 
 
 def runs(case: costs.Case, friction: float) -> dict[str, Callable[[], costs.Row]]:
-    """What to time, by name."""
+    """Return the runs to time, by name."""
     return {
         costs.YARDSTICK: case.linear,
         f"{costs.YARDSTICK}, multigrid": partial(case.linear, "multigrid"),
         "by default": partial(case.package, friction),
         "condensed": partial(case.package, friction, condensation=True),
-        "all unknowns, L-BFGS, multigrid": partial(
+        "all dofs, L-BFGS, multigrid": partial(
             case.package, friction, method="lbfgs", condensation=False, linear_solver="multigrid"
         ),
         **{name: partial(case.plain, friction, kind) for kind, name in costs.PLAIN.items()},
@@ -40,16 +40,16 @@ def runs(case: costs.Case, friction: float) -> dict[str, Callable[[], costs.Row]
 
 
 def main() -> None:
-    """Run."""
+    """Measure and write."""
     parser = costs.parser(__doc__, "ball")
     parser.add_argument(
-        "--cells", type=int, nargs="+", default=[7, 11, 16, 23, 32], help="a side; table: the last"
+        "--cells", type=int, nargs="+", default=[7, 11, 16, 23, 32], help="cells per side"
     )
-    parser.add_argument("--reference", type=int, default=40, help="cells a side of the finer mesh")
+    parser.add_argument("--reference", type=int, default=40, help="cells per side of the reference")
     parser.add_argument("--friction", type=float, default=0.3)
     arguments = parser.parse_args()
     if MPI.COMM_WORLD.size > 1:
-        parser.error("times here are of one rank; large.py takes several (--ranks)")
+        parser.error("runs on one rank; for several see large.py")
     sizes, finer = arguments.cells, arguments.reference
     if arguments.short:
         sizes, finer = [6, 8, 11], 14
@@ -68,7 +68,7 @@ def main() -> None:
 
     title = f"Ball on a block, trilinear, μ = {arguments.friction:g}, k h/E = "
     title += f"{arguments.stiffness:g}"
-    cases = {f"{n} cells a side": partial(make, n) for n in sizes}
+    cases = {f"{n} cells per side": partial(make, n) for n in sizes}
     costs.study("ball", title, cases, partial(runs, friction=arguments.friction), arguments)
 
 

@@ -1,7 +1,8 @@
-"""What contact costs in units of one linear solve: the yardsticks, and the study of a scene.
+"""Cost of contact in units of one linear solve: reference solvers, and the study of a problem.
 
-The yardsticks are what a user of DOLFINx writes: one linear solve, and a penalty form with Newton's
-method (SNES ``newtonls``, the consistent tangent), every step by MUMPS' LU or by GMRES with GAMG.
+The reference solvers are those that a user of DOLFINx would write: one linear solve, and a penalty
+form with Newton's method (SNES ``newtonls``, consistent tangent) and LU by MUMPS or GMRES with
+GAMG.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from scenes.elasticity import hold
 
 YARDSTICK = "one linear solve"
 PLAIN = {"direct": "plain DOLFINx, LU", "multigrid": "plain DOLFINx, GMRES + GAMG"}
-# What residuals may have of the forces, for all; the package's default.
+# Residual relative to the forces, for all runs; the default of the package.
 TOLERANCE = 1e-9
 # Runs that take longer are not repeated (s).
 ONCE = 30.0
@@ -39,14 +40,14 @@ _REVERSE = (PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
 
 @dataclass(frozen=True)
 class Case:
-    """A body of some size, and all that is done to it.
+    """A body and the runs that are timed on it.
 
     Attributes:
         body: The body.
-        degree: Of the displacement.
+        degree: Polynomial degree of the displacement.
         stiffness: k_n = k_t in units of E/h.
-        errors: Makes the columns that tell the accuracy, of friction, number of increments and
-            the results "u", "peak" and "force"; nothing by default.
+        errors: Returns the columns of errors, from friction, number of increments and the results
+            "u", "peak" and "force"; none by default.
     """
 
     body: problems.Body
@@ -60,25 +61,25 @@ class Case:
 
     @property
     def n_dofs(self) -> int:
-        """Unknowns."""
+        """Number of dofs."""
         return problems.count(self._space)
 
     @property
     def n_contact_dofs(self) -> int:
-        """Unknowns of Γc. Collective."""
+        """Number of dofs on Γc. Collective."""
         return problems.count_on(self._space, self.body.tags.find(self.body.surface))
 
     def linear(self, kind: str = "direct") -> Row:
-        """One linear solve of the body; see `linear_solve`."""
+        """Solve the body once, without contact, by `linear_solve`."""
         return linear_solve(self.body, self.degree, kind)
 
     def plain(self, friction: float, kind: str = "direct") -> Row:
-        """By a penalty form of one's own, the load in one increment; see `newton`."""
+        """Solve a hand-written penalty form in one increment by `newton`."""
         body = replace(self.body, friction=friction)
         u, F, load, bcs = problems.parts(body, self.degree)
         load.value = body.end
         pressure, traction = problems.penalty(body, u, load, self.stiffness)
-        # The points that the package takes, so that results are the same to all digits.
+        # The quadrature of the package, so that the results agree to all digits.
         points = {"quadrature_degree": 2 * self.degree}
         ds = ufl.Measure("ds", body.mesh, subdomain_data=body.tags, metadata=points)(body.surface)
         F -= ufl.dot(traction, ufl.TestFunction(u.function_space)) * ds
@@ -97,7 +98,7 @@ class Case:
         return row | results | self.errors(friction, 1, results)
 
     def package(self, friction: float, steps: int = 1, field: str = "last", **options: Any) -> Row:
-        """By `fenics_contact`; ``options`` are those of its problem."""
+        """Solve by `fenics_contact`; ``options`` are those of `ContactProblem`."""
         body = replace(self.body, friction=friction)
         problem, contact, u, load = problems.problem(body, self.degree, self.stiffness, **options)
         try:
@@ -108,7 +109,7 @@ class Case:
             )
         except fc.NotConverged:
             return {"iterations": "none", "factorisations": ""}
-        way = "condensed" if problem.solver.condensed else problem.full.linear_kind
+        kind = "condensed" if problem.solver.condensed else problem.full.linear_kind
         found = contact.resultants()
         results = {
             "u": body.displacement(u),
@@ -116,7 +117,7 @@ class Case:
             "peak": found.max_pressure,
         }
         row: Row = {
-            "way": f"{made[-1].method}, {way}",
+            "solver": f"{made[-1].method}, {kind}",
             "iterations": sum(step.iterations for step in made),
             "factorisations": sum(step.factorisations for step in made),
         }
@@ -124,12 +125,12 @@ class Case:
 
 
 def linear_solve(body: problems.Body, degree: int, kind: str = "direct") -> Row:
-    """The unit of time: a body with Γc held or pressed, assembled and solved. Collective.
+    """Assemble and solve a body with Γc fixed or loaded: the unit of time. Collective.
 
     Args:
         body: The body.
         degree: Of the displacement.
-        kind: "direct": MUMPS' Cholesky factorisation, half of the work of LU; "multigrid":
+        kind: "direct": MUMPS' Cholesky factorisation, half the operations of LU; "multigrid":
             conjugate gradients with GAMG, to `TOLERANCE`.
     """
     u, residual, load, bcs = problems.parts(body, degree)
@@ -143,7 +144,7 @@ def linear_solve(body: problems.Body, degree: int, kind: str = "direct") -> Row:
 def solve_once(
     u: fem.Function, residual: ufl.Form, bcs: Sequence[fem.DirichletBC], kind: str = "direct"
 ) -> Row:
-    """Assemble and solve what is linear in u, which gets the solution. Collective.
+    """Assemble and solve a problem that is linear in u, which becomes the solution. Collective.
 
     Args:
         u: Displacement.
@@ -183,16 +184,16 @@ def newton(
     *,
     lift: bool = False,
 ) -> Row:
-    """Newton's method on a form, from the present u. Collective.
+    """Solve a form by Newton's method, from the present u. Collective.
 
     Args:
         F: Residual.
         u: Displacement.
-        bcs: Conditions, which u meets unless the first step is to ``lift`` it to them.
-        size: Of the forces; the residual gets `TOLERANCE` of it, as in the package.
-        kind: "direct": LU by MUMPS; "multigrid": GMRES with GAMG, told of the rigid motions, to
-            PETSc's default of 1e-5 of the residual.
-        lift: See ``bcs``.
+        bcs: Dirichlet conditions, which u satisfies unless ``lift``.
+        size: Norm of the forces; the residual is reduced to `TOLERANCE` of it.
+        kind: "direct": LU by MUMPS; "multigrid": GMRES with GAMG and the rigid-body modes as
+            near-nullspace, to PETSc's default of 1e-5 of the residual.
+        lift: Whether the first step imposes the values of ``bcs``.
     """
     residual = fem.form(F)
     tangent = fem.form(ufl.derivative(F, u, ufl.TrialFunction(u.function_space)))
@@ -222,8 +223,8 @@ def newton(
     options = {"snes_linesearch_type": "basic"}  # `bt` often fails in contact
     if kind == "multigrid":
         matrix.setNearNullSpace(linear.near_nullspace(u.function_space))
-        # The quickest of what was tried: smoothing by Jacobi needs twice the iterations, each
-        # half the work; tolerances that follow the residual do not converge with contact.
+        # The fastest of the variants tried. Jacobi smoothing needs twice the iterations at half the
+        # cost; with tolerances that follow the residual Newton's method fails with contact.
         options |= {"ksp_type": "gmres", "pc_type": "gamg", "mg_levels_pc_type": "sor"}
     else:
         options |= {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
@@ -242,7 +243,7 @@ def newton(
 
 
 def _configure(solver: PETSc.KSP | PETSc.SNES, prefix: str, options: Mapping[str, Any]) -> None:
-    """Give a solver options, and whatever else the command line has under the prefix."""
+    """Set options of a solver; options of the command line with the prefix take precedence."""
     database = PETSc.Options(prefix)
     mine = {name: value for name, value in options.items() if not database.hasName(name)}
     for name, value in mine.items():
@@ -258,40 +259,40 @@ def _configure(solver: PETSc.KSP | PETSc.SNES, prefix: str, options: Mapping[str
 def runs(
     case: Case, frictions: Sequence[float], histories: Sequence[int], *, all_unknowns: bool
 ) -> dict[str, Callable[[], Row]]:
-    """What to time, by name.
+    """Return the runs to time, by name.
 
     Args:
-        case: The scene.
+        case: The problem.
         frictions: Coefficients.
-        histories: Numbers of increments, of the cases with friction.
-        all_unknowns: Whether histories are done on all unknowns, too, which takes minutes.
+        histories: Numbers of increments of the runs with friction.
+        all_unknowns: Whether several increments are solved on all dofs, too, which takes minutes.
     """
     found: dict[str, Callable[[], Row]] = {YARDSTICK: case.linear}
-    ways: dict[str, dict[str, Any]] = {
+    variants: dict[str, dict[str, Any]] = {
         "by default": {},
         "condensed, L-BFGS": {"condensation": True, "method": "lbfgs"},
-        "all unknowns, L-BFGS": {"condensation": False, "method": "lbfgs"},
+        "all dofs, L-BFGS": {"condensation": False, "method": "lbfgs"},
     }
     for friction in frictions:
         name = f"μ = {friction:g}"
         found[f"{name}: {PLAIN['direct']}"] = partial(case.plain, friction)
         for steps in histories if friction else [1]:
-            for way, options in ways.items():
+            for variant, options in variants.items():
                 whole = not options.get("condensation", True)
                 if steps > 1 and whole and not all_unknowns:
                     continue
                 fields = ("last",) if steps == 1 or "method" in options else ("last", "every")
                 for field in fields:
-                    run = f"{name}, {steps} increments: {way}"
-                    run += ", every field" if field == "every" else ""
+                    run = f"{name}, {steps} increments: {variant}"
+                    run += ", interior in every increment" if field == "every" else ""
                     found[run] = partial(case.package, friction, steps, field, **options)
     return found
 
 
 def parser(documentation: str | None, folder: str) -> argparse.ArgumentParser:
-    """The options of every `study`: those of `timing.parser`, ``--stiffness`` and ``--only``."""
+    """Return the options of a `study`: those of `timing.parser`, ``--stiffness``, ``--only``."""
     made = timing.parser(documentation, folder)
-    made.add_argument("--stiffness", type=float, default=10.0, help="k_n and k_t h/E")
+    made.add_argument("--stiffness", type=float, default=10.0, help="k_n h/E = k_t h/E")
     made.add_argument("--only", default="", help="runs whose name contains this")
     return made
 
@@ -303,18 +304,18 @@ def study(
     choose: Callable[[Case], dict[str, Callable[[], Row]]],
     arguments: argparse.Namespace,
 ) -> None:
-    """Time the runs of a scene in its sizes; write tables and plots.
+    """Time the runs of a problem on several meshes; write the tables.
 
     Args:
-        name: Of the files.
-        title: Of the tables.
-        cases: Make the scene in its sizes, smallest first; by the name of the size. The table
-            is of the last.
-        choose: The runs of a scene, from which ``--only`` takes some.
-        arguments: Those of `parser`.
+        name: Stem of the files.
+        title: Title of the tables.
+        cases: Create the problem in its sizes, smallest first, by name of the size. The detailed
+            table is of the last.
+        choose: Returns the runs of a problem, of which ``--only`` selects some.
+        arguments: Parsed options of `parser`.
     """
     everything: list[Row] = []
-    waits: dict[str, float] = {}  # of the smallest scene, which compiles the forms
+    waits: dict[str, float] = {}  # first runs, on the smallest mesh
     for size, make in cases.items():
         case = make()
         only = arguments.only
@@ -322,22 +323,15 @@ def study(
         rows = timing.measure(
             chosen, repeat=arguments.repeat, first=None if waits else chosen, once=ONCE
         )
-        waits = waits or {row["run"]: row.pop("first use [s]") for row in rows}
+        waits = waits or {row["run"]: row.pop("first run [s]") for row in rows}
         rows = timing.in_units_of(rows, YARDSTICK, "linear solves")
         if size == list(cases)[-1]:
-            rows = [row | {"first use [s]": waits[row["run"]]} for row in rows]
-            heading = f"{title}: {case.n_dofs} dofs, {case.n_contact_dofs} of the contact surface"
-            heading += f", medians of {arguments.repeat} (of one, beyond {ONCE:g} s)"
+            rows = [row | {"first run [s]": waits[row["run"]]} for row in rows]
+            heading = f"{title}: {case.n_dofs} dofs, {case.n_contact_dofs} on Γc"
+            heading += f", medians of {arguments.repeat} (one run above {ONCE:g} s)"
             timing.write(arguments.output, name, heading, rows)
         sizes = {"size": size, "dofs": case.n_dofs, "contact dofs": case.n_contact_dofs}
         everything += [sizes | row for row in rows]
     columns = ("dofs", "contact dofs", "run", "iterations", "seconds", "linear solves")
     short = [{column: row[column] for column in columns} for row in everything]
     timing.write(arguments.output, f"{name}_sizes", f"{title}: cost by size", short)
-    for x in ("dofs", "contact dofs"):
-        series = {}
-        for run in dict.fromkeys(row["run"] for row in everything):
-            mine = [row for row in everything if row["run"] == run and row["iterations"] != "none"]
-            series[run] = [row[x] for row in mine], [row["seconds"] for row in mine]
-        path = arguments.output / f"{name}_{x.replace(' ', '_')}.png"
-        timing.draw(path, title, x, "seconds", series)

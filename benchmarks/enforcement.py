@@ -1,16 +1,13 @@
-"""Penalty, augmented Lagrangian and Nitsche's method: error and time on two scenes.
+"""Penalty, augmented Lagrangian and Nitsche's method: error and time.
 
-Scenes: the half-cylinder of ``demos/hertz.py`` without friction and with μ = 0.2 in one increment,
-and the GRECO block, both of quadratic cells. Errors are against this package's solution by
-multipliers on cells of half the size, whose own peak pressure and displacement are tabulated with
-the published values; the pressure's error is that in the mean square over Γc. Nitsche's method is
-here a UFL form and a Newton iteration by hand, each step a factorisation by MUMPS, as a user of
-DOLFINx would write it: its stresses on Γc are those of the bulk form's cells, which a condensed
-problem does not have. Meshing, and compiling forms, are not counted.
+Problems: the half-cylinder of ``demos/hertz.py`` without friction and with μ = 0.2 in one
+increment, and the GRECO block, both with quadratic cells. Errors are relative to this package's
+augmented Lagrangian solution on cells of half the size; the pressure error is the L² norm on Γc.
+Nitsche's method is a hand-written UFL form with Newton's method in DOLFINx, each step factored by
+MUMPS: it needs the stresses of the cells at Γc, which a condensed problem does not have. Meshing
+and compilation are not included.
 
     OMP_NUM_THREADS=1 python benchmarks/enforcement.py
-
-Writes tables, CSV files, and plots of error against time.
 """
 
 from __future__ import annotations
@@ -48,7 +45,7 @@ ONCE = 5.0
 
 @dataclass
 class Found:
-    """A solution on Γc: coordinate along it, pressure, penetration, shear, areas of the points."""
+    """A solution on Γc: coordinates, pressure, penetration, friction force, quadrature weights."""
 
     displacement: float
     x: Array
@@ -59,23 +56,23 @@ class Found:
     iterations: int
 
     def row(self, reference: Found) -> timing.Row:
-        """What the table has of it."""
+        """Return the row of the table."""
         order = np.argsort(reference.x)
         exact = np.interp(self.x, reference.x[order], reference.pressure[order])
         norm = np.sqrt(self.measure @ exact**2)
         peak = reference.pressure.max()
         row: timing.Row = {
-            "displacement, error": abs(self.displacement / reference.displacement - 1),
-            "peak pressure, error": abs(self.pressure.max() / peak - 1),
-            "pressure, error": float(np.sqrt(self.measure @ (self.pressure - exact) ** 2) / norm),
+            "displacement error": abs(self.displacement / reference.displacement - 1),
+            "peak pressure error": abs(self.pressure.max() / peak - 1),
+            "pressure error": float(np.sqrt(self.measure @ (self.pressure - exact) ** 2) / norm),
         }
         if reference.shear:
-            row["shear, error"] = abs(self.shear / reference.shear - 1)
+            row["friction force error"] = abs(self.shear / reference.shear - 1)
         return row | {"penetration": self.penetration, "iterations": self.iterations}
 
 
 def by_package(body: Body, stiffness: float, enforcement: str, tolerance: float = 1e-5) -> Found:
-    """Penalty or multipliers."""
+    """Solve by the penalty or the augmented Lagrangian method of the package."""
     choices = {"enforcement": enforcement, "tolerance": tolerance}
     problem, contact, u, load = problems.problem(body, 2, stiffness, choices=choices)
     load.value = body.end
@@ -93,11 +90,11 @@ def by_package(body: Body, stiffness: float, enforcement: str, tolerance: float 
 
 
 class NewtonFailed(RuntimeError):
-    """Newton's method by hand did not converge."""
+    """The hand-written Newton method did not converge."""
 
 
 def by_nitsche(body: Body, factor: float, share: float) -> Found:
-    """Nitsche's method for contact with friction (Chouly, Hild), γ = kE/h.
+    """Solve by Nitsche's method for frictional contact (Chouly, Hild), γ = kE/h.
 
     ∫ σ(u):ε(v) - θ ∫ σ(u)n·σ(v)n/γ + ∫ P(σ(u)n - γ jump)·(θ σ(v)n/γ - v) over Γc, P the projection
     onto pressures and tractions within the cone; θ = ``share``, 1: symmetric without friction.
@@ -171,7 +168,7 @@ def by_nitsche(body: Body, factor: float, share: float) -> Found:
 
 
 def methods(make: Callable[[], Body]) -> dict[str, Callable[[], Found]]:
-    """What to compare, by name."""
+    """Return the methods to compare, by name."""
     found: dict[str, Callable[[], Found]] = {
         f"penalty {k:g}": lambda k=k: by_package(make(), k, "penalty") for k in PENALTIES
     }
@@ -183,7 +180,7 @@ def methods(make: Callable[[], Body]) -> dict[str, Callable[[], Found]]:
 def compare(
     name: str, make: Callable[[Any], Body], size: float, finer: float, folder: Path, repeat: int
 ) -> None:
-    """One scene: a table and a plot."""
+    """Write the table of one problem."""
     reference = by_package(make(finer), 10.0, "augmented", tolerance=1e-8)
     coarse: Any = {"GRECO": 8}.get(name.split()[0], 0.5)
 
@@ -202,30 +199,19 @@ def compare(
     rows = timing.in_units_of(rows, YARDSTICK, "time / penalty 10")
     dofs = problems.count(problems.parts(make(size), 2)[0].function_space)
     note = f"Reference: displacement {reference.displacement:.9g}, peak pressure "
-    note += f"{reference.pressure.max():.7g}, shear {reference.shear:.7g}."
+    note += f"{reference.pressure.max():.7g}, friction force {reference.shear:.7g}."
     stem = name.lower().replace(" ", "_").replace("=", "").replace("μ", "mu").replace(".", "")
     timing.write(folder, stem, f"{name}, {dofs} dofs", rows, note)
-    done = [row for row in rows if row["iterations"] != "none"]
-    kinds = dict.fromkeys(row["run"].split()[0] for row in done)
-    series = {
-        kind: tuple(
-            [row[column] for row in done if row["run"].startswith(kind)]
-            for column in ("seconds", "displacement, error")
-        )
-        for kind in kinds
-    }
-    label = "error of the displacement"
-    timing.draw(folder / f"{stem}.png", name, "seconds", label, series, fitted=False)
 
 
 def main() -> None:
-    """Run."""
+    """Measure and write."""
     parser = timing.parser(__doc__, "enforcement")
-    parser.add_argument("--h", type=float, default=0.02, help="cells of the half-cylinder")
-    parser.add_argument("--cells", type=int, default=64, help="cells of a side of the block")
+    parser.add_argument("--h", type=float, default=0.02, help="cell size of the half-cylinder")
+    parser.add_argument("--cells", type=int, default=64, help="cells per side of the block")
     arguments = parser.parse_args()
     if MPI.COMM_WORLD.size > 1:
-        parser.error("times are of one rank")
+        parser.error("runs on one rank")
     h, cells = (0.1, 16) if arguments.short else (arguments.h, arguments.cells)
     for friction in (0.0, 0.2):
         name = f"Half-cylinder μ = {friction:g}"

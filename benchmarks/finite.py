@@ -1,19 +1,18 @@
-"""What contact adds to Newton's method at large strains, with and without friction.
+"""Newton iterations at large strains, with contact and for the bulk alone.
 
     python benchmarks/finite.py
 
-Two scenes: a block 16 x 10 of neo-Hookean rubber under a rigid disc of radius 4 that is pressed in
-by 3, turned by 0.8 and dragged by 2 (demos/rolling.py); and a small block of rubber that is pressed
-on another one and dragged along it by four fifths of its length (scenes/rubbed.py). Each history is
-solved three times: with contact; with the displacements of Γc (and of what lies opposite) that were
-found prescribed there, without any contact, by the same solver in the same increments; and likewise
-by SNES on the form as a user of DOLFINx writes it. So all have the same solutions, and the last two
-have what the bulk alone costs: Newton steps, factorisations, and the time of all increments
-(medians of ``--repeat`` runs).
+Two problems: a block 16 x 10 of neo-Hookean rubber under a rigid disc of radius 4 that is pressed
+in by 3, rotated by 0.8 and slid by 2 (demos/rolling.py); and a rubber block that is pressed on
+another one and slid along it by four fifths of its length (scenes/rubbed.py). Each history is
+solved three times: with contact; without contact, with the computed displacements of Γc (and of the
+opposing surface) as Dirichlet conditions, by the same solver in the same increments; and the latter
+by SNES on the form in plain DOLFINx. All have the same solutions; the last two give the cost of the
+bulk: Newton iterations, factorisations, and CPU time of all increments (median of ``--repeat``).
 
-Newton steps are given over those of both. By the package they are fewer: it follows prescribed
-values by a step on the tangent factored last, before Newton's method begins, as it follows tools;
-in plain DOLFINx that is the first step of each increment.
+Newton iterations are given relative to both. The package needs fewer for the bulk: it follows
+prescribed values by a step with the last factored tangent before Newton's method starts; in plain
+DOLFINx this is the first iteration of each increment.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from fenics_contact.types import Array
 from scenes import rubbed
 from scenes.blocks import BOTTOM, LEFT, TOP, block_mesh
 
-PRESSED, MORE = 12, 8  # increments of the press, and of turn and drag each
+PRESSED, MORE = 12, 8  # increments of indentation, and of rotation and sliding each
 RADIUS, DEPTH, TURN, WAY = 4.0, 3.0, 0.8, 2.0
 PATH = (
     *((0.0, DEPTH * i / PRESSED, 0.0) for i in range(1, PRESSED + 1)),
@@ -47,28 +46,28 @@ PATH = (
 
 
 class UnderADisc:
-    """A block of rubber under a disc.
+    """A rubber block under a disc.
 
     Attributes:
-        path: Places of the disc, one an increment.
-        parts: Increments by what is done in them.
-        held: Tags of the facets whose displacements are prescribed where there is no contact.
-        free: Tag of facets that contact never reaches.
-        bcs: Conditions with contact.
+        path: Positions of the disc, one per increment.
+        parts: Increments of each part of the path.
+        held: Tags of the facets with prescribed displacements in the runs without contact.
+        free: Tag of facets that are never in contact.
+        bcs: Dirichlet conditions of the run with contact.
         contact: The contact.
     """
 
     path = PATH
     parts: Mapping[str, slice] = {
-        "pressed": slice(PRESSED),
-        "turned": slice(PRESSED, -MORE),
-        "dragged": slice(-MORE, None),
+        "indentation": slice(PRESSED),
+        "rotation": slice(PRESSED, -MORE),
+        "sliding": slice(-MORE, None),
     }
     held = (BOTTOM, TOP)
     free = LEFT
 
     def __init__(self, friction: float, fine: int) -> None:
-        """Set it up, ``fine`` cells per unit of length."""
+        """Create it with ``fine`` cells per unit of length."""
         mesh, self.tags = block_mesh("quadrilateral", n=(16 * fine, 10 * fine), size=(16.0, 10.0))
         mesh.geometry.x[:, 0] -= 8
         self.u = fem.Function(fem.functionspace(mesh, ("Lagrange", 2, (2,))))
@@ -92,12 +91,12 @@ class UnderADisc:
 
 
 class OneOnAnother(rubbed.Rubbed):
-    """Two blocks of rubber; see `UnderADisc`."""
+    """Two rubber blocks, with the attributes of `UnderADisc`."""
 
     path = rubbed.PATH
     parts: Mapping[str, slice] = {
-        "pressed": slice(rubbed.PRESSED),
-        "dragged": slice(rubbed.PRESSED, None),
+        "indentation": slice(rubbed.PRESSED),
+        "sliding": slice(rubbed.PRESSED, None),
     }
     held = (rubbed.BOTTOM, rubbed.TOP, rubbed.LOWER, rubbed.UPPER)
     free = rubbed.SIDE
@@ -108,7 +107,7 @@ SCENES: Mapping[str, Scene] = {"disc": UnderADisc, "two bodies": OneOnAnother}
 
 
 def with_contact(made: UnderADisc | OneOnAnother) -> tuple[timing.Row, list[Array]]:
-    """What it took, and the displacements after every increment."""
+    """Solve with contact; return the row and the displacements of every increment."""
     problem = fc.ContactProblem(made.residual, made.u, bcs=made.bcs, contacts=[made.contact])
     steps, states, start = [], [], time.process_time()
     for place in made.path:
@@ -116,11 +115,11 @@ def with_contact(made: UnderADisc | OneOnAnother) -> tuple[timing.Row, list[Arra
         steps.append(problem.solve())
         problem.commit()
         states.append(made.u.x.array.copy())
-    return told(made, steps, start), states
+    return row_of(made, steps, start), states
 
 
 def held(made: UnderADisc | OneOnAnother) -> tuple[fem.Function, list[fem.DirichletBC]]:
-    """Conditions on all that is moved where there is no contact, and their values."""
+    """Return the function of prescribed values and the conditions of the runs without contact."""
     V = made.u.function_space
     values = fem.Function(V)
     faces = np.sort(np.concatenate([made.tags.find(tag) for tag in made.held]))
@@ -128,7 +127,7 @@ def held(made: UnderADisc | OneOnAnother) -> tuple[fem.Function, list[fem.Dirich
 
 
 def prescribed(made: UnderADisc | OneOnAnother, states: Sequence[Array]) -> timing.Row:
-    """The bulk alone, Γc moved as it was; what it took. The plane that is there is never met."""
+    """Solve the bulk alone by the package, whose contact plane is never reached; return the row."""
     values, bcs = held(made)
     far = fc.HalfSpace((0.0, 100.0), (0.0, -1.0))
     surface = fc.ContactSurface(made.u.function_space.mesh, made.tags, made.free)
@@ -140,11 +139,11 @@ def prescribed(made: UnderADisc | OneOnAnother, states: Sequence[Array]) -> timi
         steps.append(problem.solve())
         problem.commit()
     check(made.u, states[-1])
-    return told(made, steps, start)
+    return row_of(made, steps, start)
 
 
 def plain(made: UnderADisc | OneOnAnother, states: Sequence[Array]) -> timing.Row:
-    """The same by SNES alone, to the same share of the forces."""
+    """Solve the bulk alone by SNES, to the same residual; return the row."""
     values, bcs = held(made)
     compiled = fem.form(made.residual)
     iterations, start = [], time.process_time()
@@ -161,13 +160,13 @@ def plain(made: UnderADisc | OneOnAnother, states: Sequence[Array]) -> timing.Ro
 
 
 def check(u: fem.Function, state: Array) -> None:
-    """See that u is a state: forces are met to 1e-9 of the largest, displacements to less."""
+    """Assert that u is the state with contact; residuals are 1e-9 of the largest force."""
     size = np.abs(state).max(initial=0.0)
     assert np.abs(u.x.array - state).max(initial=0.0) < 1e-5 * size
 
 
-def told(made: UnderADisc | OneOnAnother, steps: Sequence[fc.Step], start: float) -> timing.Row:
-    """Newton steps by parts of the path, and what else it took."""
+def row_of(made: UnderADisc | OneOnAnother, steps: Sequence[fc.Step], start: float) -> timing.Row:
+    """Return the row of a run by the package."""
     factorisations = [step.factorisations for step in steps]
     return counted(made, [step.iterations for step in steps], factorisations, start)
 
@@ -178,10 +177,10 @@ def counted(
     factorisations: Sequence[int],
     start: float,
 ) -> timing.Row:
-    """The row of a run."""
+    """Return the row of a run: iterations by parts of the path, factorisations, CPU time."""
     row: timing.Row = {name: sum(steps[part]) for name, part in made.parts.items()}
-    row |= {"Newton steps": sum(steps), "factorisations": sum(factorisations)}
-    return row | {"solving [s]": time.process_time() - start}  # of the processor
+    row |= {"Newton iterations": sum(steps), "factorisations": sum(factorisations)}
+    return row | {"solving [s]": time.process_time() - start}  # CPU time
 
 
 def main() -> None:
@@ -198,10 +197,8 @@ def main() -> None:
             _, states = with_contact(make())
             runs: dict[str, Callable[[], timing.Row]] = {
                 "contact": lambda make=make: with_contact(make())[0],
-                "prescribed": functools.partial(
-                    lambda make, s: prescribed(make(), s), make, states
-                ),
-                "prescribed, plain DOLFINx": functools.partial(
+                "bulk only": functools.partial(lambda make, s: prescribed(make(), s), make, states),
+                "bulk only, DOLFINx": functools.partial(
                     lambda make, s: plain(make(), s), make, states
                 ),
             }
@@ -209,15 +206,17 @@ def main() -> None:
             _, alone, bare = made
             for row in made:
                 ratio = {
-                    "steps / plain": row["Newton steps"] / bare["Newton steps"],
-                    "steps / prescribed": row["Newton steps"] / alone["Newton steps"],
-                    "time / prescribed": row["solving [s]"] / alone["solving [s]"],
+                    "iterations / DOLFINx": row["Newton iterations"] / bare["Newton iterations"],
+                    "iterations / package": row["Newton iterations"] / alone["Newton iterations"],
+                    "time / bulk only": row["solving [s]"] / alone["solving [s]"],
                 }
-                head = {"scene": name, "μ": friction, "dofs": states[0].size}
+                head = {"problem": name, "μ": friction, "dofs": states[0].size}
                 rows.append(head | {k: v for k, v in row.items() if k != "seconds"} | ratio)
                 if MPI.COMM_WORLD.rank == 0:
                     print(*rows[-1].values(), sep="  ", flush=True)
-    timing.write(arguments.output, "finite", "Newton's method with contact and without it", rows)
+    timing.write(
+        arguments.output, "finite", "Newton iterations with contact and for the bulk alone", rows
+    )
 
 
 if __name__ == "__main__":

@@ -1,12 +1,11 @@
-"""Half-cylinder on a rigid plane: what contact costs in units of one linear solve.
+"""Half-cylinder on a rigid plane: cost relative to one linear solve.
 
-The scene of ``demos/hertz.py``, without friction and with, in one increment and in forty: by this
-package as it chooses by itself, condensed with L-BFGS, and on all unknowns; by a penalty form
-written by hand in DOLFINx with Newton's method, every step a factorisation by MUMPS; and one linear
-solve of the same body glued to the plane. Meshing is not counted, and the compiling of forms stands
-apart; everything else is in the times. Errors are those against the independent solution of the
-demo, with exact complementarity; with friction in one increment, whose solution is another one,
-against this package's by multipliers on finer cells.
+The problem of ``demos/hertz.py``, without and with friction, in one increment and in 40. Compared
+are this package with its defaults, with static condensation and L-BFGS, and on all dofs; a
+hand-written penalty form in DOLFINx with Newton's method and MUMPS' LU; and one linear solve of the
+same body tied to the plane. Meshing is not included, the compilation of forms is separate. Errors
+are relative to the independent solution of the demo (exact complementarity); with friction in one
+increment, to this package's augmented Lagrangian solution on a finer mesh.
 
     OMP_NUM_THREADS=1 python benchmarks/half_cylinder.py
     OMP_NUM_THREADS=1 python benchmarks/half_cylinder.py --short
@@ -24,13 +23,13 @@ from benchmarks import costs
 from scenes import problems
 from scenes.problems import hertz
 
-# The fewest increments whose solution is that of the reference's history.
+# Fewest increments that are compared with the reference.
 MANY = 40
 
 
 @cache
 def one_increment(friction: float, h: float) -> dict[str, float]:
-    """The solution of one increment: multipliers, quadratic cells of size h."""
+    """Return the augmented Lagrangian solution of one increment, quadratic cells of size h."""
     body = problems.half_cylinder(friction, h)
     choices = {"enforcement": "augmented", "tolerance": 1e-7}
     problem, contact, u, load = problems.problem(body, 2, 10.0, choices=choices)
@@ -40,7 +39,7 @@ def one_increment(friction: float, h: float) -> dict[str, float]:
 
 
 def errors(finer: float, friction: float, steps: int, results: costs.Row) -> costs.Row:
-    """Of the displacement of the top, and of the peak pressure."""
+    """Return the errors of the displacement of the top and of the peak pressure (%)."""
     if friction and steps < MANY:
         exact = one_increment(friction, finer)
     elif friction in hertz.EXACT:
@@ -55,22 +54,22 @@ def errors(finer: float, friction: float, steps: int, results: costs.Row) -> cos
 
 
 def main() -> None:
-    """Run."""
+    """Measure and write."""
     parser = costs.parser(__doc__, "half_cylinder")
     parser.add_argument(
         "--h",
         type=float,
         nargs="+",
         default=[0.25, 0.12, 0.06, 0.03, 0.0165, 0.0115],
-        help="cell sizes on Γc; the table is of the last",
+        help="cell sizes on Γc",
     )
     parser.add_argument("--degree", type=int, default=2)
     parser.add_argument("--friction", type=float, nargs="*", default=[0.0, 0.2])
     parser.add_argument("--increments", type=int, nargs="*", default=[1, MANY])
-    parser.add_argument("--all", action="store_true", help="histories on all unknowns too")
+    parser.add_argument("--all", action="store_true", help="40 increments on all dofs, too")
     arguments = parser.parse_args()
     if MPI.COMM_WORLD.size > 1:
-        parser.error("times here are of one rank; ranks.py compares several")
+        parser.error("runs on one rank; for several see ranks.py")
     sizes = [0.25, 0.12, 0.06] if arguments.short else arguments.h
     finer = min(sizes) / 1.5
     for friction in arguments.friction:

@@ -1,19 +1,19 @@
-r"""Ball on a block in three dimensions, from thirty thousand to a million unknowns.
+r"""Ball on a block in 3D, from 32 thousand to a million dofs: time and memory.
 
-The scene of ``ball.py`` in one increment, every run in a process of its own, so that its peak
-memory is its own: one linear solve of the same body by multigrid (the yardstick), and this package
-as it chooses by itself. ``--runs`` names others: the linear solve by a factorisation, this package
-as it is told, and Newton's method as a user of DOLFINx writes it. All to 1e-9 of the forces, the
-script's linear solves to PETSc's 1e-5. Meshes and compiled forms are not counted.
+The problem of ``ball.py`` in one increment, each run in a new process, so that peak memory is its
+own: one linear solve of the same body by multigrid, and this package with its defaults. ``--runs``
+selects others: the linear solve by factorisation, this package with other options, and a
+hand-written Newton method in DOLFINx. Residuals are below 1e-9 of the forces; the linear solves of
+the hand-written method use PETSc's default of 1e-5. Meshing and compilation are not included.
 
     OMP_NUM_THREADS=1 python benchmarks/large.py              # seven minutes
-    OMP_NUM_THREADS=1 python benchmarks/large.py --cells 69   # a million unknowns alone: five
+    OMP_NUM_THREADS=1 python benchmarks/large.py --cells 69   # a million dofs only: five
     OMP_NUM_THREADS=1 python benchmarks/large.py --cells 47 --ranks 1 2
 
-The force is compared with the finest mesh's, and with Hertz's F = 4/3 E* √R d^{3/2} for a
-half-space without friction: the block is ten contact radii wide and held there, which stiffens it
-by some a/L, and friction by two percent. "messages", "MB sent" and "reductions" are of one rank
-(the largest) in the solution, as PETSc counts them; ``parallel.py`` makes a model of them.
+The force is compared with that of the finest mesh, and with Hertz's F = 4/3 E* √R d^{3/2} for a
+frictionless half-space: the block is ten contact radii wide and constrained there, which stiffens
+it by about a/L, and friction by 2 %. "messages", "MB sent" and "reductions" are PETSc's counts of
+one rank (the largest) during the solution; ``parallel.py`` uses them in a model of the cost.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ FACTOR = 10.0  # k_n h/E = k_t h/E
 YARDSTICK = "linear, multigrid"
 DEFAULT = (YARDSTICK, "contact")
 CELLS = {31_944: 21, 107_811: 32, 331_776: 47, 1_029_000: 69}
-# Factorisations of more unknowns than this are minutes, or do not fit.
+# Most dofs for factorisations; more take minutes, or do not fit into memory.
 MANY = 150_000
-# Where the time of a solution goes, by PETSc's names.
+# Operations of a solution, by PETSc's names of events.
 EVENTS = {
     "products with matrices": ("MatMult", "MatMultAdd", "MatMultTranspose"),
     "smoothing": ("MatSOR",),
     "set-up of multigrid": ("PCSetUp",),
-    "sums over all ranks": ("VecNorm", "VecTDot", "VecDot", "VecMDot", "VecReduceComm"),
+    "reductions": ("VecNorm", "VecTDot", "VecDot", "VecMDot", "VecReduceComm"),
     "residuals": ("SNESFunctionEval",),
 }
 
@@ -56,17 +56,17 @@ Run = Callable[[costs.Case], costs.Row]
 
 
 def package(**options: Any) -> Run:
-    """This package."""
+    """Return a run of this package."""
     return lambda case: case.package(FRICTION, **options)
 
 
 def yardstick(kind: str) -> Run:
-    """One linear solve."""
+    """Return a run of one linear solve."""
     return lambda case: case.linear(kind)
 
 
 def by_hand(kind: str) -> Run:
-    """A script on top of DOLFINx."""
+    """Return a run of the hand-written method in DOLFINx."""
     return lambda case: case.plain(FRICTION, kind)
 
 
@@ -87,7 +87,7 @@ FACTORED = ("linear, direct", "contact, condensed", "by hand, LU")
 
 
 def child(run: str, cells: int, repeat: int) -> None:
-    """One run in this process; its row as JSON, the last line that rank 0 prints. Collective."""
+    """Time one run and print its row as JSON, the last line of rank 0. Collective."""
     PETSc.Log.begin()
     start = time.perf_counter()
     RUNS[run](costs.Case(problems.ball_on_block(6), 1, FACTOR))
@@ -104,7 +104,7 @@ def child(run: str, cells: int, repeat: int) -> None:
     row = {"run": run, "dofs": case.n_dofs, "ranks": COMM.size} | row
     row |= {"seconds": statistics.median(times), "GiB": timing.peak_memory()}
     row |= {"Gflop": flops / 1e9, "messages": messages, "MB sent": sent / 1e6}
-    row |= {"reductions": reductions, "first use [s]": first}
+    row |= {"reductions": reductions, "first run [s]": first}
     for name, seconds in zip(EVENTS, shares, strict=True):
         row[f"{name} [s]"] = COMM.allreduce(float(seconds), op=MPI.MAX)
     if COMM.rank == 0:
@@ -112,15 +112,15 @@ def child(run: str, cells: int, repeat: int) -> None:
 
 
 def counted() -> np.ndarray:
-    """Operations, messages, bytes sent and reductions of this rank so far, in solutions."""
+    """Return operations, messages, bytes sent and reductions of this rank in solves so far."""
     found = [PETSc.Log.Event(name).getPerfInfo() for name in ("KSPSolve", "SNESSolve")]
-    # Linear solves inside of SNES are counted there.
+    # SNES includes its linear solves.
     info = max(found, key=lambda item: item["flops"])
     return np.array([info[k] for k in ("flops", "numMessages", "messageLength", "numReductions")])
 
 
 def events() -> np.ndarray:
-    """Seconds of this rank so far in each of `EVENTS`."""
+    """Return the seconds of this rank so far in each of `EVENTS`."""
     return np.array(
         [
             sum(PETSc.Log.Event(name).getPerfInfo()["time"] for name in names)
@@ -130,7 +130,7 @@ def events() -> np.ndarray:
 
 
 def start(run: str, cells: int, ranks: int, repeat: int) -> dict[str, Any]:
-    """The row of a run in new processes."""
+    """Return the row of a run in new processes."""
     words = ["--child", run, "--cells", cells, "--repeat", repeat]
     try:
         return answer(ranks, Path(__file__).resolve(), *words)
@@ -139,7 +139,7 @@ def start(run: str, cells: int, ranks: int, repeat: int) -> dict[str, Any]:
 
 
 def in_units(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of one mesh, with times in units of linear solves on as many ranks, and speed-ups."""
+    """Add times in linear solves on as many ranks, and speed-ups, to the rows of one mesh."""
 
     def of(run: str, ranks: int) -> float:
         return next((r["seconds"] for r in rows if (r["run"], r["ranks"]) == (run, ranks)), np.nan)
@@ -148,16 +148,16 @@ def in_units(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         for name in (YARDSTICK, "linear, direct"):
             unit = of(name, row["ranks"])
             if not np.isnan(unit):
-                row[f"in solves ({name.split()[1]})"] = row["seconds"] / unit
+                row[f"linear solves ({name.split()[1]})"] = row["seconds"] / unit
         if row["ranks"] > 1:
             row["speed-up"] = of(row["run"], 1) / row["seconds"]
     return rows
 
 
 def main() -> None:
-    """Run."""
+    """Measure and write."""
     parser = timing.parser(__doc__, "large")
-    parser.add_argument("--cells", type=int, nargs="*", help=f"along an edge; by default {CELLS}")
+    parser.add_argument("--cells", type=int, nargs="*", help=f"per edge; default {CELLS}")
     parser.add_argument("--ranks", type=int, nargs="*", default=[1])
     parser.add_argument("--runs", nargs="*", choices=RUNS, default=list(DEFAULT))
     parser.add_argument("--child", choices=RUNS, help=argparse.SUPPRESS)
@@ -183,21 +183,11 @@ def main() -> None:
     finest = [row["force"] for row in rows if "force" in row]
     for row in rows:
         if "force" in row:
-            # The force is that on a quarter.
+            # A quarter is modelled.
             row["force/finest - 1"] = row["force"] / finest[-1] - 1
             row["force/Hertz - 1"] = 4 * row["force"] / problems.hertz_force() - 1
     title = f"Ball on a block, hexahedra, μ = {FRICTION:g}, k h/E = {FACTOR:g}"
     timing.write(arguments.output, "large", title, rows)
-    series: dict[str, tuple[list[float], list[float]]] = {}
-    memory: dict[str, tuple[list[float], list[float]]] = {}
-    for row in rows:
-        if row["ranks"] == 1 and "dofs" in row and row["iterations"] != "none":
-            for picture, column in ((series, "seconds"), (memory, "GiB")):
-                x, y = picture.setdefault(row["run"], ([], []))
-                x.append(row["dofs"])
-                y.append(row[column])
-    timing.draw(arguments.output / "seconds.png", title, "unknowns", "seconds", series)
-    timing.draw(arguments.output / "memory.png", title, "unknowns", "peak memory [GiB]", memory)
 
 
 if __name__ == "__main__":

@@ -1,23 +1,21 @@
-r"""Two ranks against one, and a model of the cost fitted to them.
+r"""Two ranks compared with one, and a model of the cost fitted to them.
 
 The ball on a block of ``large.py`` in several sizes, solved by multigrid on one and on two ranks:
-one linear solve, and contact with friction in one increment by L-BFGS and by Newton's method. What
-a message, a reduction and a byte cost between two processes of this machine is measured apart, and
-so is what two ranks that copy at once leave each other of the memory's bandwidth. With them
+one linear solve, and contact with friction in one increment by L-BFGS and by Newton's method. The
+cost of a message, a reduction and a byte between two processes of this machine is measured
+separately, and so is the memory bandwidth per rank when both ranks copy at once. The model is
 
     T = c n/p + m (α + s/(m β)) + r γ log₂ p
 
-for each iteration, on p ranks and with n unknowns: c is fitted to one rank's times; m, s and r, the
-messages, bytes and reductions of a rank, are counted by PETSc. The table sets the model beside the
-measured times, and a picture draws it for more ranks.
+for each iteration, on p ranks and with n dofs: c is fitted to the times on one rank; m, s and r,
+the messages, bytes and reductions of a rank, are counted by PETSc.
 
     OMP_NUM_THREADS=1 python benchmarks/parallel.py            # ten minutes
     OMP_NUM_THREADS=1 python benchmarks/parallel.py --short
-    python benchmarks/parallel.py --tables       # from what was measured last, anew
+    python benchmarks/parallel.py --tables       # from stored measurements
 
-Two tables go from 1 to 1,024 ranks and from 1e5 to 1e9 unknowns, on paper: contact by multigrid as
-the model has it, and what the interface of the ranks takes where a problem is condensed.
-Another table says where the time goes, operation by operation, and what limits two ranks.
+Two tables extrapolate from 1 to 1,024 ranks and from 1e5 to 1e9 dofs: contact by multigrid, and the
+interface of the ranks with static condensation. Another table has the time by operation.
 """
 
 from __future__ import annotations
@@ -37,23 +35,24 @@ from mpi4py import MPI
 from benchmarks import large, timing
 from fenics_contact import plotting
 from scenes.processes import answer
+from verification import report
 
 RUNS = ("linear, multigrid", "contact, multigrid", "contact, multigrid, Newton")
 CELLS = (24, 32, 47)
-# Neighbours of a part of a body that is cut into many.
+# Neighbours of a subdomain, with many ranks.
 NEIGHBOURS = 6
 Row = timing.Row
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What ranks cost each other.
+    """Costs of communication, and of shared memory bandwidth.
 
     Attributes:
         alpha: Time of an empty message (s).
-        beta: Bytes sent in a second.
+        beta: Bytes sent per second.
         gamma: Time of a reduction over two ranks (s).
-        bus: Time of a copy in memory while the other rank copies, over that alone.
+        bus: Time of a memory copy while the other rank copies as well, relative to one alone.
     """
 
     alpha: float
@@ -62,15 +61,15 @@ class Machine:
     bus: float = 1.0
 
 
-# Beyond one machine, in round numbers, one rank to a memory bus.
+# Assumed networks, one rank per memory bus.
 NETWORKS = {
     "fast network": Machine(2e-6, 10e9, 4e-6),
     "Ethernet": Machine(50e-6, 0.1e9, 100e-6),
 }
 
 
-# Of the tables on paper: unknowns, ranks, the memory of a rank (GiB), and how many unknowns a rank
-# needs to have, fewer of which nobody solves by multigrid; and what an interface may take (s).
+# Of the extrapolated tables: dofs, ranks, memory of a rank (GiB), fewest dofs of a rank, and the
+# longest elimination of an interface (s).
 SIZES = (1e5, 1e6, 1e7, 1e8, 1e9)
 RANKS = (1, 4, 16, 64, 256, 1024)
 NODE, FEWEST, BEARABLE = 16.0, 5000, 600.0
@@ -93,7 +92,7 @@ def fit_message(sizes: Sequence[float], times: Sequence[float]) -> tuple[float, 
 
 
 def measure_machine() -> Machine:
-    """On two ranks. Collective."""
+    """Measure the constants on two ranks. Collective."""
     comm = MPI.COMM_WORLD
     other = 1 - comm.rank
     sizes, times = [8 * 4**k for k in range(10)], []
@@ -116,7 +115,7 @@ def measure_machine() -> Machine:
         start = time.perf_counter()
         comm.Allreduce(one, sums)
         waits.append(time.perf_counter() - start)
-    # Copies alone, one rank after the other, and at once.
+    # Copies of one rank after the other, then of both at once.
     a, b = np.zeros(10_000_000), np.ones(10_000_000)
     alone = together = 0.0
     for turn in range(2):
@@ -142,12 +141,12 @@ def _copy(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def predicted(c: float, row: Row, machine: Machine) -> float:
-    """Time by the model, of what a row says of unknowns, iterations and counts.
+    """Return the time of the model for the dofs, iterations and counts of a row.
 
     Args:
-        c: Time for an unknown in an iteration (s).
+        c: Time per dof and iteration (s).
         row: "dofs", "ranks", "iterations"; "messages", "MB sent" and "reductions" of a rank.
-        machine: What ranks cost each other.
+        machine: Constants.
     """
     p = row["ranks"]
     work = c * row["dofs"] / p * row["iterations"]
@@ -158,15 +157,15 @@ def predicted(c: float, row: Row, machine: Machine) -> float:
 
 
 def fit_operations(rows: Sequence[Row]) -> float:
-    """Fit c to the rows on one rank: the geometric mean of time by unknown and iteration (s)."""
+    """Fit c to the rows on one rank: geometric mean of the time per dof and iteration (s)."""
     each = [r["seconds"] / r["dofs"] / r["iterations"] for r in rows if r["ranks"] == 1]
     return float(np.exp(np.mean(np.log(each))))
 
 
 def on_many(rows: Sequence[Row], dofs: float, ranks: int) -> Row:
-    """Counts of an iteration on many ranks, from those of two.
+    """Extrapolate the counts of an iteration from two ranks to many.
 
-    On two ranks a body is cut once, through some n^(2/3) unknowns; on many every part has
+    On two ranks the body is cut once, through about n^(2/3) dofs; on many every subdomain has
     `NEIGHBOURS` cuts through (n/p)^(2/3).
     """
     two = [r for r in rows if r["ranks"] == 2]
@@ -187,7 +186,7 @@ def on_many(rows: Sequence[Row], dofs: float, ranks: int) -> Row:
 
 
 def speed_up(c: float, rows: Sequence[Row], dofs: float, ranks: int, machine: Machine) -> float:
-    """By the model."""
+    """Return the speed-up of the model."""
     return c * dofs / predicted(c, on_many(rows, dofs, ranks), machine)
 
 
@@ -195,7 +194,7 @@ def speed_up(c: float, rows: Sequence[Row], dofs: float, ranks: int, machine: Ma
 
 
 def compared(rows: Sequence[Row], machine: Machine) -> list[Row]:
-    """Measured and by the model, two ranks beside one."""
+    """Return the table of measured times and the model, on one and two ranks."""
     found = []
     for run in dict.fromkeys(row["run"] for row in rows):
         mine = [row for row in rows if row["run"] == run]
@@ -210,13 +209,13 @@ def compared(rows: Sequence[Row], machine: Machine) -> list[Row]:
                 new["speed-up, model"] = predicted(c, one, machine) / new["model [s]"]
                 new["messages and reductions [s]"] = predicted(0.0, row, machine)
             new["GiB per rank"] = row["GiB"] / row["ranks"]
-            new["kB per unknown"] = row["GiB"] * 2**20 / row["dofs"]
+            new["kB per dof"] = row["GiB"] * 2**20 / row["dofs"]
             found.append(new)
     return found
 
 
 def operations(rows: Sequence[Row]) -> list[Row]:
-    """Where the time of the largest problems goes, and what two ranks make of it."""
+    """Return the table of times by operation, of the largest problem on one and two ranks."""
     largest = max(row["dofs"] for row in rows)
     found = []
     for run in dict.fromkeys(row["run"] for row in rows):
@@ -227,19 +226,19 @@ def operations(rows: Sequence[Row]) -> list[Row]:
         times = {name: (one[f"{name} [s]"], two[f"{name} [s]"]) for name in large.EVENTS}
         times["all"] = one["seconds"], two["seconds"]
         for name, (t1, t2) in times.items():
-            row: Row = {"run": run, "dofs": largest, "part": name}
-            row |= {"1 rank [s]": t1, "2 ranks [s]": t2, "share": t2 / two["seconds"]}
+            row: Row = {"run": run, "dofs": largest, "operation": name}
+            row |= {"1 rank [s]": t1, "2 ranks [s]": t2, "fraction": t2 / two["seconds"]}
             found.append(row | {"speed-up": t1 / t2 if t1 and t2 else float("nan")})
     return found
 
 
 def counts(rows: Sequence[Row]) -> list[Row]:
-    """What a rank of two does and sends in an iteration."""
+    """Return the table of operations and messages of a rank per iteration, on two ranks."""
     return [
         {
             "run": row["run"],
             "dofs": row["dofs"],
-            "operations per unknown": row["Gflop"] * 1e9 / row["iterations"] / row["dofs"] * 2,
+            "operations per dof": row["Gflop"] * 1e9 / row["iterations"] / row["dofs"] * 2,
             "messages": row["messages"] / row["iterations"],
             "MB sent": row["MB sent"] / row["iterations"],
             "reductions": row["reductions"] / row["iterations"],
@@ -250,11 +249,11 @@ def counts(rows: Sequence[Row]) -> list[Row]:
 
 
 def beyond(c: float, rows: Sequence[Row], here: Machine) -> list[Row]:
-    """Speed-ups that the model gives on more ranks."""
+    """Return the table of speed-ups of the model on many ranks."""
     found = []
     for name, machine in NETWORKS.items():
         for dofs in (1e6, 1e7):
-            row: Row = {"ranks on": name, "unknowns": f"{dofs:.0e}"}
+            row: Row = {"network": name, "dofs": f"{dofs:.0e}"}
             for ranks in (8, 64, 512):
                 row[f"{ranks} ranks"] = speed_up(c, rows, dofs, ranks, machine)
             found.append(row)
@@ -262,18 +261,20 @@ def beyond(c: float, rows: Sequence[Row], here: Machine) -> list[Row]:
 
 
 def by_multigrid(rows: Sequence[Row], c: float, machine: Machine) -> list[Row]:
-    """Seconds of one increment of contact on many ranks, by the model.
+    """Return the table of times of one increment with contact on many ranks, by the model.
 
     Args:
-        rows: Contact by multigrid, measured on one rank and on two.
-        c: Time for an unknown in an iteration (s).
-        machine: What ranks cost each other.
+        rows: Contact by multigrid, measured on one and two ranks.
+        c: Time per dof and iteration (s).
+        machine: Constants.
     """
     iterations = max(row["iterations"] for row in rows)
-    memory = min(row["GiB"] / row["dofs"] for row in rows)  # of the largest: libraries weigh less
+    memory = min(
+        row["GiB"] / row["dofs"] for row in rows
+    )  # of the largest problem, least affected by libraries
     found = []
     for dofs in SIZES:
-        row: Row = {"unknowns": f"{dofs:.0e}"}
+        row: Row = {"dofs": f"{dofs:.0e}"}
         for ranks in RANKS:
             one = {"dofs": dofs, "ranks": 1, "iterations": 1}
             each = on_many(rows, dofs, ranks) if ranks > 1 else one
@@ -289,21 +290,21 @@ def by_multigrid(rows: Sequence[Row], c: float, machine: Machine) -> list[Row]:
 
 
 def interfaces() -> list[Row]:
-    """What the interface of the ranks takes where a square or cube is merged on one rank."""
+    """Return the table of interfaces of the ranks in static condensation, for square and cube."""
     found = []
     for d, body in ((2, "square"), (3, "cube")):
         for dofs in SIZES:
             for ranks in RANKS[1:]:
                 cuts = d * (ranks ** (1 / d) - 1)
                 shared = d * cuts * (dofs / d) ** (1 - 1 / d)
-                row: Row = {"body": body, "unknowns": f"{dofs:.0e}", "ranks": ranks}
-                row |= {"shared unknowns": shared, "dense matrix [GiB]": 8 * shared**2 / 2**30}
+                row: Row = {"body": body, "dofs": f"{dofs:.0e}", "ranks": ranks}
+                row |= {"interface dofs": shared, "dense matrix [GiB]": 8 * shared**2 / 2**30}
                 found.append(row | {"seconds at 20 Gflop/s": 2 / 3 * shared**3 / 20e9})
     return [row for row in found if row["seconds at 20 Gflop/s"] < BEARABLE]
 
 
 def draw(path: Path, rows: Sequence[Row], machine: Machine) -> None:
-    """Speed-up over ranks by the model, with what is measured."""
+    """Draw the speed-up of the model over the ranks, with the measured ones."""
     mine = [row for row in rows if row["run"] == RUNS[1]]
     c = fit_operations(mine)
     ranks = 2 ** np.arange(0, 11)
@@ -311,19 +312,19 @@ def draw(path: Path, rows: Sequence[Row], machine: Machine) -> None:
         for number, dofs in enumerate((1e5, 1e6, 1e7)):
             for style, (name, network) in zip("-:", NETWORKS.items(), strict=True):
                 values = [1.0] + [speed_up(c, mine, dofs, p, network) for p in ranks[1:]]
-                label = f"{dofs:.0e} unknowns, {name}"
+                label = f"{dofs:.0e} dofs, {name}"
                 axes.loglog(ranks, values, style, color=f"C{number}", label=label)
         measured = [row["speed-up"] for row in mine if row["ranks"] == 2]
         axes.loglog([2] * len(measured), measured, "ko", label="measured, one machine")
         axes.loglog(ranks, ranks, color="0.7", linewidth=0.8, label="ideal")
-        axes.set(title="Contact by L-BFGS and multigrid, by the model", xlabel="ranks")
+        axes.set(title="Contact by L-BFGS and multigrid, model", xlabel="ranks")
         axes.set_ylabel("speed-up")
         axes.grid(alpha=0.25, which="both")
         axes.legend(fontsize=8)
 
 
 def measured(path: Path) -> list[Row]:
-    """Rows that were saved, numbers as such."""
+    """Read stored rows, with numbers converted."""
 
     def value(text: str) -> float | int | str:
         for kind in (int, float):
@@ -333,60 +334,60 @@ def measured(path: Path) -> list[Row]:
                 pass
         return text
 
-    return [{k: value(v) for k, v in row.items() if v} for row in timing.read(path)]
+    return [{k: value(v) for k, v in row.items() if v} for row in report.read(path)]
 
 
 def launch_machine() -> Machine:
-    """`measure_machine` in two new processes."""
+    """Run `measure_machine` in two new processes."""
     return Machine(**answer(2, Path(__file__).resolve(), "--machine"))
 
 
-def report(folder: Path, rows: list[Row], machine: Machine) -> None:
-    """Write the tables and the picture; pure functions of the rows."""
+def write_tables(folder: Path, rows: list[Row], machine: Machine) -> None:
+    """Write the tables and the figure from the measured rows."""
     c = {run: fit_operations([r for r in rows if r["run"] == run]) for run in RUNS}
     mine = [row for row in rows if row["run"] == RUNS[1]]
     operations_take = ", ".join(f"{1e6 * value:.2g} µs ({run})" for run, value in c.items())
     note = (
         f"α = {machine.alpha * 1e6:.2g} µs, β = {machine.beta / 1e9:.3g} GB/s, "
-        f"γ = {machine.gamma * 1e6:.2g} µs between two ranks of this machine. A copy in memory "
-        f"takes {machine.bus:.2f} times as long while the other rank copies, too: two ranks make "
-        f"what memory limits {2 / machine.bus:.2f} times as quick. c, the time of an unknown in an "
+        f"γ = {machine.gamma * 1e6:.2g} µs between two ranks of this machine. A memory copy "
+        f"takes {machine.bus:.2f} times as long while the other rank copies as well: memory-bound "
+        f"operations are {2 / machine.bus:.2f} times as fast on two ranks. c, the time per dof and "
         f"iteration on one rank: {operations_take}."
     )
-    timing.write(folder, "parallel_1", "Two ranks against one", compared(rows, machine), note)
+    timing.write(folder, "parallel_1", "Two ranks compared with one", compared(rows, machine), note)
     timing.write(
-        folder, "parallel_2", "Where the time goes", operations(rows),
-        "Seconds of the slowest rank in PETSc's operations, which lie partly within each other: "
-        "products and smoothing are also part of the set-up. What is in none of them is the "
-        "assembly of the matrix, the law on Γc and the set-up of forms.",
+        folder, "parallel_2", "Time by operation", operations(rows),
+        "Seconds of the slowest rank in PETSc's operations, which overlap: products and smoothing "
+        "are also part of the set-up. Not included are the assembly of the matrix, the law on Γc "
+        "and the set-up of forms.",
     )  # fmt: skip
     timing.write(
-        folder, "parallel_3", "What a rank does in an iteration, on two ranks", counts(rows)
+        folder, "parallel_3", "Operations of a rank per iteration, on two ranks", counts(rows)
     )
-    title = "Speed-up on more ranks by the model, contact by L-BFGS and multigrid"
+    title = "Speed-up on more ranks (model), contact by L-BFGS and multigrid"
     assumed = ", ".join(
         f"{name}: α = {m.alpha * 1e6:g} µs, β = {m.beta / 1e9:g} GB/s, γ = {m.gamma * 1e6:g} µs"
         for name, m in NETWORKS.items()
     )
-    assumed = f"Assumed, {assumed}, one rank to a memory bus, {NEIGHBOURS} neighbours. Coarse "
-    assumed += "levels that leave ranks without work, and imbalance, are not in it."
+    assumed = f"Assumed, {assumed}, one rank per memory bus, {NEIGHBOURS} neighbours. "
+    assumed += "Idle ranks on coarse levels, and load imbalance, are not included."
     timing.write(folder, "parallel_4", title, beyond(c[RUNS[1]], mine, machine), assumed)
     iterations = max(row["iterations"] for row in mine)
-    title = "One increment of contact by L-BFGS and multigrid, on paper"
+    title = "One increment with contact by L-BFGS and multigrid (model)"
     assumed = (
         f"The model on the fast network, with c as measured here and {iterations} iterations, the "
-        "most that were measured, whatever the size: nothing was run beyond 332,000 unknowns. "
-        f'"memory": more than {NODE:g} GiB a rank; "too few": fewer than {FEWEST} unknowns a '
-        "rank. Coarse levels on one rank, and imbalance, are not in it."
+        "largest number measured, for all sizes: nothing was run beyond 332,000 dofs. "
+        f'"memory": more than {NODE:g} GiB per rank; "too few": fewer than {FEWEST} dofs per '
+        "rank. Coarse levels on one rank, and load imbalance, are not included."
     )
     on_paper = by_multigrid(mine, c[RUNS[1]], NETWORKS["fast network"])
     timing.write(folder, "parallel_5", title, on_paper, assumed)
     assumed = (
-        "A square or cube cut into as many as there are ranks: unknowns in the cuts, their dense "
-        "matrix on the first rank, and the 2/3 n³ operations to eliminate it. Left out is what "
-        f"takes more than {BEARABLE:g} s."
+        "A square or cube cut into one subdomain per rank: interface dofs, their dense matrix on "
+        "rank 0, and the 2/3 n³ operations of its elimination. Omitted are those of more than "
+        f"{BEARABLE:g} s."
     )
-    title = "The interface of the ranks where a problem is condensed, on paper"
+    title = "The interface of the ranks with static condensation (model)"
     timing.write(folder, "parallel_6", title, interfaces(), assumed)
     draw(folder / "speed_up.png", rows, machine)
 
@@ -396,11 +397,13 @@ def main() -> None:
     parser = timing.parser(__doc__, "parallel")
     parser.add_argument("--cells", type=int, nargs="*", default=list(CELLS))
     parser.add_argument("--machine", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument("--tables", action="store_true", help="from what was measured last")
+    parser.add_argument(
+        "--tables", action="store_true", help="write tables and figure of stored measurements"
+    )
     arguments = parser.parse_args()
     if arguments.tables:
         machine = Machine(**json.loads((arguments.output / "machine.json").read_text()))
-        report(arguments.output, measured(arguments.output / "parallel.csv"), machine)
+        write_tables(arguments.output, measured(arguments.output / "parallel.csv"), machine)
         return
     if arguments.machine:
         machine = measure_machine()
@@ -419,13 +422,13 @@ def main() -> None:
                 )
         rows += large.in_units(some)
     arguments.output.mkdir(parents=True, exist_ok=True)
-    timing.save(arguments.output / "parallel.csv", rows)
+    report.save(arguments.output / "parallel.csv", rows)
     failed = [row for row in rows if row["iterations"] in ("none", "failed")]
     if failed:
         sys.exit(f"failed: {failed}")
     machine = launch_machine()
     (arguments.output / "machine.json").write_text(json.dumps(machine.__dict__, indent=1) + "\n")
-    report(arguments.output, rows, machine)
+    write_tables(arguments.output, rows, machine)
 
 
 if __name__ == "__main__":

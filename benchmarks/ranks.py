@@ -1,10 +1,10 @@
-"""Half-cylinder on one rank and on several: what each gains, and what plain DOLFINx does there.
+"""Half-cylinder on one rank and on several: speed-up of this package and of plain DOLFINx.
 
-The scene of ``half_cylinder.py``, without friction and with, in one increment and in forty, by this
-package as it chooses by itself; one linear solve of the same body glued to the plane (MUMPS'
-Cholesky factorisation on as many ranks); and a penalty form written by hand in DOLFINx with
-Newton's method and MUMPS' LU. Meshes and compiled forms are not counted. Times are those of the
-slowest rank, in units of one linear solve on one rank; on several ranks, of one on as many, too.
+The problem of ``half_cylinder.py``, without and with friction, in one increment and in 40, by this
+package with its defaults; one linear solve of the same body tied to the plane (MUMPS' Cholesky
+factorisation); and a hand-written penalty form in DOLFINx with Newton's method and MUMPS' LU.
+Meshing and compilation are not included. Times are those of the slowest rank, also in units of one
+linear solve on one rank, and on the same number of ranks.
 
     OMP_NUM_THREADS=1 python benchmarks/ranks.py                 # two minutes
     OMP_NUM_THREADS=1 python benchmarks/ranks.py --ranks 1 2 4 --h 0.0115
@@ -35,7 +35,7 @@ Row = timing.Row
 
 
 def runs(case: costs.Case) -> dict[str, Callable[[], Row]]:
-    """What to time, by name."""
+    """Return the runs to time, by name."""
     found: dict[str, Callable[[], Row]] = {costs.YARDSTICK: case.linear}
     for friction in dict.fromkeys(friction for friction, _ in HISTORIES):
         name = f"μ = {friction:g}: {costs.PLAIN['direct']}"
@@ -46,7 +46,7 @@ def runs(case: costs.Case) -> dict[str, Callable[[], Row]]:
 
 
 def child(h: float, repeat: int) -> None:
-    """All runs in these processes; their rows as JSON, the last line of rank 0. Collective."""
+    """Time all runs and print their rows as JSON, the last line of rank 0. Collective."""
     small, case = (
         costs.Case(problems.half_cylinder(0.0, size), DEGREE, STIFFNESS) for size in (0.25, h)
     )
@@ -57,12 +57,12 @@ def child(h: float, repeat: int) -> None:
 
 
 def start(h: float, ranks: int, repeat: int) -> list[Row]:
-    """The rows of a size in new processes."""
+    """Return the rows of a mesh size, measured in new processes."""
     return answer(ranks, Path(__file__).resolve(), "--child", "--h", h, "--repeat", repeat)
 
 
 def compared(rows: list[Row]) -> list[Row]:
-    """Times in linear solves and speed-ups, of rows of one size."""
+    """Return the rows of one size with times in linear solves and speed-ups."""
 
     def seconds(run: str, ranks: int) -> float:
         return next((r["seconds"] for r in rows if (r["run"], r["ranks"]) == (run, ranks)), np.nan)
@@ -71,9 +71,11 @@ def compared(rows: list[Row]) -> list[Row]:
     for row in rows:
         new = {name: row[name] for name in ("dofs", "run", "ranks", "iterations", "seconds")}
         new["linear solves on one rank"] = row["seconds"] / seconds(costs.YARDSTICK, 1)
-        new["on as many"] = row["seconds"] / seconds(costs.YARDSTICK, row["ranks"])
+        new["linear solves on as many ranks"] = row["seconds"] / seconds(
+            costs.YARDSTICK, row["ranks"]
+        )
         new["speed-up"] = seconds(row["run"], 1) / row["seconds"]
-        # The same scene, whatever its number of ranks: these do not differ.
+        # The results do not depend on the number of ranks.
         new |= {name: row[name] for name in ("force", "peak") if name in row}
         found.append(new)
     return found

@@ -1,4 +1,4 @@
-"""What contact is to cost, beside what the benchmarks measured."""
+"""Targets for the cost of contact, compared with the measurements of the benchmarks."""
 
 from __future__ import annotations
 
@@ -7,48 +7,50 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks import timing
+from verification import report
 
+Row = dict[str, Any]
 Rows = Sequence[dict[str, str]]
 NOT_MEASURED = "not measured"
 
 
 @dataclass(frozen=True)
 class Target:
-    """One number to meet.
+    """An upper or lower limit of a measured quantity.
 
     Attributes:
-        scene: What is solved.
-        what: What is measured.
-        table: The CSV, in the benchmarks' output.
-        measure: Makes the number of its rows, and what else to say; raises `LookupError` where
-            the run is not among them.
-        limit: The number to meet.
-        above: Whether it is to be exceeded.
+        problem: The problem that is solved.
+        quantity: The quantity that is measured.
+        table: CSV file in the output of the benchmarks.
+        measure: Returns the value from its rows, and notes; raises `LookupError` if the run is
+            missing.
+        limit: The target.
+        above: Whether the limit is a lower one.
     """
 
-    scene: str
-    what: str
+    problem: str
+    quantity: str
     table: str
     measure: Callable[[Rows], tuple[float, str]]
     limit: float
     above: bool = False
 
-    def row(self, folder: Path) -> timing.Row:
-        """The target, what was measured, and whether it is met."""
+    def row(self, folder: Path) -> Row:
+        """Return the target, the measured value, and whether it is met."""
         sign = "≥" if self.above else "≤"
-        row: timing.Row = {"scene": self.scene, "target": f"{self.what} {sign} {self.limit:.3g}"}
+        row: Row = {"problem": self.problem, "quantity": self.quantity}
+        row |= {"target": f"{sign} {self.limit:.3g}"}
         try:
-            value, note = self.measure(timing.read(folder / self.table))
+            value, note = self.measure(report.read(folder / self.table))
         except (LookupError, FileNotFoundError):
-            return row | {"measured": "", "met": NOT_MEASURED, "with": ""}
+            return row | {"measured": "", "met": NOT_MEASURED, "notes": ""}
         met = value >= self.limit if self.above else value <= self.limit
-        # A run that failed has no time: NaN is neither above nor below.
-        return row | {"measured": value, "met": "yes" if met else "no", "with": note}
+        # The time of a failed run is NaN, which does not meet a limit.
+        return row | {"measured": value, "met": "yes" if met else "no", "notes": note}
 
 
 def ratio(over: str, under: str, size: int = 0) -> Callable[[Rows], tuple[float, str]]:
-    """Seconds of one run over those of another, on one rank, of at least ``size`` dofs."""
+    """Measure the time of a run relative to another, on one rank with ``size`` dofs or more."""
 
     def measure(rows: Rows) -> tuple[float, str]:
         one, other = (_find(rows, run, size) for run in (over, under))
@@ -60,7 +62,7 @@ def ratio(over: str, under: str, size: int = 0) -> Callable[[Rows], tuple[float,
 
 
 def memory(run: str, size: int) -> Callable[[Rows], tuple[float, str]]:
-    """Peak memory of a run on one rank, of at least ``size`` dofs (GiB)."""
+    """Measure the peak memory of a run on one rank with ``size`` dofs or more (GiB)."""
 
     def measure(rows: Rows) -> tuple[float, str]:
         row = _find(rows, run, size)
@@ -70,7 +72,7 @@ def memory(run: str, size: int) -> Callable[[Rows], tuple[float, str]]:
 
 
 def speed_up(run: str, size: int) -> Callable[[Rows], tuple[float, str]]:
-    """Two ranks against one, of at least ``size`` dofs, and less than twice as many."""
+    """Measure the speed-up of two ranks with ``size`` dofs or more, and less than twice as many."""
 
     def measure(rows: Rows) -> tuple[float, str]:
         one, two = (_find(rows, run, size, ranks) for ranks in (1, 2))
@@ -80,31 +82,37 @@ def speed_up(run: str, size: int) -> Callable[[Rows], tuple[float, str]]:
     return measure
 
 
-def newton_steps(scene: str, friction: str, beside: str) -> Callable[[Rows], tuple[float, str]]:
-    """Newton steps with contact over those of the bulk alone, of `benchmarks/finite.py`.
+def newton_iterations(
+    problem: str, friction: str, other: str
+) -> Callable[[Rows], tuple[float, str]]:
+    """Measure Newton iterations with contact relative to the bulk alone (`benchmarks/finite.py`).
 
     Args:
-        scene: As it is called there.
+        problem: Name of the problem there.
         friction: μ.
-        beside: "plain" or "prescribed": by what the bulk alone is solved.
+        other: "DOLFINx" or "package": solver of the bulk alone.
     """
 
     def measure(rows: Rows) -> tuple[float, str]:
         for row in rows:
-            if (row["scene"], float(row["μ"]), row["run"]) == (scene, float(friction), "contact"):
-                note = f"{row['Newton steps']} steps, {row['dofs']} dofs"
-                return float(row[f"steps / {beside}"]), note
-        raise LookupError(scene)
+            if (row["problem"], float(row["μ"]), row["run"]) == (
+                problem,
+                float(friction),
+                "contact",
+            ):
+                note = f"{row['Newton iterations']} iterations, {row['dofs']} dofs"
+                return float(row[f"iterations / {other}"]), note
+        raise LookupError(problem)
 
     return measure
 
 
 def worst(ranks: int) -> Callable[[Rows], tuple[float, str]]:
-    """Most linear solves of an increment that has a solution, on a number of ranks."""
+    """Measure the largest cost of an increment with a solution, in linear solves."""
 
     def measure(rows: Rows) -> tuple[float, str]:
         mine = [row for row in rows if int(row["ranks"]) == ranks]
-        found = [row for row in mine if not row["way"].startswith("refused")]
+        found = [row for row in mine if not row["method"].startswith("refused")]
         if not found:
             raise LookupError(ranks)
         most = max(found, key=lambda row: float(row["linear solves"]))
@@ -123,7 +131,7 @@ def _find(rows: Rows, run: str, size: int, ranks: int = 1) -> dict[str, str]:
 
 
 def _seconds(row: dict[str, str]) -> float:
-    """NaN for a run that failed."""
+    """Return the seconds of a row, NaN for a failed run."""
     return float("nan") if row["iterations"] in ("none", "failed") else float(row["seconds"])
 
 
@@ -132,45 +140,48 @@ def _all() -> list[Target]:
     solve, lu, gamg = "one linear solve", "plain DOLFINx, LU", "plain DOLFINx, GMRES + GAMG"
     found = []
     for friction, increments, limit in (("0", 1, 1.0), ("0.2", 1, 1.3), ("0.2", 40, 2.0)):
-        scene = f"half-cylinder, μ = {friction}, {increments} increments"
+        problem = f"half-cylinder, μ = {friction}, {increments} increment{'s' * (increments > 1)}"
         run = f"μ = {friction}, {increments} increments: by default"
-        found.append(Target(scene, "time / linear solve", cylinder, ratio(run, solve), limit))
+        found.append(Target(problem, f"time / {solve}", cylinder, ratio(run, solve), limit))
         if increments == 1:
             plain = ratio(run, f"μ = {friction}: {lu}")
-            found.append(Target(scene, f"time / {lu}", cylinder, plain, 1 / 8))
-    scene = "ball on a block, μ = 0.3"
+            found.append(Target(problem, f"time / {lu}", cylinder, plain, 1 / 8))
+    problem = "ball on a block, μ = 0.3"
     for other, limit in ((solve, 2.5), (lu, 1 / 6), (gamg, 1 / 2)):
-        found.append(Target(scene, f"time / {other}", ball, ratio("by default", other), limit))
+        found.append(Target(problem, f"time / {other}", ball, ratio("by default", other), limit))
     tagged = ratio("10 increments", solve)
-    scene = "ball on a block, all of its top tagged, 10 increments"
-    found.append(Target(scene, "time / linear solve", "tagged/tagged.csv", tagged, 2.5))
+    problem = "ball on a block, whole top face on Γc, 10 increments"
+    found.append(Target(problem, f"time / {solve}", "tagged/tagged.csv", tagged, 2.5))
     for ranks in (1, 2):
-        scene = f"plates under a bolt, each increment, {ranks} rank{'s' * (ranks > 1)}"
+        problem = f"bolted joint, worst increment, {ranks} rank{'s' * (ranks > 1)}"
         joint = "bolted_joint/bolted_joint.csv"
-        found.append(Target(scene, "time / linear solve", joint, worst(ranks), 3.0))
-    for what in ("disc", "two bodies"):
+        found.append(Target(problem, f"time / {solve}", joint, worst(ranks), 3.0))
+    for what, bodies in (
+        ("disc", "rubber block under a disc"),
+        ("two bodies", "two rubber blocks"),
+    ):
         for friction in ("0", "0.3"):
-            scene = f"rubber at large strains, {what}, μ = {friction}"
-            for beside, name in (("plain", "plain DOLFINx's"), ("prescribed", "the package's")):
-                steps = newton_steps(what, friction, beside)
-                target = f"Newton steps / {name} without contact"
-                found.append(Target(scene, target, "finite/finite.csv", steps, 1.3))
+            problem = f"{bodies}, μ = {friction}"
+            for other in ("DOLFINx", "package"):
+                measure = newton_iterations(what, friction, other)
+                target = f"Newton iterations / bulk alone ({other})"
+                found.append(Target(problem, target, "finite/finite.csv", measure, 1.3))
     large, million = "large/large.csv", 1_000_000
-    scene = "ball on a block, a million dofs"
+    problem = "ball on a block, a million dofs"
     one = ratio("contact", "linear, multigrid", million)
-    found.append(Target(scene, "time / multigrid linear solve", large, one, 1.6))
-    found.append(Target(scene, "memory [GiB]", large, memory("contact", million), 20.0))
+    found.append(Target(problem, "time / multigrid solve", large, one, 1.6))
+    found.append(Target(problem, "memory [GiB]", large, memory("contact", million), 20.0))
     for friction, increments in (("0", 1), ("0.2", 1), ("0.2", 40)):
-        scene = f"half-cylinder, μ = {friction}, {increments} increments"
+        problem = f"half-cylinder, μ = {friction}, {increments} increment{'s' * (increments > 1)}"
         two = speed_up(f"μ = {friction}, {increments} increments", 100_000)
         found.append(
-            Target(scene, "speed-up of two ranks", "ranks/ranks.csv", two, 1.5, above=True)
+            Target(problem, "speed-up of two ranks", "ranks/ranks.csv", two, 1.5, above=True)
         )
     for size in (100_000, 300_000):
-        scene = f"ball on a block, {size} dofs and more"
+        problem = f"ball on a block, {size} dofs or more"
         two = speed_up("contact, multigrid", size)
         found.append(
-            Target(scene, "speed-up of two ranks", "parallel/parallel.csv", two, 1.5, above=True)
+            Target(problem, "speed-up of two ranks", "parallel/parallel.csv", two, 1.5, above=True)
         )
     return found
 
@@ -179,5 +190,5 @@ TARGETS: tuple[Target, ...] = tuple(_all())
 
 
 def table(folder: Path, targets: Sequence[Target] = TARGETS) -> list[dict[str, Any]]:
-    """All targets, of the CSV files that the benchmarks left in a folder."""
+    """Return all targets with the measurements in a folder."""
     return [target.row(folder) for target in targets]

@@ -1,13 +1,12 @@
-"""Five tasks as a new user has them, each script started in an empty folder: how long it takes.
+"""CPU time of five scripts of the documentation, each started in an empty folder.
 
-A task is run as a process of its own, first with nothing in the caches (compiled forms, fonts of
-Matplotlib), then again. Times are those of the processor, for the whole process and the compilers
-that it starts: imports, meshing and pictures are in them, the start of a container is not. By the
-clock of an idle machine they are up to half as much longer; on a busy one they stay much as they
-are. Every script ends with an assertion of its result but the README's, which a test has.
+Each script is run in a new process, first with empty caches (compiled forms, fonts of Matplotlib),
+then again. CPU times include imports, compilers, meshing and figures, but not the start of a
+container. Wall times on an idle machine are up to half as long again. All scripts but that of the
+README, which has a test, end with an assertion of their result.
 
     python benchmarks/tasks.py            # three minutes
-    python benchmarks/tasks.py --short    # the README's script alone
+    python benchmarks/tasks.py --short    # the script of the README only
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ from pathlib import Path
 from benchmarks import timing
 
 ROOT = Path(__file__).resolve().parent.parent
-# What a user wants, and the script that the documentation gives for it.
+# Tasks, and the scripts of the documentation.
 TASKS = {
-    "the README's first script": "README.md",
-    "a bracket from gmsh under a ball, drawn in space": "docs/scripts/bracket.py",
-    "bodies that slide to and fro, with the loop": "docs/scripts/sliding.py",
-    "a rubber seal": "docs/scripts/seal.py",
-    "a law of one's own": "examples/own_law.py",
+    "first script of the README": "README.md",
+    "bracket meshed with Gmsh under a ball, plots in 3D": "docs/scripts/bracket.py",
+    "cyclic sliding with hysteresis loop": "docs/scripts/sliding.py",
+    "rubber seal": "docs/scripts/seal.py",
+    "user-defined law": "examples/own_law.py",
 }
 
 
 def script(place: str, folder: Path) -> Path:
-    """Put a task's script into a folder, as a user does: copied, or out of the README."""
+    """Copy the script of a task, or the code block of the README, into a folder."""
     source, made = ROOT / place, folder / "script.py"
     if source.suffix == ".md":
         (text,) = re.findall(r"```python\n(.*?)```", source.read_text(), flags=re.DOTALL)
@@ -47,16 +46,16 @@ def script(place: str, folder: Path) -> Path:
 
 
 def used() -> float:
-    """Seconds of the processor that ended children have taken so far."""
+    """Return the CPU time of terminated child processes so far (s)."""
     spent = resource.getrusage(resource.RUSAGE_CHILDREN)
     return spent.ru_utime + spent.ru_stime
 
 
 def run(place: str, repeat: int) -> timing.Row:
-    """Seconds of the first run and of later ones (the median), and the pictures that it draws.
+    """Return the seconds of the first run and of later ones (median), and the number of figures.
 
     Raises:
-        RuntimeError: The script fails; its output is shown.
+        RuntimeError: The script fails.
     """
     seconds = []
     with tempfile.TemporaryDirectory() as name, tempfile.TemporaryDirectory() as cache:
@@ -72,16 +71,16 @@ def run(place: str, repeat: int) -> timing.Row:
             seconds.append(used() - start)
             if done.returncode:
                 raise RuntimeError(f"{place} ended with {done.returncode}: {done.stderr[-2000:]}")
-        pictures = len(list(folder.rglob("*.png")))
+        figures = len(list(folder.rglob("*.png")))
     return {
         "first run [s]": seconds[0],
-        "again [s]": statistics.median(seconds[1:]),
-        "pictures": pictures,
+        "later runs [s]": statistics.median(seconds[1:]),
+        "figures": figures,
     }
 
 
 def main() -> None:
-    """Run them one after another."""
+    """Measure and write."""
     parser = timing.parser(__doc__, "tasks")
     arguments = parser.parse_args()
     tasks = dict(list(TASKS.items())[:1]) if arguments.short else TASKS
@@ -89,7 +88,11 @@ def main() -> None:
         {"task": task, "script": f"`{place}`"} | run(place, arguments.repeat)
         for task, place in tasks.items()
     ]
-    timing.write(arguments.output, "tasks", "Five first scripts, from an empty folder", rows)
+    title = "CPU time of five first scripts"
+    timing.write(arguments.output, "tasks", title, rows)
+    # Included by docs/expect.md.
+    lines = [f"## {title}", "", *timing.table(rows)]
+    (arguments.output / "tasks.md").write_text("\n".join(lines).rstrip() + "\n")
 
 
 if __name__ == "__main__":
