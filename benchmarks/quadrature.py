@@ -1,7 +1,7 @@
 """Quadrature on Γc: error and oscillation of the pressure by degree and scheme.
 
 Half-cylinder of ``demos/hertz.py`` without friction, linear and quadratic displacements (degree p);
-1 to p + 2 Gauss points per edge (quadrature degree 1 to 2p + 3; the default, 2p, has p + 1 points),
+2 to p + 2 Gauss points per edge (quadrature degree 3 to 2p + 3; the default, 2p, has p + 1 points),
 and vertex quadrature; penalty of 10 and 1000 E/h, and augmented Lagrangian. The reference is the
 augmented Lagrangian solution with quadratic cells of a quarter of the smallest size. Two measures
 of the pressure: its L² error, and its largest error for x < 0.85 a, where the pressure is smooth,
@@ -45,7 +45,7 @@ def solve(
 
 def rules(degree: int) -> dict[str, dict[str, Any]]:
     """Return the rules by name; degrees 2n - 2 and 2n - 1 have the same n points on an edge."""
-    gauss = {f"Gauss {n}": {"quadrature_degree": 2 * n - 1} for n in range(1, degree + 3)}
+    gauss = {f"Gauss {n}": {"quadrature_degree": 2 * n - 1} for n in range(2, degree + 3)}
     return gauss | ({"vertex": {"quadrature_scheme": "vertex"}} if degree == 1 else {})
 
 
