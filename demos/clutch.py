@@ -174,14 +174,14 @@ def compare(path: list[dict[str, float]], turned: list[dict[str, float]]) -> dic
     ratios = [r["torque"] / r["of all slipping"] for r in path if r["angle"] >= STEADY]
     last = path[-1]
     values = {
-        "torque over μ F arm, even pressure": last["torque"] / (MU * last["force"] * ARM),
-        "torque over ∫ μ p r, farthest": max(ratios, key=lambda q: abs(q - 1)),
-        "torque over that of the disc's plate": last["torque"] / last["held"],
+        "torque / uniform pressure theory": last["torque"] / (MU * last["force"] * ARM),
+        "torque / ∫ μ p r, worst increment": max(ratios, key=lambda q: abs(q - 1)),
+        "torque / reaction torque": last["torque"] / last["held"],
     }
     references = dict(zip(values, ((1.0, 0.02), (1.0, 1e-6), (1.0, 1e-6)), strict=True))
     for name in ("force", "torque"):
         pairs = zip(path[: len(turned)], turned, strict=True)
-        apart = f"{name}, scene turned, from at rest"
+        apart = f"{name}, rotating frame, relative change"
         values[apart] = max(abs(a[name] - b[name]) for a, b in pairs) / last[name]
         references[apart] = (0.0, 1e-7)
     return output.compare(values, references)

@@ -223,13 +223,13 @@ def main() -> int:
     sine, part = np.sin(angle), friction * np.cos(angle)
     least, most = half / (sine + part), half / (sine - part) if sine > part else np.inf
     values = {
-        "lift of a flank [daN]": forces.force[1],
-        "half of the top's reaction [daN]": fitting.reaction(),
-        "N without friction [daN]": without,
-        "N below its least, share": max(0.0, 1 - normal / least),
-        "N above its most, share": max(0.0, normal / most - 1),
-        "twice the load, difference": differ(comm, 2 * once, twice),
-        f"{arguments.increments} increments, difference": differ(comm, once, often),
+        "vertical force on a flank [daN]": forces.force[1],
+        "half of the top reaction [daN]": fitting.reaction(),
+        "normal force, μ = 0 [daN]": without,
+        "normal force below the lower bound, relative": max(0.0, 1 - normal / least),
+        "normal force above the upper bound, relative": max(0.0, normal / most - 1),
+        "twice the load, relative difference": differ(comm, 2 * once, twice),
+        f"{arguments.increments} increments, relative difference": differ(comm, once, often),
     }
     exact = (half, half, half / sine, 0.0, 0.0, 0.0, 0.0)
     allowed = (EQUILIBRIUM,) * 5 + (SAME,) * 2

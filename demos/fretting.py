@@ -111,9 +111,11 @@ def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
     kept = left["status"] != fc.Status.OPEN
     values = {
         "loop area [mJ/mm]": area,
-        "work of friction [mJ/mm]": float(work[steps + 1 :].sum()),
-        "gap in the loop over its width": abs(moved[-1] - top) / (top - bottom),
-        "shear left at q = 0, centre [MPa]": float(np.interp(0, left["x"][kept, 0], shear[kept])),
+        "dissipated energy [mJ/mm]": float(work[steps + 1 :].sum()),
+        "closing error of the loop / width": abs(moved[-1] - top) / (top - bottom),
+        "residual shear traction at q = 0, centre [MPa]": float(
+            np.interp(0, left["x"][kept, 0], shear[kept])
+        ),
     }
     exact, centre = energy(amplitude), float(unloaded(np.zeros(1), amplitude)[0])
     expected = ((exact, ENERGY), (exact, ENERGY), (0.0, CLOSURE), (centre, SHEAR))

@@ -194,9 +194,12 @@ def main() -> int:
     start, comm, folder = time.perf_counter(), MPI.COMM_WORLD, arguments.output
 
     tilted = tilt(arguments)
-    values = {"slope refused": tilted["limit"], "T/N over tan α, error": tilted["ratio_error"]}
-    references = {"slope refused": (arguments.friction, STATICS)}
-    references["T/N over tan α, error"] = (0.0, STATICS)
+    values = {
+        "slope at the friction limit": tilted["limit"],
+        "T/N / tan α, error": tilted["ratio_error"],
+    }
+    references = {"slope at the friction limit": (arguments.friction, STATICS)}
+    references["T/N / tan α, error"] = (0.0, STATICS)
     pushed = []
     for friction in WEDGE_FRICTIONS:
         problem, block, run = push(arguments, friction)

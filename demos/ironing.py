@@ -167,20 +167,20 @@ def compare(path: list[dict[str, float]]) -> dict[str, Any]:
     values = {
         "half-width [mm]": float(column["half_width"].mean()),
         "peak pressure [MPa]": float(column["peak"].mean()),
-        "spread of the peak [MPa]": float(np.ptp(column["peak"])) / 2,
-        "tangential over normal": float((column["tangential"] / column["normal"]).mean()),
+        "variation of the peak [MPa]": float(np.ptp(column["peak"])) / 2,
+        "tangential / normal force": float((column["tangential"] / column["normal"]).mean()),
         "vertical force [N/mm]": float(column["vertical"].mean()),
-        "friction's work over the drag's": float(
+        "dissipation / work of the drag force": float(
             column["dissipation"].sum() / (column["drag"] * column["way"]).sum()
         ),
     }
     references = {
         "half-width [mm]": (float(HALF_WIDTH), 0.02),
         "peak pressure [MPa]": (peak, 0.02),
-        "spread of the peak [MPa]": (0.0, 0.01 * peak),
-        "tangential over normal": (MU, 1e-6),
+        "variation of the peak [MPa]": (0.0, 0.01 * peak),
+        "tangential / normal force": (MU, 1e-6),
         "vertical force [N/mm]": (P, 1e-6),
-        "friction's work over the drag's": (1.0, 0.01),
+        "dissipation / work of the drag force": (1.0, 0.01),
     }
     return output.compare(values, references)
 

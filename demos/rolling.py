@@ -127,11 +127,11 @@ def compare(path: list[dict[str, float]], other: list[dict[str, float]]) -> dict
             references[label] = (reference, 1e-7 * size / (reference or 1.0))
     last = max(row["normal"] for row in path)
     apart = [abs(a[n] - b[n]) for a, b in zip(path, other, strict=True) for n in names]
-    values["block moved instead, over force"] = max(apart) / last
-    references["block moved instead, over force"] = (0.0, 1e-10)
+    values["moving block: change of force / force"] = max(apart) / last
+    references["moving block: change of force / force"] = (0.0, 1e-10)
     sliding = next(row for row in path if row["stick"] == 0 and row["time"] > 1)
-    values["torque over μ R ∫p, slipping"] = sliding["torque"] / (MU * R * sliding["pressure"])
-    references["torque over μ R ∫p, slipping"] = (1.0, 0.02)
+    values["torque / (μ R ∫p), full slip"] = sliding["torque"] / (MU * R * sliding["pressure"])
+    references["torque / (μ R ∫p), full slip"] = (1.0, 0.02)
     return output.compare(values, references)
 
 

@@ -112,14 +112,14 @@ def compare(
     alpha, phi = np.arctan2(P, R), np.arctan(friction)
     lowered, raised = path[PRESSED + TURNED - 1], path[-1]
     values = {
-        "no friction: largest of |M / (F P) - 1|": max(
+        "μ = 0: largest |M / (F P) - 1|": max(
             abs(abs(row["torque"] / row["force"]) / P - 1) for row in free
         ),
         "raising, M / (F R)": -raised["torque"] / (raised["force"] * R),
         "lowering, M / (F R)": -lowered["torque"] / (lowered["force"] * R),
     }
     references = {
-        "no friction: largest of |M / (F P) - 1|": (0.0, 1e-9),
+        "μ = 0: largest |M / (F P) - 1|": (0.0, 1e-9),
         "raising, M / (F R)": (float(np.tan(alpha + phi)), WITHIN / np.tan(alpha + phi)),
         "lowering, M / (F R)": (float(np.tan(alpha - phi)), WITHIN / np.tan(alpha - phi)),
     }

@@ -199,8 +199,8 @@ def compare(runs: list[Run]) -> dict[str, Any]:
         0.03,
     )
     for one, other in zip(coarse, fine, strict=True):
-        values[f"bed over lid, {one.name}"] = one.bed[-1] / one.lid[-1]
-        references[f"bed over lid, {one.name}"] = (1.0, 1e-6)
+        values[f"reaction of the base / lid, {one.name}"] = one.bed[-1] / one.lid[-1]
+        references[f"reaction of the base / lid, {one.name}"] = (1.0, 1e-6)
         values[f"force [N/mm], {one.name}"] = one.lid[-1]
         references[f"force [N/mm], {one.name}"] = (other.lid[-1], 0.01)
         values[f"peak [MPa], {one.name}"] = one.peak[-1]

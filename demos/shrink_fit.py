@@ -137,12 +137,12 @@ def solve(
         "pressure [MPa]": mean,
         "bore, radial displacement [mm]": output.at_node(u, (INNER, 0))[0],
         "outside, radial displacement [mm]": output.at_node(u, (OUTER, 0))[0],
-        "unevenness of the pressure": float(np.abs(points["pressure"] / mean - 1).max()),
+        "variation of the pressure": float(np.abs(points["pressure"] / mean - 1).max()),
     }
     references = {
         name: (exact, TOLERANCE) for name, exact in zip(values, (p, bore, surface), strict=False)
     }
-    references["unevenness of the pressure"] = (0.0, EVENNESS)
+    references["variation of the pressure"] = (0.0, EVENNESS)
     result = {
         "kind": kind,
         "references": output.compare(values, references),

@@ -277,37 +277,50 @@ def compare(dry: Scene, pushed: Scene, oiled: Scene) -> dict[str, Any]:
     for name, way in (("pushed", 1), ("pulled", -1)):
         at = s if way == 1 else s * (1 - 2 * TURNING)
         value = dry.mean_pressure[name]
-        entries[f"mean pressure {name} [MPa]"] = (value, joint.mean_pressure(at, way), 0.005)
+        motion = "insertion" if way == 1 else "extraction"
+        entries[f"mean pressure, {motion} [MPa]"] = (value, joint.mean_pressure(at, way), 0.005)
         value = abs(dry.at(at)[1])
-        entries[f"dry, {name} [N]"] = (value, abs(joint.force(at, way)), 0.005)
+        entries[f"dry, {motion} force [N]"] = (value, abs(joint.force(at, way)), 0.005)
         # The last time, on the way back; so the first on the way in.
         rows = dry.path if way == 1 else dry.path[::-1]
         value = next(abs(f) for q, _, f in rows if abs(q - s / 2) < 1e-9)
-        entries[f"dry, {name} half-way [N]"] = (value, abs(joint.force(s / 2, way)), bare)
+        entries[f"dry, {motion} force at half depth [N]"] = (
+            value,
+            abs(joint.force(s / 2, way)),
+            bare,
+        )
     _, places, forces = np.array([(0.0, 0.0, 0.0), *dry.path]).T
     gone = int(np.argmax((places < s) & (forces < 0) & (np.arange(len(places)) > 0)))
     share = np.interp(0.0, forces[gone : gone - 2 : -1], places[gone : gone - 2 : -1]) / s
-    entries["dry, way left when released"] = (float(share), 1.0, 0.005)
-    entries["dry, force when out [N]"] = (forces[-1], 0.0, 1e-6 * joint.force(s, 1))
+    entries["dry, relative depth after release"] = (float(share), 1.0, 0.005)
+    entries["dry, force when extracted [N]"] = (forces[-1], 0.0, 1e-6 * joint.force(s, 1))
     work = float(np.trapezoid(forces, places))
-    entries["work in and out over friction's"] = (work / dry.dissipation, 1.0, 0.01)
+    entries["external work / dissipation"] = (work / dry.dissipation, 1.0, 0.01)
 
     way = pushed.at(1.0)[0]
-    entries["dry, by force: way [mm]"] = (way, s, 0.01)
-    entries["dry, by force: left, released"] = (pushed.at(0.0)[0] / way, 1.0, 0.005)
+    entries["dry, prescribed force: depth [mm]"] = (way, s, 0.01)
+    entries["dry, prescribed force: relative depth after release"] = (
+        pushed.at(0.0)[0] / way,
+        1.0,
+        0.005,
+    )
     way, hold = oiled.at(1.0)[0], oiled.joint.tangent(-1) / oiled.joint.tangent(1)
-    entries["oil: way [mm]"] = (way, s, 0.005)
-    entries["oil: left, held"] = (oiled.at(1.1 * hold)[0] / way, 1.0, 0.005)
+    entries["lubricated: depth [mm]"] = (way, s, 0.005)
+    entries["lubricated: relative depth, holding force"] = (
+        oiled.at(1.1 * hold)[0] / way,
+        1.0,
+        0.005,
+    )
     for share in (0.5, 0.2):
-        name = f"oil: left, {share:g} of what holds"
+        name = f"lubricated: relative depth, {share:g} of the holding force"
         entries[name] = (oiled.at(hold * share)[0] / way, share, (1 - share) * s / LENGTH)
-    entries["oil: left, released"] = (oiled.at(0.0)[0] / way, 0.0, 1e-6)
+    entries["lubricated: relative depth after release"] = (oiled.at(0.0)[0] / way, 0.0, 1e-6)
     # Where cells of both do not match, stiff springs scatter from point to point.
     z, pressure = oiled.pressures["pushed"]
     share = pressure / oiled.joint.pressure(s, z, 1)
     tenths = [share[np.floor(10 * z / LENGTH) == i].mean() for i in range(1, 9)]
     uneven = float(np.abs(np.array(tenths) - 1).max())
-    entries["oil: unevenness, eight tenths"] = (uneven, 0.0, 0.02)
+    entries["lubricated: variation of the pressure, 80 % of the length"] = (uneven, 0.0, 0.02)
     return output.compare(
         {name: value for name, (value, _, _) in entries.items()},
         {name: (reference, tolerance) for name, (_, reference, tolerance) in entries.items()},

@@ -196,16 +196,16 @@ def compare(whole: Run, quarter: Run, fine: Run) -> dict[str, Any]:
     values, references = {}, {}
     for c in SHOWN:
         i = CLOSING.index(c)
-        values[f"force, closed by {c:g} [N/mm]"] = whole.force[i]
-        references[f"force, closed by {c:g} [N/mm]"] = (quarter.force[i], ROUTES)
-        values[f"force, quarter, by {c:g} [N/mm]"] = quarter.force[i]
-        references[f"force, quarter, by {c:g} [N/mm]"] = (fine.force[i], CELLS)
-    values["wall on wall at the end [N/mm]"] = whole.inside[-1]
-    references["wall on wall at the end [N/mm]"] = (quarter.inside[-1], ROUTES)
+        values[f"force, compression {c:g} [N/mm]"] = whole.force[i]
+        references[f"force, compression {c:g} [N/mm]"] = (quarter.force[i], ROUTES)
+        values[f"force, quarter model, compression {c:g} [N/mm]"] = quarter.force[i]
+        references[f"force, quarter model, compression {c:g} [N/mm]"] = (fine.force[i], CELLS)
+    values["self-contact force at the end [N/mm]"] = whole.inside[-1]
+    references["self-contact force at the end [N/mm]"] = (quarter.inside[-1], ROUTES)
     found = whole.lower[0] / whole.force[0], whole.wider[0] / whole.force[0]
-    for name, value, known in zip(("lower", "wider"), found, slopes(), strict=True):
-        values[f"{name} by the force [mm²/N]"] = value
-        references[f"{name} by the force [mm²/N]"] = (known, BEAM)
+    for name, value, known in zip(("vertical", "horizontal"), found, slopes(), strict=True):
+        values[f"compliance, {name} [mm²/N]"] = value
+        references[f"compliance, {name} [mm²/N]"] = (known, BEAM)
     return output.compare(values, references)
 
 

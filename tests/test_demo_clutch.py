@@ -29,7 +29,7 @@ def test_torque_of_full_slip(tmp_path: Path) -> None:
     assert last["torque"] == pytest.approx(last["of all slipping"], rel=1e-6)
     assert last["torque"] == pytest.approx(last["held"], rel=1e-6)
     for name in ("force", "torque"):
-        assert found[f"{name}, scene turned, from at rest"] < 1e-7
+        assert found[f"{name}, rotating frame, relative change"] < 1e-7
     # Stick, then some of both, then slip all over, with a torque that grows until then.
     assert path[1]["slip"] == 0 and path[4]["stick"] and path[4]["slip"]
     assert all(row["stick"] == 0 for row in path[5:])

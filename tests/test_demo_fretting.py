@@ -37,11 +37,13 @@ def test_cycle(tmp_path: Path) -> None:
     result = run_demo("fretting", tmp_path)
     found = values(result)
     assert found["loop area [mJ/mm]"] == pytest.approx(energy(0.7), rel=0.01)
-    assert found["work of friction [mJ/mm]"] == pytest.approx(energy(0.7), rel=0.005)
-    assert found["gap in the loop over its width"] <= 1e-4
+    assert found["dissipated energy [mJ/mm]"] == pytest.approx(energy(0.7), rel=0.005)
+    assert found["closing error of the loop / width"] <= 1e-4
     # Traction of the turn less twice that of half the force, in the centre: p₀ = 9.3514.
     centre = 0.2 * 9.3514 * ((1 - math.sqrt(0.3)) - 2 * (1 - math.sqrt(0.65)))
-    assert found["shear left at q = 0, centre [MPa]"] == pytest.approx(centre, rel=0.03)
+    assert found["residual shear traction at q = 0, centre [MPa]"] == pytest.approx(
+        centre, rel=0.03
+    )
     # Where the load turns round all points stick, and Newton's method starts from that: 3 and 2
     # iterations, as in an ordinary increment. By a step on the last tangent points slip the wrong
     # way: it takes 25 and 39 from there.

@@ -25,13 +25,15 @@ def test_pushed_in_released_and_pulled_out(tmp_path: Path) -> None:
     """
     result = run_demo("tapered_pin", tmp_path, "--cells", "20")
     found = values(result)
-    assert found["mean pressure pushed [MPa]"] == pytest.approx(205.4, rel=5e-3)
-    assert found["dry, pushed [N]"] == pytest.approx(82.6e3, rel=5e-3)
-    assert found["dry, pulled [N]"] == pytest.approx(71.2e3, rel=5e-3)
-    assert found["dry, way left when released"] > 0.995
-    assert found["dry, by force: left, released"] > 0.995
-    assert found["oil: left, 0.5 of what holds"] == pytest.approx(0.5, rel=0.02)
-    assert found["oil: left, released"] == pytest.approx(0.0, abs=1e-6)
+    assert found["mean pressure, insertion [MPa]"] == pytest.approx(205.4, rel=5e-3)
+    assert found["dry, insertion force [N]"] == pytest.approx(82.6e3, rel=5e-3)
+    assert found["dry, extraction force [N]"] == pytest.approx(71.2e3, rel=5e-3)
+    assert found["dry, relative depth after release"] > 0.995
+    assert found["dry, prescribed force: relative depth after release"] > 0.995
+    assert found["lubricated: relative depth, 0.5 of the holding force"] == pytest.approx(
+        0.5, rel=0.02
+    )
+    assert found["lubricated: relative depth after release"] == pytest.approx(0.0, abs=1e-6)
     dry, _, oiled = result["paths"]
     # Dry the force changes its sign at once; with oil it stays a push all the way out.
     (turned,) = [i for i, (s, _, _) in enumerate(dry) if abs(s - 2.0) < 1e-9]

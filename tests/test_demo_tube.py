@@ -24,8 +24,8 @@ def test_forces_before_and_after_it_closes(tmp_path: Path) -> None:
     """
     result = run_demo("tube", tmp_path)
     found = values(result)
-    assert found["lower by the force [mm²/N]"] == pytest.approx(64.368, rel=0.015)
-    assert found["wider by the force [mm²/N]"] == pytest.approx(56.207, rel=0.015)
+    assert found["compliance, vertical [mm²/N]"] == pytest.approx(64.368, rel=0.015)
+    assert found["compliance, horizontal [mm²/N]"] == pytest.approx(56.207, rel=0.015)
     whole, quarter = (result["forces"][name] for name in ("tube", "quarter"))
     assert whole == pytest.approx(quarter, rel=1e-3)
     closing, inside = result["closing"], result["inside"]["tube"]

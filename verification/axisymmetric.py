@@ -21,9 +21,9 @@ SIZE = (100.0, 200.0)  # radius and height of what it stands on
 
 @case(
     "Punch with rounded edge, two bodies, NAFEMS R0094-2",
-    "1 %: the published values are those of two programs with cells that are coarse at the edge of "
-    "the contact; here finer cells change them by less than 0.1 %",
-    budget="the displacement of a point is not among the budget's quantities",
+    "1 %: published values of two programs with coarse meshes at the edge; the mesh error here "
+    "is less than 0.1 %",
+    budget="point displacements are not in the error budget",
 )
 def punch(h: float = 1.0) -> Outcome:
     """A punch of steel under 100 MPa on aluminium, its end flat with a fillet at the edge.
@@ -58,10 +58,10 @@ def punch(h: float = 1.0) -> Outcome:
         rows.append(Row(name, found[friction], published, "Konter, NAFEMS 2006", 0.01))
         total = np.pi * RADIUS**2 * 100.0
         force = float(contact.resultants().force[1])
-        name = f"force over the load, μ = {friction:g}"
+        name = f"contact force / load, μ = {friction:g}"
         rows.append(Row(name, force / total, 1.0, "equilibrium", 1e-6))
     change = found[0.1] - found[0.0]
-    name = "what friction takes off u_y(M) [mm]"
+    name = "change of u_y(M) by friction [mm]"
     rows.append(Row(name, change, 0.1329 - 0.1308, "Konter, NAFEMS 2006", 0.05))
     cells = mesh.topology.index_map(2).size_global
     return Outcome(

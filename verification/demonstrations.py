@@ -173,40 +173,42 @@ def greco() -> Outcome:
 DEMOS = [
     Case(
         "Half-cylinder on a plane, a/R = 0.26",
-        "0.4 %, with friction 1 % (2 % for the largest shear), and what h leaves: see the demo",
+        "0.4 %; with friction 1 %, 2 % for the largest shear traction; plus the mesh error "
+        "stated in the demo",
         half_cylinder,
         slow=True,
     ),
     Case(
         "Half-cylinder on a plane, friction in one increment",
-        "1 % as for 80 increments, 2 % for the largest shear; the zone to the spacing of points",
+        "1 % as for 80 increments, 2 % for the largest shear traction; zones: spacing of the "
+        "quadrature points",
         half_cylinder_at_once,
         slow=True,
-        budget="one increment is what is computed here, no error; the table has two",
+        budget="the single increment is prescribed, not an error",
     ),
     Case(
         "Half-cylinder on a plane, a/R = 0.048",
-        "1 %: what a/R leaves between the body and a half-plane, and h = a/38",
+        "1 %: finite a/R, and h = a/38",
         thin_half_cylinder,
         slow=True,
     ),
     Case(
         "Block with friction (GRECO)",
-        "0.3 % against the converged values, 5 % against the published ones as stated for them; "
-        "zones to the spacing of the points",
+        "0.3 % for converged values, 5 % for published ones, as stated there; zones: spacing of "
+        "the quadrature points",
         greco,
         slow=True,
     ),
     demo(
         "Sphere on a block, ball on a plane",
-        "2 %: cells of an eighth of the contact's radius, bodies of finite size",
+        "2 %: cells of 1/8 of the contact radius, finite size of the bodies",
         "sphere",
         source={"": "Hertz"},
         label="case",
     ),
     demo(
-        "Two cylinders pressed, then sheared",
-        "2 %: a/R = 0.085, and the points of the cells; forces are equilibrium",
+        "Two cylinders, normal then tangential load",
+        "2 %: a/R = 0.085 and spacing of the quadrature points; forces: equilibrium",
         "two_cylinders",
         source={
             "force": "equilibrium",
@@ -217,119 +219,127 @@ DEMOS = [
     ),
     demo(
         "Fretting cycle of two cylinders",
-        "1 % for energies, 3 % for the shear that is left: a difference of two curves",
+        "1 % for energies; 3 % for the residual shear traction, a difference of two curves",
         "fretting",
-        source={"gap": "closed loop", "": "Mindlin, Deresiewicz"},
-        budget="energies and the shear at a point are not among the budget's quantities; the "
-        "contact is that of the two cylinders",
+        source={"closing": "closed loop", "": "Mindlin, Deresiewicz"},
+        budget="energies and point values are not in the error budget",
     ),
     demo(
         "Shrink fit",
-        "0.5 %: the penalty's share of the interference and the cells; evenness to 1 %",
+        "0.5 %: penalty and mesh; 1 % for the variation of the pressure",
         "shrink_fit",
-        source={"uneven": "axial symmetry", "": "Lamé"},
+        source={"variation": "axial symmetry", "": "Lamé"},
         label="kind",
     ),
     demo(
-        "Cylinder dragged along a block",
-        "2 % for width and peak, the peak even to 1 %: the points of the cells; 1e-6: equilibrium; "
-        "1 % for the work: small displacements",
+        "Cylinder sliding along a block",
+        "2 % for width and peak, 1 % for the variation of the peak: spacing of the quadrature "
+        "points; 1e-6: equilibrium; 1 % for the work: small displacements",
         "ironing",
         source={
-            "force": "equilibrium",
-            "over normal": "Coulomb",
+            "tangential": "Coulomb",
             "work": "energy",
-            "spread": "steady state",
+            "variation": "steady state",
+            "force": "equilibrium",
             "": "Johnson, sliding cylinder",
         },
     ),
     demo(
-        "Band on a drum that turns (capstan), finite",
-        "1.25 t/(2R): the formula is that of a band without thickness, and 1.0 of it is the arm of "
-        "the tension; extrapolated to t = 0 the product of both t/R; 2 % of the pressure and 0.5 % "
-        "of the torque: t/R",
+        "Band on a rotating drum (capstan), finite kinematics",
+        "1.25 t/(2R), as the formula is for zero thickness; extrapolated to t = 0: product of "
+        "both t/R; 2 % for the pressure, 0.5 % for the torque: t/R",
         "capstan",
         source={"torque": "equilibrium", "p R": "equilibrium", "": "Eytelwein, μπ"},
-        budget="the formula is known to t/(2R), more than the error",
+        budget="the formula is accurate to t/(2R), which exceeds the error",
     ),
     demo(
-        "O-ring between plates and in a groove, finite",
-        "5 %: the formula is a fit; 3 % for Hertz: a facet; 1 % and 2 % between meshes; 1e-6: "
+        "O-ring between plates and in a groove, finite kinematics",
+        "5 %: the formula is a fit; 3 % for Hertz: one facet; 1 % and 2 % between meshes; 1e-6: "
         "equilibrium",
         "seal",
-        source={"c = 0.02": "Hertz", "c =": "Lindley", "bed": "equilibrium", "": "half the cells"},
-        budget="the formula is a fit, known to less than the error",
+        source={
+            "c = 0.02": "Hertz",
+            "c =": "Lindley",
+            "reaction": "equilibrium",
+            "": "half the mesh size",
+        },
+        budget="the formula is a fit, less accurate than the solution",
     ),
     demo(
-        "Tapered pin pressed in, released, pulled out, finite",
-        "0.5 % where pin and hub are level: axial displacements of the flanks 0.2 %, cells and "
-        "penalty 0.1 %; before that, bare ends over length; 1 % for the way by a dry force: strain "
-        "of the pin; 1 % for the work: trapezia",
+        "Tapered pin: insertion, release, extraction, finite kinematics",
+        "0.5 % at full depth: axial displacements of the flanks 0.2 %, mesh and penalty 0.1 %; "
+        "at half depth: uncovered length; 1 % for the depth under a prescribed force: strain of "
+        "the pin; 1 % for the work: trapezoidal rule",
         "tapered_pin",
         source={
             "work": "energy",
-            "out": "no contact",
-            "released": "self-locking: tan α and μ",
-            "left": "statics: tan α and μ",
-            "dry, pu": "Lamé, Coulomb",
+            "extracted": "no contact",
+            "release": "self-locking: tan α and μ",
+            "relative depth": "statics: tan α and μ",
+            "insertion force": "Lamé, Coulomb",
+            "extraction force": "Lamé, Coulomb",
             "": "Lamé",
         },
-        budget="ends that are not covered and axial displacements weigh more than the error",
+        budget="uncovered ends and axial displacements exceed the error",
     ),
     demo(
-        "Screw turned under a nut of rubber, finite",
-        "1e-9 without friction: the work of torque and force, to the solver's tolerance; with it "
-        "3e-4 of F R: the middle of the pressure, and the square of the width over R",
+        "Screw in a rubber nut, finite kinematics",
+        "1e-9 without friction: solver tolerance; with friction 3e-4 of F R: centre of "
+        "pressure, and (width/R)²",
         "screw",
-        source={"no friction": "work: M = F P", "": "square thread: tan(α ± φ)"},
-        budget="torque over force follows from statics",
+        source={"μ = 0": "work: M = F P", "": "square thread: tan(α ± φ)"},
+        budget="results follow from statics",
     ),
     demo(
-        "Ring of rubber turned on a disc, finite",
-        "2 %: the pressure is not even, the ring has 32 sides; 1e-6: slip along the radius that is "
-        "left; 1e-7: the solver's tolerance",
+        "Rubber ring rotating on a disc (clutch), finite kinematics",
+        "2 %: non-uniform pressure, 32 facets around the ring; 1e-6: radial slip; 1e-7: solver "
+        "tolerance",
         "clutch",
         source={
-            "even pressure": "textbooks: μ F 2/3 (b³ - a³)/(b² - a²)",
-            "plate": "equilibrium",
-            "turned": "frame indifference",
+            "uniform pressure": "uniform pressure: μ F 2/3 (b³ - a³)/(b² - a²)",
+            "reaction": "equilibrium",
+            "rotating": "frame indifference",
             "": "Coulomb",
         },
-        budget="torque over force follows from statics, the rest from equilibrium",
+        budget="results follow from statics",
     ),
     demo(
-        "Tube of rubber pinched until it touches itself, finite",
-        "1e-3: normals of curved walls do not end at mirror images; 1 %: between meshes; 1.5 %: "
-        "(t/R)²/2, as sections do not stay plane",
+        "Rubber tube compressed to self-contact, finite kinematics",
+        "1e-3: projections on curved walls are not symmetric; 1 %: between meshes; 1.5 %: "
+        "(t/R)²/2, as sections do not remain plane",
         "tube",
         source={
-            "quarter": "half the cells",
-            "by the force": "Winkler's curved beam, Timoshenko",
-            "": "a quarter on a rigid plane",
+            "quarter": "half the mesh size",
+            "compliance": "Winkler's curved beam, Timoshenko",
+            "": "quarter model on a rigid plane",
         },
-        budget="forces here are compared between routes with the same errors, slopes with a beam, "
-        "known to less than the error",
+        budget="forces are compared between models with equal errors, compliances with beam "
+        "theory, less accurate than the solution",
     ),
     demo(
-        "Disc pressed into rubber, turned and dragged, finite",
-        "1e-7 of the force that presses, the digits that are written down; 1e-10 between two "
-        "routes of one program; 2 % for what penetration takes off the radius",
+        "Disc pressed into rubber, rotated and slid, finite kinematics",
+        "1e-7 of the normal force: digits of the reference; 1e-10 between two models in one "
+        "program; 2 % for the radius, reduced by the penetration",
         "rolling",
-        source={"instead": "relative motion", "slipping": "Coulomb", "": "GetFEM 5.4.2, same mesh"},
-        budget="the second program has the same mesh and penalty, and with them the same errors",
+        source={
+            "moving block": "relative motion",
+            "full slip": "Coulomb",
+            "": "GetFEM 5.4.2, same mesh",
+        },
+        budget="the other program has the same mesh and penalty, and the same errors",
     ),
     demo(
         "Male–female fitting",
-        "1e-7: equilibrium to the solver's tolerance; 1e-8 for homogeneity",
+        "1e-7: solver tolerance; 1e-8 for homogeneity",
         "fitting",
         source={"difference": "homogeneity", "": "statics"},
-        budget="forces follow from statics and are met to round-off",
+        budget="results follow from statics, up to round-off",
     ),
     demo(
         "Block on a rigid incline; wedge",
-        "1e-4, to which the limit is searched; 1e-6 for the wedge: statics",
+        "1e-4: resolution of the bisection; 1e-6 for the wedge: statics",
         "incline",
         source={"F/G": "NAFEMS CGS-4: (tan α + μ)/(1 - μ tan α)", "": "statics: tan α = μ"},
-        budget="forces follow from statics and are met to round-off",
+        budget="results follow from statics, up to round-off",
     ),
 ]

@@ -1,11 +1,12 @@
-"""How good the error estimates are: estimated over true errors, and docs/effectivity.md.
+"""Effectivity of the error estimates (estimated over true errors); writes docs/effectivity.md.
 
     python verification/effectivity.py
     python verification/effectivity.py --output /tmp/page.md
+    python verification/effectivity.py --page          # page and figure of stored values
 
-Part by part on the half-cylinder, where one cause of error at a time can be taken away; and as a
-whole on all cases of the verification, coarser ones of the same among them, that have exact or
-converged values for quantities of the budget. The exit code is 1 if the median of the effectivities
+Each part of the error budget is verified on the half-cylinder, where one cause of error at a time
+can be removed; all parts together on the verification cases, also on coarser meshes, that have
+exact or converged values for quantities of the budget. The exit code is 1 if a median effectivity
 is outside of 0.3 to 3.
 """
 
@@ -20,28 +21,37 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import fenics_contact as fc
 from demos import hertz
+from fenics_contact import plotting
 from fenics_contact.estimates.errors import quantities
 from scenes import problems
 from scenes.elasticity import stress
 from scenes.processes import ROOT
-from verification import half_planes
+from verification import half_planes, report
 from verification.cases import Case, Outcome
 from verification.demonstrations import DEMOS, run, runs
 from verification.run import CASES
 
 PAGE = ROOT / "docs" / "effectivity.md"
 USEFUL = (0.3, 3.0)
-# A part's true errors smaller than this, relative, are no better known than the better solution is.
+# Relative errors below this are not resolved by the more accurate solution.
 KNOWN = 1e-6
 
 
 @dataclass(frozen=True)
 class Row:
-    """An estimate beside the error it is of, both relative to the quantity.
+    """An estimated and a true error, both relative to the quantity.
 
-    A true error below ``known`` is no better known than its reference is.
+    Attributes:
+        scene: Case and its options.
+        part: Part of the error budget.
+        quantity: Quantity of the budget.
+        estimated: Estimated error.
+        true: True error.
+        known: Uncertainty of the reference, below which the effectivity is unknown.
     """
 
     scene: str
@@ -53,7 +63,7 @@ class Row:
 
     @property
     def effectivity(self) -> float | None:
-        """Estimated over true error, without signs; None where the true one is not known."""
+        """Estimated over true error, without signs; None if the true error is not known."""
         return abs(self.estimated / self.true) if abs(self.true) > self.known else None
 
 
@@ -66,7 +76,7 @@ def half_cylinder(
     steps: int = 1,
     rtol: float = 1e-9,
 ) -> tuple[dict[str, float], fc.ErrorBudget]:
-    """Quantities and error budget; stiffness ``factor`` E/h with h = 0.21 whatever the mesh."""
+    """Return quantities and error budget, with k_n = ``factor`` E/0.21 on all meshes."""
     body = problems.half_cylinder(friction, h)
     k = factor * body.E / 0.21
     law = fc.Coulomb(friction, k, k) if friction else fc.Frictionless(k)
@@ -83,7 +93,7 @@ def half_cylinder(
 def part(
     name: str, scene: str, rough: tuple[Any, fc.ErrorBudget], better: dict[str, float]
 ) -> Iterator[Row]:
-    """One part of a budget against a solution without this error, for quantities that have it."""
+    """Compare one part of a budget with a solution without this error."""
     values, budget = rough
     for quantity, value in values.items():
         true = (value - better[quantity]) / value
@@ -92,7 +102,7 @@ def part(
 
 
 def parts() -> Iterator[Row]:
-    """One cause of error after the other, all else equal."""
+    """Yield the parts of the budget, one cause of error at a time."""
     for friction in (0.0, 0.2):
         steps = 2 if friction else 1
         scene = f"μ = {friction:g}"
@@ -100,7 +110,7 @@ def parts() -> Iterator[Row]:
             given: dict[str, Any] = {"friction": friction, "degree": degree, "steps": steps}
             hard, _ = half_cylinder(factor=300, **given)
             for factor in (1, 3, 10):
-                title = f"{scene}, degree {degree}, k h/E = {factor}"
+                title = f"{scene}, degree {degree}, k_n h/E = {factor}"
                 yield from part("enforcement", title, half_cylinder(factor=factor, **given), hard)
             fine, _ = half_cylinder(h=0.05, friction=friction, steps=steps)
             for h in (0.84, 0.42, 0.21):
@@ -117,11 +127,11 @@ def parts() -> Iterator[Row]:
         yield from (row for row in rows if row.quantity == "friction force")
 
 
-# Peak of the half-cylinder with μ = 0.2: quadratic cells of 0.05 and 0.025 give 151.82 and 151.86
-# in 80 increments, 151.87 in 160. The independent solution's 150.8 is known to 1 % only.
+# Peak pressure of the half-cylinder with μ = 0.2: quadratic cells of 0.05 and 0.025 give 151.82 and
+# 151.86 in 80 increments, 151.87 in 160. The independent solution, 150.8, is accurate to 1 % only.
 PEAK = 151.87
-# Demo, options, exact or converged values, of the demo's own references by name or numbers, and how
-# well they are known.
+# Demo, options, exact or converged values (numbers, or names of the demo's references), and their
+# relative uncertainty.
 Truths = dict[str, str | float]
 WHOLES: list[tuple[str, tuple[str, ...], Truths, float]] = [
     *(
@@ -189,34 +199,35 @@ WHOLES: list[tuple[str, tuple[str, ...], Truths, float]] = [
 
 
 def of_demos() -> Iterator[Row]:
-    """All parts together against exact or converged values."""
+    """Yield all parts together for the demos, compared with exact or converged values."""
     for name, options, truths, known in WHOLES:
         for one in runs(run(name, *options, "--errors")):
             budget = fc.ErrorBudget(**one["errors"])
             references = one["references"]
-            label = " ".join([name, one.get("kind") or one.get("case") or "", *options])
+            kind = one.get("kind") or one.get("case")
+            label = " ".join([name, *([kind] if kind else []), *options])
             for quantity, given in truths.items():
                 value = budget.values[quantity]
                 whole = quantity == "normal force" and name == "sphere"
                 if whole and one["case"] != "block":
-                    continue  # Hertz's relation of depth and force is that of the block
+                    continue  # Hertz's relation of depth and force holds for the block only
                 if isinstance(given, str):
                     given = next(e["reference"] for n, e in references.items() if given in n)
                 if whole:
                     given = given / 4  # a quarter is modelled
                 true = (value - given) / value
-                # The references are of small displacements, too.
+                # The references are for small displacements as well.
                 parts = {n: p for n, p in budget.parts.items() if n != "kinematics"}
                 total = dataclasses.replace(budget, parts=parts).total[quantity]
-                yield Row(label, "all", quantity, total, true, known)
+                yield Row(label, "all parts", quantity, total, true, known)
 
 
 def of_cases() -> Iterator[Row]:
-    """The same of the cases without a demo; those of two curves coarser and softer, too."""
+    """Yield all parts together for the other cases, two of them on coarser meshes, too."""
 
     def rows(title: str, made: Outcome) -> Iterator[Row]:
         for e in made.estimates() if made.estimates else ():
-            yield Row(title, "all", e.quantity, e.estimated, e.true, e.known)
+            yield Row(title, "all parts", e.quantity, e.estimated, e.true, e.known)
 
     for case in CASES:
         if not case.budget:
@@ -224,63 +235,107 @@ def of_cases() -> Iterator[Row]:
     for n in (32, 64):
         yield from rows(f"Wavy surface, {n} cells", half_planes.wavy(n))
     for h, k in ((1.0, 1.0), (2.0, 1.0), (2.0, 3.0)):
-        yield from rows(f"Cylinder on block, h = {h:g}, k h/E = {k:g}", half_planes.cylinder(h, k))
-
-
-def table(rows: list[Row]) -> list[str]:
-    """Rows in Markdown."""
-    lines = ["| scene | quantity | estimated | true | effectivity |", "|---|---|---|---|---|"]
-    for row in rows:
-        shown = "not known"
-        if row.effectivity is not None:
-            useful = USEFUL[0] <= row.effectivity <= USEFUL[1]
-            shown = f"{row.effectivity:.2f}" if useful else f"**{row.effectivity:.2g}**"
-        cells = [row.scene, row.quantity, f"{row.estimated:.2%}", f"{row.true:.2%}", shown]
-        lines.append(f"| {' | '.join(cells)} |")
-    return [*lines, ""]
-
-
-def page(rows: list[Row]) -> str:
-    """The page, medians first."""
-    names = list(dict.fromkeys(row.part for row in rows))
-    lines = [
-        "# Effectivity of the error estimates",
-        "",
-        "Written by `python verification/effectivity.py`. Effectivity is estimated over true "
-        f"error; values outside of {USEFUL[0]:g} to {USEFUL[1]:g} are bold. Errors are relative to "
-        "the quantity. A part is compared with a solution in which its cause is next to absent and "
-        "all else equal; all parts together (the root of the sum of their squares) with the exact "
-        "or converged values of the verification. Where parts cancel in truth, that is too large. "
-        "*Not known* are effectivities where the true error is below what the reference is known "
-        "to: 0.1 % for converged values, (a/R)² for Hertz's; they are not counted. With friction "
-        f"the half-cylinder's peak is that of finer meshes, {PEAK:g}.",
-        "",
-        "| part | estimates | median | useful |",
-        "|---|---|---|---|",
-    ]
-    for name in names:
-        found = effectivities(rows, name)
-        useful = sum(USEFUL[0] <= e <= USEFUL[1] for e in found)
-        lines.append(
-            f"| {name} | {len(found)} | {statistics.median(found):.2f} | {useful} of {len(found)} |"
+        yield from rows(
+            f"Cylinder on block, h = {h:g}, k_n h/E = {k:g}", half_planes.cylinder(h, k)
         )
-    lines.append("")
-    for name in names:
-        title = "All parts together" if name == "all" else name.capitalize()
-        lines += [f"## {title}", "", *table([row for row in rows if row.part == name])]
-    lines += ["## Cases of the verification without estimates", ""]
-    lines += ["| case | why |", "|---|---|"]
-    lines += [f"| {case.name} | {case.budget} |" for case in without()]
-    return "\n".join(lines) + "\n"
 
 
-def effectivities(rows: list[Row], name: str) -> list[float]:
-    """Those of a part that are known."""
-    return [row.effectivity for row in rows if row.part == name and row.effectivity is not None]
+def stored(row: Row) -> dict[str, Any]:
+    """Return the row of the CSV file."""
+    found: dict[str, Any] = {"part": row.part, "case": row.scene, "quantity": row.quantity}
+    found |= {"estimated [%]": 100 * row.estimated, "true [%]": 100 * row.true}
+    if row.effectivity is None:
+        return found | {"effectivity": "", "useful": ""}
+    useful = USEFUL[0] <= row.effectivity <= USEFUL[1]
+    return found | {"effectivity": row.effectivity, "useful": "yes" if useful else "no"}
+
+
+def page(rows: list[dict[str, str]]) -> str:
+    """Return the page in Markdown."""
+    known = [row for row in rows if row["useful"]]
+    bad = [row for row in known if row["useful"] == "no"]
+    lines = ["# Effectivity of the error estimates", ""]
+    lines += report.text(
+        f"**{len(known) - len(bad)} of {len(known)} effectivities are between {USEFUL[0]:g} and "
+        f"{USEFUL[1]:g}.** The effectivity is the estimated over the true error, both relative to "
+        "the quantity.",
+        "Each part of the error budget (enforcement, discretisation, solver, increments) is "
+        "compared with a solution in which its cause is nearly absent, all else being equal. All "
+        "parts together, the root of the sum of their squares, are compared with exact or "
+        "converged values of the [verification cases](verification.md); the estimate is too large "
+        "where errors of different parts cancel.",
+    )
+    body = []
+    for name in dict.fromkeys(row["part"] for row in rows):
+        found = effectivities(rows, name)
+        useful = sum(row["useful"] == "yes" for row in known if row["part"] == name)
+        body.append((name, len(found), f"{statistics.median(found):.2f}", useful))
+    between = f"between {USEFUL[0]:g} and {USEFUL[1]:g}"
+    lines += report.table(("part", "estimates", "median effectivity", between), body)
+    lines += ["![Estimated over true error](effectivity.png)", ""]
+    lines += report.text(
+        f"*Estimated and true errors, and the range {USEFUL[0]:g} to {USEFUL[1]:g} of the "
+        "effectivity. Errors below 0.005 % are not drawn. Grey: the true error is "
+        "below the uncertainty of the reference (0.1 % for converged values, (a/R)² for Hertz); "
+        f"these {len(rows) - len(known)} are not counted. The peak pressure of the half-cylinder "
+        f"with friction is that of finer meshes, {PEAK:g}.*"
+    )
+    lines += [f"## Effectivities below {USEFUL[0]:g} or above {USEFUL[1]:g}", ""]
+    columns = ("part", "case", "quantity", "estimated [%]", "true [%]", "effectivity")
+    shown = [
+        [
+            *(row[c] for c in columns[:3]),
+            *(f"{float(row[c]):.2f}" for c in columns[3:5]),
+            report.number(row["effectivity"], 2),
+        ]
+        for row in bad
+    ]
+    lines += report.table(columns, shown)
+    lines += report.text(
+        "They occur mostly where the true error is small, as errors of opposite sign cancel. All "
+        "values are in [effectivity.csv](effectivity.csv)."
+    )
+    lines += ["## Verification cases without estimates", ""]
+    lines += report.table(("case", "reason"), [(case.name, case.budget) for case in without()])
+    lines += report.text(
+        "Written by `python verification/effectivity.py`; `--page` writes the page and its figure "
+        "from the stored values."
+    )
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def draw(path: Path, rows: list[dict[str, str]]) -> None:
+    """Draw estimated over true errors."""
+    ends = np.array([5e-3, 40.0])
+    with plotting.figure(path, size=(7.0, 5.4)) as axes:
+        for name, marker in zip(dict.fromkeys(r["part"] for r in rows), "osv^D", strict=True):
+            mine = [row for row in rows if row["part"] == name]
+            for known, colour in ((True, None), (False, "0.6")):
+                at = np.abs(
+                    [
+                        (float(row["true [%]"]), float(row["estimated [%]"]))
+                        for row in mine
+                        if bool(row["useful"]) == known
+                    ]
+                ).reshape(-1, 2)
+                at = at[(at >= ends[0]).all(axis=1)].T
+                label = name if known else None
+                axes.loglog(*at, marker, color=colour, markersize=5, alpha=0.7, label=label)
+        axes.loglog(ends, ends, "k-", linewidth=1, label="effectivity 1")
+        for factor in USEFUL:
+            axes.loglog(ends, factor * ends, "k:", linewidth=1)
+        axes.set(xlabel="true error [%]", ylabel="estimated error [%]", xlim=ends, ylim=ends)
+        axes.grid(alpha=0.25)
+        axes.legend(fontsize=8)
+
+
+def effectivities(rows: list[dict[str, str]], name: str) -> list[float]:
+    """Return the known effectivities of a part."""
+    return [float(row["effectivity"]) for row in rows if row["part"] == name and row["useful"]]
 
 
 def without() -> list[Case]:
-    """Cases that have nothing to compare estimates with."""
+    """Return the cases without a value to compare estimates with."""
     return [case for case in DEMOS + CASES if case.budget]
 
 
@@ -288,14 +343,20 @@ def main() -> int:
     """Compute and write; 0 if every median is useful."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--output", type=Path, default=PAGE, help="page to write")
+    parser.add_argument("--page", action="store_true", help="only write the page of stored values")
     arguments = parser.parse_args()
-    rows = []
-    for source in (parts, of_demos, of_cases):
-        for row in source():
-            rows.append(row)
-            print(f"{row.part}: {row.scene}, {row.quantity}: {row.effectivity}", flush=True)
+    data = arguments.output.with_suffix(".csv")
+    if not arguments.page:
+        made = []
+        for source in (parts, of_demos, of_cases):
+            for row in source():
+                made.append(stored(row))
+                print(*made[-1].values(), sep="; ", flush=True)
+        report.save(data, made)
+    rows = report.read(data)
     arguments.output.write_text(page(rows))
-    medians = [statistics.median(effectivities(rows, name)) for name in {row.part for row in rows}]
+    draw(arguments.output.with_suffix(".png"), rows)
+    medians = [statistics.median(effectivities(rows, name)) for name in {r["part"] for r in rows}]
     return int(not all(USEFUL[0] <= median <= USEFUL[1] for median in medians))
 
 

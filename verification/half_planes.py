@@ -20,10 +20,8 @@ GROUND, LOAD, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
 
 @case(
     "Rigid flat punch on a half-plane",
-    "0.5 %: the half-plane ends at 50 a, and next to the corner the singular pressure is smeared "
-    "over two of the cells, 1/160 of a",
-    budget="the force is given, the largest pressure infinite, and so is the displacement of a "
-    "half-plane",
+    "0.5 %: half-plane truncated at 50 a; singular pressure at the corner, cells of a/160",
+    budget="the force is given; peak pressure and displacement are infinite",
 )
 def flat_punch() -> Outcome:
     """Half of it, driven by a force: the pressure inside |x| ≤ 0.9 a, and the load inside x."""
@@ -64,15 +62,15 @@ def flat_punch() -> Outcome:
     share = 2 * float(points["measure"][inside] @ p[inside]) / force
     source = "(2/π) arcsin 0.9"
     rows.append(
-        Row("share of the load in |x| ≤ 0.9 a", share, 2 / np.pi * np.arcsin(0.9), source, 0.005)
+        Row("load in |x| ≤ 0.9 a / total load", share, 2 / np.pi * np.arcsin(0.9), source, 0.005)
     )
     return Outcome(tuple(rows), f"{len(x) - 1} × {len(y) - 1} quadrilaterals, degree 2", body.dofs)
 
 
 @case(
     "Wavy surface, Westergaard",
-    "1 %: 256 cells over half a wave leave half a cell, 0.6 %, in a/λ = 1/6; a smooth pressure is "
-    "far better, but the stiffness of 10 E/h lowers the wave by some 0.1 %",
+    "1 %: half a cell is 0.6 % of a/λ = 1/6; the penalty of 10 E/h reduces the amplitude by "
+    "about 0.1 %",
 )
 def wavy(n: int = 256) -> Outcome:
     """An elastic half-plane pressed on a rigid wave by p*/4, p*/2, 3p*/4; period by symmetry.
@@ -115,7 +113,7 @@ def wavy(n: int = 256) -> Outcome:
         s, sx = np.sin(np.pi * width), np.sin(np.pi * x / wave)
         exact = 2 * mean * np.cos(np.pi * x / wave) / s**2 * np.sqrt(np.maximum(s**2 - sx**2, 0))
         rms = np.sqrt(points["measure"] @ (p - exact) ** 2 / (points["measure"] @ exact**2))
-        rows.append(Row(f"error of p(x), rms, at {share:g} p*", float(rms), 0.0, source, 0.01))
+        rows.append(Row(f"L² error of p(x) at {share:g} p*", float(rms), 0.0, source, 0.01))
 
     def estimates() -> Iterator[Estimate]:
         # A half-plane of 1.5 waves' depth ends where the wave has decayed by exp(-3π).
@@ -185,7 +183,7 @@ def cylinder_on_block(h: float):
 
 @case(
     "Cylinder on block, two bodies, NAFEMS R0094-1",
-    "1.5 %, that is (a/R)²: Hertz takes the cylinder for a parabola and the normals for parallel",
+    "1.5 % = (a/R)²: Hertz's theory assumes a parabola and parallel normals",
 )
 def cylinder(h: float = 0.25, stiffness: float = 10.0) -> Outcome:
     """35 kN/mm on a steel cylinder, on a block of 70 GPa, small displacements, no friction.
@@ -206,7 +204,7 @@ def cylinder(h: float = 0.25, stiffness: float = 10.0) -> Outcome:
     list(fc.increments(problem, load, 0.0, total / 2, steps=2))
     r, points = contact.resultants(), contact.gather()
     rows = (
-        Row("contact force per half [N/mm]", r.force[1], total / 2, "the load", 1e-6),
+        Row("contact force per half [N/mm]", r.force[1], total / 2, "applied load", 1e-6),
         Row("half-width a [mm]", _half_width(points), 6.2146, "Hertz", 0.015),
         Row("peak pressure p₀ [MPa]", r.max_pressure, 3585.4, "Hertz", 0.015),
     )

@@ -13,11 +13,10 @@ GROUND, TOP, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
 
 
 @case(
-    "Two spheres pressed, then sheared (Cattaneo, Mindlin)",
-    "2 %: a zone ends between points of quadratic cells of a/5, a/15 apart, and the half-spaces "
-    "end at 6 a",
+    "Two spheres, normal then tangential load (Cattaneo, Mindlin)",
+    "2 %: quadrature points are a/15 apart; half-spaces truncated at 6 a",
     slow=True,
-    budget="Hertz is known to some 1 % where the half-spaces end at 6 a, more than the error",
+    budget="truncation of the half-spaces at 6 a changes the reference by 1 %, more than the error",
 )
 def spheres() -> Outcome:
     """Two blocks of one material stand for the spheres: the gap between them is r²/2R.
@@ -59,7 +58,7 @@ def spheres() -> Outcome:
     star = modulus / (1 - nu**2) / 2
     a = (3 * force * radius / (4 * star)) ** (1 / 3)
     p0 = 3 * force / (2 * np.pi * a**2)
-    source = "Hertz, of the force that was measured"
+    source = "Hertz, for the computed force"
     rows = [
         Row("contact radius a", np.sqrt(2 * r.area / np.pi), a, source, 0.02),
         Row("peak pressure p₀", r.max_pressure, p0, source, 0.02),
@@ -88,13 +87,11 @@ def spheres() -> Outcome:
         s = np.linalg.norm(points["x"][middle, :2], axis=1) / a
         exact = friction * p0 * (np.sqrt(1 - s**2) - c * np.sqrt(1 - (s / c) ** 2))
         ratio = float(traction.mean() / exact.mean())
-        rows.append(
-            Row(f"shear traction at the centre over Mindlin's, {at}", ratio, 1.0, source, 0.02)
-        )
+        rows.append(Row(f"shear traction at the centre / Mindlin, {at}", ratio, 1.0, source, 0.02))
         made = value - slope * share
         part = unit * (1 - (1 - share) ** (2 / 3) - 2 / 3 * share)
-        rows.append(Row(f"displacement made by slip, {at}", made, part, source, 0.02))
-        rows.append(Row(f"normal force kept, {at}", 2 * r.normal_force, force, "symmetry", 0.002))
+        rows.append(Row(f"displacement due to slip, {at}", made, part, source, 0.02))
+        rows.append(Row(f"normal force, {at}", 2 * r.normal_force, force, "symmetry", 0.002))
     return Outcome(tuple(rows), "2 bodies, hexahedra of a/5 and a/4, degree 2", body.dofs)
 
 
