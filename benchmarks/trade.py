@@ -1,20 +1,13 @@
-"""What accuracy costs: every knob turned on five scenes, true error against time.
+"""Accuracy versus cost: parameters varied on five problems, true error over time.
 
-Scenes: the half-cylinder without friction and with μ = 0.2, the GRECO block, a rigid ball on a
-block in three dimensions, and the shrink fit of two rings. One knob after another is turned around
-a base point, and mesh size, degree and enforcement together. Errors are the largest of the relative
-errors of normal force, friction force, peak pressure and a displacement, against Lamé's solution
-for the rings and else against a solution of this package on a far finer mesh with multipliers, a
-tight tolerance and many increments, which is compared with published values. Times are in
-units of one linear solve of the same mesh and degree (assembly, factorisation, solution, Γc held)
-made in turn with the runs, the quickest of ``--repeat`` and for the unit of all; meshing and the
-compiling of forms, done before, are not counted.
+Problems, errors and times are described on the page, docs/trade.md, which `trade_page.py` writes.
 
     OMP_NUM_THREADS=1 python benchmarks/trade.py            # ten minutes; writes docs/
     OMP_NUM_THREADS=1 python benchmarks/trade.py --short    # a minute; writes to --output only
+    python benchmarks/trade.py --page                       # page and figures of docs/trade.csv
 
-Rows are kept in ``trade.csv`` of the output folder as they are done: a run that was killed goes on
-there when started again; ``--fresh`` starts anew. A setting that fails is a row, too.
+Rows are stored in the output folder as they are computed: an interrupted study continues there;
+``--fresh`` starts anew. A setting that fails has a row, too.
 """
 
 from __future__ import annotations
@@ -34,7 +27,7 @@ from tqdm import tqdm
 
 import fenics_contact as fc
 from benchmarks import costs, timing
-from benchmarks.trade_page import draw, page, slug
+from benchmarks.trade_page import draw, page
 from benchmarks.trade_scenes import (
     COLUMNS,
     COMPILED,
@@ -48,13 +41,14 @@ from benchmarks.trade_scenes import (
 from fenics_contact.contact.accuracy import PRESETS
 from scenes import problems
 from scenes.problems import Body
+from verification import report
 
 Row = timing.Row
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
 # Runs that take longer than this are not repeated (s).
 LONG = 3.0
-# A history is given up after this time (s).
+# Time limit of a load history (s).
 LIMIT = 20.0
 
 
@@ -62,7 +56,7 @@ LIMIT = 20.0
 
 
 def solve(body: Body, setting: Setting, limit: float = LIMIT) -> Row:
-    """Make the contact problem and lead the load to its end: what its row has, but the time."""
+    """Solve the contact problem up to its full load; return the row without times."""
     made = problems.parts(body, setting.degree)
     rule: dict[str, Any] = {}
     if setting.quadrature == "vertex":
@@ -103,7 +97,7 @@ def solve(body: Body, setting: Setting, limit: float = LIMIT) -> Row:
         for step in fc.increments(problem, load, 0.0, body.end, steps=wanted, max_cuts=2):
             steps.append(step)
             if limit and step.load != body.end and time.perf_counter() - start > limit:
-                raise TimeoutError(f"given up after {limit:g} s, at {step.load / body.end:.0%}")
+                raise TimeoutError(f"time limit of {limit:g} s, at {step.load / body.end:.0%}")
     except (fc.NotConverged, TimeoutError, ValueError, MemoryError, PETSc.Error) as error:
         words = " ".join(str(error).split())
         return row | {"failure": f"{type(error).__name__}: {words[:150]}", "steps": len(steps)}
@@ -111,8 +105,8 @@ def solve(body: Body, setting: Setting, limit: float = LIMIT) -> Row:
     return row | {
         "steps": len(steps),
         "iterations": sum(step.iterations for step in steps),
-        "rounds": sum(step.augmentations for step in steps),
-        "finished by": " ".join(sorted({step.method for step in steps})),
+        "augmentations": sum(step.augmentations for step in steps),
+        "method": " ".join(sorted({step.method for step in steps})),
         "normal force": resultants.normal_force,
         "friction force": resultants.tangential_force,
         "peak pressure": resultants.max_pressure,
@@ -121,9 +115,9 @@ def solve(body: Body, setting: Setting, limit: float = LIMIT) -> Row:
 
 
 def errors(row: Row, reference: Row) -> Row:
-    """Relative errors of a row, and the largest of them; nothing for what has no value."""
+    """Return the relative errors of a row that has results, and the largest of them."""
     found = {
-        f"{name}, error": abs(float(row[name]) / float(reference[name]) - 1)
+        f"{name} error": abs(float(row[name]) / float(reference[name]) - 1)
         for name in QUANTITIES
         if row.get(name) not in (None, "") and float(reference.get(name) or 0.0)
     }
@@ -131,10 +125,7 @@ def errors(row: Row, reference: Row) -> Row:
 
 
 def timed(one: Scene, setting: Setting, repeat: int, limit: float = LIMIT) -> Row:
-    """Solve in turn with the linear problem, quick ones several times: the least times.
-
-    What else a machine does only ever adds to a time.
-    """
+    """Time a setting and the linear problem in turn, several times if fast; return the minima."""
     body = one.make(setting.h)
     runs = {
         "linear": lambda: costs.linear_solve(body, setting.degree),
@@ -153,14 +144,14 @@ def timed(one: Scene, setting: Setting, repeat: int, limit: float = LIMIT) -> Ro
     }
 
 
-# ---- rows that survive ---------------------------------------------------------------------------
+# ---- stored rows ---------------------------------------------------------------------------------
 
 
 class Store:
-    """Rows in a CSV file, each written as it is done; a line that was cut off is dropped."""
+    """Rows in a CSV file, each written when computed; an incomplete last line is dropped."""
 
     def __init__(self, path: Path) -> None:
-        """Read what is there.
+        """Read the stored rows.
 
         Raises:
             ValueError: The file has other columns.
@@ -175,17 +166,17 @@ class Store:
             return
         if len(whole) < len(text):
             os.truncate(path, len(whole))
-        self.rows = read(path)
+        self.rows = report.read(path)
         if self.rows and tuple(self.rows[0]) != COLUMNS:
-            raise ValueError(f"{path} has other columns than this study; start it with --fresh")
+            raise ValueError(f"{path} has columns of another study; use --fresh")
 
     def find(self, role: str, setting: Setting) -> dict[str, str] | None:
-        """The row of a setting."""
+        """Return the row of a setting."""
         wanted = {"role": role} | {name: str(v) for name, v in asdict(setting).items()}
         return next((r for r in self.rows if all(r[k] == v for k, v in wanted.items())), None)
 
     def add(self, role: str, setting: Setting, row: Row) -> dict[str, str]:
-        """Append a row, to the disk."""
+        """Append a row, and flush it to disk."""
         full = {"role": role} | asdict(setting) | row
         with open(self.path, "a", newline="") as file:
             csv.DictWriter(file, COLUMNS, extrasaction="ignore", lineterminator="\n").writerow(full)
@@ -195,14 +186,8 @@ class Store:
         return self.rows[-1]
 
 
-def read(path: Path) -> list[dict[str, str]]:
-    """The rows of a study."""
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def in_linear_solves(rows: Sequence[Row]) -> list[Row]:
-    """The rows with their times in units of the quickest linear solve of the same mesh."""
+    """Add times in units of the fastest linear solve of the same mesh."""
     units: dict[tuple[str, ...], float] = {}
     for row in rows:
         key = row["scene"], row["h"], row["degree"]
@@ -214,7 +199,7 @@ def in_linear_solves(rows: Sequence[Row]) -> list[Row]:
 
 
 def write(path: Path, rows: Sequence[Row]) -> None:
-    """All rows as a new file."""
+    """Write all rows to a new file."""
     with open(path, "w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
@@ -222,7 +207,7 @@ def write(path: Path, rows: Sequence[Row]) -> None:
 
 
 def study(scenes: dict[str, Scene], store: Store, repeat: int, short: bool) -> None:
-    """Make the rows that are not there yet."""
+    """Compute the missing rows."""
     settings = [(one, setting) for one in scenes.values() for setting in sweep(one, short)]
     warm: set[tuple[Any, ...]] = set()
     quiet = None if MPI.COMM_WORLD.rank == 0 else True
@@ -231,7 +216,7 @@ def study(scenes: dict[str, Scene], store: Store, repeat: int, short: bool) -> N
             bar.set_description(one.name)
             if store.find("sweep", setting) is None:
                 reference = find_reference(one, store)
-                # What is compiled, and for what: on the coarsest mesh, before anything is timed.
+                # Compile the forms on the coarsest mesh, before timing.
                 forms = (one.name, *(getattr(setting, name) for name in COMPILED))
                 if forms not in warm:
                     body = one.make(one.sizes[0])
@@ -244,7 +229,7 @@ def study(scenes: dict[str, Scene], store: Store, repeat: int, short: bool) -> N
 
 
 def find_reference(one: Scene, store: Store) -> Row:
-    """Exact values, or those of the reference solution, made at first use."""
+    """Return exact values, or those of the reference solution, computed at first use."""
     if one.reference is None:
         return dict(one.published)
     row: Row | None = store.find("reference", one.reference)
@@ -257,29 +242,28 @@ def find_reference(one: Scene, store: Store) -> Row:
 
 
 def main() -> None:
-    """Run what is missing, then draw and write."""
+    """Compute missing rows; write the page and its figures."""
     parser = timing.parser(__doc__, "trade")
-    parser.add_argument(
-        "--page", type=Path, help="by default docs/trade.md; of a short run in the output folder"
-    )
-    parser.add_argument("--fresh", action="store_true", help="forget the rows of earlier runs")
+    parser.add_argument("--page", action="store_true", help="only write the page of stored rows")
+    parser.add_argument("--fresh", action="store_true", help="discard the rows of earlier runs")
     arguments = parser.parse_args()
     if MPI.COMM_WORLD.size > 1:
-        parser.error("times are of one rank")
+        parser.error("runs on one rank")
     scenes = short_scenes() if arguments.short else all_scenes()
-    path = arguments.output / ("short.csv" if arguments.short else "rows.csv")
-    if arguments.fresh:
-        path.unlink(missing_ok=True)
-    store = Store(path)
-    study(scenes, store, arguments.repeat, arguments.short)
-    target = arguments.page or (arguments.output if arguments.short else DOCS) / "trade.md"
-    target.parent.mkdir(parents=True, exist_ok=True)
-    rows = in_linear_solves(store.rows)
-    for one in scenes.values():
-        draw(target.with_name(f"{target.stem}-{slug(one.name)}.png"), one, rows)
-    write(target.with_suffix(".csv"), rows)
+    target = (arguments.output if arguments.short else DOCS) / "trade.md"
+    if arguments.page:
+        rows = report.read(target.with_suffix(".csv"))
+    else:
+        path = arguments.output / ("short.csv" if arguments.short else "rows.csv")
+        if arguments.fresh:
+            path.unlink(missing_ok=True)
+        store = Store(path)
+        study(scenes, store, arguments.repeat, arguments.short)
+        rows = in_linear_solves(store.rows)
+        write(target.with_suffix(".csv"), rows)
+    draw(target, scenes, rows)
     advice = "" if arguments.short else (HERE / "trade_advice.md").read_text()
-    target.write_text(page(scenes, rows, target.stem, __doc__ or "", advice))
+    target.write_text(page(scenes, rows, target.stem, advice))
     print(target)
 
 

@@ -1,49 +1,50 @@
-"""What the rows of `benchmarks/trade.py` say: those that no other dominates, pictures, the page."""
+"""Evaluation of the rows of `benchmarks/trade.py`: non-dominated settings, figures, the page."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from benchmarks import timing
-from benchmarks.trade_scenes import KNOBS, QUANTITIES, Scene, Setting
+from benchmarks.trade_scenes import PARAMETERS, Scene, Setting
 from fenics_contact import plotting
+from fenics_contact.contact.accuracy import PRESETS
+from verification import report
 
 Row = timing.Row
-# A row dominates another if both its error and its time are smaller by this share.
+# A row dominates another if both its error and its time are smaller by this fraction.
 MARGIN = 0.1
+ENFORCEMENTS = (("penalty", "o-"), ("augmented", "s--"))
 
 
-def turned(row: Row, base: Setting) -> tuple[str, ...]:
-    """The knobs in which a row differs from the base point."""
-    return tuple(name for name in KNOBS if row[name] != str(getattr(base, name)))
+def changed(row: Row, base: Setting) -> tuple[str, ...]:
+    """Return the parameters in which a row differs from the base setting."""
+    return tuple(name for name in PARAMETERS if row[name] != str(getattr(base, name)))
 
 
 def describe(row: Row, base: Setting) -> str:
-    """The same with their values, in words."""
+    """Return the changed parameters with their values as text."""
     if row["accuracy"]:
         return f"accuracy = {row['accuracy']}"
-    names = [name for name in turned(row, base) if name not in ("h", "degree")]
+    names = [name for name in changed(row, base) if name not in ("h", "degree")]
     return ", ".join(f"{name} = {_short(row[name])}" for name in names) or "base"
 
 
 def comparable(row: Row, rows: Sequence[Row]) -> list[Row]:
-    """Rows with a solution of the same scene, mesh and degree: times have the same unit."""
+    """Return the solved rows of the same problem, mesh and degree, whose times have one unit."""
     same = ("scene", "h", "degree")
     return [r for r in rows if solved(r) and all(r[name] == row[name] for name in same)]
 
 
 def solved(row: Row) -> bool:
-    """Whether a row of the sweep has a solution."""
+    """Whether a row of the parameter study has a solution."""
     return row["role"] == "sweep" and row["error"] != ""
 
 
 def dominating(row: Row, rows: Sequence[Row], margin: float = MARGIN) -> list[Row]:
-    """Those of the rows that have both less error and less time, each by the margin."""
+    """Return the rows with both less error and less time, each by the margin."""
     return [
         other
         for other in rows
@@ -52,111 +53,60 @@ def dominating(row: Row, rows: Sequence[Row], margin: float = MARGIN) -> list[Ro
 
 
 def front(rows: Sequence[Row]) -> list[Row]:
-    """Rows that no other beats in both error and time, the quickest first."""
-    kept: list[Row] = []
+    """Return the rows that no other has both less error and less time than, fastest first."""
+    found: list[Row] = []
     for row in sorted(rows, key=lambda r: (float(r["time"]), float(r["error"]))):
-        if not kept or float(row["error"]) < float(kept[-1]["error"]):
-            kept.append(row)
-    return kept
+        if not found or float(row["error"]) < float(found[-1]["error"]):
+            found.append(row)
+    return found
 
 
-def draw(path: Path, one: Scene, rows: Sequence[Row]) -> None:
-    """Error over time: the knobs on the base mesh, and all meshes in one unit."""
-    base = one.base
-    rows = [row for row in rows if row["scene"] == one.name and solved(row)]
-    here = [r for r in rows if r["h"] == str(base.h) and r["degree"] == str(base.degree)]
-    with plotting.figure(path, 2, size=(5.6, 4.4)) as (left, right):
-        groups: dict[str, list[Row]] = {}
-        for row in here:
-            names = turned(row, base)
-            group = "accuracy" if row["accuracy"] else names[0] if len(names) == 1 else "several"
-            groups.setdefault(group if names else "base", []).append(row)
-        for (name, some), marker in zip(groups.items(), "so^vD<>pPX*hd", strict=False):
-            at = [[float(row[c]) for row in some] for c in ("time", "error")]
-            size = 9 if name in ("accuracy", "base") else 5
-            left.loglog(*at, marker, markersize=size, label=name, alpha=0.8)
-        for row in groups.get("accuracy", []):
-            place = float(row["time"]), float(row["error"])
-            left.annotate(row["accuracy"], place, xytext=(6, 5), textcoords="offset points")
-        best = front(here)
-        at = [[float(row[c]) for row in best] for c in ("time", "error")]
-        left.step(*at, "k-", where="post", linewidth=0.8, label="front")
-        left.set(title=f"{one.name}, h = {_short(base.h)}", xlabel="time / linear solve")
-        unit = np.median([float(row["linear solve [s]"]) for row in here])
-        for degree, marker in (("1", "o"), ("2", "s")):
-            for number, h in enumerate(one.sizes):
-                some = [r for r in rows if r["h"] == str(h) and r["degree"] == degree]
-                if some:
-                    at = [
-                        [float(row["seconds"]) / unit for row in some],
-                        [float(row["error"]) for row in some],
-                    ]
-                    label = f"h = {_short(h)}, degree {degree}"
-                    right.loglog(
-                        *at, marker, color=f"C{number}", markersize=4, alpha=0.7, label=label
-                    )
-        right.set(title="all meshes", xlabel=f"time / linear solve of h = {_short(base.h)}")
-        for axes in (left, right):
-            axes.set_ylabel("largest relative error")
-            axes.grid(alpha=0.25)
-            axes.legend(fontsize=7)
+# ---- page ----------------------------------------------------------------------------------------
 
 
-def page(scenes: dict[str, Scene], rows: Sequence[Row], stem: str, about: str, advice: str) -> str:
-    """Everything in Markdown: references, advice, pictures, fronts, knobs, failures.
+def page(scenes: Mapping[str, Scene], rows: Sequence[Row], stem: str, advice: str) -> str:
+    """Return the page in Markdown.
 
     Args:
-        scenes: By name.
-        rows: Of the study.
-        stem: Of the names of pictures.
-        about: What the study is: its second paragraph and the third are shown.
-        advice: What to choose.
+        scenes: Problems by name.
+        rows: Rows of the study.
+        stem: Stem of the names of CSV file and figures.
+        advice: Recommendations.
     """
-    lines = ["# Speed for accuracy", "", *_unwrapped(about)[1:3], "", advice.strip(), ""]
-    lines += ["## References", ""]
+    lines = ["# Accuracy versus cost", ""]
+    lines += report.text(
+        "Five problems: the half-cylinder without friction and with μ = 0.2 (20 increments), the "
+        "GRECO block, a rigid ball on a block in 3D, and the shrink fit of two rings. One "
+        "parameter at a time is varied from a base setting (" + _base(scenes) + "); mesh size, "
+        "degree and enforcement are varied together. The error is the largest of the relative "
+        "errors of normal force, friction force, peak pressure and a displacement. The time is in "
+        "units of one linear solve of the same mesh and degree (assembly, factorisation and "
+        "solution with Γc fixed), both the fastest of several runs; meshing and compilation are "
+        f"not included. All {sum(r['role'] == 'sweep' for r in rows)} runs are in "
+        f"[{stem}.csv]({stem}.csv)."
+    )
+    lines += advice.strip().splitlines()
+    lines += ["", "## Settings", "", f"![Error over time, by setting]({stem}.png)", ""]
+    lines += report.text(
+        "*Error over time on the base mesh, each point one changed parameter. Line: settings that "
+        "no other dominates. Large markers: base setting and the presets of `accuracy=`.*"
+    )
+    names = [*PRESETS, *dict.fromkeys(r["accuracy"] for r in rows)]
     body = []
-    for one in scenes.values():
-        own = next((r for r in rows if r["scene"] == one.name and r["role"] == "reference"), None)
-        for name, value in one.published.items():
-            if not value:
-                continue
-            ours = f"{float(own[name]):.7g}" if own else "the exact value"
-            how = f"h = {_short(own['h'])}, {own['increments']} increments" if own else ""
-            body.append((one.name, name, ours, how, f"{value:.6g}", one.source))
-    lines += _table(("scene", "quantity", "reference", "found with", "published", "source"), body)
-    for one in scenes.values():
-        lines += ["", f"## {one.name[0].upper()}{one.name[1:]}", ""]
-        lines += [f"![Error against time, {one.name}]({stem}-{slug(one.name)}.png)", ""]
-        here = comparable({"scene": one.name} | _key(one.base), rows)
-        best = front(here)
-        body = [(describe(row, one.base), *_numbers(row)) for row in best]
-        body += [
-            (f"{describe(row, one.base)} (not on the front)", *_numbers(row))
-            for row in here
-            if (row["accuracy"] or not turned(row, one.base)) and row not in best
-        ]
-        head = ("setting", "error", "largest in", "time", "iterations")
-        lines += [f"The front at h = {_short(one.base.h)}, degree {one.base.degree}:", ""]
-        lines += [*_table(head, body), "", "Mesh, degree and enforcement (error · time):", ""]
-        lines += _grid(one, rows)
-    lines += ["", "## Knob by knob", "", "Error · time · iterations, each knob alone turned away "]
-    lines[-1] += "from the base point: " + _base(scenes) + "."
-    for title, fixed, knob in (
-        ("k_n, in units of E/h", {}, "k_n"),
-        ("k_t, in units of k_n", {}, "k_t"),
-        ("Quadrature of Γc, degree", {}, "quadrature"),
-        ("Increments", {}, "increments"),
-        ("snes_rtol", {}, "rtol"),
-        ("Solver", {}, "solver"),
-        ("k_n with multipliers", {"enforcement": "augmented"}, "k_n"),
-        ("Tolerance of the multipliers", {"enforcement": "augmented"}, "tolerance"),
-        ("accuracy=", {}, "accuracy"),
-    ):
-        found = _knob(scenes, rows, fixed, knob)
-        if len(found) > 1:
-            lines += ["", f"### {title}", "", *_table((knob, *scenes), found)]
-    failed = [row for row in rows if row["failure"]]
-    lines += ["", "## What broke", ""]
+    for name in dict.fromkeys(["", *names]):
+        found = [_row_of(replace(one.base, accuracy=name), rows) for one in scenes.values()]
+        if any(found):
+            body.append((name or "none (base)", *map(_cell, found)))
+    lines += ["Error · time · iterations with the presets:", ""]
+    lines += report.table(("accuracy=", *scenes), body)
+    lines += ["## Stiffness and increments", "", f"![Parameters]({stem}-parameters.png)", ""]
+    lines += report.text(
+        "*Error and iterations over the stiffness (solid: penalty, dashed: augmented Lagrangian), "
+        "and error over the number of increments of the problems with friction.*"
+    )
+    lines += ["## Mesh, degree and enforcement", "", f"![Meshes]({stem}-meshes.png)", ""]
+    lines += report.text("*Error over the number of dofs, by degree and enforcement.*")
+    lines += ["## Failed settings", ""]
     body = [
         (
             row["scene"],
@@ -165,24 +115,36 @@ def page(scenes: dict[str, Scene], rows: Sequence[Row], stem: str, about: str, a
             row["failure"],
             f"{float(row['time']):.3g}",
         )
-        for row in failed
+        for row in rows
+        if row["failure"]
     ]
-    lines += _table(("scene", "setting", "error", "time"), body) if body else ["Nothing."]
-    return "\n".join(lines) + "\n"
+    lines += report.table(("problem", "setting", "error", "time"), body) if body else ["None.", ""]
+    lines += ["## References", ""]
+    lines += report.text(
+        "Errors of the shrink fit are relative to Lamé's solution; the others are relative to a "
+        "solution of this package on a finer mesh with the augmented Lagrangian method and tight "
+        "tolerances, which agrees with published values:"
+    )
+    lines += report.table(
+        ("problem", "reference", "published", "largest difference", "of"),
+        [_reference(one, rows) for one in scenes.values() if one.reference],
+    )
+    lines += report.text(
+        "Written by `OMP_NUM_THREADS=1 python benchmarks/trade.py` (ten minutes); `--page` writes "
+        "the page and its figures from the stored runs."
+    )
+    return "\n".join(lines).rstrip() + "\n"
 
 
-def _unwrapped(text: str) -> list[str]:
-    """Paragraphs."""
-    return [paragraph + "\n" for paragraph in text.split("\n\n")]
-
-
-def _table(head: Sequence[str], body: Sequence[Sequence[Any]]) -> list[str]:
-    rows = ["| " + " | ".join(str(cell) for cell in row) + " |" for row in (head, *body)]
-    return [rows[0], "|" + "---|" * len(head), *rows[1:]]
-
-
-def _key(setting: Setting) -> Row:
-    return {name: str(getattr(setting, name)) for name in KNOBS}
+def _reference(one: Scene, rows: Sequence[Row]) -> tuple[str, ...]:
+    """Return the reference of a problem and its largest difference from published values."""
+    (own,) = (r for r in rows if r["scene"] == one.name and r["role"] == "reference")
+    differences = {
+        name: abs(float(own[name]) / value - 1) for name, value in one.published.items() if value
+    }
+    worst = max(differences, key=differences.__getitem__)
+    how = f"h = {_short(own['h'])}, {own['increments']} increments"
+    return one.name, how, one.source, f"{differences[worst]:.1e}", worst
 
 
 def _short(value: Any) -> str:
@@ -192,80 +154,142 @@ def _short(value: Any) -> str:
         return str(value)
 
 
-def slug(name: str) -> str:
-    """A scene's name as a part of those of files."""
-    return name.lower().replace(" ", "-").replace("μ=", "mu-").replace(".", "")
-
-
-def _base(scenes: dict[str, Scene]) -> str:
-    """The base point in words."""
+def _base(scenes: Mapping[str, Scene]) -> str:
+    """Return the base setting as text."""
     one = next(iter(scenes.values())).base
-    found = [f"{name} = {_short(getattr(one, name))}" for name in KNOBS[1:]]
-    return ", ".join(f for f in found if not f.startswith(("increments", "tolerance", "accuracy")))
+    left_out = ("h", "increments", "tolerance", "accuracy")
+    units = {"k_n": " E/h", "k_t": " k_n"}
+    return ", ".join(
+        f"{name} = {_short(getattr(one, name))}{units.get(name, '')}"
+        for name in PARAMETERS
+        if name not in left_out
+    )
 
 
-def _numbers(row: Row) -> tuple[str, ...]:
-    """Error, what it is largest in, time and iterations."""
-    worst = next(n for n in QUANTITIES if row[f"{n}, error"] == row["error"])
-    return f"{float(row['error']):.1e}", worst, f"{float(row['time']):.1f}", row["iterations"]
-
-
-def _cell(row: Row | None, iterations: bool = True) -> str:
+def _cell(row: Row | None) -> str:
+    """Return error, time and iterations."""
     if row is None:
         return "–"
     if row["failure"]:
         return f"fails · {float(row['time']):.1f}"
-    error, _, time, count = _numbers(row)
-    return " · ".join((error, time, count) if iterations else (error, time))
-
-
-def _grid(one: Scene, rows: Sequence[Row]) -> list[str]:
-    """Mesh by mesh, degrees and enforcements beside each other."""
-    body = []
-    kinds = [(degree, way) for degree in (1, 2) for way in ("penalty", "augmented")]
-    for h in one.sizes:
-        wanted = [
-            replace(one.base, h=h, degree=degree, enforcement=enforcement)
-            for degree, enforcement in kinds
-        ]
-        found = [_row_of(setting, rows) for setting in wanted]
-        dofs = [row["dofs"] for row in (found[0], found[2]) if row]
-        body.append((_short(h), " / ".join(dofs), *(_cell(row, False) for row in found)))
-    return _table(("h", "dofs", *(f"degree {degree}, {way}" for degree, way in kinds)), body)
+    return f"{float(row['error']):.1e} · {float(row['time']):.1f} · {row['iterations']}"
 
 
 def _row_of(setting: Setting, rows: Sequence[Row]) -> Row | None:
-    wanted = {"role": "sweep", "scene": setting.scene} | _key(setting)
+    wanted = {name: str(getattr(setting, name)) for name in ("scene", *PARAMETERS)}
+    wanted["role"] = "sweep"
     return next((row for row in rows if all(row[k] == v for k, v in wanted.items())), None)
 
 
-def _knob(
-    scenes: dict[str, Scene], rows: Sequence[Row], fixed: dict[str, Any], knob: str
-) -> list[tuple[str, ...]]:
-    """Values of a knob, and what they do in every scene."""
-    values = {
-        row[knob]
-        for row in rows
-        if row["role"] == "sweep"
-        and set(turned(row, scenes[row["scene"]].base)) - {*fixed} == {knob}
-    }
-    values |= {str(getattr(one.base, knob)) for one in scenes.values()}
-    order = sorted(values, key=lambda v: (0, float(v), v) if _is_number(v) else (1, 0.0, v))
-    body = []
-    for value in order:
-        found = []
-        for one in scenes.values():
-            start = replace(one.base, **fixed)
-            kind = type(getattr(start, knob))
-            found.append(_row_of(replace(start, **{knob: kind(value)}), rows))
-        if any(found):
-            body.append((_short(value) if value else "none", *map(_cell, found)))
-    return body
+# ---- figures -------------------------------------------------------------------------------------
 
 
-def _is_number(value: str) -> bool:
-    try:
-        float(value)
-    except ValueError:
-        return False
-    return True
+def draw(target: Path, scenes: Mapping[str, Scene], rows: Sequence[Row]) -> None:
+    """Draw the figures of the page ``target``."""
+    _grid(target.with_suffix(".png"), scenes, lambda axes, one: _draw_settings(axes, one, rows))
+    _grid(
+        target.with_name(f"{target.stem}-meshes.png"),
+        scenes,
+        lambda axes, one: _draw_meshes(axes, one, rows),
+    )
+    _draw_parameters(target.with_name(f"{target.stem}-parameters.png"), scenes, rows)
+
+
+def _grid(path: Path, scenes: Mapping[str, Scene], draw_one: Callable[[Any, Scene], None]) -> None:
+    """Draw a panel for each problem, and the common legend beside the last."""
+    with plotting.figure(path, size=(13.0, 7.6)) as axes:
+        figure = axes.figure
+        axes.remove()
+        panels = figure.subplots(2, 3).ravel()
+        legend: dict[str, Any] = {}
+        for panel, one in zip(panels, scenes.values(), strict=False):
+            draw_one(panel, one)
+            panel.grid(alpha=0.25)
+            handles, labels = panel.get_legend_handles_labels()
+            legend |= dict(zip(labels, handles, strict=True))
+        for panel in panels[len(scenes) :]:
+            panel.axis("off")
+        panels[-1].legend(legend.values(), legend.keys(), loc="center", fontsize=10)
+
+
+def _draw_settings(axes: Any, one: Scene, rows: Sequence[Row]) -> None:
+    """Draw error over time of all settings on the base mesh."""
+    base = one.base
+    here = comparable({"scene": one.name, "h": str(base.h), "degree": str(base.degree)}, rows)
+    groups: dict[str, list[Row]] = {}
+    for row in here:
+        names = changed(row, base)
+        group = names[0] if len(names) == 1 else "several" if names else "base"
+        groups.setdefault(f"accuracy = {row['accuracy']}" if row["accuracy"] else group, []).append(
+            row
+        )
+    presets = [f"accuracy = {name}" for name in (*PRESETS, "0.003", "1e-4")]
+    others = [name for name in PARAMETERS if name != "accuracy"]
+    for number, name in enumerate(("base", *presets, *others, "several")):
+        some = groups.get(name, [])
+        if some:
+            at = [[float(row[c]) for row in some] for c in ("time", "error")]
+            large = number <= len(presets)
+            style = {"color": f"C{number % 10}", "markersize": 9 if large else 5, "alpha": 0.8}
+            axes.loglog(*at, "sD^v<>ophd*XP8H.+"[number], label=name, **style)
+    best = front(here)
+    at = [[float(row[c]) for row in best] for c in ("time", "error")]
+    axes.step(*at, "k-", where="post", linewidth=0.8, label="not dominated")
+    axes.set(title=f"{one.name}, h = {_short(base.h)}", xlabel="time / linear solve")
+    axes.set_ylabel("largest relative error")
+    low, high = axes.get_xlim()
+    ticks: list[float] = []
+    for x in (1.8, 2, 2.2, 2.5, 3, 4, 5, 6, 7, 8, 9, 10, 20, 30, 50, 100):
+        if low < x < high and (not ticks or x / ticks[-1] > (high / low) ** 0.08):
+            ticks.append(x)
+    axes.xaxis.set_ticks(ticks, labels=[f"{x:g}" for x in ticks])
+    axes.xaxis.set_ticks([], minor=True)
+
+
+def _draw_meshes(axes: Any, one: Scene, rows: Sequence[Row]) -> None:
+    """Draw error over dofs by degree and enforcement."""
+    for degree in (1, 2):
+        for enforcement, line in ENFORCEMENTS:
+            settings = [
+                replace(one.base, h=h, degree=degree, enforcement=enforcement) for h in one.sizes
+            ]
+            found = [row for setting in settings if (row := _row_of(setting, rows))]
+            found = [row for row in found if solved(row)]
+            at = [[float(row[c]) for row in found] for c in ("dofs", "error")]
+            label = f"degree {degree}, {enforcement}"
+            axes.loglog(*at, line, color=f"C{degree - 1}", markersize=5, label=label)
+    axes.set(title=one.name, xlabel="dofs", ylabel="largest relative error")
+
+
+def _draw_parameters(path: Path, scenes: Mapping[str, Scene], rows: Sequence[Row]) -> None:
+    """Draw error and iterations over the stiffness, and error over the number of increments."""
+    with plotting.figure(path, 3, size=(4.8, 4.2)) as (left, middle, right):
+        for number, one in enumerate(scenes.values()):
+            for enforcement, line in ENFORCEMENTS:
+                start = replace(one.base, enforcement=enforcement)
+                found = _varied(start, "k_n", rows)
+                at = [float(row["k_n"]) for row in found]
+                label = one.name if enforcement == "penalty" else None
+                style = {"color": f"C{number}", "markersize": 4, "label": label}
+                left.loglog(at, [float(row["error"]) for row in found], line, **style)
+                middle.loglog(at, [float(row["iterations"]) for row in found], line, **style)
+            if one.has_friction:
+                found = _varied(one.base, "increments", rows)
+                at = [float(row["increments"]) for row in found]
+                errors = [float(row["error"]) for row in found]
+                right.loglog(at, errors, "o-", color=f"C{number}", label=one.name)
+        left.set(xlabel="k_n h/E", ylabel="largest relative error")
+        middle.set(xlabel="k_n h/E", ylabel="iterations")
+        right.set(xlabel="number of increments", ylabel="largest relative error")
+        for axes in (left, middle, right):
+            axes.grid(alpha=0.25)
+        for axes in (middle, right):
+            axes.legend(fontsize=7)
+
+
+def _varied(base: Setting, name: str, rows: Sequence[Row]) -> list[Row]:
+    """Return the solved rows that differ from a setting in one parameter, sorted by it."""
+    kind = type(getattr(base, name))
+    values = sorted({kind(row[name]) for row in rows if row["scene"] == base.scene})
+    found = [_row_of(replace(base, **{name: value}), rows) for value in values]
+    return [row for row in found if row and solved(row)]

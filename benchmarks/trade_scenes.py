@@ -1,4 +1,4 @@
-"""The scenes of `benchmarks/trade.py`, and every setting of them that it runs."""
+"""Problems of `benchmarks/trade.py`, and the settings that it runs."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ QUANTITIES = ("normal force", "friction force", "peak pressure", "displacement")
 
 @dataclass(frozen=True)
 class Setting:
-    """One configuration: a scene, its mesh, and all knobs.
+    """One configuration: a problem, its mesh, and all parameters.
 
     Attributes:
-        scene: Name of one of `SCENES`.
-        h: Size of the cells at Γc: a length, for the ball in units of the contact radius.
-        degree: Of the displacement.
-        k_n: In units of E/h.
-        k_t: In units of k_n.
+        scene: Name of the problem.
+        h: Cell size at Γc: a length, for the ball in units of the contact radius.
+        degree: Polynomial degree of the displacement.
+        k_n: Normal stiffness in units of E/h.
+        k_t: Tangential stiffness in units of k_n.
         enforcement: "penalty" or "augmented".
-        tolerance: Of augmented enforcement.
-        quadrature: Degree of the rule on Γc, "vertex", or "default".
-        increments: Equal ones.
+        tolerance: Tolerance of the augmented Lagrangian method.
+        quadrature: Quadrature degree on Γc, "vertex", or "default".
+        increments: Number of equal increments.
         rtol: ``snes_rtol``.
-        solver: Method of the problem: "lbfgs", "newton" or "default", the package's choice.
-        accuracy: The preset that sets stiffness, enforcement and tolerances instead, if any.
+        solver: Method of the problem: "lbfgs", "newton" or "default".
+        accuracy: Preset that sets stiffness, enforcement and tolerances instead, if any.
     """
 
     scene: str
@@ -60,35 +60,36 @@ class Setting:
     accuracy: str = ""
 
 
-# Knobs that change what is compiled.
+# Parameters that change the compiled forms.
 COMPILED = ("degree", "enforcement", "quadrature", "accuracy")
-KNOBS = tuple(field.name for field in fields(Setting) if field.name != "scene")
+PARAMETERS = tuple(field.name for field in fields(Setting) if field.name != "scene")
 COLUMNS = (
     "role",
     "scene",
-    *KNOBS,
+    *PARAMETERS,
     "failure",
     "dofs",
     "steps",
     "iterations",
-    "rounds",
-    "finished by",
+    "augmentations",
+    "method",
 )
-COLUMNS += (*QUANTITIES, *(f"{name}, error" for name in QUANTITIES), "error")
+COLUMNS += (*QUANTITIES, *(f"{name} error" for name in QUANTITIES), "error")
 COLUMNS += ("seconds", "linear solve [s]", "time")
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A body at all its mesh sizes.
+    """A problem on all its meshes.
 
     Attributes:
-        name: Of it.
-        make: The body of cells of a size.
-        sizes: The meshes, coarsest first; ``base`` is one of them.
-        reference: How the reference is found, or None where there is an exact solution.
-        published: What others have, to set beside the reference.
-        source: Where that is from.
+        name: Name.
+        make: Creates the body with a cell size.
+        sizes: Cell sizes, coarsest first, including that of ``base``.
+        base: Base setting.
+        reference: Setting of the reference solution; None if there is an exact solution.
+        published: Published values.
+        source: Source of the published values.
     """
 
     name: str
@@ -101,7 +102,7 @@ class Scene:
 
     @property
     def has_friction(self) -> bool:
-        """Whether its law has."""
+        """Whether the problem has friction."""
         return self.make(self.sizes[0]).friction > 0
 
 
@@ -115,7 +116,7 @@ def scene(
     source: str,
     increments: tuple[int, int] = (1, 1),
 ) -> Scene:
-    """A scene whose reference has multipliers, tight tolerances and small increments."""
+    """Create a problem with an augmented Lagrangian reference of tight tolerances."""
     start = Setting(name, base, increments=increments[0])
     tight = {"enforcement": "augmented", "tolerance": 1e-7, "rtol": 1e-10}
     reference = None
@@ -125,7 +126,7 @@ def scene(
 
 
 def all_scenes() -> dict[str, Scene]:
-    """Those of the full study."""
+    """Return the problems of the full study."""
     hertz_ball = sphere.hertz("block", 4e-4, 0.0)
     p, bore, _ = shrink_fit.lame("plane strain")
     sizes = (0.42, 0.2, 0.1, 0.05)
@@ -204,7 +205,7 @@ def all_scenes() -> dict[str, Scene]:
 
 
 def short_scenes() -> dict[str, Scene]:
-    """Coarse meshes of the half-cylinder."""
+    """Return the problems of a short study: coarse meshes of the half-cylinder."""
     made = []
     for one in list(all_scenes().values())[:2]:
         steps = 4 if one.has_friction else 1
@@ -216,7 +217,7 @@ def short_scenes() -> dict[str, Scene]:
 
 
 def sweep(one: Scene, short: bool) -> list[Setting]:
-    """Every setting of a scene once: knob by knob, and the grids."""
+    """Return the settings of a problem: one parameter at a time, and meshes."""
     base, friction = one.base, one.has_friction
     if short:
         return [
@@ -225,22 +226,22 @@ def sweep(one: Scene, short: bool) -> list[Setting]:
             replace(base, enforcement="augmented"),
             replace(base, solver="newton"),
         ]
-    knobs: dict[str, Sequence[Any]] = {
+    values: dict[str, Sequence[Any]] = {
         "k_n": (0.1, 1.0, 100.0, 1e3, 1e4, 1e6),
-        "quadrature": ("1", "3", "5", "7", "vertex"),
+        "quadrature": ("3", "5", "7", "vertex"),
         "increments": (1, 2, 5, 10, 20, 40, 80) if friction else (1, 5),
         "rtol": (1e-2, 1e-3, 1e-4, 1e-6, 1e-12),
         "solver": ("lbfgs", "newton"),
         "accuracy": (*PRESETS, "0.003", *(() if one.make(one.sizes[0]).history else ("1e-4",))),
     }
     if friction:
-        knobs["k_t"] = (0.01, 0.1, 10.0, 100.0)
+        values["k_t"] = (0.01, 0.1, 10.0, 100.0)
     made = [base]
     for h in one.sizes:
         for degree in (1, 2):
             for enforcement in ("penalty", "augmented"):
                 made.append(replace(base, h=h, degree=degree, enforcement=enforcement))
-    made += [replace(base, **{name: v}) for name, values in knobs.items() for v in values]
+    made += [replace(base, **{name: v}) for name, some in values.items() for v in some]
     augmented = replace(base, enforcement="augmented")
     made += [replace(augmented, k_n=k) for k in (1.0, 100.0, 1e3)]
     made += [replace(augmented, tolerance=t) for t in (0.1, 1e-2, 1e-3, 1e-7)]
