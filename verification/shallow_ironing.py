@@ -1,12 +1,12 @@
-"""Shallow ironing, converged: `demos/shallow_ironing.py` with one thing varied at a time.
+"""Shallow ironing, converged: `demos/shallow_ironing.py` with one parameter varied at a time.
 
-python verification/shallow_ironing.py            # runs what is missing, then draws
+python verification/shallow_ironing.py            # computes missing runs, writes the page
 python verification/shallow_ironing.py --jobs 2
-python verification/shallow_ironing.py --draw     # evaluates what is there
+python verification/shallow_ironing.py --page     # page and figures of the stored runs
 
-Each run is a process of its own, whose row and curve are kept as it ends in
-``verification/shallow_ironing.csv`` and ``shallow_ironing_curves.csv``: a study that was ended goes
-on with what is missing. Prints the tables of docs/finite.md and draws docs/shallow-ironing.png.
+Each run is a process of its own. Rows and curves are stored at its end in
+``verification/shallow_ironing.csv`` and ``shallow_ironing_curves.csv``; an interrupted study
+continues with the missing runs. Writes docs/shallow_ironing.md and its figures.
 """
 
 from __future__ import annotations
@@ -29,13 +29,14 @@ import numpy as np
 
 from demos.shallow_ironing import Setting, solve
 from scenes.processes import ROOT, command, environment
+from verification import report
 from verification import shallow_ironing_page as page
 
 STUDY = ROOT / "verification" / "shallow_ironing.csv"
 CURVES = STUDY.with_name("shallow_ironing_curves.csv")
-PICTURE = ROOT / "docs" / "shallow-ironing.png"
+PAGE = ROOT / "docs" / "shallow_ironing.md"
 TIMEOUT = 7200.0  # s, of one run
-# Facets pass under the die: V and H are fitted by a parabola over this time, and ripple about it.
+# Times in which V and H are fitted by a parabola, as they oscillate when facets pass the die.
 WINDOW = (1.4, 1.6)
 QUANTITIES = ("V(1)", "V(1.5)", "H(1.5)")
 RESULTS = (
@@ -48,15 +49,15 @@ BASE = Setting(until=2.0)
 
 
 def sized(size: float, increments: int, until: float = 1.6) -> Setting:
-    """The base on another mesh: springs of the same stiffness, a fifth of a facet an increment."""
+    """Return the base on another mesh, with the same stiffness and a fifth of a facet per step."""
     stiffness = BASE.stiffness * size / BASE.size
     return replace(BASE, size=size, increments=increments, until=until, stiffness=stiffness)
 
 
 def settings() -> dict[str, Setting]:
-    """All runs by name, in the order in which they are made.
+    """Return all runs by name, in order.
 
-    Variants differ from the base, all else from a mesh that is coarser by half an octave.
+    Some variants differ from the base, all others from a mesh coarser by a factor of √2.
     """
     short, coarse = replace(BASE, until=1.6), sized(0.283, 180)
     runs = {
@@ -91,7 +92,7 @@ def settings() -> dict[str, Setting]:
 
 
 def evaluate(path: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """V and H at 1 and 1.5, fitted about 1.5, and how far they ripple about the fit."""
+    """Return V and H at 1 and 1.5, their fits at 1.5, and the oscillation about the fit."""
     t = np.array([row["time"] for row in path])
     found = {}
     inside = (t > WINDOW[0] - 1e-9) & (t < WINDOW[1] + 1e-9)
@@ -109,7 +110,7 @@ def evaluate(path: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def run(setting: Setting) -> tuple[dict[str, Any], list[tuple[float, float, float]]]:
-    """Solve: what its row has beside the setting, and t, V, H of all increments."""
+    """Solve; return results of the row, and t, V, H of all increments."""
     start = time.process_time()
     path, _, _, dofs = solve(setting)
     iterations = [int(row["iterations"]) for row in path]
@@ -124,7 +125,7 @@ def run(setting: Setting) -> tuple[dict[str, Any], list[tuple[float, float, floa
 
 
 def started(name: str) -> tuple[dict[str, Any], list[tuple[float, float, float]]]:
-    """`run` in a process of its own; a row with a failure where it ends otherwise."""
+    """Run in a process of its own; return a row with a failure if it does not end normally."""
     words = command(1, Path(__file__), "--one", name)
     try:
         done = subprocess.run(
@@ -135,15 +136,15 @@ def started(name: str) -> tuple[dict[str, Any], list[tuple[float, float, float]]
             return row, curve
         failure = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
     except subprocess.TimeoutExpired:
-        failure = f"given up after {TIMEOUT:g} s"
+        failure = f"time limit of {TIMEOUT:g} s"
     return {"failure": failure[:200]}, []
 
 
-# ---- rows that are kept --------------------------------------------------------------------------
+# ---- stored rows ---------------------------------------------------------------------------------
 
 
 def append(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Rows at the end of a file, to the disk, below a header where it is new."""
+    """Append rows to a file and flush it to disk; a new file gets a header."""
     new = not path.exists()
     with open(path, "a", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -152,34 +153,31 @@ def append(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]]) ->
         os.fsync(file.fileno())
 
 
-def read(path: Path) -> list[dict[str, str]]:
-    """The rows of a file; none where there is none."""
-    if not path.exists():
-        return []
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
+def stored(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a file, which need not exist."""
+    return report.read(path) if path.exists() else []
 
 
 def results() -> dict[str, dict[str, float]]:
-    """What was found, by name of the run and of the quantity; failed runs are left out."""
+    """Return the results by name of the run and of the quantity, without failed runs."""
     return {
         row["name"]: {name: float(row[name]) for name in RESULTS[:-1] if row[name]}
-        for row in read(STUDY)
+        for row in stored(STUDY)
         if not row["failure"]
     }
 
 
 def curves() -> dict[str, np.ndarray]:
-    """t, V and H of all increments, shape (n, 3), by name of the run."""
+    """Return t, V and H of all increments, shape (n, 3), by name of the run."""
     found: dict[str, list[list[float]]] = {}
-    for row in read(CURVES):
+    for row in stored(CURVES):
         found.setdefault(row["name"], []).append([float(row[name]) for name in ("t", "V", "H")])
     return {name: np.array(points) for name, points in found.items()}
 
 
 def study(names: Sequence[str], jobs: int) -> None:
-    """Make the runs that are not there yet."""
-    there = {row["name"] for row in read(STUDY)}
+    """Compute the missing runs."""
+    done = {row["name"] for row in stored(STUDY)}
     lock = Lock()
 
     def make(name: str) -> None:
@@ -193,25 +191,26 @@ def study(names: Sequence[str], jobs: int) -> None:
         print(name, row, flush=True)
 
     with ThreadPoolExecutor(jobs) as pool:
-        list(pool.map(make, [name for name in names if name not in there]))
+        list(pool.map(make, [name for name in names if name not in done]))
 
 
 def main() -> None:
-    """Run what is missing, and draw."""
+    """Compute missing runs; write the page and its figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--jobs", type=int, default=1, help="processes at a time")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="runs to make, of all")
-    parser.add_argument("--one", metavar="NAME", help="make this run and print it as JSON")
-    parser.add_argument("--draw", action="store_true", help="make no runs")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="runs to compute")
+    parser.add_argument("--one", metavar="NAME", help="compute this run and print it as JSON")
+    parser.add_argument("--page", action="store_true", help="only write page and figures")
     arguments = parser.parse_args()
     if arguments.one:
         print(json.dumps(run(settings()[arguments.one])))
         return
-    if not arguments.draw:
+    if not arguments.page:
         study(arguments.only or list(settings()), arguments.jobs)
     rows = results()
-    print("\n\n".join(made(rows) for made in (page.answers, page.budget, page.factors)))
-    page.draw(PICTURE, rows, curves())
+    PAGE.write_text(page.page(rows))
+    page.draw(PAGE.with_name("shallow-ironing.png"), rows, curves())
+    page.draw_changes(PAGE.with_name("shallow-ironing-changes.png"), rows)
 
 
 if __name__ == "__main__":
