@@ -16,6 +16,7 @@ from mpi4py import MPI
 from fenics_contact.checks.tunnelling import TunnellingCheck
 from scenes.processes import ROOT, environment
 from verification import (
+    campaigns,
     finite_reference,
     finite_scenes,
     fuzz,
@@ -618,6 +619,12 @@ def test_a_campaign_goes_on_where_it_was_ended(tmp_path):
     text = fuzz.table([str(path)])
     assert text.startswith("3 scenes")
     assert "| all | 3 |" in text
+
+
+@serial
+def test_page_of_campaigns_follows_from_stored_outcomes():
+    """The page in docs/ is that of the stored outcomes."""
+    assert campaigns.page(campaigns.campaigns()) == campaigns.PAGE.read_text()
 
 
 # ---- the reference solver ------------------------------------------------------------------------
