@@ -1,4 +1,4 @@
-"""Cases with symmetry of revolution."""
+"""Axisymmetric verification cases."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from verification.cases import Outcome, Row, case
 
 AXIS, GROUND, LOAD, FACE, SEAT = 1, 2, 3, 4, 5
 RADIUS, HEIGHT, FILLET = 50.0, 100.0, 10.0  # of the punch, mm
-SIZE = (100.0, 200.0)  # radius and height of what it stands on
+SIZE = (100.0, 200.0)  # radius and height of the base
 
 
 @case(
@@ -26,10 +26,10 @@ SIZE = (100.0, 200.0)  # radius and height of what it stands on
     budget="point displacements are not in the error budget",
 )
 def punch(h: float = 1.0) -> Outcome:
-    """A punch of steel under 100 MPa on aluminium, its end flat with a fillet at the edge.
+    """Press a flat steel punch with a fillet on aluminium by 100 MPa.
 
-    M is where the axis meets the contact; the pressure at the edge of the contact is that of a
-    corner, infinite. Cells of size ``h`` there.
+    M is the intersection of axis and contact. The pressure at the edge is singular; cells of size
+    ``h`` there.
     """
     mesh, tags = _bodies(h)
     V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
@@ -52,7 +52,7 @@ def punch(h: float = 1.0) -> Outcome:
         contact = fc.Contact(u, surface, seat, law, weight=body.weight)
         problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
         list(fc.increments(problem, pressure, 0.0, 100.0, steps=10 if friction else 1))
-        # Both bodies have a node there; they differ by what the penalty lets the one penetrate.
+        # Both bodies have a node there; their displacements differ by the penetration.
         found[friction] = float(output.at_node(u, (0.0, 0.0))[1])
         name = f"u_y(M) [mm], μ = {friction:g}"
         rows.append(Row(name, found[friction], published, "Konter, NAFEMS 2006", 0.01))
@@ -72,7 +72,7 @@ def punch(h: float = 1.0) -> Outcome:
 
 
 def _bodies(h: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """Both half-sections, r and height, fine where the fillet begins. Collective."""
+    """Mesh both half-sections, fine at the start of the fillet. Collective."""
     flat = RADIUS - FILLET
     gmsh.initialize()
     try:

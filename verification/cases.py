@@ -1,4 +1,4 @@
-"""What a case of the verification is, how it is measured, and how modules have some."""
+"""Verification cases: quantities with references, and their registration."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ __all__ = ["Case", "Estimate", "Outcome", "Row", "case", "cases_of"]
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity of a case beside its reference.
+    """One quantity of a case and its reference.
 
     Attributes:
-        quantity: Its name, unit in brackets.
-        obtained: What the computation gave.
-        reference: What it should be.
-        source: Where the reference stands.
-        tolerance: Largest error that passes, relative to the reference; absolute where that is 0.
+        quantity: Name, with the unit in brackets.
+        obtained: Computed value.
+        reference: Reference value.
+        source: Source of the reference.
+        tolerance: Largest error that passes, relative to the reference, absolute if that is 0.
     """
 
     quantity: str
@@ -33,24 +33,24 @@ class Row:
 
     @property
     def error(self) -> float:
-        """Relative to the reference; absolute where that is 0."""
+        """Error relative to the reference, absolute if that is 0."""
         return abs(self.obtained - self.reference) / (abs(self.reference) or 1.0)
 
     @property
     def passed(self) -> bool:
-        """False for results that are no numbers, too."""
+        """Whether the error is within the tolerance; False for NaN."""
         return bool(self.error <= self.tolerance)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What an error budget says of a quantity whose exact value is known.
+    """An error budget of a quantity whose exact value is known.
 
     Attributes:
-        quantity: Its name in the budget.
+        quantity: Name in the budget.
         budget: The budget.
-        exact: What the quantity should be, of the contact that is modelled.
-        known: How far that can be off, relative.
+        exact: Exact value of the modelled part.
+        known: Relative uncertainty of the exact value.
     """
 
     quantity: str
@@ -60,27 +60,27 @@ class Estimate:
 
     @property
     def true(self) -> float:
-        """The error, relative to the value that was computed."""
+        """True error relative to the computed value."""
         value = self.budget.values[self.quantity]
         return (value - self.exact) / value
 
     @property
     def estimated(self) -> float:
-        """All parts together, relative."""
+        """Estimated error of all parts together, relative."""
         return self.budget.total[self.quantity]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a case gives.
+    """The result of a case.
 
     Attributes:
-        rows: Its quantities.
-        mesh: The cells, in words.
-        dofs: Unknown displacements of the largest run.
-        seconds: Wall time of all of it.
-        estimates: Estimates the errors of the last state; collective. None if there is nothing to
-            estimate, see `Case.budget`.
+        rows: Quantities.
+        mesh: Description of the mesh.
+        dofs: Number of dofs of the largest run.
+        seconds: Wall time.
+        estimates: Yields error estimates of the last state; collective. None if there is nothing
+            to compare them with, see `Case.budget`.
     """
 
     rows: tuple[Row, ...]
@@ -101,10 +101,10 @@ class Case:
 
     Attributes:
         name: Title.
-        reason: Why the tolerance is what it is.
+        reason: Reason of the tolerances.
         compute: The computation; collective.
-        slow: Takes more than some seconds.
-        budget: Why there is no error that estimates could be compared with.
+        slow: Whether it takes more than some seconds.
+        budget: Why error estimates cannot be compared with a true error.
     """
 
     name: str
@@ -114,7 +114,7 @@ class Case:
     budget: str = ""
 
     def run(self) -> Outcome:
-        """Compute and take the time. Collective."""
+        """Compute, and measure the time. Collective."""
         start = time.perf_counter()
         made = self.compute()
         return dataclasses.replace(made, seconds=time.perf_counter() - start)
@@ -126,7 +126,7 @@ _cases: list[Case] = []
 def case(
     name: str, reason: str, *, slow: bool = False, budget: str = ""
 ) -> Callable[..., Callable[[], Outcome]]:
-    """Make a computation a case of its module."""
+    """Register a computation as a case of its module."""
 
     def enter(compute: Callable[[], Outcome]) -> Callable[[], Outcome]:
         _cases.append(Case(name, reason, compute, slow, budget))
@@ -136,5 +136,5 @@ def case(
 
 
 def cases_of(*modules: ModuleType) -> list[Case]:
-    """The cases of modules, one module after the other."""
+    """Return the cases of modules, in order."""
     return [c for module in modules for c in _cases if c.compute.__module__ == module.__name__]

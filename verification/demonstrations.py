@@ -1,4 +1,4 @@
-"""The demos as cases: each is run in a process of its own, and its result.json is read."""
+"""Demos as verification cases: each is run in a new process, and its result.json is read."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ __all__ = ["DEMOS"]
 
 
 def run(name: str, *options: str) -> dict[str, Any]:
-    """Run ``demos/NAME.py``; what it wrote.
+    """Run ``demos/NAME.py`` and return its results.
 
     Raises:
-        RuntimeError: It wrote nothing.
+        RuntimeError: The demo wrote no results.
     """
     with tempfile.TemporaryDirectory() as folder:
         words = command(1, ROOT / "demos" / f"{name}.py", *options, "--output", folder)
@@ -35,7 +35,7 @@ def run(name: str, *options: str) -> dict[str, Any]:
 
 
 def runs(result: dict[str, Any]) -> list[dict[str, Any]]:
-    """A demo's runs; it may have but one."""
+    """Return the runs of a demo, one or several."""
     return result.get("runs", [result])
 
 
@@ -48,16 +48,16 @@ def demo(
     label: str = "",
     budget: str = "",
 ) -> Case:
-    """A demo that puts value, reference and relative tolerance under "references".
+    """Create a case of a demo that has value, reference and tolerance under "references".
 
     Args:
-        title: Of the case.
-        reason: For the tolerance.
-        name: Of the demo.
-        options: Of its command line.
-        source: Of its references: of those whose name has the word, the first that fits.
-        label: Key of what tells its runs apart.
-        budget: As a `Case` has it.
+        title: Title of the case.
+        reason: Reason of the tolerances.
+        name: Name of the demo.
+        options: Options of the command line.
+        source: Sources of the references by a word of their names; the first that fits is used.
+        label: Key that distinguishes the runs.
+        budget: As in `Case`.
     """
 
     def compute() -> Outcome:
@@ -84,12 +84,12 @@ FINE = ("--h", "0.05", "--degree", "2")
 
 
 def _entries(one: dict[str, Any]) -> Iterator[Row]:
-    """Rows of the half-cylinder: pairs by component, tolerances there are absolute."""
+    """Yield the rows of the half-cylinder, whose tolerances are absolute."""
     for name, entry in one["references"].items():
         pairs = zip(np.atleast_1d(one[name]), np.atleast_1d(entry["value"]), strict=True)
         for i, (obtained, reference) in enumerate(pairs):
             if reference == 0 and np.ndim(entry["value"]) == 0:
-                continue  # friction of the frictionless run
+                continue  # friction force of the frictionless run
             quantity = name.replace("_", " ") + (f" {'xy'[i]}" if np.ndim(entry["value"]) else "")
             size = abs(reference) or 1.0
             yield Row(
@@ -102,7 +102,7 @@ def _entries(one: dict[str, Any]) -> Iterator[Row]:
 
 
 def half_cylinder() -> Outcome:
-    """The half-cylinder of the source paper, fine."""
+    """Solve the half-cylinder of the source paper on a fine mesh."""
     made = runs(run("hertz", *FINE))
     rows = [row for one in made for row in _entries(one)]
     dofs = max(one["dofs"] for one in made)
@@ -110,10 +110,10 @@ def half_cylinder() -> Outcome:
 
 
 def half_cylinder_at_once() -> Outcome:
-    """The same in one increment: another load history, another state."""
+    """Solve the half-cylinder in one increment, a different load history."""
     options = (*FINE, "--friction", "0.2", "--increments", "1")
     (one,) = runs(run("hertz", *options))
-    # Stick ends at 0.23 a: given to 0.01 a, and points are h/3 apart.
+    # The stick zone ends at 0.23 a, known to 0.01 a; quadrature points are h/3 apart.
     stick = 0.23 * one["half_width"]
     place = (0.005 * one["half_width"] + 0.05 / 3) / stick
     rows = (
@@ -125,7 +125,7 @@ def half_cylinder_at_once() -> Outcome:
 
 
 def thin_half_cylinder() -> Outcome:
-    """a/R = 0.048, where the half-cylinder is nearly a half-plane."""
+    """Solve the half-cylinder with a/R = 0.048, nearly a half-plane."""
     options = ("--h", "0.01", "--degree", "2", "--load", "1", "--friction", "0")
     (one,) = runs(run("hertz", *options))
     a = np.sqrt(8 * 8**2 / (np.pi * 1000 / (1 - 0.3**2)))
@@ -137,7 +137,7 @@ def thin_half_cylinder() -> Outcome:
 
 
 def greco() -> Outcome:
-    """Displacements along the base, forces and zones."""
+    """Solve the GRECO block: displacements along the base, forces and zones."""
     (one,) = runs(run("greco_block"))
     converged = dict(
         zip((0.0, 1.25, 5.0, 7.5, 11.25), (28.603, 27.226, 22.868, 19.807, 15.414), strict=True)

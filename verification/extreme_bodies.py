@@ -1,8 +1,8 @@
-"""The extremes of two bodies that deform and slide far.
+"""Problems with extreme parameters: finite sliding of two deformable bodies.
 
-As in `extreme_scenes` a scene is a function of the method that returns the steps made and the error
-against its reference, relative. One block of rubber is on another one; the lower one's bottom is
-held and the upper one's top led where nothing else is said.
+As in `extreme_scenes` a problem is a function of the method that returns the steps and the relative
+error. A rubber block is on another one; if not stated otherwise, the bottom of the lower one is
+fixed and the top of the upper one moved.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from verification.extreme_scenes import Array, Solve, friction_law
 from verification.present_scenes import turn
 
 BOTTOM, TOP, LOWER, UPPER, LEFT, RIGHT = 1, 2, 3, 4, 5, 6
-DOWN = 0.1  # how far blocks are pressed together
+DOWN = 0.1  # approach of the blocks
 
 
 class Two:
-    """Two blocks of rubber in plane strain, each 1 high.
+    """Two rubber blocks in plane strain, each of height 1.
 
     Attributes:
-        u, contact, problem: As made.
-        at: Where the top has been led, aside and down, and the angle of both ends (radians).
+        u, contact, problem: Displacement, contact and problem.
+        at: Displacement of the top, sideways and down, and rotation of both ends (rad).
         push: Pressure on the top.
     """
 
@@ -57,24 +57,24 @@ class Two:
         ends: str = "led",
         points: int | None = None,
     ) -> None:
-        """Make them, unloaded. Collective.
+        """Create them, unloaded. Collective.
 
         Args:
-            method: Of the problem.
-            kappa: Stiffness of the springs, by the smaller modulus over the height of a cell.
-            mu: Friction.
-            widths: Of the lower and of the upper block.
-            start: Where the upper one begins.
-            n: Cells along each.
-            rows: Cells over the height of each.
-            moduli: Of each.
-            own: Γc, `LOWER` or `UPPER`.
-            rounded: How much higher the upper one's lower side is at its ends.
-            gap: Between both.
-            ends: "led": bottom and top; "smooth": they are moved up and down alone, and the left
-                sides stay along; "confined": so do the right sides; "pushed": the bottom is held,
-                and the top along alone.
-            points: Of a facet of Γc.
+            method: Method of the problem.
+            kappa: Contact stiffness in units of the smaller modulus over the cell height.
+            mu: Friction coefficient.
+            widths: Widths of the lower and upper block.
+            start: Left end of the upper block.
+            n: Numbers of cells along the width.
+            rows: Number of cells over the height of each.
+            moduli: Young's moduli.
+            own: Tag of Γc, `LOWER` or `UPPER`.
+            rounded: Gap at the ends due to the curvature of the upper block.
+            gap: Initial gap.
+            ends: "led": all displacements of bottom and top are prescribed; "smooth": vertical
+                ones, and symmetry at the left sides; "confined": symmetry at the right sides, too;
+                "pushed": bottom fixed, top fixed horizontally.
+            points: Quadrature points per facet of Γc.
         """
         lefts = (0.0, start)
         lines = [
@@ -124,11 +124,11 @@ class Two:
 
     @property
     def force(self) -> Array:
-        """On the body with Γc, (2,)."""
+        """Contact force on the body with Γc, (2,)."""
         return self.contact.resultants().force
 
     def place(self, aside: float, down: float, angle: float) -> None:
-        """Let bottom and top be there: the top moved, then both turned about the origin."""
+        """Set the displacement of the top, and the rotation of bottom and top about the origin."""
         self._top[1].value = -down
         for bc, way in zip(self._led, ((0.0, 0.0), (aside, -down)), strict=False):
             x = self.u.function_space.tabulate_dof_coordinates()[:, :2]
@@ -137,7 +137,7 @@ class Two:
     def lead(
         self, aside: float, down: float, steps: int, angle: float = 0.0, **options: Any
     ) -> list[fc.Step]:
-        """In equal increments to a place and an angle. Collective."""
+        """Move in equal increments to a displacement and an angle. Collective."""
         start, end = self.at, np.array([aside, down, angle])
 
         def load(t: float) -> None:
@@ -148,11 +148,11 @@ class Two:
         return made
 
 
-# ---- turns and ways ------------------------------------------------------------------------------
+# ---- rotation and sliding ------------------------------------------------------------------------
 
 
 def turned_with_all(steps: int, mu: float = 0.3, angle: float = 2 * np.pi, **two: Any) -> Solve:
-    """Pressed and dragged, then both turned: the first tractions again."""
+    """Press and slide, then rotate both; the tractions rotate with the bodies."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         both = Two(method, mu=mu, rounded=0.1, **two)
@@ -166,16 +166,16 @@ def turned_with_all(steps: int, mu: float = 0.3, angle: float = 2 * np.pi, **two
 
 
 def over_facets(n: int, steps: int, mu: float, wide: int = 50) -> Solve:
-    """Dragged along a block of n facets and 20 heights, over more than half of them.
+    """Slide along a block of n facets, over more than half of them.
 
-    The force is that after a tenth of the way, whole facets before. The ends of the long block are
-    more than 4 of its heights away, which are felt by less than 1e-4.
+    Reference: the force at a tenth of the path, a whole number of facets before. The ends of the
+    long block are more than 4 heights away, which changes the force by less than 1e-4.
 
     Args:
-        n: Facets of the lower block, 20 long; those of the upper one are ``wide``, 1 long.
-        steps: Increments.
-        mu: Friction.
-        wide: See ``n``.
+        n: Facets of the lower block, of length 20.
+        steps: Number of increments.
+        mu: Friction coefficient.
+        wide: Facets of the upper block, of length 1.
     """
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
@@ -190,7 +190,7 @@ def over_facets(n: int, steps: int, mu: float, wide: int = 50) -> Solve:
 
 
 def off_the_edge(mu: float, steps: int, **two: Any) -> Solve:
-    """Dragged off the end: no force; without friction all of it again, back where it was."""
+    """Slide off the end: zero force; without friction the initial force after return."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         both = Two(method, mu=mu, **two)
@@ -207,7 +207,7 @@ def off_the_edge(mu: float, steps: int, **two: Any) -> Solve:
 
 
 def lifted(mu: float, **two: Any) -> Solve:
-    """Pressed, dragged and taken off: no force, and no strain (by displacements)."""
+    """Press, slide and lift off: zero force, and rigid-body displacements."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         both = Two(method, mu=mu, rounded=0.1, gap=1e-3, **two)
@@ -222,7 +222,7 @@ def lifted(mu: float, **two: Any) -> Solve:
     return solve
 
 
-# ---- strain, stiffness, first touch --------------------------------------------------------------
+# ---- strain, stiffness, first contact ------------------------------------------------------------
 
 
 def column(
@@ -235,10 +235,10 @@ def column(
     cuts: int = 6,
     **two: Any,
 ) -> Solve:
-    """Two blocks of a width pressed until both are as high as a share of their heights.
+    """Compress two blocks of equal width to a fraction of their height.
 
-    All stretches are uniform: the pressure is found by bisection, and that at every point of Γc
-    compared. Blocks of one modulus are free aside; of others their sides are held.
+    Stretches are uniform: the pressure is determined by bisection and compared at every point of
+    Γc. Blocks of equal modulus have free sides, others are confined.
     """
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
@@ -277,7 +277,7 @@ def rubbed(
     own: int = UPPER,
     steps: int = 2,
 ) -> Solve:
-    """A block pressed on another one, dragged and rocked: forces of the second solution."""
+    """Press a block on another one, slide and rotate it; compare with the independent solver."""
     soft = min(moduli) / moduli[0 if own == LOWER else 1]
     law: dict[str, Any] = {"kind": "coulomb" if mu else "frictionless"}
     law |= {"k_n": ["number", 4 * kappa * soft]}
@@ -298,9 +298,9 @@ def rubbed(
 
 
 def like_rigid(ratio: float, mu: float, n: tuple[int, int] = (8, 4), kappa: float = 10.0) -> Solve:
-    """A block under a plate ratio times as stiff, pressed and dragged: forces of a rigid plate.
+    """Press and slide a block under a plate of ``ratio`` times its modulus.
 
-    Γc has as many points there: a facet under many has some for each of them.
+    Reference: forces of a rigid plane, with the same quadrature points on Γc.
     """
 
     def rigid(method: str, points: int) -> Array:
@@ -332,7 +332,7 @@ def like_rigid(ratio: float, mu: float, n: tuple[int, int] = (8, 4), kappa: floa
 
 
 def from_afar(gap: float, by_force: bool = False, **two: Any) -> Solve:
-    """The upper block comes from a gap away in one increment: its force from near, or its load."""
+    """Close a gap in one increment; reference: the force without the gap, or the load."""
 
     def force(method: str, gap: float) -> tuple[list[fc.Step], float]:
         options = {"ends": "pushed"} if by_force else {"rounded": 0.1}
@@ -350,7 +350,7 @@ def from_afar(gap: float, by_force: bool = False, **two: Any) -> Solve:
 
 
 def pressed_in(steps: int, **two: Any) -> Solve:
-    """Pressed in without friction, in any number of increments: the force of 16."""
+    """Press without friction in any number of increments; reference: 16 increments."""
 
     def force(method: str, steps: int) -> tuple[list[fc.Step], Array]:
         both = Two(method, rounded=0.1, **two)

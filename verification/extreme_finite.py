@@ -1,8 +1,7 @@
-"""The extremes of finite kinematics: turns, ways, strains, stiffness, edges, and first touch.
+"""Problems with extreme parameters: finite kinematics with rigid obstacles.
 
-As in `extreme_scenes` a scene is a function of the method that returns the steps made and the error
-against its reference, relative. A block of rubber, its bottom held, is under a rigid tool where
-nothing else is said.
+As in `extreme_scenes` a problem is a function of the method that returns the steps and the relative
+error. If not stated otherwise, a rubber block with a fixed bottom is under a rigid tool.
 """
 
 from __future__ import annotations
@@ -27,13 +26,13 @@ RADIUS, DEPTH = 0.8, 0.1
 
 
 def relative(found: Any, wanted: Any) -> float:
-    """Largest difference, by the largest number wanted."""
+    """Return the largest difference relative to the largest expected value."""
     found, wanted = np.asarray(found), np.asarray(wanted)
     return float(np.abs(found - wanted).max() / np.abs(wanted).max())
 
 
 def _pressed(mu: float, method: str, **options: Any) -> tuple[Tool, list[fc.Step]]:
-    """The disc pressed in by `DEPTH`."""
+    """Press the disc in by `DEPTH`."""
     law = fc.Coulomb(mu, 1e4, 1e4) if mu else fc.Frictionless(1e4)
     solver = {"petsc_options": TIGHT, "method": method}
     tool = Tool(law=law, radius=RADIUS, solver=solver, **options)
@@ -41,7 +40,7 @@ def _pressed(mu: float, method: str, **options: Any) -> tuple[Tool, list[fc.Step
 
 
 def _led(tool: Tool, end: Any, steps: int) -> list[fc.Step]:
-    """In equal increments to a place aside, a height and an angle; the first cuts itself."""
+    """Move in equal increments to a sideways and a vertical displacement and an angle."""
     start = np.array([tool.shift.value[0], tool.shift.value[-1], float(tool.angle.value)])
 
     def load(t: float) -> None:
@@ -51,13 +50,13 @@ def _led(tool: Tool, end: Any, steps: int) -> list[fc.Step]:
     return list(fc.increments(tool.problem, load, steps=steps))
 
 
-# ---- turns and ways ------------------------------------------------------------------------------
+# ---- rotation and sliding ------------------------------------------------------------------------
 
 
 def drum(angle: float, steps: int, mu: float = 0.3, **options: Any) -> Solve:
-    """A disc pressed and turned: the moment of friction is ∫ μ p times the distance from its axis.
+    """Press and rotate a disc; the friction moment is ∫ μ p times the distance from its axis.
 
-    All of it slips, once it has turned for a while.
+    All points slip after some rotation.
     """
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
@@ -72,9 +71,9 @@ def drum(angle: float, steps: int, mu: float = 0.3, **options: Any) -> Solve:
 
 
 def turned_with_all(steps: int, angle: float = 2 * np.pi) -> Solve:
-    """Pressed and dragged, then body and disc turned about the origin: the first tractions again.
+    """Press and slide, then rotate body and disc about the origin; tractions rotate with them.
 
-    The bottom of the body is led round as a rigid body.
+    The bottom of the body moves as a rigid body.
     """
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
@@ -97,7 +96,7 @@ def turned_with_all(steps: int, angle: float = 2 * np.pi) -> Solve:
 
 
 def over_facets(n: int, steps: int, way: float) -> Solve:
-    """A block dragged under a plane of n facets, by a way: the plane in one piece."""
+    """Slide a block by ``way`` under a plane of n facets; reference: a half-space."""
 
     def force(method: str, obstacle: Any) -> tuple[list[fc.Step], Array]:
         scene = rubber(n=(8, 4))
@@ -132,7 +131,7 @@ def over_facets(n: int, steps: int, way: float) -> Solve:
 
 
 def over_drum(n: int, steps: int, angle: float) -> Solve:
-    """A drum of n facets turned under pressure: the force of one that is round."""
+    """Rotate a drum of n facets under pressure; reference: a circular one."""
 
     def force(method: str, obstacle: Any) -> tuple[list[fc.Step], Array]:
         scene = rubber(n=(12, 6))
@@ -163,7 +162,7 @@ def over_drum(n: int, steps: int, angle: float) -> Solve:
 
 
 def off_the_edge(mu: float, steps: int, linear: bool = True) -> Solve:
-    """A block dragged off the end of a plate: no force; without friction all of it again, back."""
+    """Slide a block off the end of a plate: zero force; without friction and back."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         scene = rubber(n=(8, 4), linear=linear)
@@ -194,16 +193,16 @@ def off_the_edge(mu: float, steps: int, linear: bool = True) -> Solve:
     return solve
 
 
-# ---- strain, stiffness, first touch --------------------------------------------------------------
+# ---- strain, stiffness, first contact ------------------------------------------------------------
 
 
 def column(
     kappa: float, share: float = 0.6, steps: int = 1, *, gap: float = 0.0, mu: float = 0.0
 ) -> Solve:
-    """A column 1 x 1 pressed by a plane until it is as high as a share of it, its sides free.
+    """Compress a 1 x 1 column with free sides by a plane to a fraction of its height.
 
-    The stretches are uniform: across where the stress across vanishes, along where the nominal
-    stress is that of the springs, both by bisection. Where springs are soft, the plane goes as far.
+    Stretches are uniform: laterally the stress vanishes, axially the nominal stress is the contact
+    pressure; both are determined by bisection. The displacement of the plane is prescribed.
     """
     n = (2, 4)
     k_n = kappa * E * n[1]
@@ -242,20 +241,20 @@ def _test(u: fem.Function) -> Any:
 
 
 def nominal(along: float, across: float) -> tuple[float, float]:
-    """Nominal stress along and across a column in plane strain."""
+    """Return axial and lateral nominal stress of a column in plane strain."""
     shear, lame = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
     volume = 0.5 * lame * ((along * across) ** 2 - 1)
     return tuple(shear * (s - 1 / s) + volume / s for s in (along, across))
 
 
 def stress(along: float) -> float:
-    """Nominal stress along a column whose sides are free."""
+    """Return the axial nominal stress of a column with free sides."""
     across = bisect(lambda s: nominal(along, s)[1], 0.5, 5.0)
     return nominal(along, across)[0]
 
 
 def bisect(rises: Any, low: float, high: float) -> float:
-    """Where a function that rises is zero."""
+    """Return the zero of an increasing function."""
     for _ in range(100):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if rises(middle) < 0 else (low, middle)
@@ -263,9 +262,9 @@ def bisect(rises: Any, low: float, high: float) -> float:
 
 
 def rubbed(kappa: float, mu: float, bulk: str = "rubber", steps: int = 2, **change: Any) -> Solve:
-    """A block pressed on a disc and dragged, as high as 6 cells: forces of the second solution.
+    """Press a block on a disc and slide it; compare with the solver of the random scenes.
 
-    That of the random scenes, which shares the assembly of the bulk with the package.
+    That solver shares the assembly of the bulk with the package.
     """
     law: dict[str, Any] = {"kind": "coulomb" if mu else "frictionless"}
     law |= {"k_n": ["number", 4 * kappa]} | ({"k_t": ["number", 4 * kappa]} if mu else {})
@@ -287,12 +286,12 @@ def rubbed(kappa: float, mu: float, bulk: str = "rubber", steps: int = 2, **chan
 
 
 def solved_twice(scene: dict[str, Any], make: Any, model: Any) -> Solve:
-    """A random scene's history: largest difference from the forces that the second solution finds.
+    """Solve the history of a random scene; compare the forces with the independent solver.
 
     Args:
         scene: The scene, without a method.
-        make: Its class of `finite_scenes` or `present_scenes`.
-        model: The second solution's function of that name.
+        make: Its class in `finite_scenes` or `present_scenes`.
+        model: The function of the independent solver.
     """
 
     def solve(method: str) -> tuple[list[fc.Step], float | None]:
@@ -326,7 +325,7 @@ def solved_twice(scene: dict[str, Any], make: Any, model: Any) -> Solve:
 
 
 def from_afar(gap: float, by_force: bool = False) -> Solve:
-    """The disc comes from a gap away in one increment: the force it has from near, or its load."""
+    """Close a gap by the disc in one increment; reference: the force without gap, or the load."""
 
     def force(method: str, gap: float) -> tuple[list[fc.Step], Array]:
         scene = rubber(n=(12, 6))
@@ -349,14 +348,14 @@ def from_afar(gap: float, by_force: bool = False) -> Solve:
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         made, found = force(method, gap)
-        # The mesh is not symmetric, and a disc led by a prescribed way is held aside.
+        # The mesh is not symmetric: a prescribed displacement has a lateral reaction.
         return made, relative(found[1], -60.0 if by_force else force(method, 0.0)[1][1])
 
     return solve
 
 
 def pressed_in(steps: int, down: float = 0.3, **options: Any) -> Solve:
-    """The disc pressed in without friction, in any number of increments: the force of 16."""
+    """Press the disc in without friction; reference: 16 increments."""
 
     def force(method: str, steps: int) -> tuple[list[fc.Step], Array]:
         solver = {"petsc_options": TIGHT, "method": method}

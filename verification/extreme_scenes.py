@@ -1,7 +1,8 @@
-"""The scenes of the extremes: blocks on floors and cushions, one block on another, a roller.
+"""Problems with extreme parameters at small displacements.
 
-Cold, in one increment where nothing else is said. A scene is a function of the method that returns
-the steps made and the error against its reference, relative.
+Blocks on planes, discs and balls, two blocks, a cylinder on a half-plane; in one increment from the
+unloaded state, if not stated otherwise. A problem is a function of the method that returns the
+steps and the error relative to its reference.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ Solve = Callable[[str], tuple[list[fc.Step], float | None]]
 
 
 class Block:
-    """A rectangle or box from the origin, its bottom Γc; the last coordinate is the height."""
+    """A rectangle or box with a corner at the origin and Γc at its bottom (last coordinate)."""
 
     def __init__(
         self,
@@ -48,7 +49,7 @@ class Block:
         place: Callable[[Array], Array] | None = None,
         cell: str = "quadrilateral",
     ) -> None:
-        """Mesh it; ``place`` moves the nodes (2, n) of the unit square before they are scaled."""
+        """Create the mesh; ``place`` maps the nodes (2, n) of the unit square before scaling."""
         self.d = d = len(n)
         size = (1.0,) * d if size is None else size
         kind = dolfinx.mesh.CellType[cell if d == 2 or cell != "quadrilateral" else "hexahedron"]
@@ -79,7 +80,7 @@ class Block:
         self.surface = fc.ContactSurface(mesh, self.tags, BOTTOM)
 
     def hold(self, tag: int, component: int, value: Any = 0.0) -> fem.DirichletBC:
-        """Prescribe a component on a side."""
+        """Return a Dirichlet condition for a component on a side."""
         if not isinstance(value, fem.Constant):
             value = fem.Constant(self.mesh, float(value))
         space = self.V.sub(component)
@@ -87,35 +88,35 @@ class Block:
         return fem.dirichletbc(value, dofs, space)
 
     def rollers(self) -> list[fem.DirichletBC]:
-        """No displacement across the planes x = 0 and, in space, y = 0."""
+        """Return the symmetry conditions at x = 0 and, in 3D, y = 0."""
         return [self.hold(LEFT, 0)] + ([self.hold(FRONT, 1)] if self.d == 3 else [])
 
     def moved(self, aside: float, down: float) -> list[fem.DirichletBC]:
-        """The top moved along x and down."""
+        """Return Dirichlet conditions that move the top along x and down."""
         across = [self.hold(TOP, 1)] if self.d == 3 else []
         return [self.hold(TOP, 0, aside), *across, self.hold(TOP, self.d - 1, -down)]
 
     def problem(
         self, law: Any, obstacle: Any, bcs: list[fem.DirichletBC], **options: Any
     ) -> fc.ContactProblem:
-        """The problem with one contact."""
+        """Create the problem with one contact."""
         self.contact = fc.Contact(self.u, self.surface, obstacle, law)
         return fc.ContactProblem(self.F, self.u, bcs=bcs, contacts=[self.contact], **options)
 
-    def floor(self, gap: float = 0.0) -> fc.HalfSpace:
-        """A floor below the bottom."""
+    def plane(self, gap: float = 0.0) -> fc.HalfSpace:
+        """Return a plane below the bottom."""
         up = np.eye(self.d)[-1]
         return fc.HalfSpace(-gap * up, up)
 
-    def cushion(self) -> fc.Ball:
-        """A ball (a disc) twice as wide as the block, that touches the middle of its bottom."""
+    def ball(self) -> fc.Ball:
+        """Return a ball (disc) of twice the block's width that touches the centre of its bottom."""
         a = self.size[0]
         return fc.Ball([0.5 * a] * (self.d - 1) + [-2.0 * a], 2.0 * a)
 
     def compressed(self, k_n: float, gap: float = 0.0, pressure: float = PRESSURE) -> float:
-        """Error of the displacement under a uniform pressure, sides free, relative to its size.
+        """Return the relative error of the displacement under uniform pressure with free sides.
 
-        σ = -p along the height alone; in plane strain u_y = -gap - p/k_n - (1 - ν²) p y/E and
+        σ = -p along the height; in plane strain u_y = -gap - p/k_n - (1 - ν²) p y/E and
         u_x = ν (1 + ν) p x/E; in space u_z = -gap - p/k_n - p z/E, u_x = ν p x/E, u_y = ν p y/E.
         """
         exact = fem.Function(self.V)
@@ -129,12 +130,12 @@ class Block:
 
 
 def strains(load: float, nu: float, d: int) -> tuple[float, float]:
-    """Compression along the load p/E and extension across it, plane strain or in space."""
+    """Return compression along the load p/E and lateral extension, in plane strain or 3D."""
     return ((1 - nu**2) * load, nu * (1 + nu) * load) if d == 2 else (load, nu * load)
 
 
 def difference(f: fem.Function, g: fem.Function) -> float:
-    """Largest difference of two functions, relative to the second. Collective."""
+    """Return the largest difference of two functions relative to the second. Collective."""
     comm = f.function_space.mesh.comm
     n = f.function_space.dofmap.index_map.size_local * f.function_space.dofmap.bs
     both = [float(np.abs(x).max(initial=0.0)) for x in ((f.x.array - g.x.array)[:n], g.x.array[:n])]
@@ -146,7 +147,7 @@ def difference(f: fem.Function, g: fem.Function) -> float:
 
 
 def friction_law(mu: float, k_n: Any, k_t: Any = None) -> Any:
-    """Coulomb's law, or none without friction."""
+    """Return Coulomb's law, or a frictionless one for μ = 0."""
     return fc.Coulomb(mu, k_n, k_n if k_t is None else k_t) if mu else fc.Frictionless(k_n)
 
 
@@ -160,16 +161,16 @@ def pressed(
     history: int = 1,
     **block: Any,
 ) -> Solve:
-    """A block pressed on a floor by a uniform load; held aside unless by friction alone."""
+    """Press a block on a plane by a uniform load; ``held``: with symmetry conditions."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         body = Block(**block)
         h = body.size[-1] / block.get("n", (8, 8))[-1]
         k_n = kappa * body.modulus / h
-        # A load in proportion to the modulus strains the block alike in all units.
+        # The load is proportional to the modulus: equal strains in all units.
         p = PRESSURE * load * body.modulus / E
         bcs = body.rollers() if held else []
-        problem = body.problem(friction_law(mu, k_n), body.floor(gap), bcs, method=method)
+        problem = body.problem(friction_law(mu, k_n), body.plane(gap), bcs, method=method)
 
         def apply(t: float) -> None:
             body.traction.value[-1] = -p * t
@@ -187,7 +188,7 @@ def compared(
     state: Callable[[str], tuple[list[fc.Step], Any]],
     reference: Callable[[], tuple[list[fc.Step], Any]],
 ) -> Solve:
-    """Solve by a method; error of the body's u against the reference, found once, if it is."""
+    """Solve by a method; compare u with the reference, which is solved once and may fail."""
 
     @functools.cache
     def other() -> fem.Function | None:
@@ -214,9 +215,9 @@ def dragged(
     known: float | None = None,
     **block: Any,
 ) -> Solve:
-    """The block's top moved down on the cushion and aside; error of u against another method's.
+    """Move the top of a block down and sideways on a disc or ball; compare u with another method.
 
-    The latter for the stiffness ``known``, by default the same.
+    The reference has the stiffness ``known``, by default the same.
     """
 
     def state(method: str, kappa: float = kappa, **options: Any) -> tuple[list[fc.Step], Block]:
@@ -224,7 +225,7 @@ def dragged(
         length = body.size[0]
         bcs = body.moved(aside * length, down * length)
         law = friction_law(mu, fc.RelativeStiffness(kappa), fc.RelativeStiffness(kappa * ratio))
-        problem = body.problem(law, body.cushion(), bcs, method=method, **options)
+        problem = body.problem(law, body.ball(), bcs, method=method, **options)
         return [problem.solve()], body
 
     return compared(state, lambda: state(against, known or kappa, fallback=False))
@@ -234,17 +235,17 @@ State = tuple[fc.Step, Array]
 
 
 def block_in_units(method: str, modulus: float, length: float, n: Sequence[int]) -> State:
-    """The dragged block and its displacements over its length."""
+    """Solve the block on the disc; return its displacements relative to its length."""
     body = Block(modulus=modulus, size=(length,) * len(n), n=n)
     bcs = body.moved(0.02 * length, 0.03 * length)
-    problem = body.problem(fc.Coulomb(0.3), body.cushion(), bcs, method=method)
+    problem = body.problem(fc.Coulomb(0.3), body.ball(), bcs, method=method)
     return problem.solve(), body.u.x.array / length
 
 
 def in_units(
     modulus: float, length: float, n: Sequence[int] = (8, 8), scene: Any = block_in_units
 ) -> Solve:
-    """A scene in other units: the iterations and digits of the first ones."""
+    """Solve in other units; the iterations must be equal, and the displacements are compared."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         step, u = scene(method, modulus, length, n)
@@ -256,7 +257,7 @@ def in_units(
 
 
 def poisson(nu: float, degree: int, d: int = 2) -> Solve:
-    """The force of the pressed cushion against that of a mesh twice as fine, in the plane cubic."""
+    """Compare the contact force with that of half the mesh size and higher degree."""
     n, cell, best = (16, "triangle", 3) if d == 2 else (3, "hexahedron", 2)
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
@@ -271,16 +272,16 @@ def poisson(nu: float, degree: int, d: int = 2) -> Solve:
 @functools.lru_cache(maxsize=64)
 def _force(method: str, nu: float, degree: int, n: tuple[int, ...], cell: str) -> fc.Step:
     body = Block(degree, n=n, nu=nu, cell=cell)
-    problem = body.problem(fc.Frictionless(), body.cushion(), body.moved(0.0, 0.03), method=method)
+    problem = body.problem(fc.Frictionless(), body.ball(), body.moved(0.0, 0.03), method=method)
     return problem.solve()
 
 
 def proportional(steps: int) -> Solve:
-    """Load aside and down in proportion, no gap: any number of increments has one state."""
+    """Apply a proportional load without gap, whose solution is independent of the increments."""
 
     def state(method: str, steps: int) -> tuple[list[fc.Step], Block]:
         body = Block(n=(4, 4))
-        problem = body.problem(fc.Coulomb(0.5), body.floor(), [], method=method)
+        problem = body.problem(fc.Coulomb(0.5), body.plane(), [], method=method)
 
         def load(t: float) -> None:
             body.traction.value[:] = 0.2 * t, -1.0 * t
@@ -296,9 +297,9 @@ def proportional(steps: int) -> Solve:
 
 
 def cycle(path: list[tuple[float, float]], mu: float = 0.3) -> Solve:
-    """The top led along (aside, down), and back down to the first place, without friction's trace.
+    """Move the top along a path (sideways, down) and back to its first position.
 
-    Reference: the force at the first place, found again after the last.
+    Reference: the force at the first position before the path.
     """
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
@@ -306,7 +307,7 @@ def cycle(path: list[tuple[float, float]], mu: float = 0.3) -> Solve:
         move = [fem.Constant(body.mesh, 0.0) for _ in range(2)]
         bcs = [body.hold(TOP, i, c) for i, c in enumerate(move)]
         problem = body.problem(
-            friction_law(mu, fc.RelativeStiffness(10)), body.floor(), bcs, method=method
+            friction_law(mu, fc.RelativeStiffness(10)), body.plane(), bcs, method=method
         )
         steps = []
         for aside, down in [path[0], *path, path[0]]:
@@ -323,13 +324,13 @@ def cycle(path: list[tuple[float, float]], mu: float = 0.3) -> Solve:
 
 
 def loaded(side: float, up: float, mu: float, bcs: str, n: Sequence[int] = (8, 8)) -> Solve:
-    """A load on a block on its floor, with what holds it; the force is that of the load."""
+    """Load a block on a plane; the reference of the contact force is the load."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         body = Block(n=n)
         held = {"free": [], "sides": body.rollers()}[bcs]
         problem = body.problem(
-            friction_law(mu, fc.RelativeStiffness(10)), body.floor(), held, method=method
+            friction_law(mu, fc.RelativeStiffness(10)), body.plane(), held, method=method
         )
         body.traction.value[0], body.traction.value[-1] = side, up
         step = problem.solve()
@@ -343,7 +344,7 @@ def loaded(side: float, up: float, mu: float, bcs: str, n: Sequence[int] = (8, 8
 
 
 def graded_to(ratio: float) -> Callable[[Array], Array]:
-    """Cells along x whose widths grow by ``ratio`` from the middle of Γc to its ends."""
+    """Return a map that grades cells along x by ``ratio`` from the centre of Γc to its ends."""
 
     def place(x: Array) -> Array:
         s = 2 * x[0] - 1
@@ -356,16 +357,16 @@ def graded_to(ratio: float) -> Callable[[Array], Array]:
 
 # ---- one block on another ----------------------------------------------------------------------
 
-APART = 0.25  # of the blocks when they are meshed, so that sides are told apart
+APART = 0.25  # distance of the blocks during meshing, to distinguish their sides
 
 
 class Pair:
-    """Two blocks of height 1/2 and width 1, of meshes that do not match, one above the other.
+    """Two blocks of height 1/2 and width 1 with non-matching meshes, one above the other.
 
     Attributes:
-        moduli: Of the lower and of the upper block.
-        gap: Between them (length).
-        traction: On the top (force/length).
+        moduli: Young's moduli of the lower and upper block.
+        gap: Initial gap (length).
+        traction: Traction on the top (force/length).
     """
 
     def __init__(
@@ -378,7 +379,7 @@ class Pair:
         n: tuple[int, int] = (6, 8),
         partitioner: Any = None,
     ) -> None:
-        """Mesh them; the upper one is ``contrast`` times as stiff, ``gap`` is over ``length``."""
+        """Create them; ``contrast``: ratio of moduli, ``gap``: relative to ``length``."""
         self.moduli, self.length, self.gap = (modulus, contrast * modulus), length, gap * length
         lines = [
             [np.linspace(0, 1, m + 1), low + np.linspace(0, 0.5, m // 2 + 1)]
@@ -401,7 +402,7 @@ class Pair:
         mesh = made[0]
         n_cells = mesh.topology.index_map(2).size_local + mesh.topology.index_map(2).num_ghosts
         cells = np.arange(n_cells, dtype=np.int32)
-        # The middles of cells, where the lower block ends at 1/2.
+        # Midpoints of the cells; the lower block ends at 1/2.
         height = dolfinx.mesh.compute_midpoints(mesh, 2, cells).reshape(-1, 3)[:, 1]
         upper = height > 0.5 * length
         self.cells = cells[~upper], cells[upper]
@@ -414,12 +415,12 @@ class Pair:
         self.surface = fc.ContactSurface(mesh, made[1], FRONT)
 
     def problem(self, law: Any, *, curved: bool = False, **options: Any) -> fc.ContactProblem:
-        """The problem with the contact of the lower block's top with the upper one's bottom.
+        """Create the problem with contact of the top of the lower and bottom of the upper block.
 
         Args:
-            law: Of contact.
-            curved: Let them touch in the middle alone, as if rounded by twice their width.
-            options: Of the problem.
+            law: Contact law.
+            curved: Whether the gap is that of a radius of twice the width.
+            options: Options of `ContactProblem`.
         """
         a, x = self.length, self.body.x
         obstacle = fc.DeformableBody(self.body.tags, OPPOSITE)
@@ -430,7 +431,7 @@ class Pair:
         )
 
     def press(self) -> float:
-        """Rollers below and at the left, a pressure on the top that strains the softer by 1e-3."""
+        """Apply symmetry conditions, and a pressure of 1e-3 of the smaller modulus; return it."""
         self.body.hold(BOTTOM, 1)
         self.body.hold(LEFT, 0)
         pressure = PRESSURE / E * min(self.moduli)
@@ -438,13 +439,13 @@ class Pair:
         return pressure
 
     def drag(self, down: float = 0.03, aside: float = 0.02) -> None:
-        """The lower one clamped below, the top of the upper one moved down and aside."""
+        """Clamp the bottom, and move the top down and sideways."""
         self.body.hold(BOTTOM, 0, 1)
         self.body.hold(TOP, 0, value=aside * self.length)
         self.body.hold(TOP, 1, value=-down * self.length)
 
     def compressed(self, k_n: float, pressure: float) -> float:
-        """Error under a uniform pressure, relative to the displacement's size; see `Block`."""
+        """Return the relative error of the displacement under uniform pressure, as in `Block`."""
         exact = fem.Function(self.u.function_space)
         half = 0.5 * self.length
         lower, upper = (strains(pressure / modulus, NU, 2) for modulus in self.moduli)
@@ -463,7 +464,7 @@ class Pair:
 
 
 def pressed_pair(kappa: float, **pair: Any) -> Solve:
-    """One block pressed on the other by a uniform load; k_n is that of the softer one."""
+    """Press one block on the other by a uniform load; k_n is relative to the softer one."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         both = Pair(**pair)
@@ -476,7 +477,7 @@ def pressed_pair(kappa: float, **pair: Any) -> Solve:
 
 
 def dragged_pair(kappa: float, mu: float, **pair: Any) -> Solve:
-    """One rounded block pressed on the other and dragged; against the alternation's solution."""
+    """Press rounded blocks and move them sideways; compare with method `alternating`."""
 
     def state(method: str, **options: Any) -> tuple[list[fc.Step], Pair]:
         both = Pair(**pair)
@@ -489,7 +490,7 @@ def dragged_pair(kappa: float, mu: float, **pair: Any) -> Solve:
 
 
 def pair_in_units(method: str, modulus: float, length: float, _: Any) -> State:
-    """The dragged pair and its displacements over its length."""
+    """Solve the rounded blocks; return their displacements relative to the length."""
     both = Pair(modulus=modulus, length=length)
     both.drag()
     step = both.problem(fc.Coulomb(0.3), curved=True, method=method).solve()
@@ -500,12 +501,12 @@ def pair_in_units(method: str, modulus: float, length: float, _: Any) -> State:
 
 
 def hertz(kappa: float, *, enforcement: str = "penalty") -> tuple[Solve, float]:
-    """A rigid roller on a half-plane: error of the peak pressure p₀, and what the springs predict.
+    """Press a rigid cylinder on a half-plane; return the problem and the error due to the penalty.
 
-    Springs of stiffness k_n on the surface give way by p/k_n: over the parabola's a²/2R, by which
-    the half-plane gives way, that is ε = E*/(k_n a), since p₀ = E* a/2R. Hertz's peak is missed by
-    no more than ε. Where ε > 1 it is rather the springs alone that bear the roller, with
-    P = 2/3 k_n a³/R and p₀ = k_n a²/2R; these are missed by no more than 1/ε, of their own a.
+    The penetration p₀/k_n relative to the approach a²/2R of the half-plane is ε = E*/(k_n a), as
+    p₀ = E* a/2R: Hertz's peak pressure changes by at most ε. For ε > 1 the contact is an elastic
+    foundation with P = 2/3 k_n a³/R and p₀ = k_n a²/2R, which changes by at most 1/ε with its own
+    contact half-width a.
     """
     star, radius, a = E / (1 - NU**2), 8.0, 0.1
     force = np.pi * a**2 * star / (4 * radius)
@@ -542,7 +543,7 @@ def hertz(kappa: float, *, enforcement: str = "penalty") -> tuple[Solve, float]:
 
 
 def lower_block_apart(comm: MPI.Comm, n_parts: int, cell_types: Any, cells: Any) -> Any:
-    """A partitioner of `Pair`: the lower block on the last rank, the upper one on the others."""
+    """Partition `Pair`: the lower block on the last rank, the upper one on the others."""
     n_cells = cells[0].size // 4
     n_lower = 6 * 3
     upper = np.arange(max(n_cells - n_lower, 0)) * (n_parts - 1) // max(n_cells - n_lower, 1)
@@ -554,12 +555,13 @@ def lower_block_apart(comm: MPI.Comm, n_parts: int, cell_types: Any, cells: Any)
 def ranked(
     kind: str, kappa: float, mu: float, method: str, *, apart: bool = True
 ) -> tuple[fc.Step, Array, list[int]]:
-    """One block dragged on the other or, alone, on a cushion; nodes' places with displacements.
+    """Solve two blocks, or one block on a disc, with all of Γc on the last rank if ``apart``.
 
-    On several ranks all of Γc is on the last one, if ``apart``. Collective.
+    Collective.
 
     Returns:
-        The step; (n_nodes, 4) in the order of the places; and the facets of Γc on every rank.
+        The step; coordinates and displacements of all nodes (n_nodes, 4), sorted; and the number
+        of facets of Γc on every rank.
     """
     comm = MPI.COMM_WORLD
     both = Pair(gap=1e-3, partitioner=lower_block_apart if apart and comm.size > 1 else None)
@@ -567,7 +569,7 @@ def ranked(
     law = friction_law(mu, kappa * 6 * E)
     if kind == "two bodies":
         problem = both.problem(law, method=method)
-    else:  # the upper block is pressed by nothing: it is held and stays
+    else:  # the upper block is unloaded and fixed
         both.body.bcs.clear()
         both.body.hold(OPPOSITE, 0, 1)
         both.body.hold(BOTTOM, 0, value=0.02)
@@ -587,7 +589,7 @@ def ranked(
 
 
 def on_one_rank(ranks: int, kind: str, kappa: float, mu: float) -> Solve:
-    """`ranked` in processes of its own, against the same on one rank."""
+    """Run `ranked` on several ranks; compare with one rank."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         with tempfile.TemporaryDirectory() as folder:

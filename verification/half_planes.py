@@ -1,4 +1,4 @@
-"""Cases with closed solutions for half-planes: flat punch, wavy surface, cylinder on block."""
+"""Verification cases with closed solutions: flat punch, wavy surface, cylinder on block."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ GROUND, LOAD, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
     budget="the force is given; peak pressure and displacement are infinite",
 )
 def flat_punch() -> Outcome:
-    """Half of it, driven by a force: the pressure inside |x| ≤ 0.9 a, and the load inside x."""
+    """Press a flat punch by a force (half modelled): pressure and load within |x| ≤ 0.9 a."""
     a, force, far = 1.0, 1.0, 50.0
-    # Fine towards the corner, from both sides.
+    # Graded towards the corner from both sides.
     fine = graded(0.05, 8, 1.0, 1.15)
     x = np.concatenate([(a - fine)[::-1], a + graded(0.05, 8, far - a, 1.15)[1:]])
     y = -graded(0.05, 8, far, 1.15)[::-1]
@@ -73,9 +73,9 @@ def flat_punch() -> Outcome:
     "about 0.1 %",
 )
 def wavy(n: int = 256) -> Outcome:
-    """An elastic half-plane pressed on a rigid wave by p*/4, p*/2, 3p*/4; period by symmetry.
+    """Press an elastic half-plane on a rigid wave by p*/4, p*/2 and 3p*/4.
 
-    ``n`` cells over half a wave.
+    Half a wave is modelled, with ``n`` cells.
     """
     wave, height = 1.0, 1.5
     modulus, nu, amplitude = 1000.0, 0.3, 1e-3
@@ -116,7 +116,7 @@ def wavy(n: int = 256) -> Outcome:
         rows.append(Row(f"L² error of p(x) at {share:g} p*", float(rms), 0.0, source, 0.01))
 
     def estimates() -> Iterator[Estimate]:
-        # A half-plane of 1.5 waves' depth ends where the wave has decayed by exp(-3π).
+        # At the depth of 1.5 waves the solution has decayed by exp(-3π).
         budget = fc.estimate_errors(problem, body.stress)
         yield Estimate("peak pressure", budget, peak * mean, np.exp(-3 * np.pi))
 
@@ -125,7 +125,7 @@ def wavy(n: int = 256) -> Outcome:
 
 
 def cylinder_on_block(h: float):
-    """Half of a cylinder of radius 50 on half of a block of 200 × 200, in mm. Collective.
+    """Mesh half of a cylinder of radius 50 on half of a block of 200 × 200, in mm. Collective.
 
     Cells of size ``h`` at the contact on the block, 0.8 ``h`` on the cylinder.
     """
@@ -186,16 +186,16 @@ def cylinder_on_block(h: float):
     "1.5 % = (a/R)²: Hertz's theory assumes a parabola and parallel normals",
 )
 def cylinder(h: float = 0.25, stiffness: float = 10.0) -> Outcome:
-    """35 kN/mm on a steel cylinder, on a block of 70 GPa, small displacements, no friction.
+    """Press a steel cylinder on a block of 70 GPa by 35 kN/mm, without friction.
 
-    Cells of size ``h``, a stiffness of so many E/h.
+    Cells of size ``h``, a penalty of ``stiffness`` E/h.
     """
     made = cylinder_on_block(h)
     body = Bodies(made, _moduli(made[0], 210e3, 70e3), 0.3, degree=2)
     body.hold(GROUND, 0, 1)
     body.hold(AXIS, 0)
     total = 35e3
-    # As traction on a cap, so that it is the load that is given that arrives.
+    # Traction on a cap, with the given resultant.
     width = _integral(body, LOAD)
     load = body.constant(0.0)
     body.F += load / width * body.v[1] * body.ds(LOAD)
@@ -219,7 +219,7 @@ def cylinder(h: float = 0.25, stiffness: float = 10.0) -> Outcome:
 
 
 def _moduli(mesh: dolfinx.mesh.Mesh, upper: float, lower: float) -> fem.Function:
-    """Young's modulus above and below y = 0, one value a cell."""
+    """Return Young's modulus above and below y = 0, one value per cell."""
     E = fem.Function(fem.functionspace(mesh, ("DG", 0)))
     middle = E.function_space.tabulate_dof_coordinates()[:, 1]
     E.x.array[:] = np.where(middle > 0, upper, lower)
@@ -232,7 +232,7 @@ def _integral(body: Bodies, tag: int) -> float:
 
 
 def _half_width(points) -> float:
-    """Where the gap opens, linear between the last closed and the first open point."""
+    """Return the end of the contact, linear between the last closed and the first open point."""
     x, gap = points["x"][:, 0], points["gap"]
     i = int(np.flatnonzero(gap < 0)[-1])
     return float(x[i] + (x[i + 1] - x[i]) * gap[i] / (gap[i] - gap[i + 1]))

@@ -1,4 +1,4 @@
-"""Cases in three dimensions."""
+"""Verification cases in three dimensions."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ GROUND, TOP, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
     budget="truncation of the half-spaces at 6 a changes the reference by 1 %, more than the error",
 )
 def spheres() -> Outcome:
-    """Two blocks of one material stand for the spheres: the gap between them is r²/2R.
+    """Solve two spheres as two blocks of equal material with the gap r²/2R; y ≥ 0 is modelled.
 
-    Half of the scene, y ≥ 0. Both far faces are moved as rigid ones; the forces are results. What
-    the blocks' size adds to the displacement is linear in Q: it drops out of the part that slip
-    makes of it, δ(s) - s δ'(0), the latter measured at s = 0.001.
+    The displacements of both far faces are prescribed. The finite size of the blocks adds a
+    displacement linear in Q, which cancels in the part due to slip, δ(s) - s δ'(0), where δ'(0)
+    is measured at a small s.
     """
     modulus, nu, friction, radius, far = 1000.0, 0.3, 0.4, 10.0, 6.0
     axes = []

@@ -1,4 +1,4 @@
-"""Cases whose references are statics or a few springs: nothing is left to the mesh."""
+"""Verification cases with references independent of the mesh: statics, patch test."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BASE, TOP, LEFT, RIGHT, SEAT = 1, 2, 3, 4, 5
 
 
 def block(n: tuple[int, int], size: tuple[float, float] = (1.0, 1.0), **kwargs):
-    """A rectangle with its sides tagged."""
+    """Create a rectangle with tagged sides."""
     axes = [[np.linspace(0, length, k + 1) for k, length in zip(n, size, strict=True)]]
     sides = {BASE: near(1, 0), TOP: near(1, size[1]), LEFT: near(0, 0), RIGHT: near(0, size[0])}
     return boxes(axes, sides, **kwargs)
@@ -30,9 +30,9 @@ def block(n: tuple[int, int], size: tuple[float, float] = (1.0, 1.0), **kwargs):
     budget="the contact stiffness is given; results are exact up to round-off",
 )
 def contact_spring() -> Outcome:
-    """k_n = 1, k_t = 0.5, μ = 0.5, gap 0.5, unit springs: N up to 1, then T up to 2 and back.
+    """Solve a point on unit springs: k_n = 1, k_t = μ = gap = 0.5, N up to 1, T up to 2 and back.
 
-    The springs, the loads and the contact act on the same points: the body moves as one.
+    Springs, loads and contact act on the same points, so that the body translates.
     """
     body = Bodies(block((1, 1)), 1000.0, 0.3)
     force = body.constant([0.0, 0.0])
@@ -73,10 +73,10 @@ WEIGHT = 3058.0  # N per thickness
     budget="results follow from statics, up to round-off",
 )
 def wedge() -> Outcome:
-    """Two elastic wedges of meshes that do not match, the upper one on the lower and on a pusher.
+    """Push an elastic wedge up another one, with non-matching meshes.
 
-    The upper one's weight is G; a rigid plate without friction is moved by the displacement at
-    which all that is closed slips. The plate's force F follows from G and μ alone.
+    The upper wedge of weight G is pushed by a frictionless rigid plate until all closed points
+    slip; the force F of the plate follows from G and μ.
     """
     rows, dofs = [], 0
     for friction in (0.0, 0.1, 0.2, 0.3):
@@ -84,7 +84,7 @@ def wedge() -> Outcome:
         low, high = np.linspace(0, 1, 5), np.linspace(1, 2, 6)
 
         def bend(x: np.ndarray) -> np.ndarray:
-            # Up to 1: from the floor to the slope; from there to a level top.
+            # y ≤ 1: from the base to the slope; y > 1: from the slope to a horizontal top.
             ramp = 200 + SLOPE * x[:, 0]
             y = np.where(x[:, 1] <= 1, x[:, 1] * ramp, ramp + (x[:, 1] - 1) * (500 - ramp))
             return np.column_stack([x[:, 0], y])
@@ -126,7 +126,7 @@ def wedge() -> Outcome:
     budget="the formula is accurate to t/R = 0.5 %, which exceeds the error",
 )
 def capstan() -> Outcome:
-    """A belt halfway round a fixed drum, one end under T₁, the other one drawn until all slips."""
+    """Pull a belt around half of a fixed drum until all points slip."""
     rows, dofs = [], 0
     radius, thickness, angle, tension, n = 100.0, 0.5, np.pi, 1.0, 240
     for friction in (0.1, 0.3):
@@ -139,7 +139,7 @@ def capstan() -> Outcome:
 
         body = Bodies(boxes(axes, sides, bend=bend, degree=2), 1e4, 0.0, degree=2)
         pull, draw = body.constant(0.0), body.constant(0.0)
-        body.hold(LEFT, 1, value=draw)  # at the angle 0 the belt runs along y
+        body.hold(LEFT, 1, value=draw)  # at angle 0 the belt is parallel to y
         body.F += pull * body.v[1] * body.ds(RIGHT)
         law = fc.Coulomb(friction, k_n=20.0, k_t=20.0)
         contact = body.contact(BASE, fc.Cylinder((0, 0), radius), law)
@@ -165,9 +165,9 @@ def capstan() -> Outcome:
     budget="results follow from statics, up to round-off",
 )
 def incline() -> Outcome:
-    """The steepest slope on which a block stays, on an obstacle that is elastic itself.
+    """Find the steepest slope at which a block on an elastic base does not slide, by bisection.
 
-    Gravity is turned, not the mesh. Parts of the base slip long before.
+    Gravity is rotated, not the mesh. Parts of the contact slip before the limit.
     """
     friction, weight = 0.3, 8.0
     axes = [
@@ -215,13 +215,13 @@ def incline() -> Outcome:
     budget="solutions are compared with each other",
 )
 def homogeneity() -> Outcome:
-    """Block on a plane without gap, pressed and sheared in proportion, sticking, slipping, open.
+    """Load a block on a plane without gap proportionally, with open, stick and slip zones.
 
     Twice the load gives twice the displacements, and four increments give those of one.
     """
     rows = []
     source = "homogeneous of degree one"
-    made = block((20, 20), (40.0, 40.0))  # one mesh: partitions differ from one to the next
+    made = block((20, 20), (40.0, 40.0))  # one mesh, as partitions differ
     for method in ("lbfgs", "newton"):
         one, _ = _sheared(made, method, 1.0, 1)
         twice, _ = _sheared(made, method, 2.0, 1)
@@ -245,7 +245,7 @@ def homogeneity() -> Outcome:
 
 
 def _sheared(made: Any, method: str, load: float, steps: int) -> tuple[np.ndarray, fc.Resultants]:
-    """The block of Raous under so much of its load: displacements of this rank, and counts."""
+    """Solve the block of Raous; return the displacements of this rank and the resultants."""
     body = Bodies(made, 130e3, 0.2)
     body.hold(RIGHT, 0)
     grow = body.constant(0.0)
@@ -265,7 +265,7 @@ def _sheared(made: Any, method: str, load: float, steps: int) -> tuple[np.ndarra
 
 
 def _norm(x: np.ndarray) -> float:
-    """Over all ranks."""
+    """Return the norm over all ranks."""
     return float(np.sqrt(COMM.allreduce(x @ x)))
 
 
@@ -275,7 +275,7 @@ def _norm(x: np.ndarray) -> float:
     "from which k_n = 1e12 differs by 1e-6",
 )
 def patch() -> Outcome:
-    """Two confined blocks, the top moved by 0.01: pressure and jump are uniform."""
+    """Compress two confined blocks by 0.01: pressure and jump are uniform."""
     rows, k_n = [], 1e7
     solved = []  # with the pressure of exact contact
     for nu in (0.0, 0.3):
@@ -309,7 +309,7 @@ def patch() -> Outcome:
             farthest = values[np.argmax(np.abs(values - exact))]
             source = "uniform: 0.01/(1/M + 1/k_n)" if name == "pressure" else "p/k_n"
             rows.append(Row(f"{name}, farthest point, ν = {nu:g}", farthest, exact, source, 1e-9))
-    # The exact contact of the blocks with ν = 0, but for a jump of 1e-6 of the displacement.
+    # Nearly exact contact of the blocks with ν = 0: the jump is 1e-6 of the displacement.
     body = Bodies(boxes(axes, sides), 1e6, 0.0, degree=2)
     body.hold(BASE, 1)
     body.hold(LEFT, 0)
