@@ -127,18 +127,18 @@ class Two:
         """Contact force on the body with Γc, (2,)."""
         return self.contact.resultants().force
 
-    def place(self, aside: float, down: float, angle: float) -> None:
+    def place(self, sideways: float, down: float, angle: float) -> None:
         """Set the displacement of the top, and the rotation of bottom and top about the origin."""
         self._top[1].value = -down
-        for bc, way in zip(self._led, ((0.0, 0.0), (aside, -down)), strict=False):
+        for bc, offset in zip(self._led, ((0.0, 0.0), (sideways, -down)), strict=False):
             x = self.u.function_space.tabulate_dof_coordinates()[:, :2]
-            bc.g.x.array[:] = ((x + way) @ turn(2, angle).T - x).ravel()
+            bc.g.x.array[:] = ((x + offset) @ turn(2, angle).T - x).ravel()
 
     def lead(
-        self, aside: float, down: float, steps: int, angle: float = 0.0, **options: Any
+        self, sideways: float, down: float, steps: int, angle: float = 0.0, **options: Any
     ) -> list[fc.Step]:
         """Move in equal increments to a displacement and an angle. Collective."""
-        start, end = self.at, np.array([aside, down, angle])
+        start, end = self.at, np.array([sideways, down, angle])
 
         def load(t: float) -> None:
             self.place(*(start + t * (end - start)))
@@ -151,7 +151,7 @@ class Two:
 # ---- rotation and sliding ------------------------------------------------------------------------
 
 
-def turned_with_all(steps: int, mu: float = 0.3, angle: float = 2 * np.pi, **two: Any) -> Solve:
+def rotated_together(steps: int, mu: float = 0.3, angle: float = 2 * np.pi, **two: Any) -> Solve:
     """Press and slide, then rotate both; the tractions rotate with the bodies."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
@@ -165,7 +165,7 @@ def turned_with_all(steps: int, mu: float = 0.3, angle: float = 2 * np.pi, **two
     return solve
 
 
-def over_facets(n: int, steps: int, mu: float, wide: int = 50) -> Solve:
+def slide_over_facets(n: int, steps: int, mu: float, wide: int = 50) -> Solve:
     """Slide along a block of n facets, over more than half of them.
 
     Reference: the force at a tenth of the path, a whole number of facets before. The ends of the
@@ -189,7 +189,7 @@ def over_facets(n: int, steps: int, mu: float, wide: int = 50) -> Solve:
     return solve
 
 
-def off_the_edge(mu: float, steps: int, **two: Any) -> Solve:
+def slide_off(mu: float, steps: int, **two: Any) -> Solve:
     """Slide off the end: zero force; without friction the initial force after return."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
@@ -206,7 +206,7 @@ def off_the_edge(mu: float, steps: int, **two: Any) -> Solve:
     return solve
 
 
-def lifted(mu: float, **two: Any) -> Solve:
+def lift_off(mu: float, **two: Any) -> Solve:
     """Press, slide and lift off: zero force, and rigid-body displacements."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
@@ -252,11 +252,11 @@ def column(
         made = both.lead(0.0, down, steps, max_cuts=cuts)
         k_n = kappa * min(moduli) * options.get("rows", 4)
 
-        def borne(along: float) -> float:
+        def axial_stress(along: float) -> float:
             return stress(along) if ends == "smooth" else nominal(along, 1.0)[0]
 
         def height(p: float, modulus: float) -> float:
-            return bisect(lambda s: modulus / E * borne(s) + p, 1e-3, 1.0)
+            return bisect(lambda s: modulus / E * axial_stress(s) + p, 1e-3, 1.0)
 
         def lacking(p: float) -> float:
             return p / k_n - sum(height(p, modulus) for modulus in moduli) + 2.0 * share
@@ -267,7 +267,7 @@ def column(
     return solve
 
 
-def rubbed(
+def against_solver(
     kappa: float,
     mu: float,
     bulk: str = "rubber",
@@ -297,7 +297,7 @@ def rubbed(
     return solved_twice(scene, present_scenes.PresentMade, present_reference.model)
 
 
-def like_rigid(ratio: float, mu: float, n: tuple[int, int] = (8, 4), kappa: float = 10.0) -> Solve:
+def stiff_plate(ratio: float, mu: float, n: tuple[int, int] = (8, 4), kappa: float = 10.0) -> Solve:
     """Press and slide a block under a plate of ``ratio`` times its modulus.
 
     Reference: forces of a rigid plane, with the same quadrature points on Γc.
@@ -331,7 +331,7 @@ def like_rigid(ratio: float, mu: float, n: tuple[int, int] = (8, 4), kappa: floa
     return solve
 
 
-def from_afar(gap: float, by_force: bool = False, **two: Any) -> Solve:
+def close_gap(gap: float, by_force: bool = False, **two: Any) -> Solve:
     """Close a gap in one increment; reference: the force without the gap, or the load."""
 
     def force(method: str, gap: float) -> tuple[list[fc.Step], float]:
@@ -349,7 +349,7 @@ def from_afar(gap: float, by_force: bool = False, **two: Any) -> Solve:
     return solve
 
 
-def pressed_in(steps: int, **two: Any) -> Solve:
+def indent(steps: int, **two: Any) -> Solve:
     """Press without friction in any number of increments; reference: 16 increments."""
 
     def force(method: str, steps: int) -> tuple[list[fc.Step], Array]:

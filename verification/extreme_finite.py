@@ -53,7 +53,7 @@ def _led(tool: Tool, end: Any, steps: int) -> list[fc.Step]:
 # ---- rotation and sliding ------------------------------------------------------------------------
 
 
-def drum(angle: float, steps: int, mu: float = 0.3, **options: Any) -> Solve:
+def rotate_disc(angle: float, steps: int, mu: float = 0.3, **options: Any) -> Solve:
     """Press and rotate a disc; the friction moment is ∫ μ p times the distance from its axis.
 
     All points slip after some rotation.
@@ -70,7 +70,7 @@ def drum(angle: float, steps: int, mu: float = 0.3, **options: Any) -> Solve:
     return solve
 
 
-def turned_with_all(steps: int, angle: float = 2 * np.pi) -> Solve:
+def rotated_together(steps: int, angle: float = 2 * np.pi) -> Solve:
     """Press and slide, then rotate body and disc about the origin; tractions rotate with them.
 
     The bottom of the body moves as a rigid body.
@@ -95,8 +95,8 @@ def turned_with_all(steps: int, angle: float = 2 * np.pi) -> Solve:
     return solve
 
 
-def over_facets(n: int, steps: int, way: float) -> Solve:
-    """Slide a block by ``way`` under a plane of n facets; reference: a half-space."""
+def slide_over_facets(n: int, steps: int, distance: float) -> Solve:
+    """Slide a block by ``distance`` under a plane of n facets; reference: a half-space."""
 
     def force(method: str, obstacle: Any) -> tuple[list[fc.Step], Array]:
         scene = rubber(n=(8, 4))
@@ -108,14 +108,14 @@ def over_facets(n: int, steps: int, way: float) -> Solve:
             shift.value[:] = 0.0, -0.05 * t
 
         def drag(t: float) -> None:
-            shift.value[:] = way * t, -0.05
+            shift.value[:] = distance * t, -0.05
 
         made = list(fc.increments(problem, press, steps=1))
         made += list(fc.increments(problem, drag, steps=steps))
         return made, contact.resultants().force
 
     def facets(shift: Any) -> fc.RigidSurface:
-        x = np.linspace(-3.0 - way, 3.0 + way, n + 1)
+        x = np.linspace(-3.0 - distance, 3.0 + distance, n + 1)
         points = np.column_stack([x, np.ones(n + 1)])
         numbers = np.column_stack([np.arange(n), np.arange(1, n + 1)])
         return fc.RigidSurface(points, numbers, displacement=shift)
@@ -130,7 +130,7 @@ def over_facets(n: int, steps: int, way: float) -> Solve:
     return solve
 
 
-def over_drum(n: int, steps: int, angle: float) -> Solve:
+def rotate_drum(n: int, steps: int, angle: float) -> Solve:
     """Rotate a drum of n facets under pressure; reference: a circular one."""
 
     def force(method: str, obstacle: Any) -> tuple[list[fc.Step], Array]:
@@ -161,7 +161,7 @@ def over_drum(n: int, steps: int, angle: float) -> Solve:
     return solve
 
 
-def off_the_edge(mu: float, steps: int, linear: bool = True) -> Solve:
+def slide_off(mu: float, steps: int, linear: bool = True) -> Solve:
     """Slide a block off the end of a plate: zero force; without friction and back."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
@@ -261,7 +261,9 @@ def bisect(rises: Any, low: float, high: float) -> float:
     return 0.5 * (low + high)
 
 
-def rubbed(kappa: float, mu: float, bulk: str = "rubber", steps: int = 2, **change: Any) -> Solve:
+def against_solver(
+    kappa: float, mu: float, bulk: str = "rubber", steps: int = 2, **change: Any
+) -> Solve:
     """Press a block on a disc and slide it; compare with the solver of the random scenes.
 
     That solver shares the assembly of the bulk with the package.
@@ -324,7 +326,7 @@ def solved_twice(scene: dict[str, Any], make: Any, model: Any) -> Solve:
     return solve
 
 
-def from_afar(gap: float, by_force: bool = False) -> Solve:
+def close_gap(gap: float, by_force: bool = False) -> Solve:
     """Close a gap by the disc in one increment; reference: the force without gap, or the load."""
 
     def force(method: str, gap: float) -> tuple[list[fc.Step], Array]:
@@ -354,7 +356,7 @@ def from_afar(gap: float, by_force: bool = False) -> Solve:
     return solve
 
 
-def pressed_in(steps: int, down: float = 0.3, **options: Any) -> Solve:
+def indent(steps: int, down: float = 0.3, **options: Any) -> Solve:
     """Press the disc in without friction; reference: 16 increments."""
 
     def force(method: str, steps: int) -> tuple[list[fc.Step], Array]:

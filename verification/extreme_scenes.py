@@ -91,10 +91,10 @@ class Block:
         """Return the symmetry conditions at x = 0 and, in 3D, y = 0."""
         return [self.hold(LEFT, 0)] + ([self.hold(FRONT, 1)] if self.d == 3 else [])
 
-    def moved(self, aside: float, down: float) -> list[fem.DirichletBC]:
+    def moved(self, sideways: float, down: float) -> list[fem.DirichletBC]:
         """Return Dirichlet conditions that move the top along x and down."""
         across = [self.hold(TOP, 1)] if self.d == 3 else []
-        return [self.hold(TOP, 0, aside), *across, self.hold(TOP, self.d - 1, -down)]
+        return [self.hold(TOP, 0, sideways), *across, self.hold(TOP, self.d - 1, -down)]
 
     def problem(
         self, law: Any, obstacle: Any, bcs: list[fem.DirichletBC], **options: Any
@@ -204,13 +204,13 @@ def compared(
     return solve
 
 
-def dragged(
+def on_disc(
     kappa: float,
     mu: float,
     *,
     ratio: float = 1.0,
     down: float = 0.03,
-    aside: float = 0.02,
+    sideways: float = 0.02,
     against: str = "alternating",
     known: float | None = None,
     **block: Any,
@@ -223,7 +223,7 @@ def dragged(
     def state(method: str, kappa: float = kappa, **options: Any) -> tuple[list[fc.Step], Block]:
         body = Block(**block)
         length = body.size[0]
-        bcs = body.moved(aside * length, down * length)
+        bcs = body.moved(sideways * length, down * length)
         law = friction_law(mu, fc.RelativeStiffness(kappa), fc.RelativeStiffness(kappa * ratio))
         problem = body.problem(law, body.ball(), bcs, method=method, **options)
         return [problem.solve()], body
@@ -310,8 +310,8 @@ def cycle(path: list[tuple[float, float]], mu: float = 0.3) -> Solve:
             friction_law(mu, fc.RelativeStiffness(10)), body.plane(), bcs, method=method
         )
         steps = []
-        for aside, down in [path[0], *path, path[0]]:
-            move[0].value, move[1].value = aside, -down
+        for sideways, down in [path[0], *path, path[0]]:
+            move[0].value, move[1].value = sideways, -down
             steps.append(problem.solve())
             problem.commit()
         forces = [step.contacts["contact"].normal_force for step in (steps[0], steps[-1])]
@@ -438,10 +438,10 @@ class Pair:
         self.traction.value[1] = -pressure
         return pressure
 
-    def drag(self, down: float = 0.03, aside: float = 0.02) -> None:
+    def drag(self, down: float = 0.03, sideways: float = 0.02) -> None:
         """Clamp the bottom, and move the top down and sideways."""
         self.body.hold(BOTTOM, 0, 1)
-        self.body.hold(TOP, 0, value=aside * self.length)
+        self.body.hold(TOP, 0, value=sideways * self.length)
         self.body.hold(TOP, 1, value=-down * self.length)
 
     def compressed(self, k_n: float, pressure: float) -> float:
@@ -463,7 +463,7 @@ class Pair:
         return difference(self.u, exact)
 
 
-def pressed_pair(kappa: float, **pair: Any) -> Solve:
+def flat_pair(kappa: float, **pair: Any) -> Solve:
     """Press one block on the other by a uniform load; k_n is relative to the softer one."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
@@ -476,7 +476,7 @@ def pressed_pair(kappa: float, **pair: Any) -> Solve:
     return solve
 
 
-def dragged_pair(kappa: float, mu: float, **pair: Any) -> Solve:
+def rounded_pair(kappa: float, mu: float, **pair: Any) -> Solve:
     """Press rounded blocks and move them sideways; compare with method `alternating`."""
 
     def state(method: str, **options: Any) -> tuple[list[fc.Step], Pair]:
@@ -527,9 +527,9 @@ def hertz(kappa: float, *, enforcement: str = "penalty") -> tuple[Solve, float]:
         body = Bodies(boxes([[x, y]], sides), E, NU, degree=2)
         body.hold(BOTTOM, 0, 1)
         body.hold(LEFT, 0)
-        roller = fc.Motion(force=(None, -force / 2))
+        cylinder = fc.Motion(force=(None, -force / 2))
         gap = body.x[0] ** 2 / (2 * radius)
-        obstacle = fc.PrescribedGap(gap, (0.0, 1.0), displacement=roller)
+        obstacle = fc.PrescribedGap(gap, (0.0, 1.0), displacement=cylinder)
         law = fc.Frictionless(k_n)
         contact = body.contact(FRONT, obstacle, law, enforcement=enforcement)
         problem = body.problem(contact, method=method)

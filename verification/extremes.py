@@ -34,18 +34,18 @@ from verification.extreme_scenes import (
     E,
     Solve,
     cycle,
-    dragged,
-    dragged_pair,
+    flat_pair,
     graded_to,
     hertz,
     in_units,
     loaded,
+    on_disc,
     on_one_rank,
     pair_in_units,
     poisson,
     pressed,
-    pressed_pair,
     proportional,
+    rounded_pair,
 )
 
 PAGE = ROOT / "docs" / "extremes.md"
@@ -157,14 +157,14 @@ def trials() -> Iterator[Trial]:
     for mu in (0.0, 0.3):
         for k in stiffnesses:
             name = f"block on a disc, μ = {mu:g}, k_n h/E"
-            yield Trial(name, f"{k:.0e}", dragged(k, mu), other, 1e-5)
+            yield Trial(name, f"{k:.0e}", on_disc(k, mu), other, 1e-5)
     for ratio in [10.0**i for i in range(-6, 4)]:
         case = f"{ratio:.0e}"
         yield Trial(
-            "block on a disc, μ = 0.3, k_t/k_n", case, dragged(10, 0.3, ratio=ratio), other, 1e-5
+            "block on a disc, μ = 0.3, k_t/k_n", case, on_disc(10, 0.3, ratio=ratio), other, 1e-5
         )
     for mu in (0.0, 0.01, 0.1, 0.5, 1.0, 2.0, 5.0, 10.0):
-        yield Trial("block on a disc, μ", f"{mu:g}", dragged(10, mu), other, 1e-5)
+        yield Trial("block on a disc, μ", f"{mu:g}", on_disc(10, mu), other, 1e-5)
     fine = "force, P3, half the mesh size"
     for degree in (1, 2, 3):
         for nu in (0.0, 0.3, 0.45, 0.49, 0.499, 0.4999):
@@ -212,7 +212,7 @@ def trials() -> Iterator[Trial]:
         )
     yield Trial("block on a plane, load path", "tensile load", loaded(0.0, 1.0, 0.0, "sides"))
     for down_by in (1e-12, 1e-9, 1e-6, 1e-4, 1e-3):
-        first = dragged(10, 0.3, down=down_by, aside=0.0)
+        first = on_disc(10, 0.3, down=down_by, sideways=0.0)
         yield Trial(
             "block on a disc, first contact of one node, approach",
             f"{down_by:g}",
@@ -239,7 +239,7 @@ def trials() -> Iterator[Trial]:
         meshes = {"place": graded_to(ratio), "n": (32, 8)}
         yield Trial("ratio of cell sizes", f"{ratio:g}, plane", pressed(10, **meshes), patch)
         yield Trial(
-            "ratio of cell sizes", f"{ratio:g}, disc", dragged(10, 0.3, **meshes), other, 1e-5
+            "ratio of cell sizes", f"{ratio:g}, disc", on_disc(10, 0.3, **meshes), other, 1e-5
         )
     for aspect in (1e1, 1e2, 1e3):
         wide = {"size": (aspect, 1.0)}
@@ -254,7 +254,7 @@ def trials() -> Iterator[Trial]:
         case = f"P{degree}"
         yield Trial("polynomial degree", f"{case}, plane", pressed(10, degree=degree), patch)
         yield Trial(
-            "polynomial degree", f"{case}, disc", dragged(10, 0.3, degree=degree), other, 1e-5
+            "polynomial degree", f"{case}, disc", on_disc(10, 0.3, degree=degree), other, 1e-5
         )
     yield Trial("all points of Γc closed", "μ = 0.3", pressed(10, 0.3), "applied load")
     yield Trial("all points of Γc open", "lifted block", cycle([up, up]), back)
@@ -292,11 +292,11 @@ def in_space() -> Iterator[Trial]:
         for k in (1e-3, 1e-1, 1e1, 1e2, 1e3, 1e4, 1e6, 1e8):
             name = f"3D, block on a ball, μ = {mu:g}, k_n h/E"
             # `alternating` fails for stiffer friction; the solution changes by about 1e-6.
-            kept = 1e6 if mu and k > 1e6 else k
-            reference = other if kept == k else f"{other}, k_n h/E = {kept:.0e}"
-            yield Trial(name, f"{k:.0e}", dragged(k, mu, known=kept, n=some), reference, 1e-5)
+            limited = 1e6 if mu and k > 1e6 else k
+            reference = other if limited == k else f"{other}, k_n h/E = {limited:.0e}"
+            yield Trial(name, f"{k:.0e}", on_disc(k, mu, known=limited, n=some), reference, 1e-5)
     for mu in (0.01, 1.0, 10.0):
-        yield Trial("3D, block on a ball, μ", f"{mu:g}", dragged(10, mu, n=some), other, 1e-5)
+        yield Trial("3D, block on a ball, μ", f"{mu:g}", on_disc(10, mu, n=some), other, 1e-5)
     for nu, degree in ((0.4999, 1), (0.3, 2), (0.499, 2), (0.4999, 2)):
         fine = "force, degree 2, half the mesh size"
         tolerance = np.inf if degree == 1 else 0.05
@@ -322,19 +322,19 @@ def two_bodies() -> Iterator[Trial]:
     """Two linear elastic blocks."""
     exact, other = "uniform compression (exact)", "method `alternating`"
     for k in (1e-3, 1.0, 1e3, 1e6, 1e8):
-        yield Trial("two bodies, flat, k_n h/E", f"{k:.0e}", pressed_pair(k), exact)
+        yield Trial("two bodies, flat, k_n h/E", f"{k:.0e}", flat_pair(k), exact)
     for mu in (0.0, 0.3):
         for k in (1e-3, 1e-1, 1e1, 1e2, 1e3, 1e4, 1e6, 1e8):
             name = f"two bodies, rounded, μ = {mu:g}, k_n h/E"
-            yield Trial(name, f"{k:.0e}", dragged_pair(k, mu), other, 1e-5)
+            yield Trial(name, f"{k:.0e}", rounded_pair(k, mu), other, 1e-5)
     for contrast in (1e-6, 1e-3, 1e3, 1e6):
         name, case = "two bodies, ratio of moduli", f"{contrast:.0e}"
-        yield Trial(name, f"{case}, flat", pressed_pair(10, contrast=contrast), exact)
-        round_ = dragged_pair(10, 0.3, contrast=contrast)
+        yield Trial(name, f"{case}, flat", flat_pair(10, contrast=contrast), exact)
+        round_ = rounded_pair(10, 0.3, contrast=contrast)
         yield Trial(name, f"{case}, rounded", round_, other, 1e-5)
     for gap in (1e-9, 1e-3, 1.0, 10.0, 1000.0):
         name = "two bodies, gap / width"
-        yield Trial(name, f"{gap:g}", pressed_pair(10, gap=gap), exact)
+        yield Trial(name, f"{gap:g}", flat_pair(10, gap=gap), exact)
     same = "N and mm, equal iterations"
     for modulus, length in ((1e-6, 1.0), (1e15, 1.0), (E, 1e-9), (E, 1e6)):
         case = f"E {modulus:.0e}" if modulus != E else f"length {length:.0e}"
@@ -362,30 +362,30 @@ def finite_kinematics() -> Iterator[Trial]:
     for angle, steps in ((full, 1), (full, 4), (full, 36), (100 * full, 1000)):
         case = f"{angle / full * 360:.0f}° in {steps}"
         long = steps == 1000
-        trial = Trial(name, case, finite.drum(angle, steps), moment, 1e-9, alone, slow=long)
+        trial = Trial(name, case, finite.rotate_disc(angle, steps), moment, 1e-9, alone, slow=long)
         yield trial
     for mu in (1.0, 2.0):
         case = f"360° in 12, μ = {mu:g}"
-        yield Trial(name, case, finite.drum(full, 12, mu), moment, 1e-9, alone)
-    linear = finite.drum(full, 12, linear=True)
+        yield Trial(name, case, finite.rotate_disc(full, 12, mu), moment, 1e-9, alone)
+    linear = finite.rotate_disc(full, 12, linear=True)
     yield Trial(name, "360° in 12, linear body", linear, moment, 1e-9)
     for steps in (4, 12, 36):
         case = f"body and disc together, 360° in {steps}"
-        yield Trial(name, case, finite.turned_with_all(steps), again, 1e-7, alone)
+        yield Trial(name, case, finite.rotated_together(steps), again, 1e-7, alone)
     name = "finite kinematics, sliding over facets"
     for n, steps in ((1000, 10), (4000, 40)):
-        solve, slow = finite.over_facets(2 * n, steps, 6.0), n > 1000
+        solve, slow = finite.slide_over_facets(2 * n, steps, 6.0), n > 1000
         case = f"plane of {n} facets, {steps} increments"
         yield Trial(name, case, solve, "`HalfSpace`", 1e-7, alone, slow)
     for n, steps in ((1000, 12), (1000, 100)):
         case = f"drum of {n} facets, 180° in {steps}"
-        solve = finite.over_drum(2 * n, steps, np.pi)
+        solve = finite.rotate_drum(2 * n, steps, np.pi)
         yield Trial(name, case, solve, "`Ball`", 1e-2, alone, steps == 100)
     name = "finite kinematics, sliding off the end of a plate"
     for mu, steps in ((0.0, 10), (0.0, 40), (0.3, 10), (0.3, 40), (1.0, 40)):
         reference = "zero force; initial force after return" if mu == 0 else "zero force"
         case = f"μ = {mu:g}, {steps} increments"
-        yield Trial(name, case, finite.off_the_edge(mu, steps), reference, 1e-7)
+        yield Trial(name, case, finite.slide_off(mu, steps), reference, 1e-7)
     name = "finite kinematics, rubber column compressed to 60 %"
     exact = "uniform stretch (exact)"
     for k in [10.0**i for i in range(-3, 7)]:
@@ -399,19 +399,19 @@ def finite_kinematics() -> Iterator[Trial]:
     for mu in (0.0, 0.3, 1.0):
         name = f"finite kinematics, disc pressed, slid and rotated, μ = {mu:g}, k_n h/E"
         for k in [10.0**i for i in (range(-3, 7) if mu == 0.3 else range(-3, 7, 3))]:
-            solve = finite.rubbed(k, mu)
+            solve = finite.against_solver(k, mu)
             yield Trial(name, f"{k:.0e}, rubber", solve, second, 1e-5, alone, k > 1e2)
         for k in (1e-1, 1e1, 1e3):
-            solve, methods = finite.rubbed(k, mu, "linear"), METHODS if k < 1e3 else alone
+            solve, methods = finite.against_solver(k, mu, "linear"), METHODS if k < 1e3 else alone
             yield Trial(name, f"{k:.0e}, linear body", solve, second, 1e-5, methods)
     name = "finite kinematics, first contact, gap / height"
     for gap in (0.01, 1.0, 1000.0):
         near = "force without the gap"
-        yield Trial(name, f"{gap:g}", finite.from_afar(gap), near, 1e-7, alone)
+        yield Trial(name, f"{gap:g}", finite.close_gap(gap), near, 1e-7, alone)
         yield Trial(
             name,
             f"{gap:g}, prescribed force",
-            finite.from_afar(gap, True),
+            finite.close_gap(gap, True),
             "applied load",
             1e-7,
             alone,
@@ -419,17 +419,17 @@ def finite_kinematics() -> Iterator[Trial]:
     name = "finite kinematics, number of increments"
     for steps in (1, 2, 5, 200):
         case = f"frictionless indentation in {steps}"
-        trial = Trial(
-            name, case, finite.pressed_in(steps), "16 increments", 1e-9, alone, steps == 200
-        )
+        trial = Trial(name, case, finite.indent(steps), "16 increments", 1e-9, alone, steps == 200)
         yield trial
     for steps in (1, 10, 200):
         case = f"disc rotated by 90° in {steps}"
-        yield Trial(name, case, finite.drum(full / 4, steps), moment, 1e-9, alone, steps == 200)
+        yield Trial(
+            name, case, finite.rotate_disc(full / 4, steps), moment, 1e-9, alone, steps == 200
+        )
 
 
 # Ratios of mesh size on Γc and of moduli.
-_UNLIKE = {
+_DISSIMILAR = {
     "equal bodies": {},
     "Γc 20 times finer": {"n": (2, 20)},
     "Γc 20 times coarser": {"n": (80, 2)},
@@ -444,9 +444,11 @@ def finite_bodies() -> Iterator[Trial]:
     alone, start = ("newton",), "two bodies, finite kinematics, "
     name, again = start + "both rotated by 360°, increments", "tractions before the rotation"
     for steps in (4, 12, 36):
-        yield Trial(name, f"{steps}, μ = 0.3", bodies.turned_with_all(steps), again, 1e-6, alone)
-    for mu, (case, unlike) in ((m, u) for m in (0.3, 1.0) for u in list(_UNLIKE.items())[m < 1 :]):
-        solve = bodies.turned_with_all(36, mu, **unlike)
+        yield Trial(name, f"{steps}, μ = 0.3", bodies.rotated_together(steps), again, 1e-6, alone)
+    for mu, (case, options) in (
+        (m, u) for m in (0.3, 1.0) for u in list(_DISSIMILAR.items())[m < 1 :]
+    ):
+        solve = bodies.rotated_together(36, mu, **options)
         yield Trial(name, f"36, μ = {mu:g}, {case}", solve, again, 1e-6, alone)
     name, before = start + "sliding over facets", "force several facets before"
     for n, steps, mu, wide in (
@@ -457,21 +459,21 @@ def finite_bodies() -> Iterator[Trial]:
         (1000, 10, 0.3, 12),
     ):
         case = f"{n * 11 // 20} in {steps}, {20 * wide / n:.2g} slave per master facet, μ = {mu:g}"
-        solve = bodies.over_facets(n, steps, mu, wide)
+        solve = bodies.slide_over_facets(n, steps, mu, wide)
         yield Trial(name, case, solve, before, 1e-4, alone, n == 1000)
     name = start + "sliding off the end, increments"
     for mu, steps in ((0.0, 10), (0.3, 10), (0.3, 40), (1.0, 40)):
         reference = "zero force; initial force after return" if mu == 0 else "zero force"
-        solve = bodies.off_the_edge(mu, steps)
+        solve = bodies.slide_off(mu, steps)
         yield Trial(name, f"{steps}, μ = {mu:g}", solve, reference, 1e-7, alone)
-    for case, unlike in list(_UNLIKE.items())[1:]:
-        solve = bodies.off_the_edge(0.3, 10, **unlike)
+    for case, options in list(_DISSIMILAR.items())[1:]:
+        solve = bodies.slide_off(0.3, 10, **options)
         yield Trial(name, f"10, μ = 0.3, {case}", solve, "zero force", 1e-7, alone)
     name, nothing = start + "lift-off after sliding, μ", "zero force and strain"
     for mu in (0.0, 0.3, 1.0):
-        yield Trial(name, f"{mu:g}", bodies.lifted(mu), nothing, 1e-9, alone)
-    for case, unlike in list(_UNLIKE.items())[1:]:
-        yield Trial(name, f"0.3, {case}", bodies.lifted(0.3, **unlike), nothing, 1e-9, alone)
+        yield Trial(name, f"{mu:g}", bodies.lift_off(mu), nothing, 1e-9, alone)
+    for case, options in list(_DISSIMILAR.items())[1:]:
+        yield Trial(name, f"0.3, {case}", bodies.lift_off(0.3, **options), nothing, 1e-9, alone)
     yield from _columns_of_two(start, alone)
     yield from _against_others(start, alone)
 
@@ -510,12 +512,12 @@ def _against_others(start: str, alone: tuple[str, ...]) -> Iterator[Trial]:
     for mu in (0.0, 0.3, 1.0):
         name = start + f"block pressed, slid and rotated, μ = {mu:g}, k_n h/E"
         for k in [10.0**i for i in (range(-3, 7) if mu == 0.3 else range(-3, 7, 3))]:
-            case, solve = f"{k:.0e}, rubber", bodies.rubbed(k, mu)
+            case, solve = f"{k:.0e}, rubber", bodies.against_solver(k, mu)
             yield Trial(name, case, solve, second, 1e-5, alone, k > 1e5)
         for k in (1e-1, 1e1, 1e3):
-            solve = bodies.rubbed(k, mu, "linear")
+            solve = bodies.against_solver(k, mu, "linear")
             yield Trial(name, f"{k:.0e}, linear bodies", solve, second, 1e-5, alone)
-        for case, unlike in (
+        for case, options in (
             ("Γc 20 times finer", {"n": (1, 8)}),
             ("lower body slave, 20 times finer", {"n": (50, 1), "own": bodies.LOWER}),
             ("Γc 20 times coarser", {"n": (50, 1)}),
@@ -524,7 +526,7 @@ def _against_others(start: str, alone: tuple[str, ...]) -> Iterator[Trial]:
             ("lower body 1e6 times stiffer", {"moduli": (1e6 * E, E)}),
             ("upper body 1e6 times stiffer", {"moduli": (E, 1e6 * E)}),
         ):
-            solve = bodies.rubbed(10, mu, **unlike)
+            solve = bodies.against_solver(10, mu, **options)
             yield Trial(name, f"1e+01, rubber, {case}", solve, second, 1e-5, alone)
     name = start + "stiff plate against a rigid plane, ratio of moduli"
     for ratio in (1e3, 1e6):
@@ -540,25 +542,25 @@ def _against_others(start: str, alone: tuple[str, ...]) -> Iterator[Trial]:
             case = f"{ratio:.0e}, μ = {mu:g}, k_n h/E = {k:.0e}, {n[0]} facets on {n[1]}"
             # The slave normals rotate by the elastic deformation and by the penetration.
             tolerance = 1 / ratio + 0.01 / k
-            solve = bodies.like_rigid(ratio, mu, n, k)
+            solve = bodies.stiff_plate(ratio, mu, n, k)
             yield Trial(name, case, solve, "`HalfSpace`", tolerance, alone)
     name = start + "first contact, gap / height"
     for gap in (0.01, 1.0, 1000.0):
         near = "force without the gap"
-        yield Trial(name, f"{gap:g}", bodies.from_afar(gap), near, 1e-7, alone)
-        below = bodies.from_afar(gap, own=bodies.LOWER)
+        yield Trial(name, f"{gap:g}", bodies.close_gap(gap), near, 1e-7, alone)
+        below = bodies.close_gap(gap, own=bodies.LOWER)
         yield Trial(name, f"{gap:g}, lower body slave", below, near, 1e-7, alone)
-        pushed = bodies.from_afar(gap, True)
+        pushed = bodies.close_gap(gap, True)
         yield Trial(name, f"{gap:g}, prescribed force", pushed, "applied load", 1e-7, alone)
     name = start + "number of increments"
     for steps in (1, 2, 5, 200):
-        solve = bodies.pressed_in(steps)
+        solve = bodies.indent(steps)
         case = f"frictionless indentation in {steps}"
         yield Trial(name, case, solve, "16 increments", 1e-9, alone)
-    for case, unlike in list(_UNLIKE.items())[1:]:
-        solve = bodies.pressed_in(1, **unlike)
+    for case, options in list(_DISSIMILAR.items())[1:]:
+        solve = bodies.indent(1, **options)
         # Round-off of the forces is proportional to the larger modulus.
-        tolerance = max(1e-9, 1e-13 * max(unlike.get("moduli", (E,))) / E)
+        tolerance = max(1e-9, 1e-13 * max(options.get("moduli", (E,))) / E)
         yield Trial(
             name, f"frictionless indentation in 1, {case}", solve, "16 increments", tolerance, alone
         )
