@@ -683,3 +683,39 @@ def test_the_undeformed_body_may_be_where_an_obstacle_has_no_normal():
         forces.append(contact.resultants().normal_force)
     assert forces[0] > 1.0
     assert forces[1] == pytest.approx(forces[0], rel=1e-9)
+
+
+@pytest.mark.parametrize("tags", [(FLOOR, BOTTOM), (BOTTOM, FLOOR)])
+def test_a_soft_contact_does_not_lose_the_other_body(tags):
+    """Two columns with contact 1e-3 of E/h, which are in each other by most of the load.
+
+    At twice the depth of the last commit normals meet nothing any more: force 0 for 2. Cut to half
+    it is that of springs in series, p = d/(1/k + 2 (1 - ν²)/E), which strains of 1e-3 change by
+    less than 1e-3.
+    """
+    axes = [[np.linspace(0.0, 1.0, 5), y + np.linspace(0.0, 1.0, 5)] for y in (0.0, 1.0)]
+    sides = {
+        HELD: near(1, 0.0),
+        FLOOR: between(1, 1.0, above=False),
+        BOTTOM: between(1, 1.0, above=True),
+        TOP: near(1, 2.0),
+        SIDES: near(0, 0.0),
+    }
+    bodies = Bodies(boxes(axes, sides), E, 0.3)
+    down = bodies.constant()
+    bodies.hold(HELD, 1)
+    bodies.hold(SIDES, 0)
+    bodies.hold(TOP, 1, value=down)
+    k = 1e-3 * E / 0.25
+    contact = bodies.contact(tags[0], (tags[1],), fc.Frictionless(k), kinematics="finite")
+    problem = bodies.problem(contact)
+    down.value = -0.2
+    problem.solve()
+    problem.commit()
+    down.value = -0.5
+    fails(problem, "penetrates")
+    for down.value in (-0.35, -0.5):
+        problem.solve()
+        problem.commit()
+    exact = 0.5 / (1 / k + 2 * (1 - 0.3**2) / E)
+    assert contact.resultants().normal_force == pytest.approx(exact, rel=1e-3)

@@ -650,7 +650,11 @@ class OpposingBodyProbe:
         found = search.present_hits(values.x, values.normal, contact.u, values.depth, near)
         self._here = _Side(here, self.u, found.facet, found.reference)
         self._there = _Side(there, self.u, *there.facets.lattice(opposite))
-        self._hits, self._back = found.hits, self._there.trace_back(search.rays, deepest)
+        everywhere, n_back = np.arange(len(self._there.facet)), len(self._there.side.body)
+        back = self._there.trace(search.rays, everywhere, self.u, np.full(n_back, deepest))
+        before = global_max(self._comm, contact.history.values("penetration"))
+        self._hits = self._with_lost(self._here, found.hits, before)
+        self._back = self._with_lost(self._there, back, before)
         self.x = np.concatenate([self._here.undeformed, self._there.undeformed])
         n = contact.quadrature.n_points
         gap, partner = self._hits.distance[:n], self._hits.facet[:n]
@@ -670,6 +674,26 @@ class OpposingBodyProbe:
         clear = allowed - np.maximum(depth, 0.0)
         heights = np.concatenate([here.height, there.height])
         self._clear = global_min(self._comm, np.append(clear, heights))
+
+    def _with_lost(self, side: _Side, hits: Hits, deepest: float) -> Hits:
+        """Find the opposite of places that were inside of the other body and lost it. Collective.
+
+        Rays look as deep as the points are. A place that was inside may have gone deeper.
+
+        Args:
+            side: Where the places are.
+            hits: What their rays meet.
+            deepest: Penetration of the points at the last commit (length).
+        """
+        lost = np.flatnonzero(np.isnan(hits.distance))
+        if self._before is None or not self._comm.allreduce(len(lost)):
+            return hits
+        rays, n = self._search.rays, len(side.side.body)
+        was = side.trace(rays, lost, self._before, np.full(n, deepest))
+        lost = lost[was.distance < 0]
+        if not self._comm.allreduce(len(lost)):
+            return hits
+        return hits.completed(lost, side.trace(rays, lost, self.u, np.full(n, np.inf)))
 
     def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
         """See `Probe`."""
@@ -771,22 +795,26 @@ class _Side:
         """The places in the bodies displaced by u, (n, gdim) (length)."""
         return self.side.facets.positions(self.facet, self.reference, u)[0]
 
-    def trace_back(self, rays: Rays, deepest: float) -> Hits:
-        """What the normals of the opposite surface meet of Γc. Collective.
+    def trace(self, rays: Rays, some: Index, u: fem.Function, deep: Array) -> Hits:
+        """What the normals of the surface meet of the other one. Collective.
 
         Args:
             rays: Between both surfaces.
-            deepest: Penetration between them (length).
+            some: Numbers of the places, (m,).
+            u: Displacement of the bodies.
+            deep: Penetration at each of all facets of the surface (length).
         """
+        facet, reference = self.facet[some], self.reference[some]
+        facets = self.side.facets
         return rays.follow(
-            self.facet,
-            self.reference,
-            self.normal,
-            self._u,
-            np.full(len(self.side.body), deepest),
-            back=True,
-            undeformed=self.side.facets.normals(self.facet, self.reference),
-            before=self._u,  # for the tangents
+            facet,
+            reference,
+            facets.normals(facet, reference, u),
+            u,
+            deep,
+            back=self.side is rays.there,
+            undeformed=facets.normals(facet, reference),
+            before=u,  # for the tangents
         )
 
     def moving(self, before: fem.Function, shift: Array) -> MovingFacets:

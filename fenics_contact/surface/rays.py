@@ -7,7 +7,7 @@ other, and so only up to the depth that they may (`Admission`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -182,6 +182,31 @@ class Hits:
     facet: Index
     reason: Index
     partner: Partner
+
+    def completed(self, rows: Index, others: Hits) -> Hits:
+        """Return these hits with those of some rays replaced.
+
+        Args:
+            rows: Which ones, (m,).
+            others: The hits of these, (m, …).
+        """
+
+        def replaced(mine: Any, theirs: Any) -> Any:
+            values = mine.copy()
+            values[rows] = theirs
+            return values
+
+        partner = {
+            f.name: replaced(getattr(self.partner, f.name), getattr(others.partner, f.name))
+            for f in fields(Partner)
+        }
+        return Hits(
+            place=replaced(self.place, others.place),
+            distance=replaced(self.distance, others.distance),
+            facet=replaced(self.facet, others.facet),
+            reason=replaced(self.reason, others.reason),
+            partner=Partner(**partner),
+        )
 
     def matrix(self, space: fem.FunctionSpace) -> PETSc.Mat:
         """Displacements of the places met, (d n, n_dofs); empty rows elsewhere. Collective."""
