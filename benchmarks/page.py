@@ -212,7 +212,7 @@ def _parallel(folder: Path) -> list[str]:
     lines += report.table(("run", "dofs", "iterations", "2 ranks [s]", *columns[4:]), body)
     lines += report.text(
         "One increment with contact, extrapolated by the model with a fast network (α = 2 µs, β = "
-        "10 GB/s, γ = 4 µs); nothing was run beyond 332,000 dofs. *Memory*: more than 16 GiB per "
+        "10 GB/s, γ = 4 µs); measured were up to 332,000 dofs. *Memory*: more than 16 GiB per "
         "rank; *too few*: fewer than 5000 dofs per rank. Idle ranks on coarse levels and load "
         "imbalance are not included:"
     )

@@ -376,7 +376,7 @@ def write_tables(folder: Path, rows: list[Row], machine: Machine) -> None:
     title = "One increment with contact by L-BFGS and multigrid (model)"
     assumed = (
         f"The model on the fast network, with c as measured here and {iterations} iterations, the "
-        "largest number measured, for all sizes: nothing was run beyond 332,000 dofs. "
+        "largest number measured, for all sizes: measured were up to 332,000 dofs. "
         f'"memory": more than {NODE:g} GiB per rank; "too few": fewer than {FEWEST} dofs per '
         "rank. Coarse levels on one rank, and load imbalance, are not included."
     )

@@ -34,7 +34,7 @@ __all__ = ["ErrorBudget", "estimate_errors", "quantities"]
 DISPLACEMENT = "displacement"
 # What to change where a part dominates.
 _REMEDIES = {
-    "enforcement": "a higher k_n and k_t",
+    "enforcement": 'Contact(enforcement="augmented"), with it a smaller tolerance,',
     "discretisation": "a finer mesh at the contact, or a higher degree",
     "increments": "more increments",
     "kinematics": 'Contact(kinematics="finite"), or a motion of the obstacle instead of the body,',
