@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 
-import pytest
-
-pytestmark = pytest.mark.whole
 PACKAGE = Path(__file__).resolve().parent.parent / "fenics_contact"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 ROOT = PACKAGE.parent
@@ -107,13 +104,16 @@ def test_every_module_stands_somewhere():
     assert places == {*ROOMS, *GROUND}
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name)
-def test_imports_run_downwards(path):
+def offences(paths: list[Path], find: Callable[[Path], Collection[str]]) -> dict[str, list[str]]:
+    """What is found in files, of those where something is."""
+    found = {str(path.relative_to(ROOT)): sorted(find(path)) for path in paths}
+    return {path: what for path, what in found.items() if what}
+
+
+def test_imports_run_downwards():
     """From a room to itself or to one below, never up; the ground imports ground alone."""
-    room = name(path).split(".")[0]
-    if room == "":
-        return
-    assert not upwards(room, path.read_text())
+    placed = [path for path in MODULES if name(path)]
+    assert not offences(placed, lambda path: upwards(name(path).split(".")[0], path.read_text()))
 
 
 def test_no_circle():
@@ -142,7 +142,7 @@ def touched(source: str, foreign: set[str]) -> list[str]:
     """Private members of other objects that a source touches, and private names it imports."""
     tree = ast.parse(source)
     classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
-    allowed = {node for each in classes for node in ast.walk(each) if is_member(node, each)}
+    allowed = {node for each in classes for node in members(each)}
     asked = [
         f"line {node.lineno}: {ast.unparse(node)}"
         for node in ast.walk(tree)
@@ -157,26 +157,28 @@ def touched(source: str, foreign: set[str]) -> list[str]:
     ]
 
 
-def is_member(node: ast.AST, of: ast.ClassDef) -> bool:
-    """Whether a private member that is asked for is one of a class: by name, or by annotation."""
-    if not isinstance(node, ast.Attribute):
-        return False
-    asked = ast.unparse(node.value)
+def members(of: ast.ClassDef) -> Iterator[ast.AST]:
+    """Where a class asks for members of its own: by name, or by annotation."""
+    nodes = list(ast.walk(of))
     given = {
         argument.arg
-        for argument in ast.walk(of)
+        for argument in nodes
         if isinstance(argument, ast.arg) and argument.annotation is not None
         if ast.unparse(argument.annotation) in (of.name, "Self")
     }
-    made = isinstance(node.value, ast.Call) and ast.unparse(node.value.func) in (of.name, "super")
-    return made or asked in {"self", "cls", "this", of.name, *given}
+    for node in nodes:
+        if isinstance(node, ast.Attribute) and private(node):
+            whose = node.value
+            made = isinstance(whose, ast.Call) and ast.unparse(whose.func) in (of.name, "super")
+            if made or ast.unparse(whose) in {"self", "cls", "this", of.name, *given}:
+                yield node
 
 
-@pytest.mark.parametrize("path", MODULES + OTHERS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_nobody_touches_private_members_of_another(path):
+def test_nobody_touches_private_members_of_another():
     """`x._y` is for self, and for another instance in the body of the class that has it."""
-    foreign = OF_DOLFINX | OF_NOTEBOOKS | (OF_MATPLOTLIB if path in OTHERS else set())
-    assert not touched(path.read_text(), foreign)
+    own, others = OF_DOLFINX | OF_NOTEBOOKS, OF_DOLFINX | OF_NOTEBOOKS | OF_MATPLOTLIB
+    assert not offences(MODULES, lambda path: touched(path.read_text(), own))
+    assert not offences(OTHERS, lambda path: touched(path.read_text(), others))
 
 
 def made_findable(source: str) -> bool:
@@ -195,12 +197,11 @@ def imported_tests(source: str) -> list[str]:
     return [each for each in found if re.search(r"(^|\.)(tests|test_\w+|conftest)(\.|$)", each)]
 
 
-@pytest.mark.parametrize("path", OTHERS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_scripts_stand_on_packages(path):
+def test_scripts_stand_on_packages():
     """None makes others findable but the pages' own, and no test is taken from another."""
-    if path.name not in ("conf.py", "test_docs.py", "test_architecture.py"):
-        assert not made_findable(path.read_text())
-    assert not imported_tests(path.read_text())
+    may = ("conf.py", "test_docs.py", "test_architecture.py")
+    assert not [p for p in OTHERS if p.name not in may and made_findable(p.read_text())]
+    assert not offences(OTHERS, lambda path: imported_tests(path.read_text()))
 
 
 def anything(source: str) -> list[str]:
@@ -221,10 +222,9 @@ def anything(source: str) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name)
-def test_nothing_may_be_anything_that_is_known(path):
+def test_nothing_may_be_anything_that_is_known():
     """Of what the package has classes for none is passed on, or kept, as `Any`."""
-    assert not anything(path.read_text())
+    assert not offences(MODULES, lambda path: anything(path.read_text()))
 
 
 BROKEN = {
@@ -259,10 +259,9 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("how", BROKEN)
-def test_what_breaks_a_rule_is_seen(how):
+def test_what_breaks_a_rule_is_seen():
     """Each of these would be found in a module; what the rules allow is in all modules."""
-    assert BROKEN[how]()
+    assert not [how for how, found in BROKEN.items() if not found()]
 
 
 def test_what_releases_differ_in_is_asked_of_compat():
@@ -288,9 +287,8 @@ def exported(path: Path) -> set[str]:
     return set()
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name)
-def test_what_others_import_is_in_all(path):
-    """Whether by its name, or as an attribute of the module; and what is there has no secrets."""
+def not_exported(path: Path) -> list[str]:
+    """What a module takes of another that is not in its ``__all__``, and secrets in its own."""
     said = {name(p): exported(p) for p in MODULES}
     tree, modules, unsaid = ast.parse(path.read_text()), {}, []
     for node in ast.walk(tree):
@@ -307,8 +305,12 @@ def test_what_others_import_is_in_all(path):
             module = modules.get(node.value.id)
             if module is not None and node.attr not in said[module]:
                 unsaid.append(f"{module}.{node.attr}")
-    assert not unsaid
-    assert not [n for n in said[name(path)] if re.match("_[a-z]", n)]
+    return unsaid + [n for n in said[name(path)] if re.match("_[a-z]", n)]
+
+
+def test_what_others_import_is_in_all():
+    """Whether by its name, or as an attribute of the module; and what is there has no secrets."""
+    assert not offences(MODULES, not_exported)
 
 
 def made_in_constructor(of: ast.ClassDef, known: dict[str, ast.ClassDef]) -> set[str]:

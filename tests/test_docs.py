@@ -35,11 +35,6 @@ OTHERS = sorted([*ROOT.glob("*.md"), *(ROOT / "packaging").glob("*.md")])
 BLOCK = re.compile(r"^```\{(\S+)\} ?([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
-def name(path: Path) -> str:
-    """Of a page, as it is in messages of pytest."""
-    return path.relative_to(DOCS).with_suffix("").as_posix()
-
-
 def entries(page: Path) -> list[Path]:
     """The pages in a page's toctrees."""
     found = []
@@ -56,12 +51,17 @@ def test_every_page_is_in_one_toctree() -> None:
     assert sorted([DOCS / "index.md", *listed]) == PAGES
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name)
-def test_code_is_that_of_files_that_run(page: Path) -> None:
+def test_code_is_that_of_files_that_run() -> None:
     """What is included exists, from a line to a later one; Python is not copied into pages."""
+    for page in PAGES:
+        check_code(page)
+
+
+def check_code(page: Path) -> None:
+    """The test above, of a page."""
     text = page.read_text()
     # Pieces for a reader who knows the rest; all of it is tested by the files that it names.
-    assert page.stem == "finite" or "```python" not in text
+    assert page.stem == "finite" or "```python" not in text, page
     for kind, target, body in BLOCK.findall(text):
         if kind != "literalinclude":
             continue
@@ -72,9 +72,9 @@ def test_code_is_that_of_files_that_run(page: Path) -> None:
         first = options.get("start-at") or options.get("start-after")
         last = options.get("end-before")
         begin = next((i for i, line in enumerate(lines) if first and first in line), None)
-        assert begin is not None, f"{target} has no {first!r}"
+        assert begin is not None, f"{page}: {target} has no {first!r}"
         if last:
-            assert any(last in line for line in lines[begin + 1 :]), f"{target}: {last!r}"
+            assert any(last in line for line in lines[begin + 1 :]), f"{page}: {target}: {last!r}"
 
 
 def anchors(page: Path) -> set[str]:
@@ -93,55 +93,58 @@ def links(page: Path) -> list[str]:
     return re.findall(r"\]\(([^)\s]+)\)", page.read_text())
 
 
-@pytest.mark.parametrize("page", [*OTHERS, *PAGES], ids=lambda p: p.relative_to(ROOT).as_posix())
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_lead_somewhere() -> None:
     """To files and headings that are there, wherever the page is read: as a page, or in its file.
 
     Addresses elsewhere are asked by ``sphinx -b linkcheck``, those of pages: so others have none
     that no page has.
     """
+    asked = {link for page in PAGES for link in links(page)}
     dead = []
-    for link in links(page):
+    for page, link in ((each, link) for each in [*OTHERS, *PAGES] for link in links(each)):
         path, _, anchor = link.partition("#")
         target = (page.parent / path) if path else page
         if link.startswith("https://"):
-            alive = any(link in links(each) for each in PAGES)
+            alive = link in asked
         else:
             alive = target.exists() and (not anchor or anchor in anchors(target))
         if not alive:
-            dead.append(link)
+            dead.append((page.name, link))
     assert dead == []
 
 
-@pytest.mark.parametrize("page", [*OTHERS, *PAGES], ids=lambda p: p.relative_to(ROOT).as_posix())
-def test_files_that_are_named_exist(page: Path) -> None:
+def test_files_that_are_named_exist() -> None:
     """What stands in backticks or a command and begins with a folder of the project."""
-    if page.stem == "CHANGELOG":
-        return  # It tells of files that were there.
     folders = "benchmarks|demos|docker|docs|examples|packaging|scenes|tests|verification"
-    named = re.findall(rf"[` ]((?:{folders})/[\w./-]*\w)", page.read_text())
-    assert [name for name in named if not (ROOT / name).exists()] == []
+    # The changelog tells of files that were there.
+    pages = [page for page in [*OTHERS, *PAGES] if page.stem != "CHANGELOG"]
+    named = [
+        (page.name, file)
+        for page in pages
+        for file in re.findall(rf"[` ]((?:{folders})/[\w./-]*\w)", page.read_text())
+    ]
+    assert [(page, file) for page, file in named if not (ROOT / file).exists()] == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
-def test_tests_that_are_named_exist(page: Path) -> None:
-    """What a page says that a test holds: the file is there, and in it the test, where named."""
+def test_tests_that_are_named_exist() -> None:
+    """What pages say that a test holds: the file is there, and in it the test, where named."""
     missing = []
-    for file, name in re.findall(r"`(?:tests/)?(test_\w+\.py)(?:::(\w+))?`", page.read_text()):
+    text = "".join(page.read_text() for page in PAGES)
+    for file, name in re.findall(r"`(?:tests/)?(test_\w+\.py)(?:::(\w+))?`", text):
         path = ROOT / "tests" / file
         if not path.exists() or (name and f"def {name}(" not in path.read_text()):
             missing.append(f"{file}::{name}")
     assert missing == []
 
 
-@pytest.mark.parametrize("picture", sorted(DOCS.glob("*.png")), ids=lambda path: path.stem)
-def test_every_picture_has_its_command(picture: Path) -> None:
+def test_every_picture_has_its_command() -> None:
     """It is on a page, which names a script: that it draws the picture nobody can see here."""
     pages = [page.read_text() for page in [*PAGES, ROOT / "README.md"]]
-    shown = [text for text in pages if picture.name in text]
-    assert shown
-    for text in shown:
-        assert re.search(r"(python (demos|benchmarks|verification)|`docs/scripts)/\w+\.py", text)
+    for picture in DOCS.glob("*.png"):
+        shown = [text for text in pages if picture.name in text]
+        assert shown, picture
+        for text in shown:
+            assert re.search(r"(python (demos|benchmarks|verification)|`docs/scripts)/\w+\.py", text), picture
 
 
 def documented() -> list[str]:
