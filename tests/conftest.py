@@ -87,8 +87,9 @@ def pytest_runtest_protocol() -> Iterator[None]:
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item: pytest.Item) -> None:
     """Destroy objects on all ranks at once: destructors of PETSc and DOLFINx may be collective."""
-    gc.collect()
-    MPI.COMM_WORLD.barrier()
+    if MPI.COMM_WORLD.size > 1:
+        gc.collect()
+        MPI.COMM_WORLD.barrier()
 
 
 def pytest_sessionstart() -> None:
