@@ -5,9 +5,15 @@ import gc
 import os
 from collections import defaultdict
 from collections.abc import Iterator
+from importlib.machinery import EXTENSION_SUFFIXES
+from importlib.util import module_from_spec, spec_from_file_location
 from math import ceil
+from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
+from ffcx.codegeneration import jit
 from mpi4py import MPI
 
 # Assertions of the scenes tell what differs, too.
@@ -17,12 +23,30 @@ _stderr = 2
 # A rank that waits for another inside C++ holds the interpreter's lock, so that no other timeout
 # gets to act. Four times the longest test.
 _DEADLOCK_SECONDS = 300
+_found_by_ffcx = jit.get_cached_module
+_forms: dict[Path, ModuleType] = {}
 
 
 def pytest_configure() -> None:
-    """Keep the error stream."""
+    """Keep the error stream; load compiled forms by name."""
     global _stderr
     _stderr = os.dup(2)
+    jit.get_cached_module = _form
+
+
+def _form(name: str, objects: list[str], folder: Path, timeout: float) -> tuple[Any, Any]:
+    """A compiled form, loaded once by its name, without a list of the folder of all of them.
+
+    FFCx lists it for each form that is made: of ten thousand files that is half of the tests' time.
+    """
+    path = Path(folder) / f"{name}{EXTENSION_SUFFIXES[0]}"
+    if path not in _forms:
+        spec = spec_from_file_location(name, path)
+        if not path.with_name(f"{name}.c.cached").exists() or spec is None or spec.loader is None:
+            return _found_by_ffcx(name, objects, folder, timeout)
+        _forms[path] = module_from_spec(spec)
+        spec.loader.exec_module(_forms[path])
+    return [getattr(_forms[path].lib, each) for each in objects], _forms[path]
 
 
 @pytest.hookimpl(tryfirst=True)
