@@ -5,7 +5,7 @@ Every assertion looks at gathered data: a rank that failed alone would leave the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -163,3 +163,14 @@ def same_field(
     reference.interpolate(expected)
     comm = f.function_space.mesh.comm
     return close(gathered(comm, owned(f)), gathered(comm, owned(reference)), rtol, scale=scale)
+
+
+def same_effort(iterations: Sequence[int], others: Sequence[int]) -> bool:
+    """Whether as many increments took as many iterations each, but for one.
+
+    By round-off the last iteration is just enough, or just not; what else makes more or fewer of
+    them, as units in a setting of the solver, makes many.
+    """
+    return len(iterations) == len(others) and all(
+        abs(a - b) <= 1 for a, b in zip(iterations, others, strict=True)
+    )

@@ -15,7 +15,7 @@ from fenics_contact.systems.condensation import Condensation
 from fenics_contact.systems.condensed import worthwhile
 from fenics_contact.systems.unknowns import Selection
 from scenes.blocks import CELLS, GRID, LEFT, RIGHT, TOP, block, kirchhoff
-from scenes.comparing import close, gathered, owned, raised_everywhere
+from scenes.comparing import close, gathered, owned, raised_everywhere, same_effort
 from scenes.rubbing import PATH, Rub, cushion, walk
 from scenes.two_blocks import Slider
 
@@ -150,7 +150,8 @@ LAWS = {
 def test_path(cell, degree, law, method):
     """To and fro with prescribed values that change: states, forces, works; one factorisation.
 
-    Iterations are of the same order: the condensed Newton method is the same one.
+    Iterations are of the same order: the condensed Newton method is the same one, and half as many
+    again would be another one, or another start.
     """
     iterations = {}
 
@@ -271,7 +272,7 @@ def test_modulus_changed():
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_units(method):
-    """The same iterations and digits in other units, 1e-9 of the fields."""
+    """The same effort and digits in other units, 1e-9 of the fields."""
     results = []
     for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1e9)]:
         made = Rub(
@@ -281,7 +282,7 @@ def test_units(method):
         iterations = [s.iterations for s in steps]
         results.append((iterations, owned(made.scene.u) / length, made.contact.traction / pressure))
     for iterations, u, traction in results[1:]:
-        assert iterations == results[0][0]
+        assert same_effort(iterations, results[0][0])
         assert close(u, results[0][1], 1e-9)
         assert close(traction, results[0][2], 1e-9)
 

@@ -85,6 +85,7 @@ def test_without_a_fallback_it_fails_and_says_why(caplog):
     with caplog.at_level(logging.INFO, "fenics_contact"), pytest.raises(fc.NotConverged) as caught:
         problem.solve()
     (attempt,) = caught.value.attempts
+    # All that it may take: a cycle does not end by itself.
     assert attempt.method == "newton" and attempt.iterations == caught.value.iterations == 100
     for text in (attempt.outcome, str(caught.value)):
         assert "contact chatters" in text and "16 points keep changing between" in text

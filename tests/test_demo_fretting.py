@@ -50,7 +50,8 @@ def test_cycle(tmp_path: Path) -> None:
     rows = result["rows"]
     assert rows[9]["force"] < rows[8]["force"] and rows[25]["force"] > rows[24]["force"]
     assert rows[9]["iterations"] <= 6 and rows[25]["iterations"] <= 6
-    assert sum(row["iterations"] for row in rows) <= 120  # 88 measured, on what contact touches
+    # 88 measured, on what contact touches; a third more tells of worse starts all along the cycle.
+    assert sum(row["iterations"] for row in rows) <= 120
     assert (tmp_path / "loop.png").read_bytes()[:4] == b"\x89PNG"
 
 

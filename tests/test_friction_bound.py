@@ -162,7 +162,6 @@ def test_friction_by_the_slip_distance(cell, method):
         assert step.verdict.failures == [] and step.contacts["contact"].stick == 0
         moved = gathered(COMM, contact.values.increment)[:, 0]
         assert close(moved, np.full_like(moved, (0.4 - MU) / RATE), 1e-4)
-        assert step.iterations < 20
         problem.commit()
 
 

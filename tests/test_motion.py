@@ -64,6 +64,7 @@ def test_newton_converges_quadratically_with_a_turning_normal():
     problem.commit()
     contact.applied_force[0] = 0.6
     step = problem.solve()
+    # Without the derivative of the normal the error falls by a factor, to 1e-9 in many steps.
     assert step.iterations <= 5
     assert close(contact.resultants().force, [0.6, 5.0], 1e-8)
 

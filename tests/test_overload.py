@@ -83,6 +83,7 @@ def test_it_ends_soon_and_says_why(method):
 
         words = "overload: along the rotation about z", "Try a smaller load, more friction"
         raised_everywhere(solve, fc.NotConverged, *words)
+        # The limits of the methods in turn are several hundred: it is told before they are met.
         assert failed[0].iterations < 300
 
 

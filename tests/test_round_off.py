@@ -60,6 +60,7 @@ def test_a_soft_block_on_a_stiff_slab(stiffness, carried, options):
     said = [str(w.message) for w in caught if "round-off of its displacements" in str(w.message)]
     assert len(said) == len(inexact)
     assert bool(inexact) == (stiffness > 1e7)
+    # Newton's method stops at round-off; where it is not known, only at its limit of 100.
     assert step.iterations <= 20
 
 
