@@ -7,7 +7,6 @@ from collections import defaultdict
 from collections.abc import Iterator
 from importlib.machinery import EXTENSION_SUFFIXES
 from importlib.util import module_from_spec, spec_from_file_location
-from math import ceil
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -53,10 +52,9 @@ def _form(name: str, objects: list[str], folder: Path, timeout: float) -> tuple[
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the cases of parametrized tests that do not run by default as slow.
 
-    One case in six runs, at least two, on several ranks half as many, and all with
-    ``@pytest.mark.whole``: those that together have the most values of the parameters, in the order
-    of the file; of one parameter those at equal distances. What runs on all kinds of cells is slow
-    on hexahedra, whose forms take longest to compile, except in modules marked ``hexahedra``.
+    The first and the last case run, which differ in all parameters; all with
+    ``@pytest.mark.whole``. What runs on all kinds of cells is slow on hexahedra, whose forms take
+    longest to compile, except in modules marked ``hexahedra``.
     """
     cases = defaultdict(list)
     for item in items:
@@ -67,27 +65,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.slow)
         elif not item.get_closest_marker("slow"):
             cases[item.nodeid.partition("[")[0]].append(item)
-    for those in cases.values():
-        number = max(2, ceil(len(those) / 6))
-        if MPI.COMM_WORLD.size > 1:
-            number = ceil(number / 2)
-        kept = _most_varied(those, number)
-        for item in those:
-            if item not in kept:
-                item.add_marker(pytest.mark.slow)
-
-
-def _most_varied(cases: list[pytest.Item], number: int) -> list[pytest.Item]:
-    """Cases that together have the most values of the parameters."""
-    left, kept = cases[:: max(1, len(cases) // number)] + cases, []
-    seen: set[tuple[str, int]] = set()
-    while left and len(kept) < number:
-        values = [set(item.callspec.indices.items()) - seen for item in left]  # type: ignore[attr-defined]
-        best = max(range(len(left)), key=lambda i: len(values[i]))
-        seen |= values[best]
-        kept.append(left[best])
-        left = [item for item in left if item is not kept[-1]]
-    return kept
+    for item in (item for those in cases.values() for item in those[1:-1]):
+        item.add_marker(pytest.mark.slow)
 
 
 def pytest_exception_interact(report: pytest.TestReport) -> None:

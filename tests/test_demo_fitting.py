@@ -39,6 +39,7 @@ def test_statics_and_homogeneity(tmp_path: Path) -> None:
         assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.slow
 def test_another_geometry(tmp_path: Path) -> None:
     """Steeper flanks, more friction: the demo's own checks hold (exit code 0)."""
     result = run_demo("fitting", tmp_path, "--f", "60", "--friction", "0.3", "--h", "2")

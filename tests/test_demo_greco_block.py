@@ -31,6 +31,7 @@ def test_displacements_forces_and_zones(tmp_path: Path) -> None:
         assert (tmp_path / name).read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.slow
 def test_increments_do_not_matter(tmp_path: Path) -> None:
     """Zero gap and a proportional load: ten increments give the state of one, to the solver's 1e-9.
 
@@ -48,4 +49,3 @@ def test_two_ranks_agree(tmp_path: Path) -> None:
     serial = run_demo("greco_block", tmp_path / "1", "--cells", "20")
     parallel = run_demo("greco_block", tmp_path / "2", "--cells", "20", ranks=2)
     assert parallel["displacements_um"] == pytest.approx(serial["displacements_um"], rel=1e-7)
-    assert parallel["iterations"] == serial["iterations"]

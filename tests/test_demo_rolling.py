@@ -15,6 +15,7 @@ pytestmark = [
 ]
 
 
+@pytest.mark.slow  # the same scene, numbers and digits: test_finite_references.py
 def test_forces_and_torque(tmp_path: Path) -> None:
     """GetFEM's at the end of pressing, turning and dragging; the disc slips before it is dragged.
 

@@ -34,6 +34,7 @@ def test_cattaneo_mindlin(tmp_path: Path) -> None:
         assert (tmp_path / f"{name}.pvd").exists()
 
 
+@pytest.mark.slow
 def test_increments_do_not_matter_here(tmp_path: Path) -> None:
     """Under monotonic shear slip only spreads, one way: one increment ends where four do.
 
