@@ -52,9 +52,10 @@ def _form(name: str, objects: list[str], folder: Path, timeout: float) -> tuple[
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the cases of parametrized tests that do not run by default as slow.
 
-    The first and the last case run, which differ in all parameters; all with
-    ``@pytest.mark.whole``. What runs on all kinds of cells is slow on hexahedra, whose forms take
-    longest to compile, except in modules marked ``hexahedra``.
+    The first and the last case run, which differ in all parameters; with ``@pytest.mark.each``
+    every value of each parameter, in as few cases; with ``@pytest.mark.whole`` all. What runs on
+    all kinds of cells is slow on hexahedra, whose forms take longest to compile, except in modules
+    marked ``hexahedra``.
     """
     cases = defaultdict(list)
     for item in items:
@@ -65,8 +66,24 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.slow)
         elif not item.get_closest_marker("slow"):
             cases[item.nodeid.partition("[")[0]].append(item)
-    for item in (item for those in cases.values() for item in those[1:-1]):
-        item.add_marker(pytest.mark.slow)
+    for those in cases.values():
+        kept = _each(those) if those[0].get_closest_marker("each") else [those[0], those[-1]]
+        for item in those:
+            if item not in kept:
+                item.add_marker(pytest.mark.slow)
+
+
+def _each(cases: list[pytest.Item]) -> list[pytest.Item]:
+    """First the cases of which no value has been seen, then those of which not all have been."""
+    kept: list[pytest.Item] = []
+    seen: set[tuple[str, str]] = set()
+    for enough in (set.isdisjoint, lambda values, seen: not values <= seen):
+        for item in cases:
+            values = {(name, repr(value)) for name, value in item.callspec.params.items()}  # type: ignore[attr-defined]
+            if enough(values, seen):
+                kept.append(item)
+                seen |= values
+    return kept
 
 
 def pytest_exception_interact(report: pytest.TestReport) -> None:

@@ -126,6 +126,7 @@ def test_the_mesh_it_takes():
     assert max(again.relative("discretisation").values()) < min(worst, 2 * wanted)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("wanted", ["best", 0.0, -1.0, 2.0, float("nan"), [0.1, 0.2]])
 def test_other_words(wanted):
     """No such word, or no relative error: said on all ranks, with those there are."""

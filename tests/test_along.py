@@ -127,6 +127,7 @@ def test_an_oval_hole():
     on_first(compare)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("which", "label", "n_curves"),
     [

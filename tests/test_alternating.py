@@ -36,6 +36,7 @@ def test_the_same_solution(cell, degree):
         assert close(a, b, 1e-6)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "law",
     [

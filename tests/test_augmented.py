@@ -115,6 +115,7 @@ def walk(law: str, stiffness: fc.RelativeStiffness, path=PATH, **options):
     return found, contact
 
 
+@pytest.mark.each
 @pytest.mark.skipif(COMM.size > 1, reason="of the laws; ranks are compared below")
 @pytest.mark.parametrize("law", LAWS)
 def test_limit_of_the_penalty(law: str) -> None:
@@ -243,6 +244,7 @@ def test_projection_leaves_no_creep_behind() -> None:
 # ---- forms, obstacles, ranks, files --------------------------------------------------------------
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("law", ["frictionless", "coulomb", "tresca", "cone", "ellipse"])
 def test_force_and_tangent_with_multipliers(law: str) -> None:
     """The tangent is the derivative of the force, and the force that of the potential.

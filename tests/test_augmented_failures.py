@@ -61,6 +61,7 @@ BAD = {
 }
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("case", BAD)
 def test_bad_arguments(case: str) -> None:
     """Refused by `Contact`, on all ranks, by name."""

@@ -200,6 +200,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("busy", [None, *BUSY])
 @pytest.mark.parametrize("scene", REFUSED, ids=lambda scene: scene.__name__)
 def test_what_is_refused_alone_is_refused_beside_others(scene, busy):
@@ -308,6 +309,7 @@ HOLD = {
 _ALONE: dict[str, list[Array]] = {}
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("busy", BUSY)
 @pytest.mark.parametrize("scene", HOLD)
 def test_what_holds_alone_holds_beside_others(scene, busy):

@@ -68,6 +68,7 @@ def test_a_locked_wedge_stays(method):
     assert close(found, expected, 0.02)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("method", [None, "newton", "lbfgs"])
 @pytest.mark.parametrize("pull", [0.01, 0.2])
 def test_a_locked_wedge_is_not_taken_for_a_released_one(pull, method):

@@ -78,6 +78,7 @@ def test_condition_on_components():
         assert step.contacts["contact"].normal_force == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("kind", ["vector", "function", "component by function"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_conditions_of_every_kind(cell, kind):

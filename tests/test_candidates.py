@@ -85,6 +85,7 @@ def test_laws(law):
     assert_same(found, full)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("method", ["lbfgs", "newton", "alternating", "continuation"])
 def test_methods(method):
     """By every method; L-BFGS ends at less digits, and all unknowns are solved as exactly."""

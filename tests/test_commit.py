@@ -70,6 +70,7 @@ def failed(problem, contact):
     contact.parameters["displacement"].value[:] = kept
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("recover_interior", [True, False])
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("between", [changed, moved, twice, failed])

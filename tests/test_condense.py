@@ -144,6 +144,7 @@ LAWS = {
 }
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize(("cell", "degree"), [("quadrilateral", 1), ("triangle", 2)])

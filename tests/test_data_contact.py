@@ -259,6 +259,7 @@ def test_a_file_of_other_data_is_refused(tmp_path):
     raised_everywhere(lambda: fc.checkpoint.load(made(61), path), ValueError, "RigidProfile")
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
 @pytest.mark.parametrize("shape", ["ball", "profile", "facets"])
 def test_a_scene_that_moves_and_turns_as_a_whole(cell, shape):

@@ -203,6 +203,7 @@ def test_a_ball_moved_by_its_center_bears():
     assert min(forces[1]) > 0
 
 
+@pytest.mark.each
 @KINEMATICS
 @pytest.mark.parametrize("at", [0.07, 0.3, 0.55])
 @pytest.mark.parametrize("steps", [1, 2, 4])
@@ -220,6 +221,7 @@ def test_a_pin_does_not_pass_between_places(steps, at, kinematics):
             problem.commit()
 
 
+@pytest.mark.each
 @KINEMATICS
 @pytest.mark.parametrize("at", [0.25, 0.3, 0.55])
 @pytest.mark.parametrize("far", [0.03, 0.4])
@@ -267,6 +269,7 @@ def test_a_blade_does_not_pierce_a_facet(steps, at, kinematics):
     assert reached - 0.04 <= 0.07 * 0.25
 
 
+@pytest.mark.each
 @KINEMATICS
 @pytest.mark.parametrize(("at", "aside"), [(0.3, 0.1), (0.35, -0.15), (0.7, -0.15)])
 def test_a_pin_that_moves_aside_is_not_overlooked(kinematics, at, aside):
@@ -394,6 +397,7 @@ def test_a_blade_is_not_turned_through_a_body(steps):
             problem.commit()
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("angle", [1.5 * np.pi, 2 * np.pi, -4 * np.pi])
 @pytest.mark.parametrize("length", [1.2, 0.45])
 def test_a_blade_is_not_turned_around_through_a_body(length, angle):
@@ -438,6 +442,7 @@ def test_a_ball_turns_around_in_place():
     assert force > 0
 
 
+@pytest.mark.each
 @KINEMATICS
 @pytest.mark.parametrize("at", [0.5, 0.53, 0.5625, 0.46])
 def test_a_ball_between_two_points_is_seen(kinematics, at):
@@ -485,6 +490,7 @@ def test_open_points_are_looked_at(kind):
             problem.commit()
 
 
+@pytest.mark.each
 @KINEMATICS
 @pytest.mark.parametrize("way", [0.3, 0.7, 2.5])
 def test_a_body_does_not_enter_another_from_aside(kinematics, way):

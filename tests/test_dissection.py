@@ -40,6 +40,7 @@ def sparse(K):
     return PETSc.Mat().createAIJ(K.shape, csr=csr, comm=PETSc.COMM_SELF)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("inner", [10_000, 150, 40, 3])
 @pytest.mark.parametrize(
     ("symmetric", "shift"),

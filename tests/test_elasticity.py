@@ -86,6 +86,7 @@ UNIFORM = [
 ]
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize(("kind", "options", "area", "along", "across"), UNIFORM)
 def test_column(kind, options, area, along, across, degree) -> None:
@@ -234,6 +235,7 @@ def test_what_has_no_sense_is_refused() -> None:
     LinearElastic(u, E, 0.5, "plane stress")  # incompressible sheets are ordinary
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("isochoric", [False, True])
 @pytest.mark.parametrize("kind", ["plane strain", "axisymmetric", "3D"])
 def test_neo_hookean_column_at_large_strain(kind, isochoric):

@@ -287,6 +287,7 @@ def test_multigrid_gives_the_same_budget():
             assert close(multigrid.relative(part)[name], value, 1e-6, scale=1.0)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("kind", ["plane strain", "plane stress", "axisymmetric"])
 @pytest.mark.parametrize("bulk", ["linear", "rubber", "mixed"])
 def test_stresses_of_the_package(kind, bulk):

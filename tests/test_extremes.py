@@ -133,6 +133,7 @@ MORE = [
 ]
 
 
+@pytest.mark.each
 @pytest.mark.skipif(COMM.size > 1, reason="scenes of other tests run in parallel")
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("trial", FAST + MORE, ids=lambda t: f"{t.group} {t.case}")

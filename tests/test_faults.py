@@ -87,6 +87,7 @@ def pair(method="lbfgs", **kwargs):
 # ---- in a solve ----------------------------------------------------------------------------------
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("method", METHODS)
 def test_an_exception_in_a_callback(method, condensation, monkeypatch):
@@ -136,6 +137,7 @@ def test_snes_is_stopped(method, monkeypatch):
     goes_on(made, twin)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
@@ -343,6 +345,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return found
 
 
+@pytest.mark.each
 @pytest.mark.skipif(COMM.size > 1, reason="the limit would hit what MPI keeps in files, too")
 @pytest.mark.parametrize("kind", ["checkpoint", "json", "series", "picture"])
 @pytest.mark.parametrize("first", [True, False])

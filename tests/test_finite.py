@@ -114,6 +114,7 @@ def states(scene, contact, shift, angle, n=3):
         contact.commit()
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("cell", CELLS)
 def test_derivatives(cell, shape):
@@ -136,6 +137,7 @@ def test_derivatives(cell, shape):
     assert np.all(seen > 0)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
 @pytest.mark.parametrize(
     ("shape", "enforcement"),
@@ -215,6 +217,7 @@ def _refused(arguments, law=None, **options):
 FLOOR = fc.HalfSpace((0, 1), (0, -1))
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("make", "error", "text"),
     [

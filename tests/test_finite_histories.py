@@ -19,6 +19,7 @@ COMM = MPI.COMM_WORLD
 PATH = [(0.0, -0.06), (0.0, -0.12), (0.05, -0.15), (0.1, -0.15), (0.06, -0.14)]
 
 
+@pytest.mark.each
 @pytest.mark.parametrize(
     ("shape", "enforcement"),
     [

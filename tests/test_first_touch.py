@@ -67,6 +67,7 @@ class Pin:
         return np.array([r.normal_force, r.tangential_force, r.max_pressure, took])
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("driven", ["load", "bore", "hole"])
@@ -149,6 +150,7 @@ class Blocks:
         return np.array([step.energy.dissipation, *r.force, r.tangential_force])
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("opposite", ["body", "floor", "moved"])
 def test_a_way_along_in_the_air_is_no_slip(opposite, kinematics):

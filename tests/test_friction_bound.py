@@ -98,6 +98,7 @@ RATIOS = {
 }
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("name", RATIOS)
 def test_what_bounds_tangential_forces_follows_from_the_friction_bound(name):
     """μ times the shape of the yield surface where the bound is μ p; else nothing does."""

@@ -221,6 +221,7 @@ def _more_work(record):
     vars(record["energy"])["work"] *= 1.001
 
 
+@pytest.mark.whole
 @serial
 @pytest.mark.parametrize(
     ("spoiled", "check"),
@@ -422,6 +423,7 @@ def test_an_obstacle_that_is_elsewhere_is_found(what):
     assert played(TURNING, changed=changed).outcome == "wrong"
 
 
+@pytest.mark.whole
 @serial
 @pytest.mark.parametrize("kind", finite_scenes.KINDS)
 def test_shapes_of_the_second_solution(kind):

@@ -29,6 +29,7 @@ def body_of(w: fem.Function, nu: float, kind: str, isochoric: bool) -> tuple[Neo
     return body, body.residual(v, dx, q=q)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("isochoric", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("nu", [0.3, 0.5])
@@ -98,6 +99,7 @@ def stresses(along: float, nu: float, kind: str, isochoric: bool) -> tuple[float
     return low, found[2], pressure
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("isochoric", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("nu", [0.4, 0.4999, 0.5])

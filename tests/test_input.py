@@ -50,6 +50,7 @@ def test_form_without_stiffness():
 # ---- not finite ----------------------------------------------------------------------------------
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("name", ["traction", "body_force", "E", "nu"])
 def test_constants_not_finite(name, value):
@@ -123,6 +124,7 @@ def test_function_not_finite_on_one_rank(what):
     raised_everywhere(build_and_solve(scene), ValueError, f"the {what}", "finite")
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("kind", ["constant", "function"])
 def test_dirichlet_value_not_finite(kind, value):

@@ -30,6 +30,7 @@ def contact_with(u, scene: Block) -> Callable:
     return lambda: fc.Contact(u, scene.surface, scene.floor(), coulomb())
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("element", "words"),
     [
@@ -240,6 +241,7 @@ def test_arguments_of_a_surface():
     )
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("degree", [1, 2.5, 2.0, "2", True, 0, -1])
 def test_quadrature_degree(degree):
     """A degree is an integer, at least 2: one point does not resist a tilt of its facet."""
@@ -393,6 +395,7 @@ def test_unknown_method():
     )
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("value", [-0.1, 1.1, np.nan, "1"])
 @pytest.mark.parametrize("name", ["alpha", "phi"])
 def test_shares_out_of_range(name, value):
@@ -403,6 +406,7 @@ def test_shares_out_of_range(name, value):
     )
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("value", [0, -0.1, np.nan, "20 %", True])
 def test_small_displacement_tolerance_out_of_range(value):
     """A positive number, infinite included."""

@@ -33,6 +33,7 @@ BAD_NUMBERS = [
 ]
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(("name", "value"), BAD_NUMBERS)
 def test_parameter_out_of_range_by_number(name, value):
     """μ < 0, k_n ≤ 0, k_t ≤ 0 and what is not finite, as numbers: refused by `Contact`."""
@@ -40,6 +41,7 @@ def test_parameter_out_of_range_by_number(name, value):
     raised_everywhere(lambda: scene.contact(coulomb(**{name: value})), ValueError, name, "contact")
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(("name", "value"), BAD_NUMBERS)
 def test_parameter_out_of_range_by_constant(name, value):
     """The same as a ``fem.Constant``: refused by `ContactProblem`."""
@@ -48,6 +50,7 @@ def test_parameter_out_of_range_by_constant(name, value):
     raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize(("name", "value"), BAD_NUMBERS)
 def test_parameter_changed_to_out_of_range(name, value):
     """The same after a change of ``contact.parameters``: refused by the next solve, u unchanged."""
@@ -60,6 +63,7 @@ def test_parameter_changed_to_out_of_range(name, value):
     assert all(COMM.allgather(bool(np.array_equal(scene.u.x.array, before))))
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("name", "expression"),
     [
@@ -94,6 +98,7 @@ def in_space() -> Block:
     return block("tetrahedron", up=-1.0)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("value", [2, 0, -4, 3.5, "5", True])
 def test_polygon_of_too_few_sides(value):
     """A polygon has a whole number of sides, three or more: refused by the law itself."""
@@ -138,6 +143,7 @@ def test_elliptic_friction_is_solved():
     assert step.contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("value", [0.0, -0.1, np.nan, np.inf])
 @pytest.mark.parametrize("name", ["friction", "transverse_friction"])
 def test_axis_of_the_ellipse_out_of_range(name, value):
@@ -154,6 +160,7 @@ def test_axis_of_the_ellipse_out_of_range(name, value):
     raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("value", "words"),
     [
@@ -196,6 +203,7 @@ def test_direction_of_friction_parallel_to_the_normal():
     raised_everywhere(problem.solve, ValueError, "direction", "finite")
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("name", "value"),
     [("k_n", -1.0), ("k_n", np.inf), ("k_t", -1.0), ("k_t", np.nan)],
@@ -227,6 +235,7 @@ def test_tresca_pressure_out_of_range(pressure):
     raised_everywhere(lambda: scene.contact(law), ValueError, "pressure")
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("value", ["rough", "0.3", True, 0.3 + 1j, {}, ["a", "b"], [[1.0], 2.0]])
 def test_parameter_of_a_wrong_type(value):
     """What cannot be a coefficient is a TypeError that names the parameter."""
@@ -259,6 +268,7 @@ def test_parameter_of_a_wrong_shape():
     raised_everywhere(lambda: scene.contact(coulomb(x)), ValueError, "friction", "scalar")
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("factor", [0.0, -1.0, np.nan, np.inf, "10"])
 def test_scaled_factor_out_of_range(factor):
     """A factor of E/h is a positive number."""
@@ -268,6 +278,7 @@ def test_scaled_factor_out_of_range(factor):
 # ---- gap, normal, weight, modulus ----------------------------------------------------------------
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("kind", ["number", "constant", "ufl"])
 @pytest.mark.parametrize("name", ["gap", "weight"])
 def test_gap_or_weight_not_finite(name, kind):
@@ -362,6 +373,7 @@ def test_missing_modulus():
     raised_everywhere(lambda: contact.form(v), ValueError, "modulus", "k_n")
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("modulus", [0.0, -1.0, np.nan, np.inf, "E", True])
 def test_modulus_out_of_range(modulus):
     """A modulus is positive and finite."""
@@ -384,6 +396,7 @@ def test_modulus_function_out_of_range(value):
     )
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("what", ["friction", "gap", "weight", "displacement", "normal"])
 def test_data_that_depend_on_the_displacement(what):
     """Data are numbers while an increment is solved: what follows from u is none, and is named."""

@@ -317,6 +317,7 @@ def test_foundation(name, d, data):
 # ---- the tangential law --------------------------------------------------------------------------
 
 
+@pytest.mark.each
 @pytest.mark.parametrize(("name", "d"), FRICTION)
 @properties
 @given(data=st.data())
@@ -370,6 +371,7 @@ def test_traction_is_the_closest_point(name, d, data):
     assert np.max(others @ slipped) <= tau @ slipped + 10 * rounding
 
 
+@pytest.mark.each
 @pytest.mark.parametrize(("name", "d"), ALL)
 @properties
 @given(data=st.data())

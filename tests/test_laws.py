@@ -137,6 +137,7 @@ def directions(scene: Scene) -> list[np.ndarray]:
     return found
 
 
+@pytest.mark.each
 @pytest.mark.parametrize(
     ("cell", "degree", "law"),
     [
@@ -213,6 +214,7 @@ def check_shape(scene: Scene, state: State, law: str, r: np.ndarray, tangent: PE
         assert skew <= 1e-13, state.name
 
 
+@pytest.mark.each
 @pytest.mark.parametrize(
     ("cell", "law"),
     [(cell, law) for cell in CELLS for law in ("coulomb", "foundation")]

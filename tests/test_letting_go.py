@@ -67,6 +67,7 @@ class Free:
         return step.iterations, place.mean()
 
 
+@pytest.mark.each
 @pytest.mark.parametrize(
     ("bulk", "kinematics"), [("linear", "small"), ("linear", "finite"), ("rubber", "finite")]
 )
@@ -104,6 +105,7 @@ def test_rubber_that_is_let_go_stays_in_any_units(cell, size):
     assert released <= 15
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("bulk", BULKS)
 @pytest.mark.parametrize("friction", [0.02, 0.1])
 @pytest.mark.parametrize("n", [1, 2, 3])

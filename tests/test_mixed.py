@@ -54,6 +54,7 @@ def tool(how: str, cell: str = "triangle", **options) -> Tool:
 # ---- whole histories -----------------------------------------------------------------------------
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("how", HOW)
 def test_history(how):
     """Down, along, back and turned: all verdicts pass, which compare forces by a cross-check.
@@ -79,6 +80,7 @@ def test_history(how):
     assert np.abs(made.resultant()).min() > 0.1
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("how", ["Taylor-Hood", "MINI", "by force", "augmented", "linear"])
 def test_going_on_from_a_file(how, tmp_path):
     """Broken off while the tool turns, and taken up: the same digits on one rank, 1e-7 on more."""

@@ -63,6 +63,7 @@ def obstacles(mesh):
     }
 
 
+@pytest.mark.each
 @pytest.mark.parametrize(
     "name", ["plane", "moved", "hole", "distance", "spline", "polyline", "turned"]
 )

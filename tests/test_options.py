@@ -130,6 +130,7 @@ GOOD = {
 }
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("method", [None, "newton", "continuation"])
 @pytest.mark.parametrize("condensation", [None, False])
 def test_options_that_nothing_reads(command_line, method, condensation, caplog) -> None:

@@ -56,6 +56,7 @@ def test_a_twist():
         assert "rotation about z" in found.in_words()
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("method", [None, "newton", "lbfgs", "alternating", "continuation"])
 def test_it_ends_soon_and_says_why(method):
     """Tresca's and Coulomb's law, by statics: below the limit solved, above it refused.
@@ -87,6 +88,7 @@ def test_it_ends_soon_and_says_why(method):
         assert failed[0].iterations < 300
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("method", [None, "lbfgs", "newton", "alternating", "continuation"])
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
 def test_loads_that_grow_together_are_none(cell, method):
@@ -103,6 +105,7 @@ def test_loads_that_grow_together_are_none(cell, method):
     assert found.normal_force == pytest.approx(10.0, rel=1e-6)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("method", [None, "lbfgs", "newton", "alternating", "continuation"])
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
 @pytest.mark.parametrize("by", ["top", "gap"])
@@ -129,6 +132,7 @@ def test_a_tight_fit_is_none(by, cell, method):
     assert found.normal_force == pytest.approx(force, rel=1e-6)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("method", [None, "lbfgs", "newton", "alternating", "continuation"])
 @pytest.mark.parametrize("stiffness", [1e1, 1e3])
 @pytest.mark.parametrize("share", [0.7, 0.8, 0.97])

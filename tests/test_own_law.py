@@ -34,6 +34,7 @@ EXACT = 1e-7
 METHODS = ("lbfgs", "newton", "continuation", "alternating")
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
@@ -94,6 +95,7 @@ def test_any_units():
     assert close(found[1], found[0], EXACT) and close(found[2], found[0], EXACT)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])

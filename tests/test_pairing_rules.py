@@ -267,6 +267,7 @@ LAWS = {
 }
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("name", LAWS)
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
@@ -497,6 +498,7 @@ def test_touching_is_no_penetration():
             assert undetected(problem.solve()) == []
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("counts", [(1, 20), (20, 1), (3, 20), (20, 3), (7, 8)])
 @pytest.mark.parametrize("swap", [False, True])
 def test_meshes_of_any_ratio_pass(counts, swap):

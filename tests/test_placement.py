@@ -98,6 +98,7 @@ def obstacles(d: int) -> dict:
     return named
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("kind", obstacles(2))
 @pytest.mark.parametrize("d", [2, 3])
 def test_gap_and_normal(d, kind):
@@ -114,6 +115,7 @@ def test_gap_and_normal(d, kind):
     check(moved, reference, -2 * shift)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("kind", obstacles(2))
 @pytest.mark.parametrize("d", [2, 3])
 def test_displacement_by_a_constant(d, kind):
@@ -159,6 +161,7 @@ def test_obstacle_by_a_function(d):
     check(contact, lambda x, s: (0.2 + 0.5 * x[:, 0] - 0.1 * x[:, 1], 0 * x - np.eye(d)[-1]))
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("kind", ["half-space", "ball", "cylinder"])
 def test_prescribed_gap_does_not_depend_on_the_geometry(d, kind):
@@ -246,6 +249,7 @@ def test_a_body_that_touches_does_not_penetrate(caplog):
 # ---- bad input -----------------------------------------------------------------------------------
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("obstacle", "words"),
     [
@@ -275,6 +279,7 @@ def test_bad_obstacle_in_the_plane(obstacle, words):
     )
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("obstacle", "words"),
     [

@@ -124,6 +124,7 @@ def loaded(pair: Pair, along: float) -> None:
     pair.place(pair.pressed(pair.wobbled(0.013, 2), 0.045, along) @ turn(d, 1.1).T)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("along", [0.004, 0.08])
 @pytest.mark.parametrize(("cell", "degree"), [*((c, 1) for c in CELLS), ("triangle", 2)])
@@ -334,6 +335,7 @@ def _crossed(pair):
     return TunnellingCheck([pair.contact]).evaluate(pair.before)["contact"].crossed
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 @pytest.mark.parametrize(
     ("ways", "through"),
@@ -353,6 +355,7 @@ def test_points_that_go_through_a_body_are_seen(cell, ways, through):
     assert (_crossed(pair) is not None) == through
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 @pytest.mark.parametrize(
     ("ways", "through"),

@@ -43,6 +43,7 @@ def test_the_same_solution(cell, degree, k):
     assert close(*states, 1e-6)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize(
     "law",
     [

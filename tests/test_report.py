@@ -215,6 +215,7 @@ def alone():
     return made.problem, made.problem.solve(), None
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("scene", [space, bodies, finite, alone], ids=lambda f: f.__name__)
 def test_all_kinds(scene, tmp_path, curves):
     """In space, between bodies, at large displacements, and for a step that is not committed."""

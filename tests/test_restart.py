@@ -35,6 +35,7 @@ pytestmark = pytest.mark.mpi
 # ---- the same digits -----------------------------------------------------------------------------
 
 
+@pytest.mark.each
 @pytest.mark.parametrize(("update", "stop"), [("increment", 5), ("auto", 2), ("auto", 6)])
 @pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
@@ -90,6 +91,7 @@ def products() -> list[tuple]:
     return chosen if COMM.size == 1 else chosen[::4]
 
 
+@pytest.mark.each
 @pytest.mark.newest
 @pytest.mark.parametrize(("obstacle", "law", "how", "method", "extra"), products())
 def test_products(obstacle, law, how, method, extra, tmp_path):
@@ -320,6 +322,7 @@ def test_a_loop_that_was_left_goes_on(tmp_path):
     assert differences(made, whole, 1e-7) == []
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("obstacle", ["rigid", "body", "body, pairs found anew"])
 def test_results_of_a_finished_history(obstacle, enforcement, tmp_path):

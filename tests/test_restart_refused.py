@@ -63,6 +63,7 @@ OTHER = {
 }
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("other", OTHER)
 def test_changed_data_are_refused(other, saved):
     """Each is named with both values; the problem is as before, and goes on if it is told to."""
@@ -113,6 +114,7 @@ FIXED = {
 }
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("other", FIXED)
 def test_what_cannot_be_taken_over_is_refused_in_any_case(other, saved):
     """Other meshes, elements, points and histories have no place for the state."""
@@ -285,6 +287,7 @@ def spoilt(name):
     }[name]
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("how", ["nan", "complex", "single", "words", "scalar", "short", "none"])
 @pytest.mark.parametrize("what", ["nodes", "contact floor", "stiffness", "state", "numbers"])
 def test_arrays_that_are_none_of_a_state(what, how, saved):
@@ -378,6 +381,7 @@ def test_increments_that_are_never_asked_for(caplog):
     assert made.problem.increment == 1
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

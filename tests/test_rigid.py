@@ -32,6 +32,7 @@ def test_inside_and_outside_of_a_cone(m):
         assert unbalanced(rays, outside) >= 0.99 * (w @ outside) / np.abs(w).max()
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("needed", range(7))
 def test_one_ray_of_many_balances(needed):
     """Some of many rays are tried first; the only one that makes the force may be any of them.

@@ -117,6 +117,7 @@ def places(points, n=600):
     return np.concatenate([wide, near])
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("name", SURFACES)
 def test_distance_and_sign(name):
     """Against all facets one by one, and the winding number: round-off, 1e-12."""
@@ -131,6 +132,7 @@ def test_distance_and_sign(name):
     assert surface.facets.closed
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("name", [*SURFACES, "profile", "extruded", "turned"])
 def test_normal_and_curvature_are_derivatives(name):
     """Against central differences over h = 1e-6, where these stay on one facet, edge or corner.
@@ -339,6 +341,7 @@ def test_stl_files(binary, tmp_path):
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("make", "text"),
     [

@@ -39,6 +39,7 @@ def pressed(stiffness: float, carried: float, **options) -> tuple[Array, fc.Step
     return step.contacts["joint"].force, step
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("options", WAYS, ids=["condensed", "lbfgs", "newton"])
 @pytest.mark.parametrize(
     ("stiffness", "carried"), [(1e6, 10.0), (1e8, 10.0), (1e9, 10.0), (1e12, 0.3)]

@@ -59,6 +59,7 @@ def forces(shape, length, *, quadrature=None, degree=1, **options):
     return np.array(found), contact
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("length", [1.0, 2.0])
 @pytest.mark.parametrize("shape", ["cylinder", "ball", "profile"])

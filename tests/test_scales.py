@@ -52,6 +52,7 @@ def touched_again(level, small, *, accuracy=None, cell="triangle", **options):
     return found, np.finfo(float).eps * E * left
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("accuracy", [None, "draft", "standard", "fine"])
 @pytest.mark.parametrize("level", [10.0, 1e3, 1e7, 1e10])
 def test_a_light_touch_after_a_heavy_one(level, accuracy):
@@ -145,6 +146,7 @@ def beside(ratio, *, one_contact=False, joined=False, friction=0.5, **options):
     return loads, found, step
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("one_contact", [False, True])
 @pytest.mark.parametrize("method", [None, "lbfgs", "newton"])
 @pytest.mark.parametrize("ratio", [1e3, 1e4, 1e8])
@@ -201,6 +203,7 @@ def test_a_soft_body_beside_a_stiff_one(condensation):
 # ---- numbers that are none -----------------------------------------------------------------------
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("place", ["residual", "force", "tolerance"])
 def test_what_is_not_finite_does_not_pass(place, value):

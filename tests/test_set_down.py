@@ -84,6 +84,7 @@ def obstacle(scene, shape, gap):
     return fc.Ball(centre, 5.0, inside=True)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("bulk", BULKS)
 @pytest.mark.parametrize("shape", ["plane", "cylinder", "distance", "bowl"])
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])

@@ -226,6 +226,7 @@ def tilted(angle, how):
     return step.verdict.small_displacement_error["contact"], contact.resultants().force
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("how", ["expression", "function", "function on Γc", "profile"])
 def test_a_plane_tilted_by_its_displacement_is_no_plane(how):
     """The estimate is the difference to the tilted plane itself; none if shifted.

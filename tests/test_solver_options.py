@@ -195,6 +195,7 @@ def test_types_of_snes_that_work(kind, condensation):
     assert same_states(made, usual, 1e-6)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("kind", ["vinewtonrsls", "fas", "newton", "ksponly"])
 def test_types_of_snes_that_cannot_work(kind):
     """Some want bounds or a hierarchy, and without them end the program: refused by name."""

@@ -350,6 +350,7 @@ SLIDING = {
 }
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("kind", SLIDING)
 @pytest.mark.parametrize("cell", ["tetrahedron", "hexahedron"])
@@ -378,6 +379,7 @@ def test_sliding_aslant(cell, kind, method):
     assert {"cone", "slip", "dissipation"} <= set(step.verdict.laws["contact"])
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("what", "claim"),
     [("nothing", ""), ("metric", "slip"), ("friction", "cone"), ("modes", "dissipation")],

@@ -50,6 +50,7 @@ def test_ends_of_increments_as_given():
     assert made.push[0].value == 0.1
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("load", "steps", "word"),
     [

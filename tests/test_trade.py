@@ -16,6 +16,7 @@ pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="of one process"
 STUDY = ROOT / "docs" / "trade.csv"
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("name", trade_scenes.all_scenes())
 def test_references_meet_published_values(name: str) -> None:
     """References agree with published values within the tolerances of the demos.

@@ -449,6 +449,7 @@ def test_nothing_holds_a_smooth_roller():
 FLAT = {"point": (0, 1), "normal": (0, -1)}
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("rotation", "options", "error", "text"),
     [

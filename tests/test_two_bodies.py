@@ -440,6 +440,7 @@ def test_facets_over_which_the_opposite_ends_are_warned_of(cell, n, width) -> No
     assert forces[1] == pytest.approx(forces[2], rel=0.02)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("here", "there", "told"),
     [
@@ -490,6 +491,7 @@ def test_long_and_narrow_facets_are_counted_across(here, there, told) -> None:
     assert forces[0] == pytest.approx(forces[1], rel=0.01)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("kinematics", "solver", "method"),
     [

@@ -32,6 +32,7 @@ def same(results) -> None:
             assert close(field, first, 1e-9)
 
 
+@pytest.mark.each
 @pytest.mark.parametrize("condensation", CONDENSATION)
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
@@ -68,6 +69,7 @@ IN_SPACE = [
 ]
 
 
+@pytest.mark.each
 @pytest.mark.parametrize(("law", "method"), IN_SPACE)
 def test_in_space(law, method):
     """The same in space, with every surface of friction."""
@@ -94,6 +96,7 @@ def test_in_space(law, method):
     same(results)
 
 
+@pytest.mark.each
 @pytest.mark.skipif(COMM.size > 1, reason="equal meshes are not distributed equally")
 @pytest.mark.parametrize("condensation", CONDENSATION)
 @pytest.mark.parametrize("method", METHODS)

@@ -54,6 +54,7 @@ def test_the_changed_law_is_sound_when_nothing_is_changed():
     assert not any(s.verdict.failures for s in steps)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "what", ["cone", "friction bound", "stiffness", "adhesion", "penetration", "slip", "direction"]
 )

@@ -15,6 +15,7 @@ from verification.run import CASES
 pytestmark = pytest.mark.mpi
 
 
+@pytest.mark.each
 @pytest.mark.parametrize(
     "case",
     [
