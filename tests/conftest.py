@@ -53,21 +53,26 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the cases of parametrized tests that do not run by default as slow.
 
     The first and the last case run, which differ in all parameters; with ``@pytest.mark.each``
-    every value of each parameter, in as few cases; with ``@pytest.mark.whole`` all. What runs on
-    all kinds of cells is slow on hexahedra, whose forms take longest to compile, except in modules
-    marked ``hexahedra``.
+    every value of each parameter, in as few cases; with ``@pytest.mark.whole`` all. On several
+    ranks the last case runs. What runs on all kinds of cells is slow on hexahedra, whose forms take
+    longest to compile, except in modules marked ``hexahedra``.
     """
     cases = defaultdict(list)
     for item in items:
         values = getattr(item, "callspec", None)
-        if values is None or item.get_closest_marker("whole"):
+        if values is None or (item.get_closest_marker("whole") and MPI.COMM_WORLD.size == 1):
             continue
         if "hexahedron" in values.id.split("-") and not item.get_closest_marker("hexahedra"):
             item.add_marker(pytest.mark.slow)
         elif not item.get_closest_marker("slow"):
             cases[item.nodeid.partition("[")[0]].append(item)
     for those in cases.values():
-        kept = _each(those) if those[0].get_closest_marker("each") else [those[0], those[-1]]
+        if MPI.COMM_WORLD.size > 1:
+            kept = those[-1:]
+        elif those[0].get_closest_marker("each"):
+            kept = _each(those)
+        else:
+            kept = [those[0], those[-1]]
         for item in those:
             if item not in kept:
                 item.add_marker(pytest.mark.slow)

@@ -151,7 +151,6 @@ def test_scenes_that_were_wrong(entry):
 
 
 @pytest.mark.mpi
-@pytest.mark.whole
 @pytest.mark.parametrize("form", fuzz_scenes.FORMS[1:])
 def test_forms_are_written_in_many_ways(form):
     """Bodies of two materials, linear and of rubber, each form of them: as the one with E by cell.
@@ -598,6 +597,7 @@ def test_minimise_keeps_what_fails_and_nothing_else():
     assert found["bodies"][0]["n"] == [1, 1]
 
 
+@pytest.mark.slow
 @serial
 def test_a_campaign_goes_on_where_it_was_ended(tmp_path):
     path = tmp_path / "results.csv"
