@@ -115,7 +115,6 @@ def walk(law: str, stiffness: fc.RelativeStiffness, path=PATH, **options):
     return found, contact
 
 
-@pytest.mark.each
 @pytest.mark.skipif(COMM.size > 1, reason="of the laws; ranks are compared below")
 @pytest.mark.parametrize("law", LAWS)
 def test_limit_of_the_penalty(law: str) -> None:
