@@ -144,7 +144,9 @@ def test_every_picture_has_its_command() -> None:
         shown = [text for text in pages if picture.name in text]
         assert shown, picture
         for text in shown:
-            assert re.search(r"(python (demos|benchmarks|verification)|`docs/scripts)/\w+\.py", text), picture
+            assert re.search(
+                r"(python (demos|benchmarks|verification)|`docs/scripts)/\w+\.py", text
+            ), picture
 
 
 def documented() -> list[str]:

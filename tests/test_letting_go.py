@@ -105,7 +105,6 @@ def test_rubber_that_is_let_go_stays_in_any_units(cell, size):
     assert released <= 15
 
 
-@pytest.mark.each
 @pytest.mark.parametrize("bulk", BULKS)
 @pytest.mark.parametrize("friction", [0.02, 0.1])
 @pytest.mark.parametrize("n", [1, 2, 3])

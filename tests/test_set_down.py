@@ -14,7 +14,7 @@ from dolfinx import fem
 
 import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic, NeoHookean
-from scenes.blocks import BOTTOM, LEFT, TOP, block_mesh, dimension
+from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block_mesh, dimension
 from scenes.comparing import close, gathered
 from scenes.elasticity import displacement_space, hold
 from scenes.stacks import FLOOR, ROOF, joint, stack
@@ -396,3 +396,24 @@ def test_set_down_and_carried_at_once(first, slope, kinematics):
     assert abs(reference[2]) > 0.05
     for forces in found.values():
         assert close(forces, reference, 1e-6)
+
+
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+@pytest.mark.parametrize("bulk", BULKS)
+def test_a_floor_is_raised_into_a_block(bulk, kinematics):
+    """In the first increment, by less than the gap or by more: the block is held along x alone.
+
+    Nothing slips after first touch. Reference: the floor at rest, to 1e-6 of the forces.
+    """
+    found = []
+    for up in (0.0, 0.2, 0.5):
+        scene = Hovering("triangle", bulk, (0.0, -1.0))
+        mesh = scene.u.function_space.mesh
+        scene.bcs = [hold(scene.u, scene.tags, side, 0) for side in (LEFT, RIGHT)]
+        shift = fem.Constant(mesh, np.array([0.0, up]))
+        floor = fc.HalfSpace((0.0, -0.3), (0.2, 1.0), shift)
+        contact = scene.contact(floor, friction=0.2, kinematics=kinematics)
+        scene.problem(contact, small_displacement_tolerance=np.inf).solve()
+        resultants = contact.resultants()
+        found.append([*resultants.force, resultants.tangential_force])
+    assert close(found[1:], found[:1] * 2, 1e-6)

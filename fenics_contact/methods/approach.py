@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,6 +100,12 @@ class Approach:
         borne = full.contact_force_sizes(committed=finite)
         idle = (borne < _IDLE * load_size)[groups] & (not first)
         untouched = self._untouched()
+        if first:
+            here = full.state()
+            with self._at_start(before):
+                self._go(before)
+                untouched = np.union1d(untouched, self._untouched())
+            self._go(here)
         if len(untouched) < len(motions.free) and motions.turning:
             # An obstacle that turns freely is rolled by what its points slip, and first touch is a
             # point that does not tell.
@@ -187,19 +194,29 @@ class Approach:
         # led along by then: slip is counted from where its increment starts.
         of_bodies = motions.of_any_body()[which]
         if of_bodies.any() and any(contact.law.has_friction for contact in full.contacts):
-            self._go(before)
-            ways = [contact.opposite.way_back(contact.values) for contact in full.contacts]
-            with contextlib.ExitStack() as back:
-                for contact, way in zip(full.contacts, ways, strict=True):
-                    back.enter_context(contact.opposite.displaced(way))
+            with self._at_start(before):
                 self._go(np.where(full.constrained, before, aloft))
                 if self._rest(load, which):
-                    for contact, jumps in zip(
-                        full.contacts, self._felt(which[of_bodies])[1], strict=True
-                    ):
+                    felt = self._felt(which[of_bodies])[1]
+                    for contact, jumps in zip(full.contacts, felt, strict=True):
                         contact.set_down(_feeling(jumps))
             self._go(landed)
         self._follow_stiffness()
+
+    @contextlib.contextmanager
+    def _at_start(self, before: Array) -> Iterator[None]:
+        """Evaluate contacts with rigid obstacles where they were at the last commit. Collective.
+
+        Args:
+            before: As in `lead`.
+        """
+        self._go(before)
+        contacts = self._full.contacts
+        ways = [contact.opposite.way_back(contact.values) for contact in contacts]
+        with contextlib.ExitStack() as back:
+            for contact, way in zip(contacts, ways, strict=True):
+                back.enter_context(contact.opposite.displaced(way))
+            yield
 
     def _rest(self, load: Array, which: Index) -> bool:
         """Move bodies from here to where they rest, or to first touch. Collective.
