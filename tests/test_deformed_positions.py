@@ -725,3 +725,52 @@ def test_a_soft_contact_does_not_lose_the_other_body(tags):
         problem.commit()
     exact = 0.5 / (1 / k + 2 * (1 - 0.3**2) / E)
     assert contact.resultants().normal_force == pytest.approx(exact, rel=1e-3)
+
+
+@KINEMATICS
+@pytest.mark.parametrize("n", [(4, 4), (1, 1)])
+def test_a_block_whose_sides_are_tagged_slides_on_a_floor(n, kinematics):
+    """By a fifth of its width in one increment: its corner enters nothing but the floor.
+
+    Reference: friction μ N in full slip, to 1e-9.
+    """
+    axes = [[np.linspace(0.0, 1.0, n[0] + 1), np.linspace(0.0, 0.5, n[1] + 1)]]
+    tags = {BOTTOM: near(1, 0.0), TOP: near(1, 0.5), SIDES: either(near(0, 0.0), near(0, 1.0))}
+    body = Bodies(boxes(axes, tags), E, 0.3)
+    down, along = body.constant(-1e-3), body.constant()
+    body.hold(TOP, 1, value=down)
+    body.hold(TOP, 0, value=along)
+    surface = fc.ContactSurface(body.mesh, body.tags, [BOTTOM, SIDES])
+    floor = fc.HalfSpace((0.0, 0.0), (0.0, 1.0))
+    contact = fc.Contact(body.u, surface, floor, fc.Coulomb(0.3), kinematics=kinematics)
+    problem = body.problem(contact)
+    for along.value in (0.0, 0.2):
+        problem.solve()
+        problem.commit()
+    force = contact.resultants().force
+    assert -force[0] == pytest.approx(0.3 * force[1], rel=1e-9)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_a_roller_goes_past_the_end_of_a_block_and_back(n):
+    """Whose bottom and end are tagged, at a depth far below the size of a facet.
+
+    Reference: the forces on the way out, to 1e-6: without friction it goes back through them.
+    """
+    axes = [[np.linspace(0.0, 1.0, n + 1), np.linspace(0.0, 1.0, n + 1)]]
+    tags = {BOTTOM: near(1, 0.0), TOP: near(1, 1.0), SIDES: near(0, 1.0)}
+    body = Bodies(boxes(axes, tags, simplex=True), E, 0.3)
+    body.hold(TOP, 0, 1)
+    shift = body.constant((0.0, 0.01))
+    roller = fc.Ball((0.6, -0.3), 0.3, displacement=shift)
+    surface = fc.ContactSurface(body.mesh, body.tags, [BOTTOM, SIDES])
+    contact = fc.Contact(body.u, surface, roller, fc.Frictionless(), kinematics="finite")
+    problem = body.problem(contact)
+    forces = []
+    for way in [*np.arange(0.0, 1.3, 0.2), *np.arange(1.0, -0.1, -0.2)]:
+        shift.value[0] = way
+        problem.solve()
+        problem.commit()
+        forces.append(contact.resultants().force)
+    forces = np.array(forces)
+    assert np.abs(forces[:7] - forces[::-1][:7]).max() <= 1e-6 * np.abs(forces).max()

@@ -242,6 +242,25 @@ class Probe(Protocol):
         """Find the undeformed places, (n, gdim) (length), that crossed the opposite. Collective."""
 
 
+@dataclass(frozen=True)
+class _Surface:
+    """The flat pieces of Γc.
+
+    Attributes:
+        facets: Those of this rank, at rest.
+        allowed: Allowed depth below each of all, (n,) (length).
+        corner: Its first corner, (n, gdim) (length).
+        normal: Its outward unit normal, (n, gdim).
+        middle: Its middle on the undeformed Γc, (n, gdim) (length).
+    """
+
+    facets: MovingFacets
+    allowed: Array
+    corner: Array
+    normal: Array
+    middle: Array
+
+
 class RigidObstacleProbe:
     """Places of Γc in the frame of a rigid obstacle, at both ends of an increment.
 
@@ -394,10 +413,14 @@ class RigidObstacleProbe:
         for way in (aside, -aside):
             narrow &= self._sampler.sample(place + way)[0] >= 0
         some, place, inward = some[narrow], place[narrow], inward[narrow]
+        surface = self._surface(self.points, allowed) if self._comm.allreduce(len(some)) else None
         reach = allowed[some]
         while self._comm.allreduce(len(some)):
-            beyond = self._sampler.sample(place + reach[:, None] * inward)[0] < 0
+            assert surface is not None
+            tip = place + reach[:, None] * inward
+            beyond = self._sampler.sample(tip)[0] < 0
             beyond &= reach <= size[some] + allowed[some]
+            beyond &= ~self._is_shallow(tip, -inward, surface)
             some, place, inward = some[beyond], place[beyond], inward[beyond]
             reach = reach[beyond] + _DEPTH_RESOLUTION * size[some]
             depth[some] = reach
@@ -581,17 +604,49 @@ class RigidObstacleProbe:
         """
         if not self._comm.allreduce(int((through >= 0).any())):
             return self.x[:0]
+        surface = self._surface(field, allowed)
+        depth = -_dot(points - surface.corner[through], surface.normal[through])
+        rows = np.flatnonzero((through >= 0) & (depth > surface.allowed[through]))
+        normal = surface.normal[through[rows]]
+        depth, facet = self._below(points[rows], normal, 2 * depth[rows], surface.facets)
+        deep = (facet >= 0) & (depth > surface.allowed[facet])
+        deep &= ~self._is_shallow(points[rows], normal, surface)
+        return np.asarray(surface.middle[np.unique(facet[deep])])
+
+    def _surface(self, field: Array, allowed: Array) -> _Surface:
+        """Collect the flat pieces of Γc on all ranks. Collective.
+
+        Args:
+            field: The points of Γc in the frame of the obstacle, (n_points, gdim) (length).
+            allowed: Allowed depth at the places of this rank, (n_places,) (length).
+        """
         most: Array = np.zeros(len(self._places.size))
         np.maximum.at(most, self._facet, allowed)
         facets, middles = self._places.moving_facets(field, field), self._places.piece_middles()
         most = np.repeat(most, len(middles) // max(len(most), 1))
         table = np.column_stack([most, facets.start[:, 0], facets.normals(), middles])
         table = gather_rows(self._comm, table)
-        most, (corner, normal, middles) = table[:, 0], np.split(table[:, 1:], 3, axis=1)
-        depth = -_dot(points - corner[through], normal[through])
-        rows = np.flatnonzero((through >= 0) & (depth > most[through]))
-        depth, facet = self._below(points[rows], normal[through[rows]], 2 * depth[rows], facets)
-        return np.asarray(middles[np.unique(facet[(facet >= 0) & (depth > most[facet])])])
+        return _Surface(facets, table[:, 0], *np.split(table[:, 1:], 3, axis=1))
+
+    def _is_shallow(self, points: Array, normal: Array, surface: _Surface) -> Mask:
+        """Find points that are no deeper below some facet than is allowed there. Collective.
+
+        At an edge of the body what is deep below one face may have hardly entered the other one.
+        Faces opposite to the first one do not count: what is close to them has gone through.
+
+        Args:
+            points: (n, gdim) (length).
+            normal: Outward unit normal of the facet that each is deep below, (n, gdim).
+            surface: Γc.
+        """
+        depth = -np.einsum("nmd,md->nm", points[:, None] - surface.corner, surface.normal)
+        near = (depth >= 0) & (depth <= surface.allowed)
+        row, facet = np.nonzero(near & (normal @ surface.normal.T > _OPPOSITE_SIDES))
+        reach = 2 * depth[row, facet] + _DEPTH_RESOLUTION * surface.allowed[facet]
+        _, met = self._below(points[row], surface.normal[facet], reach, surface.facets)
+        found = np.zeros(len(points), dtype=np.bool_)
+        found[row[met == facet]] = True
+        return found
 
     def _below(
         self, points: Array, outward: Array, reach: Array, facets: MovingFacets
