@@ -417,3 +417,25 @@ def test_a_floor_is_raised_into_a_block(bulk, kinematics):
         resultants = contact.resultants()
         found.append([*resultants.force, resultants.tangential_force])
     assert close(found[1:], found[:1] * 2, 1e-6)
+
+
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+@pytest.mark.parametrize("bulk", BULKS)
+@pytest.mark.parametrize("gap", [0.0, 0.2])
+def test_a_floor_takes_a_block_along_as_it_lands(gap, bulk, kinematics):
+    """In one increment, by a tenth of its width: nothing else holds the block along x.
+
+    Reference: the same with the floor at rest, moved by the floor's displacement, to 1e-6.
+    """
+    found = []
+    for along in (0.0, 0.1):
+        scene = Hovering("quadrilateral", bulk, (0.0, -1.0))
+        shift = fem.Constant(scene.u.function_space.mesh, np.array([along, 0.0]))
+        floor = fc.HalfSpace((0.0, -gap), (0.0, 1.0), shift)
+        contact = scene.contact(floor, kinematics=kinematics)
+        scene.problem(contact, small_displacement_tolerance=np.inf).solve()
+        comm = scene.u.function_space.mesh.comm
+        place = gathered(comm, contact.own_displacement())[:, 0].mean() - along
+        found.append([place, contact.resultants().tangential_force])
+    assert found[0][1] > 0.1
+    assert close(found[1], found[0], 1e-6)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,10 @@ _ALONG = 0.05
 # How far bodies are set down into their obstacles, by the largest gap: round-off is to leave none
 # of the points that bear open, ten times the tolerance of the linear programme.
 _INTO = 1e-9
+# Gap, by the size of the mesh, up to which points touch what a body rests on.
+_TOUCHING = 1e-6
+# Part of a free motion, squared, that points must feel to take a body along: less is round-off.
+_SHARED = 1e-6
 # Relative sizes of motions at points, and of forces, that are none.
 _FELT = 1e-10
 # Where gaps are not linear in rigid motions a body is set down step by step, in the first of which
@@ -178,37 +182,65 @@ class Approach:
         """Move bodies that touch nothing to where they rest, or to first touch. Collective.
 
         Slip is counted from where they rest as the increment begins: before prescribed
-        displacements, those of obstacles among them, change.
+        displacements, those of obstacles among them, change. They go along with the obstacles on
+        which they rest then, and to where they rest at the end of the increment.
 
         Args:
             load: As in `lead`.
             before: As in `lead`.
             which: Numbers of their free motions.
         """
-        full, motions = self._full, self._motions
+        full = self._full
         aloft = full.state()
-        if not self._rest(load, which):
-            return
-        landed = full.state()
         # An obstacle pressed by a force comes to a body as one that is led there does, and may be
         # led along by then: slip is counted from where its increment starts.
-        of_bodies = motions.of_any_body()[which]
-        if of_bodies.any() and any(contact.law.has_friction for contact in full.contacts):
-            with self._at_start(before):
+        of_bodies = which[self._motions.of_any_body()[which]]
+        if len(of_bodies) and any(contact.law.has_friction for contact in full.contacts):
+            along = None
+            with self._at_start(before) as ways:
                 self._go(np.where(full.constrained, before, aloft))
                 if self._rest(load, which):
-                    felt = self._felt(which[of_bodies])[1]
-                    for contact, jumps in zip(full.contacts, felt, strict=True):
+                    along = self._along(which, ways)
+                    for contact, jumps in zip(full.contacts, self._felt(of_bodies)[1], strict=True):
                         contact.set_down(_feeling(jumps))
-            self._go(landed)
+            self._go(aloft)
+            if along is not None:
+                self._move(which, along)
+        self._rest(load, which)
         self._follow_stiffness()
 
+    def _along(self, which: Index, ways: Sequence[Array]) -> Array:
+        """How bodies go along with obstacles that they touch, at best. Collective.
+
+        Args:
+            which: Numbers of their free motions.
+            ways: For every contact the displacement of the obstacle, (n_points, gdim) (length).
+
+        Returns:
+            Coefficients of the free motions.
+        """
+        gram: Array = np.zeros((len(which), len(which)))
+        work: Array = np.zeros(len(which))
+        for contact, jumps, way in zip(
+            self._full.contacts, self._felt(which)[1], ways, strict=True
+        ):
+            touches = contact.values.opening <= _TOUCHING * self._full.scales.mesh_size
+            weights = np.where(contact.paired & touches, contact.measure, 0.0)
+            gram += np.einsum("mqd,q,nqd->mn", jumps, weights, jumps)
+            work += np.einsum("mqd,q,qd->m", jumps, weights, way)
+        comm = self._full.unknowns.comm
+        gram, work = global_sum(comm, gram), global_sum(comm, work)
+        return agreed(comm, np.linalg.lstsq(gram, work, rcond=_SHARED)[0])
+
     @contextlib.contextmanager
-    def _at_start(self, before: Array) -> Iterator[None]:
+    def _at_start(self, before: Array) -> Iterator[list[Array]]:
         """Evaluate contacts with rigid obstacles where they were at the last commit. Collective.
 
         Args:
             before: As in `lead`.
+
+        Yields:
+            For every contact the displacement of the obstacle, (n_points, gdim) (length).
         """
         self._go(before)
         contacts = self._full.contacts
@@ -216,7 +248,7 @@ class Approach:
         with contextlib.ExitStack() as back:
             for contact, way in zip(contacts, ways, strict=True):
                 back.enter_context(contact.opposite.displaced(way))
-            yield
+            yield ways
 
     def _rest(self, load: Array, which: Index) -> bool:
         """Move bodies from here to where they rest, or to first touch. Collective.
