@@ -154,6 +154,21 @@ def test_a_distance_that_is_no_number_is_refused(distance):
     raised_everywhere(problem.solve, fc.NotConverged, "is not a number")
 
 
+def test_an_obstacle_that_is_no_number_at_the_end_of_an_increment_is_refused():
+    """A bump that ends, moved aside from under a body that hovers over it: first touch is asked."""
+    scene = rubber(n=(4, 2), E=10.0)
+    shift = fem.Constant(scene.mesh, np.zeros(2))
+    bump = fc.SignedDistance(
+        lambda x: scene.height + 0.5 - x[1] - 0.4 * ufl.sqrt(1.0 - x[0] ** 2 / 9.0), shift
+    )
+    problem, _ = scene.problem(bump, fc.Coulomb(0.2))
+    for shift.value[0] in (0.5, 1.5):
+        problem.solve()
+        problem.commit()
+    shift.value[0] = 3.5
+    raised_everywhere(problem.solve, fc.NotConverged, "is not a number")
+
+
 def test_sliding_round_an_obstacle_is_no_passage():
     """Points that go a quarter of the way round a roller, outside of it or on it."""
     scene = rubber(n=(16, 4), E=10.0)

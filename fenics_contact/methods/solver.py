@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact import compat
@@ -605,7 +606,8 @@ class Solver:
             start: The state in which it starts, prescribed values as they were.
 
         Returns:
-            The state; None where the other contacts do not hold the bodies.
+            The state; None if the other contacts do not hold the bodies, or contact forces are
+            not finite.
         """
         full, present = self._full, self._full.state()
         moved = None
@@ -619,7 +621,10 @@ class Solver:
                     full.update_stiffness()
                 for contact in full.contacts:
                     contact.evaluate()
-                if not self.equations.is_constrained():
+                finite = bool(np.isfinite(self.system.contact_force()).all())
+                if not (
+                    self._comm.allreduce(finite, op=MPI.MIN) and self.equations.is_constrained()
+                ):
                     return None
                 closed = [contact.status != Status.OPEN for contact in full.contacts]
                 springs = [c.springs(s, s) for c, s in zip(full.contacts, closed, strict=True)]
