@@ -12,7 +12,7 @@ from fenics_contact.elasticity import NeoHookean
 from scenes import rubbed
 from scenes.blocks import BOTTOM, LEFT, TOP, block_mesh
 from scenes.elasticity import displacement_space, hold
-from verification.extreme_finite import turned_with_all
+from verification.extreme_finite import rotated_together
 
 pytestmark = pytest.mark.two_ranks
 
@@ -195,6 +195,6 @@ def test_a_body_led_round_with_its_tool_takes_few_steps():
     The first guess follows body and tool, 228 steps; by the body alone, as if the tool stayed
     behind, 335, and where it did not follow tools at all 344.
     """
-    steps, error = turned_with_all(36)("newton")
+    steps, error = rotated_together(36)("newton")
     assert error < 1e-9
     assert sum(step.iterations for step in steps) <= 250
