@@ -39,6 +39,8 @@ _PREDICTED_DEPTH, _PREDICTED_UNRESISTED = 0.15, 0.05
 _DEPTH_RESOLUTION = 0.02
 # Cosine of the angle between the normals of opposite sides of an obstacle: 120 degrees and more.
 _OPPOSITE_SIDES = -0.5
+# Cosine of the angle between the normals of two faces that meet at an edge: 60 degrees and more.
+_EDGE = 0.5
 # Rotation (radians), and round-off, over which the displacement is taken as linear in time.
 _LINEAR_ROTATION = np.pi / 2 + 1e-9
 # Bisections of a path at the place where the normal turns to the opposite side.
@@ -629,7 +631,7 @@ class RigidObstacleProbe:
         return _Surface(facets, table[:, 0], *np.split(table[:, 1:], 3, axis=1))
 
     def _is_shallow(self, points: Array, normal: Array, surface: _Surface) -> Mask:
-        """Find points that are no deeper below some facet than is allowed there. Collective.
+        """Find points that are no deeper below another face than is allowed there. Collective.
 
         At an edge of the body what is deep below one face may have hardly entered the other one.
         Faces opposite to the first one do not count: what is close to them has gone through.
@@ -641,7 +643,8 @@ class RigidObstacleProbe:
         """
         depth = -np.einsum("nmd,md->nm", points[:, None] - surface.corner, surface.normal)
         near = (depth >= 0) & (depth <= surface.allowed)
-        row, facet = np.nonzero(near & (normal @ surface.normal.T > _OPPOSITE_SIDES))
+        cosine = normal @ surface.normal.T
+        row, facet = np.nonzero(near & (cosine > _OPPOSITE_SIDES) & (cosine < _EDGE))
         reach = 2 * depth[row, facet] + _DEPTH_RESOLUTION * surface.allowed[facet]
         _, met = self._below(points[row], surface.normal[facet], reach, surface.facets)
         found = np.zeros(len(points), dtype=np.bool_)
