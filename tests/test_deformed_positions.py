@@ -203,22 +203,27 @@ def test_a_ball_moved_by_its_center_bears():
     assert min(forces[1]) > 0
 
 
+def refuse_pin(center, radius, ups, kinematics):
+    """A pin that is led up into a held block through these displacements is refused at one."""
+    body = block(n=(4, 2))
+    up = body.constant(np.zeros(2))
+    body.hold(TOP, 0, 1)
+    pin = fc.Ball(center, radius, displacement=up)
+    contact = body.contact(BOTTOM, pin, fc.Frictionless(), kinematics=kinematics)
+    problem = body.problem(contact)
+    with pytest.raises(fc.NotConverged):
+        for up.value[1] in ups:
+            problem.solve()
+            problem.commit()
+
+
 @pytest.mark.each
 @KINEMATICS
 @pytest.mark.parametrize("at", [0.07, 0.3, 0.55])
 @pytest.mark.parametrize("steps", [1, 2, 4])
 def test_a_pin_does_not_pass_between_places(steps, at, kinematics):
     """Of the radius 0.01, led 0.6 into facets of 0.25: no place of these is in it at either end."""
-    body = block(n=(4, 2))
-    up = body.constant(np.zeros(2))
-    body.hold(TOP, 0, 1)
-    pin = fc.Ball((at, -0.03), 0.01, displacement=up)
-    contact = body.contact(BOTTOM, pin, fc.Frictionless(), kinematics=kinematics)
-    problem = body.problem(contact)
-    with pytest.raises(fc.NotConverged):
-        for up.value[1] in np.linspace(0.0, 0.6, steps + 1)[1:]:
-            problem.solve()
-            problem.commit()
+    refuse_pin((at, -0.03), 0.01, np.linspace(0.0, 0.6, steps + 1)[1:], kinematics)
 
 
 @pytest.mark.each
@@ -227,16 +232,7 @@ def test_a_pin_does_not_pass_between_places(steps, at, kinematics):
 @pytest.mark.parametrize("far", [0.03, 0.4])
 def test_a_pin_thinner_than_what_is_allowed_does_not_pass_slowly(far, at, kinematics):
     """Of the diameter 0.008, into a facet of 0.25, by less than is allowed there; then far."""
-    body = block(n=(4, 2))
-    up = body.constant(np.zeros(2))
-    body.hold(TOP, 0, 1)
-    pin = fc.Ball((at, -0.005), 0.004, displacement=up)
-    contact = body.contact(BOTTOM, pin, fc.Frictionless(), kinematics=kinematics)
-    problem = body.problem(contact)
-    with pytest.raises(fc.NotConverged):
-        for up.value[1] in [0.002, 0.004, 0.006, 0.008, 0.01, 0.012, far]:
-            problem.solve()
-            problem.commit()
+    refuse_pin((at, -0.005), 0.004, [0.002, 0.004, 0.006, 0.008, 0.01, 0.012, far], kinematics)
 
 
 @KINEMATICS

@@ -37,6 +37,9 @@ __all__ = ["OpposingBodyProbe", "RigidObstacleProbe", "Tunnelling", "TunnellingC
 _PREDICTED_DEPTH, _PREDICTED_UNRESISTED = 0.15, 0.05
 # Penetration, as a share of the facet, that two quadrature rules may differ by.
 _DEPTH_RESOLUTION = 0.02
+# The largest penetration, as a share of the facet, that places without resistance may have been
+# allowed at the last commit.
+_ALLOWED_BEFORE = _PREDICTED_DEPTH + _DEPTH_RESOLUTION
 # Cosine of the angle between the normals of opposite sides of an obstacle: 120 degrees and more.
 _OPPOSITE_SIDES = -0.5
 # Cosine of the angle between the normals of two faces that meet at an edge: 60 degrees and more.
@@ -474,7 +477,7 @@ class RigidObstacleProbe:
         # what is inside of the body was outside, or inside by what was allowed.
         changed = not np.array_equal(self._sampler.committed_shape, self._shape)
         inside = _dot(toward, self._outward(self._facet, field_end)) < 0
-        before = np.where(inside, (_PREDICTED_DEPTH + _DEPTH_RESOLUTION) * size, 0.0)
+        before = np.where(inside, _ALLOWED_BEFORE * size, 0.0)
         near = changed | ~(distance_end > way + angle * radius + before)
         # A diverged state is not finite, and is refused for its residual.
         near = np.flatnonzero(near & np.isfinite(way) & np.isfinite(distance_end))
@@ -518,7 +521,7 @@ class RigidObstacleProbe:
     def _entered_before(
         self, points: Array, facet: Index, outward: Array, some: Mask, field: Array
     ) -> Index:
-        """Through which flat piece of Γc, of those of all ranks, points entered before. Collective.
+        """Find the flat pieces of Γc through which points entered the body before. Collective.
 
         Args:
             points: Of the obstacle, in its frame, (n, gdim) (length).
@@ -528,13 +531,13 @@ class RigidObstacleProbe:
             field: The points of Γc in that frame, (n_points, gdim) (length).
 
         Returns:
-            (n,), -1 for points that are outside, or below another surface of a thin body.
+            Their numbers among those of all ranks, (n,); -1 for points that are outside, or below
+            another surface of a thin body.
         """
         found = np.full(len(points), -1)
         if self._comm.allreduce(int(some.any())):
             size, height = self._places.size[facet[some]], self._places.facets.heights()
-            reach = (_PREDICTED_DEPTH + _DEPTH_RESOLUTION) * size
-            reach = np.minimum(reach, height[facet[some]] / 2)
+            reach = np.minimum(_ALLOWED_BEFORE * size, height[facet[some]] / 2)
             facets = self._places.moving_facets(field, field)
             _, found[some] = self._below(points[some], outward[some], reach, facets)
         return found

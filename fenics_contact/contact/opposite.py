@@ -341,10 +341,11 @@ class Opposite(ABC):
         """Directions in the frame of the history, as they are in space: (n_points, gdim)."""
         return vectors
 
-    def way_back(self, values: PointValues) -> Array:
-        """From where points are to where they were, as seen from the obstacle, (n_points, gdim).
+    def committed_offset(self, values: PointValues) -> Array:
+        """Return the offset from the points to their committed places relative to the obstacle.
 
-        At the committed ``u`` it is the displacement of a rigid obstacle since the last commit.
+        At the committed ``u`` it is the displacement of a rigid obstacle since the last commit,
+        (n_points, gdim) (length).
 
         Args:
             values: Of the last evaluation.

@@ -106,7 +106,7 @@ class Approach:
         untouched = self._untouched()
         if first:
             here = full.state()
-            with self._at_start(before):
+            with self._obstacles_at_start(before):
                 self._go(before)
                 untouched = np.union1d(untouched, self._untouched())
             self._go(here)
@@ -197,20 +197,22 @@ class Approach:
         of_bodies = which[self._motions.of_any_body()[which]]
         if len(of_bodies) and any(contact.law.has_friction for contact in full.contacts):
             along = None
-            with self._at_start(before) as ways:
+            with self._obstacles_at_start(before) as ways:
                 self._go(np.where(full.constrained, before, aloft))
-                if self._rest(load, which):
-                    along = self._along(which, ways)
+                if self._find_rest_position(load, which):
+                    along = self._fit_obstacle_motion(which, ways)
                     for contact, jumps in zip(full.contacts, self._felt(of_bodies)[1], strict=True):
                         contact.set_down(_feeling(jumps))
             self._go(aloft)
             if along is not None:
                 self._move(which, along)
-        self._rest(load, which)
+        self._find_rest_position(load, which)
         self._follow_stiffness()
 
-    def _along(self, which: Index, ways: Sequence[Array]) -> Array:
-        """How bodies go along with obstacles that they touch, at best. Collective.
+    def _fit_obstacle_motion(self, which: Index, ways: Sequence[Array]) -> Array:
+        """Fit free motions to the motion of the obstacles that bodies touch. Collective.
+
+        Least squares over the points in touch.
 
         Args:
             which: Numbers of their free motions.
@@ -233,7 +235,7 @@ class Approach:
         return agreed(comm, np.linalg.lstsq(gram, work, rcond=_SHARED)[0])
 
     @contextlib.contextmanager
-    def _at_start(self, before: Array) -> Iterator[list[Array]]:
+    def _obstacles_at_start(self, before: Array) -> Iterator[list[Array]]:
         """Evaluate contacts with rigid obstacles where they were at the last commit. Collective.
 
         Args:
@@ -244,13 +246,13 @@ class Approach:
         """
         self._go(before)
         contacts = self._full.contacts
-        ways = [contact.opposite.way_back(contact.values) for contact in contacts]
+        ways = [contact.opposite.committed_offset(contact.values) for contact in contacts]
         with contextlib.ExitStack() as back:
             for contact, way in zip(contacts, ways, strict=True):
                 back.enter_context(contact.opposite.displaced(way))
             yield ways
 
-    def _rest(self, load: Array, which: Index) -> bool:
+    def _find_rest_position(self, load: Array, which: Index) -> bool:
         """Move bodies from here to where they rest, or to first touch. Collective.
 
         Args:

@@ -59,7 +59,7 @@ class FirstTouch:
         full.set_state(start)
         for contact in contacts:
             contact.evaluate()
-        ways = [contact.opposite.way_back(contact.values) for contact in contacts]
+        ways = [contact.opposite.committed_offset(contact.values) for contact in contacts]
         apart = [
             n for n, given in enumerate(zip(contacts, ways, strict=True)) if self._is_apart(*given)
         ]

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact import compat
@@ -31,6 +30,7 @@ from fenics_contact.methods.primal_dual import PrimalDual
 from fenics_contact.methods.quasi_newton import QuasiNewton
 from fenics_contact.methods.rounds import INNER, solve_in_rounds
 from fenics_contact.methods.starts import Starts
+from fenics_contact.parallel import global_max
 from fenics_contact.systems import linear
 from fenics_contact.systems.choice import linear_kind, reason_not_to_condense
 from fenics_contact.systems.condensed import CondensedSystem
@@ -621,10 +621,8 @@ class Solver:
                     full.update_stiffness()
                 for contact in full.contacts:
                     contact.evaluate()
-                finite = bool(np.isfinite(self.system.contact_force()).all())
-                if not (
-                    self._comm.allreduce(finite, op=MPI.MIN) and self.equations.is_constrained()
-                ):
+                largest = global_max(self._comm, np.abs(self.system.contact_force()))
+                if not (np.isfinite(largest) and self.equations.is_constrained()):
                     return None
                 closed = [contact.status != Status.OPEN for contact in full.contacts]
                 springs = [c.springs(s, s) for c, s in zip(full.contacts, closed, strict=True)]
