@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,13 +26,14 @@ from fenics_contact.checks.given import (
 from fenics_contact.checks.judge import Judge
 from fenics_contact.checks.step import Step
 from fenics_contact.checks.verdict import Attempt, NotConverged, Verdict
-from fenics_contact.contact.contact import Contact, Found
+from fenics_contact.contact.contact import Contact
 from fenics_contact.methods.approach import Approach
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
 from fenics_contact.methods.first_touch import FirstTouch
 from fenics_contact.methods.load_balance import LoadBalance
 from fenics_contact.methods.solver import Settings, Solver
 from fenics_contact.parallel import fail_together, global_max, warn
+from fenics_contact.state import State, Trial
 from fenics_contact.systems import linear
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.committed import CommittedState
@@ -51,34 +52,6 @@ logger = logging.getLogger("fenics_contact")
 
 # Outcome of an attempt that retained too few unknowns.
 _SPREADS = "contact spreads beyond the retained dofs"
-
-
-@dataclass(frozen=True)
-class _Solved:
-    """What `ContactProblem.solve` found, until it is committed or dropped.
-
-    Attributes:
-        state: This rank's unknowns; where u is behind, those that are not.
-        contacts: The state of every contact.
-    """
-
-    state: Array
-    contacts: list[Found]
-
-
-@dataclass(frozen=True)
-class _Balance:
-    """What goes with a state of the unknowns.
-
-    Attributes:
-        load: External forces at this rank's unknowns (force).
-        energy: Forces and energies there.
-        pending: What brings up the rest of u, where that is behind; None: it is not.
-    """
-
-    load: Array
-    energy: EnergyState
-    pending: Array | None = None
 
 
 class ContactProblem:
@@ -201,7 +174,6 @@ class ContactProblem:
             linear.warn_of_slow_blas()
         self.u = u
         self.bulk = Bulk(F, self.displacement)
-        self.increment = 0
         self.prefix = prefix
         self._comm = u.function_space.mesh.comm
         n_motions = sum(len(contact.motions) for contact in self.contacts)
@@ -236,17 +208,12 @@ class ContactProblem:
         self._judge = Judge(self.full, self.motions, tolerance=tolerance, cross_check=cross_check)
         self.solver = Solver(self.full, self.motions, settings)
 
-        # The present state, and the committed one: unknowns (the present ones are those of u), what
-        # goes with them, and how far the last increment moved them.
-        self._committed = self.full.state()
         self._approach = Approach(self.full, self.motions)
         self._first_touch = FirstTouch(self.full)
         for contact in self.contacts:
             contact.evaluate()
-        self._commits = [contact.commits for contact in self.contacts]
-        self._now = self._then = self._loaded() if any(self._commits) else self._unloaded()
-        self._rate: Array | None = None
-        self._solved: _Solved | None = None
+        self.state = self._initial_state()
+        self._trial: Trial | None = None
         self._fresh = True  # nothing was solved yet
         self._told = False  # of an increment that was not committed
 
@@ -262,20 +229,29 @@ class ContactProblem:
         self._balance.check_constraints(self.operators)
         self.bulk.note_data()
 
-    def _unloaded(self) -> _Balance:
-        """That of a body at rest."""
-        nothing = Forces.none(self._committed, self.full.label)
-        forces: dict[object, Forces] = {self.full.mark: nothing}
-        load: Array = np.zeros(self.unknowns.n_local)
-        return _Balance(load, EnergyState.unloaded(forces, self.contacts))
+    def _initial_state(self) -> State:
+        """Return a body at rest, or the state that another problem has left. Collective."""
+        unknowns, mark = self.full.state(), self.full.mark
+        contacts = tuple(contact.state for contact in self.contacts)
+        if any(state.commits for state in contacts):
+            load = self.present_load()
+            self.full.begin(load)
+            bulk = self.full.with_obstacles(self.bulk.assemble_residual())
+            forces: dict[object, Forces] = {mark: self.full.present_forces(bulk)}
+            return State(unknowns, contacts, load, EnergyState.at(forces, self.contacts))
+        forces = {mark: Forces.none(unknowns, self.full.label)}
+        energy = EnergyState.unloaded(forces, self.contacts)
+        return State(unknowns, contacts, np.zeros_like(unknowns), energy)
 
-    def _loaded(self) -> _Balance:
-        """That of the state that another problem has left. Collective."""
-        load = self.present_load()
-        self.full.begin(load)
-        bulk = self.full.with_obstacles(self.bulk.assemble_residual())
-        forces: dict[object, Forces] = {self.full.mark: self.full.present_forces(bulk)}
-        return _Balance(load, EnergyState.at(forces, self.contacts))
+    @property
+    def increment(self) -> int:
+        """Number of committed increments."""
+        return self.state.increment
+
+    @property
+    def _present(self) -> State | Trial:
+        """The state that u is of: solved and not committed, or committed."""
+        return self._trial or self.state
 
     @property
     def snes(self) -> PETSc.SNES:
@@ -336,12 +312,12 @@ class ContactProblem:
     @property
     def load(self) -> Array:
         """External forces of the last solve at this rank's unknowns (force)."""
-        return self._now.load
+        return self._present.load
 
     @property
     def committed_energy(self) -> EnergyState:
         """Forces and energies at the last commit, the start of the increment's energy balance."""
-        return self._then.energy
+        return self.state.energy
 
     def present_state(self) -> Array:
         """Return a copy of this rank's present unknowns (length). Collective.
@@ -369,7 +345,7 @@ class ContactProblem:
             then the right-hand side is the present residual.
         """
         self.complete()
-        with self.solver.linearised(springs, self._now.load) as solve:
+        with self.solver.linearised(springs, self._present.load) as solve:
             yield solve
 
     # ---- solving ---------------------------------------------------------------------------------
@@ -400,17 +376,19 @@ class ContactProblem:
         """
         start = time.perf_counter()
         self._check_committed()
+        self._check_histories()
         first, self._fresh = self._fresh, False
         if first:
             for contact in self.contacts:
                 contact.begin()
+            self.state = replace(self.state, contacts=tuple(c.state for c in self.contacts))
             if not self.bulk.linear:  # whose tangent is that of u, and E may be another by now
                 self._modulus.measure()
-        behind = self._now.pending is not None or self._then.pending is not None
+        behind = any(state.interior is not None for state in (self._present, self.state))
         if behind and not self.solver.is_current():
             self._complete_all()  # what it takes is about to go
         self.solver.equations.factorisations = 0
-        saved, diagonal = (self.full.state(), self._now), self.full.diagonal.copy()
+        start_unknowns, diagonal = self.full.state(), self.full.diagonal.copy()
         try:
             # A trial of a line search may overflow, and the convergence test and the verdict see
             # it: a warning, on the rank that has the point, must not become an error there alone.
@@ -422,13 +400,13 @@ class ContactProblem:
                         step = self._solve(start, ahead, recover_interior, tried)
                     # Outside, lest a SNES that is made anew takes its options for the caller's.
                     if step is None:
-                        self._go_back(*saved)
+                        self._go_back(start_unknowns)
                         spread = sum(attempt.outcome == _SPREADS for attempt in tried)
                         self.solver.change(anew=spread <= 1)
                 release_interrupt()
         except BaseException as error:
             fail_together(self._comm, error)
-            self._go_back(*saved)
+            self._go_back(start_unknowns)
             if not self.bulk.linear:  # that of cells near collapse would excuse any residual
                 self.full.diagonal = diagonal
             if not isinstance(error, NotConverged | ValueError):
@@ -442,7 +420,7 @@ class ContactProblem:
     def _check_committed(self) -> None:
         """Warn, once, where an increment with friction is solved and the last is no history."""
         friction = any(contact.law.has_friction for contact in self.contacts)
-        if self._solved is None or self._told or not friction:
+        if self._trial is None or self._told or not friction:
             return
         self._told = True
         warn(
@@ -451,13 +429,23 @@ class ContactProblem:
             "from the same state: call commit() to accept an increment, or restore() to discard it",
         )
 
-    def _go_back(self, state: Array, balance: _Balance) -> None:
-        """To where the increment starts: committed, or solved and not committed. Collective."""
-        self._now = balance
-        self.full.set_state(state)
-        found = [None] * len(self.contacts) if self._solved is None else self._solved.contacts
-        for contact, solved in zip(self.contacts, found, strict=True):
-            contact.restore(solved)
+    def _check_histories(self) -> None:
+        """Raise a ValueError if a contact was committed elsewhere since the last commit."""
+        for contact, state in zip(self.contacts, self.state.contacts, strict=True):
+            if contact.state.commits != state.commits:
+                raise ValueError(
+                    f"{contact.name}: its history was committed by another problem or by "
+                    "Contact.commit() since this problem's last commit, so that this problem "
+                    "cannot continue; create a new ContactProblem with these contacts and the "
+                    "present u"
+                )
+
+    def _go_back(self, unknowns: Array) -> None:
+        """Restore u, and the contacts of the trial or of the last commit. Collective."""
+        self.full.set_state(unknowns)
+        trials = [None] * len(self.contacts) if self._trial is None else self._trial.contacts
+        for contact, trial in zip(self.contacts, trials, strict=True):
+            contact.restore(trial)
 
     def _solve(self, start: float, ahead: float, field: bool, tried: list[Attempt]) -> Step | None:
         """`solve`; None if it takes other unknowns than are kept. Collective.
@@ -484,7 +472,7 @@ class ContactProblem:
         solver.update_system(stiffness_changed)
         self.full.scales.begin(self.operators)
         solver.system.begin(load)
-        solver.equations.began = self._committed
+        solver.equations.began = self.state.unknowns
         led = np.where(self.constrained, before, self.full.state())
         self._first_touch.count_slip(led, solver.end_without)
         solver.starts.carried = self._approach.carried
@@ -493,14 +481,14 @@ class ContactProblem:
         with solver.system.acting():
             reason, attempts, rounds = solver.solve(
                 ahead=ahead,
-                rate=self._rate,
+                rate=self.state.change,
                 cold=cold,
                 stiffness_changed=stiffness_changed,
-                load_before=self._then.load,
+                load_before=self.state.load,
             )
         # Points outside of what is kept have to be looked at, and it takes all of u to do so.
         lags = not field and not solver.system.confined and self._may_lag()
-        pending = solver.system.pending_field if lags else None
+        interior = solver.system.pending_field if lags else None
         if not lags:
             solver.system.complete(solver.system.pending_field)
         for contact in self.contacts:
@@ -511,15 +499,14 @@ class ContactProblem:
         tried += attempts
         kinematics = reason > 0  # a solver that failed may have no factors for it
         if lags:
-            self._begin_energy_kept()
+            self._begin_condensed_energy()
             verdict, energies = self._judge_kept(kinematics=kinematics)
         else:
             assemble = field or not solver.system.confined
             verdict, energies = self._judge_all(kinematics=kinematics, assemble=assemble)
-        self._now = _Balance(load, energies, pending)
         if reason <= 0 or verdict.failures:
             raise self._not_converged(reason, verdict, tried)
-        energy = energies.since(self._then.energy, self.contacts, self.full.scales)
+        energy = energies.since(self.state.energy, self.contacts, self.full.scales)
         verdict = replace(verdict, friction_energy_gain=energy.friction_energy_gain)
         if verdict.failures:
             raise self._not_converged(reason, verdict, tried)
@@ -527,8 +514,8 @@ class ContactProblem:
         self._judge.warn_of_round_off(verdict)
         self._judge.warn_of_few_points()
         loaded = [verdict.equations[contact.name].is_loaded for contact in self.contacts]
-        found = [c.found(is_loaded=some) for c, some in zip(self.contacts, loaded, strict=True)]
-        self._solved = _Solved(self.full.state(), found)
+        trials = (c.trial(is_loaded=some) for c, some in zip(self.contacts, loaded, strict=True))
+        self._trial = Trial(self.full.state(), tuple(trials), load, energies, interior)
         return Step(
             increment=self.increment + 1,
             reason=reason,
@@ -563,14 +550,16 @@ class ContactProblem:
             return False
         if any(contact.opposite.pairs_anew for contact in self.contacts):
             return False
-        if self.solver.system.mark in self._then.energy.forces:
+        if self.solver.system.mark in self.state.energy.forces:
             return True
-        return self.increment == 0 and not self._comm.allreduce(int(self._committed.any()))
+        return self.increment == 0 and not self._comm.allreduce(int(self.state.unknowns.any()))
 
-    def _begin_energy_kept(self) -> None:
-        """Have the committed forces in the coordinates of the unknowns kept; at rest are none."""
-        nothing = Forces.none(np.zeros(1), np.zeros(1, dtype=np.intp))
-        self._then.energy.forces.setdefault(self.solver.system.mark, nothing)
+    def _begin_condensed_energy(self) -> None:
+        """Give the committed state its forces at the retained dofs: none, at rest."""
+        mark, energy = self.solver.system.mark, self.state.energy
+        if mark not in energy.forces:
+            nothing = Forces.none(np.zeros(1), np.zeros(1, dtype=np.intp))
+            self.state = replace(self.state, energy=energy.with_forces(mark, nothing))
 
     def complete(self) -> Verdict | None:
         """Recover the interior displacement of the increment solved last. Collective.
@@ -585,56 +574,46 @@ class ContactProblem:
         Raises:
             NotConverged: The equations do not hold on all unknowns.
         """
-        now = self._now
-        if now.pending is None:
+        present, is_committed = self._present, self._trial is None
+        if present.interior is None:
             return None
-        committed = self._then.pending is now.pending
-        if committed:
+        if is_committed:
             for contact in self.contacts:
                 contact.restore()
         before = self.full.state()
-        self.solver.system.complete(now.pending)
-        self.full.begin(now.load)
+        self.solver.system.complete(present.interior)
+        self.full.begin(present.load)
         verdict, forces = self._judged(self.full, self.full.product_force(), laws=False)
         if verdict.failures:
             self.full.set_state(before)
-            number = self.increment + (not committed)
+            number = self.increment + (not is_committed)
             reason = int(self.snes.getConvergedReason())
             raise NotConverged(number, reason, verdict, prefix=self.prefix)
-        self._now = replace(now, pending=None)
-        energy = self._then.energy if committed else now.energy
-        energy.forces[self.full.mark] = forces
-        if committed:
-            self._committed = self.full.state()
-            self._then = replace(self._then, pending=None)
-        elif self._solved is not None:
-            self._solved = replace(self._solved, state=self.full.state())
+        energy = present.energy.with_forces(self.full.mark, forces)
+        completed = replace(present, unknowns=self.full.state(), interior=None, energy=energy)
+        if isinstance(completed, State):
+            self.state = completed
+        else:
+            self._trial = completed
         return verdict
 
     def _complete_all(self) -> None:
         """Complete the present state, and the committed one if it is another. Collective."""
         self.complete()
-        if self._then.pending is None:
+        trial, unknowns = self._trial, self.full.state()
+        if trial is None or self.state.interior is None:
             return
-        state, now, solved = self.full.state(), self._now, self._solved
         try:
             self.restore()
             self.complete()
         finally:
-            self._solved = solved
-            self._go_back(state, now)
+            self._trial = trial
+            self._go_back(unknowns)
 
     def _check_before(self) -> Array:
         """Look at all that was given; the external forces (force). Collective."""
         self.bulk.check_finite()
-        for contact, commits in zip(self.contacts, self._commits, strict=True):
-            if contact.commits != commits:
-                raise ValueError(
-                    f"{contact.name}: its history was committed by another problem or by "
-                    "Contact.commit() since this problem's last commit, so that this problem "
-                    "cannot continue; create a new ContactProblem with these contacts and the "
-                    "present u"
-                )
+        for contact in self.contacts:
             contact.check_input()
         load = self.present_load()
         size = global_max(self._comm, np.abs(load))
@@ -682,7 +661,7 @@ class ContactProblem:
             rtol=equations.rtol,
             laws=laws,
             respond=self.solver.respond if kinematics else None,
-            before=self.full.displacement_at(self._committed) if laws else None,
+            before=self.full.displacement_at(self.state.unknowns) if laws else None,
         )
 
     @interrupts_held()
@@ -693,43 +672,42 @@ class ContactProblem:
         since. Without a solution since the last commit there is no effect. If the commit fails,
         the history is unchanged.
         """
-        if self._solved is None:
+        if self._trial is None:
             return
-        solutions = zip(self.contacts, self._solved.contacts, strict=True)
-        due = [contact.opposite.pairs_due(found.points) for contact, found in solutions]
+        trials = zip(self.contacts, self._trial.contacts, strict=True)
+        due = [contact.opposite.pairs_due(trial.points) for contact, trial in trials]
         if any(due):  # which takes all of u, whatever of it was wanted
             self.complete()
-            assert self._solved
-        solved, self._solved = self._solved, None
-        before = [c.committed() for c in self.contacts]
+        trial, start = self._trial, self.state
         try:
-            self.full.set_state(solved.state)
-            for contact, found in zip(self.contacts, solved.contacts, strict=True):
+            self.full.set_state(trial.unknowns)
+            for contact, found in zip(self.contacts, trial.contacts, strict=True):
                 contact.commit(found)
         except BaseException as error:
             fail_together(self._comm, error)
-            for contact, state in zip(self.contacts, before, strict=True):
-                contact.set_committed(state)
+            for contact, state in zip(self.contacts, start.contacts, strict=True):
+                contact.set_state(state)
             self.restore()
             raise
-        state = self.full.state()
-        self._rate = state - self._committed
-        self._committed = state
-        jumps = [contact.opposite.committed_jump for contact in self.contacts]
-        self._then = replace(self._now, energy=self._now.energy.between(jumps))
-        self._commits = [contact.commits for contact in self.contacts]
-        self.increment += 1
+        unknowns = self.full.state()
+        self.state = State(
+            unknowns=unknowns,
+            contacts=tuple(contact.state for contact in self.contacts),
+            load=trial.load,
+            energy=trial.energy.between([c.opposite.committed_jump for c in self.contacts]),
+            interior=trial.interior,
+            change=unknowns - start.unknowns,
+            increment=start.increment + 1,
+        )
+        self._trial = None
 
     def restore(self) -> None:
         """Discard an increment that was not committed: u is reset to the last commit. Collective.
 
         The history changes at `commit` only.
         """
-        self._solved = None
-        self.full.set_state(self._committed)
-        self._now = self._then
-        for contact in self.contacts:
-            contact.restore()
+        self._trial = None
+        self._go_back(self.state.unknowns)
 
     # ---- going on in another run -----------------------------------------------------------------
 
@@ -742,8 +720,8 @@ class ContactProblem:
             ValueError: The present state is not that of the last commit.
         """
         now = self.full.state()
-        differs = self._now.pending is not self._then.pending or not np.array_equal(
-            now, self._committed
+        differs = self._present.interior is not self.state.interior or not np.array_equal(
+            now, self.state.unknowns
         )
         if self._comm.allreduce(int(differs)):
             raise ValueError(
@@ -751,18 +729,19 @@ class ContactProblem:
                 "were changed; call commit() or restore() before saving the state"
             )
         self.complete()
-        forces = self._then.energy.forces[self.full.mark]
+        state = self.state
+        forces = state.energy.forces[self.full.mark]
         kept = np.zeros(self.unknowns.n_local, dtype=bool)
         if self.solver.condensed:
             kept[self.solver.system.unknowns.kept] = True
         return CommittedState(
-            state=self._committed,
-            rate=np.zeros(kept.size) if self._rate is None else self._rate,
+            state=state.unknowns,
+            rate=np.zeros(kept.size) if state.change is None else state.change,
             internal=forces.internal,
             external=forces.external,
             kept=kept,
             constrained=self.constrained,
-            increment=self.increment,
+            increment=state.increment,
             expected=self.expected_increments,
             pairs_anew=tuple(contact.opposite.pairs_anew for contact in self.contacts),
         )
@@ -821,31 +800,34 @@ class ContactProblem:
 
         Args:
             taken: The state.
-            points: For every contact, the history and values that `Contact.take_up` takes.
+            points: For every contact, the history and values that `Contact.load_restart` takes.
         """
         self.expected_increments = taken.expected
-        self._fresh, self._solved = False, None
+        self._fresh, self._trial = False, None
         self.solver.keep(np.flatnonzero(taken.kept).astype(np.int32))
-        self.increment = taken.increment
-        self._committed = taken.state.copy()
-        self._rate = taken.rate.copy() if taken.increment else None
         self.full.set_state(taken.state)
         load = self.present_load()
         self.full.begin(load)
         for contact, (history, values), anew in zip(
             self.contacts, points, taken.pairs_anew, strict=True
         ):
-            contact.take_up(history, values, anew=anew)
+            contact.load_restart(history, values, anew=anew)
         found = Forces(taken.state, taken.internal, taken.external, self.full.label)
         forces: dict[object, Forces] = {self.full.mark: found}
         energy = EnergyState.at(forces, self.contacts)
-        energy = energy.between([c.opposite.committed_jump for c in self.contacts])
-        self._now = self._then = _Balance(load, energy)
-        self._commits = [contact.commits for contact in self.contacts]
+        self.state = State(
+            unknowns=taken.state.copy(),
+            contacts=tuple(contact.state for contact in self.contacts),
+            load=load,
+            energy=energy.between([c.opposite.committed_jump for c in self.contacts]),
+            change=taken.rate.copy() if taken.increment else None,
+            increment=taken.increment,
+        )
         self.restart_solver()
 
     def restart_solver(self) -> None:
         """Discard what the solver stores from earlier increments. Collective."""
         self.solver.restart()
-        for mark in set(self._then.energy.forces) - {self.full.mark}:
-            del self._then.energy.forces[mark]
+        energy, mark = self.state.energy, self.full.mark
+        forces = {mark: energy.forces[mark]}
+        self.state = replace(self.state, energy=replace(energy, forces=forces))

@@ -21,6 +21,7 @@ ROOMS = [
     "contact",
     "systems",
     "checks",
+    "state",
     "methods",
     "problem",
     "results",

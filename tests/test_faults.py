@@ -310,15 +310,15 @@ def test_a_commit_fails():
     problem = made.problem
     before = snapshot(made)
     problem.solve()
-    update = made.contact.history.commit
+    update = made.contact.history.packed
 
     def broken(values):
         update(values)  # already written when it fails
         raise Fault("put in on purpose")
 
-    made.contact.history.commit = broken
+    made.contact.history.packed = broken
     raised_everywhere(problem.commit, Fault, "on purpose")
-    made.contact.history.commit = update
+    made.contact.history.packed = update
     assert identical(snapshot(made), before)
     assert problem.increment == 2
     goes_on(made, twin)

@@ -246,7 +246,7 @@ def spoiling(spoil):
         def spoiled():
             commit()
             values = {n: history.values(n) for n in history.names}
-            history.commit(values | spoil(history))
+            history.assign(values | spoil(history))
 
         problem.commit = spoiled
 

@@ -91,6 +91,10 @@ class EnergyState:
         springs = [np.asarray(c.measure * c.values.stored) for c in contacts]
         return cls(forces, [_ways(c, c.traction) for c in contacts], springs)
 
+    def with_forces(self, mark: Any, forces: Forces) -> EnergyState:
+        """Return this state with the forces in other coordinates, too."""
+        return dataclasses.replace(self, forces={**self.forces, mark: forces})
+
     def between(self, jumps: Sequence[Array]) -> EnergyState:
         """Return this state with relative displacements of new pairs."""
         ways = [

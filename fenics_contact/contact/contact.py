@@ -36,39 +36,40 @@ from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import ContactSurface, tagged_facets
 from fenics_contact.types import Array, Mask
 
-__all__ = ["Committed", "Contact", "Found"]
+__all__ = ["Contact", "ContactState", "ContactTrial"]
 
 
 @dataclass(frozen=True)
-class Found:
-    """A solved state of a contact, which `Contact.commit` makes the history.
+class ContactState:
+    """A committed state of a contact: its history, and the results of the increment before it.
 
     Attributes:
-        points: All fields at this rank's quadrature points.
-        history: The fields that become history, by name.
-        counted: `PointFields.rows` from which its slip is measured; None: the committed state.
-    """
-
-    points: PointValues
-    history: Mapping[str, Array]
-    counted: Array | None
-
-
-@dataclass(frozen=True)
-class Committed:
-    """A committed state of a contact.
-
-    Attributes:
-        history: `PointFields.rows`.
-        opposite: Committed state of the obstacle and of the pairs.
-        commits: `Contact.commits`.
+        history: Committed tractions, slip and slip reference, and multipliers: `PointFields.rows`.
+        opposite: Committed place of the obstacle, and the pairs.
         points: All fields at this rank's points; None before the first commit.
+        commits: Number of commits so far.
     """
 
     history: Array
     opposite: OppositeState
-    commits: int
-    points: PointValues | None
+    points: PointValues | None = None
+    commits: int = 0
+
+
+@dataclass(frozen=True)
+class ContactTrial:
+    """A solved state of a contact, which `Contact.commit` makes the committed one.
+
+    Attributes:
+        points: All fields at this rank's quadrature points.
+        history: The fields that become history, by name.
+        reference: The history that the increment started from, with the slip reference of bodies
+            that were positioned: `PointFields.rows`.
+    """
+
+    points: PointValues
+    history: Mapping[str, Array]
+    reference: Array
 
 
 class Contact(PointResults):
@@ -133,7 +134,7 @@ class Contact(PointResults):
         finite: Whether the kinematics are finite.
         opposite: The contact kinematics, those of the obstacle or the opposing body.
         acting: The law evaluated at the points.
-        commits: Number of commits.
+        state: The committed state.
 
     Raises:
         ValueError: ``u`` is not a displacement on this mesh; data of obstacle or law are invalid.
@@ -220,7 +221,6 @@ class Contact(PointResults):
         if self.multipliers is not None:
             fields |= {"multiplier": 0}
         self.history = PointFields(self.quadrature, fields)
-        self.commits = 0
 
         # Contact is a sparse matrix from u to the jump at the points, and the law there: as
         # expressions for the form on Γc, and evaluated at the points for everything else.
@@ -238,12 +238,11 @@ class Contact(PointResults):
         self.opposite = opposite_of(parts, finite=self.finite)
         self.acting = ActingLaw(law, self.opposite, self.quadrature)
         self._values: PointValues | None = None
-        self._committed_values: PointValues | None = None
-        self._aloft: Array | None = None  # history rows as committed, if slip has a new reference
         if not self.rigid:
             self.pair()
         self.opposite.begins_anew()
-        self._count_anew()
+        self.state = ContactState(self.history.rows(), self.opposite.state())
+        self._start()
 
     # ---- forms -----------------------------------------------------------------------------------
 
@@ -570,23 +569,19 @@ class Contact(PointResults):
         """Discard the last evaluation: the next access to a result evaluates the present ``u``."""
         self._values = None
 
-    def restore(self, found: Found | None = None) -> None:
-        """Restore multipliers and results of the last commit. Collective.
+    def restore(self, trial: ContactTrial | None = None) -> None:
+        """Restore history, multipliers and results of the last commit. Collective.
 
         The results are restored, not evaluated again: at the committed state the law would return
         stick at points that slipped to it. Before the first commit there are no results.
 
         Args:
-            found: A state solved since then, whose results are restored instead.
+            trial: A state solved since then, whose results are restored instead.
         """
-        counted = self._aloft if found is None or found.counted is None else found.counted
-        if counted is not None:
-            self.history.set_rows(counted)
-        if found is None or found.counted is None:
-            self._aloft = None
+        self.history.set_rows(self.state.history if trial is None else trial.reference)
         if self.multipliers is not None:
             self.multipliers.restore(self.history)
-        self._values = self._committed_values if found is None else found.points
+        self._values = self.state.points if trial is None else trial.points
 
     def enforcement_error(self) -> float:
         """Return the traction that is left to the penalty, relative to the largest. Collective.
@@ -640,7 +635,7 @@ class Contact(PointResults):
             )
         return self.multipliers
 
-    def found(self, *, is_loaded: bool = True) -> Found:
+    def trial(self, *, is_loaded: bool = True) -> ContactTrial:
         """Return a copy of the evaluated state, for `commit`.
 
         Args:
@@ -660,8 +655,7 @@ class Contact(PointResults):
             }
         if self.multipliers is not None:
             values |= self.multipliers.committed(points)
-        counted = None if self._aloft is None else self.history.rows()
-        return Found(points, self.opposite.committed_fields(values), counted)
+        return ContactTrial(points, self.opposite.committed_fields(values), self.history.rows())
 
     def set_down(self, moved: Mask) -> None:
         """Measure slip from the state evaluated last at points that were unloaded. Collective.
@@ -684,12 +678,10 @@ class Contact(PointResults):
         """Measure slip at some points from the state evaluated last. Collective."""
         if not self.law.has_friction:
             return
-        if self._aloft is None:
-            self._aloft = self.history.rows()
         kept = {name: self.history.values(name) for name in self.history.names}
         feet = self.opposite.feet(self.values)
         counted = {n: np.where(points[:, None], v, kept[n]) for n, v in feet.items()}
-        self.history.commit(kept | counted)
+        self.history.assign(kept | counted)
         self.forget()
 
     def begin(self) -> None:
@@ -698,54 +690,40 @@ class Contact(PointResults):
         The obstacle is taken in its initial position. The constructor does so with the ``u`` at
         construction, and `ContactProblem` again before its first increment.
         """
-        if not self.commits and self.opposite.begins_anew():
-            self._count_anew()
+        if not self.state.commits and self.opposite.begins_anew():
+            self._start()
 
-    def _count_anew(self) -> None:
-        """Store the displacements from which slip is measured in the history. Collective."""
+    def _start(self) -> None:
+        """Make the present ``u`` the state before the first increment. Collective."""
         if self.law.has_friction:
             start = {name: self.history.values(name) for name in self.history.names}
-            self.history.commit(start | self.opposite.start())
-        self.restore()
+            self.history.assign(start | self.opposite.start())
+        self.set_state(ContactState(self.history.rows(), self.opposite.state()))
 
-    def commit(self, found: Found | None = None) -> None:
-        """Make a state the history of the next increment. Collective.
+    def commit(self, trial: ContactTrial | None = None) -> None:
+        """Make a solved state the history of the next increment. Collective.
 
         Args:
-            found: A state returned by `found`; by default the state at the present ``u``.
+            trial: A state returned by `trial`; by default the state at the present ``u``.
         """
-        if found is None:
+        if trial is None:
             self.evaluate()
-            found = self.found()
-        values = dict(found.history)
-        self._aloft = None
-        self.commits += 1
-        self.history.commit(values)
-        self._values = found.points  # results stay those of the solution, whatever its pairs
-        moved = self.opposite.commit(found.points)
+            trial = self.trial()
+        # Results stay those of the solution, whatever its pairs.
+        moved = self.opposite.commit(trial.points)
+        history = dict(trial.history)
         if moved is not None and self.law.has_friction:
-            self.history.commit(values | {"jump": values["jump"] + moved})
-        self._committed_values = found.points
-        if self.multipliers is not None:
-            self.multipliers.restore(self.history)
+            history["jump"] = history["jump"] + moved
+        rows, commits = self.history.packed(history), self.state.commits + 1
+        self.set_state(ContactState(rows, self.opposite.state(), trial.points, commits))
 
-    def committed(self) -> Committed:
-        """Return the committed state, for `set_committed`."""
-        rows, state = self.history.rows(), self.opposite.state()
-        rows = rows if self._aloft is None else self._aloft.copy()
-        return Committed(rows, state, self.commits, self._committed_values)
-
-    def set_committed(self, state: Committed) -> None:
-        """Reset the committed state to an earlier one. Collective.
-
-        Call `restore` afterwards to discard what was evaluated since then.
-        """
-        self.history.set_rows(state.history)
-        self._aloft = None
+    def set_state(self, state: ContactState) -> None:
+        """Make a state the committed one, and the present one. Collective."""
         self.opposite.set_state(state.opposite)
-        self.commits, self._committed_values = state.commits, state.points
+        self.state = state
+        self.restore()
 
-    def take_up(self, history: Array, values: Mapping[str, Array], *, anew: bool) -> None:
+    def load_restart(self, history: Array, values: Mapping[str, Array], *, anew: bool) -> None:
         """Make a state of another run the committed one. Collective.
 
         ``u`` and the loads must be those of that run.
@@ -755,9 +733,8 @@ class Contact(PointResults):
             values: The arrays of its `values`, which become the results.
             anew: Whether pairs are found again at every commit of that run.
         """
-        self.history.set_rows(history)
-        self._aloft = None
-        self._committed_values = None
+        commits = self.state.commits + 1
+        self.set_state(ContactState(history, self.opposite.state()))
 
         def present() -> PointValues:
             self.restore()
@@ -765,11 +742,11 @@ class Contact(PointResults):
 
         unknown = np.zeros(self.quadrature.n_points)
         self.opposite.resume(values.get("depth", unknown), present, anew=anew)
-        self.commits += 1
-        mine = self.values.arrays
-        if {n: v.shape for n, v in values.items()} == {n: v.shape for n, v in mine.items()}:
-            self._values = PointValues.of(values)
-        self._committed_values = self._values
+        points = self.values
+        shapes = {n: v.shape for n, v in points.arrays.items()}
+        if {n: v.shape for n, v in values.items()} == shapes:
+            points = PointValues.of(values)
+        self.set_state(ContactState(history, self.opposite.state(), points, commits))
 
     @property
     def values(self) -> PointValues:

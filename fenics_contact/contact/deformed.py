@@ -91,7 +91,7 @@ class VaryingMotion:
         by_facet = (np.linalg.pinv(away, rcond=_FLAT) @ change).swapaxes(1, 2)
         self._slope[self._rows] = by_facet[:, None]
         moved = shift + np.einsum("qij,qj->qi", self._slope, displacement)
-        self._fields.commit({"moved": moved})
+        self._fields.assign({"moved": moved})
 
     def turn(self, gap: Array, normal: Array) -> tuple[Array, Array]:
         """Distance and normal of the displaced obstacle, from those before the rotation by w."""

@@ -209,7 +209,7 @@ class SampledView:
         """Sample at the present displacement of the points. Collective."""
         found = self._evaluate()
         rows = self._jump.x.array.reshape(-1, self._d)
-        self._fields.commit(found | {"at": rows[: len(found["gap"])]})
+        self._fields.assign(found | {"at": rows[: len(found["gap"])]})
 
     def values(self, name: str) -> Array:
         """What was sampled by a name: "gap", "slope" (of the gap), "normal" …; a copy."""

@@ -258,7 +258,7 @@ class Multipliers:
     def shrink(self, share: float) -> None:
         """Begin the rounds with a share of λ_n; λ_t, which friction has come to, stays."""
         values = {name: self.fields.values(name) for name in ("pressure", *self._vectors)}
-        self.fields.commit(values | {"pressure": share * values["pressure"]})
+        self.fields.assign(values | {"pressure": share * values["pressure"]})
 
     def update(self, values: PointValues) -> None:
         """Make the tractions of an evaluated contact the multipliers, and go on. Collective."""
@@ -267,7 +267,7 @@ class Multipliers:
         rows = made = np.column_stack(list(found.values()))
         for i, accelerated in enumerate(self._accelerated):
             rows = np.where((self._patch == i)[:, None], accelerated(given, made), rows)
-        self.fields.commit(
+        self.fields.assign(
             {"pressure": rows[:, 0], "traction": rows[:, 1:], "normal": values.framed_normal}
         )
 
@@ -296,7 +296,7 @@ class Multipliers:
         self._first[:] = np.nan
         self._left_out = None
         values = {"pressure": history.values("multiplier")}
-        self.fields.commit(values | {name: history.values(name) for name in self._vectors})
+        self.fields.assign(values | {name: history.values(name) for name in self._vectors})
 
 
 def _patches(quadrature: SurfaceQuadrature) -> tuple[Index, int]:

@@ -78,7 +78,7 @@ class PointData:
         if changed:
             self._dependence.forget()  # until all is sampled
             self.values = self._evaluate()
-            self._fields.commit(self.values)
+            self._fields.assign(self.values)
             self._dependence.note()
 
 

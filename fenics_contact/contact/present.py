@@ -181,7 +181,7 @@ class PresentPairs(Pairs):
             committed = self.turned(history.values("traction"))
         turns = {f"turn {i}": rotation[:, i] for i in range(self._gdim)}
         told = {"jump": self._jump_since(), "foot": none, "committed": committed}
-        self.told.commit(told | turns)
+        self.told.assign(told | turns)
 
     def _jump_since(self) -> Array:
         """Displacement relative to the partner since the last commit, (n_points, d). Collective."""
@@ -203,7 +203,7 @@ class PresentPairs(Pairs):
             slip = self.turned(now.way - history.values("jump"))
             start = self.turned(traction.values("traction"))
         values = {"gap": now.gap, "normal": now.normal, "slip": slip, "traction": start}
-        self.felt.commit(values)
+        self.felt.assign(values)
 
     @cached_property
     def reach(self) -> PETSc.Mat:

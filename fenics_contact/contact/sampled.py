@@ -59,7 +59,7 @@ class SampledPlaces:
                 fields["normal"][changed] = sample.normal
                 for i in range(d):
                     fields[f"curvature {i}"][changed] = sample.curvature[:, i]
-        self._fields.commit(fields | {"place": place})
+        self._fields.assign(fields | {"place": place})
         self._at = place
 
     def values(self, name: str) -> Array:

@@ -143,7 +143,7 @@ class Approach:
         gram: Array = np.zeros((n_free, n_free))
         work: Array = np.zeros(n_free)
         for contact, jumps in zip(contacts, self._felt(np.arange(n_free))[1], strict=True):
-            points, way = contact.committed().points, np.zeros(contact.points.shape)
+            points, way = contact.state.points, np.zeros(contact.points.shape)
             if points is None:
                 continue
             if contact.opposite.carries:

@@ -15,7 +15,7 @@ __all__ = ["PointFields"]
 
 
 class PointFields:
-    """Named fields in one quadrature function, changed by `commit` and `set_rows` alone.
+    """Named fields in one quadrature function, changed by `assign` and `set_rows` alone.
 
     Attributes:
         function: The function that holds all fields, for use in forms (a coefficient on the
@@ -55,7 +55,7 @@ class PointFields:
         return ufl.as_vector([self.function[i] for i in range(place.start, place.stop)])
 
     def values(self, name: str) -> Array:
-        """Committed values at the owned points, (n_points,) or (n_points, d); a copy."""
+        """Values at the owned points, (n_points,) or (n_points, d); a copy."""
         rows = self.function.x.array.reshape(-1, self._size)
         return rows[: self._n_owned, self._slices[name]].copy()
 
@@ -77,14 +77,23 @@ class PointFields:
         array[: self._n_owned] = rows
         self.function.x.scatter_forward()
 
-    def commit(self, values: Mapping[str, Array]) -> None:
+    def packed(self, values: Mapping[str, Array]) -> Array:
+        """Return fields given by name as `rows` has them, (n_points, n_components).
+
+        Raises:
+            KeyError: A field is missing.
+            ValueError: A shape is wrong.
+        """
+        rows = np.empty((self._n_owned, self._size))
+        for name, place in self._slices.items():
+            rows[:, place] = values[name]
+        return rows
+
+    def assign(self, values: Mapping[str, Array]) -> None:
         """Replace every field by its values at the owned points. Collective.
 
         Raises:
             KeyError: A field is missing; nothing has changed then.
             ValueError: A shape is wrong; nothing has changed then.
         """
-        rows = np.empty((self._n_owned, self._size))
-        for name, place in self._slices.items():
-            rows[:, place] = values[name]
-        self.set_rows(rows)
+        self.set_rows(self.packed(values))

@@ -157,7 +157,7 @@ class ReferenceScales:
             self._couple(operators)
         borne: Array = np.zeros(n)
         for operator, (one, other) in zip(operators, self._partners, strict=True):
-            committed = operator.contact.committed().points
+            committed = operator.contact.state.points
             if committed is not None:
                 force = operator.contact.measure * np.abs(committed.total_traction).sum(axis=1)
                 borne += np.bincount(one, force, minlength=n)
