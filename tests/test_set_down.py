@@ -419,6 +419,28 @@ def test_a_floor_is_raised_into_a_block(bulk, kinematics):
     assert close(found[1:], found[:1] * 2, 1e-6)
 
 
+@pytest.mark.parametrize("bulk", BULKS)
+def test_a_floor_turns_as_a_block_lands(bulk):
+    """The block comes down by 0.3 in the increment in which the floor turns about a far axis.
+
+    Reference: the floor 0.3 higher, about an axis as much higher, to 1e-6: the block slips by what
+    the floor has moved while they touch.
+    """
+    found = []
+    for gap in (1e-9, 0.3):
+        scene = Hovering("triangle", bulk, (0.0, -1.0))
+        mesh = scene.u.function_space.mesh
+        scene.bcs = [hold(scene.u, scene.tags, side, 0) for side in (LEFT, RIGHT)]
+        angle = fem.Constant(mesh, 4e-6)  # the points stick
+        floor = fc.HalfSpace((0.0, -gap), (0.1, 1.0), rotation=fc.Rotation(angle, (2.0, 1.0 - gap)))
+        contact = scene.contact(floor, friction=1.0)
+        scene.problem(contact).solve()
+        resultants = contact.resultants()
+        found.append([*resultants.force, resultants.tangential_force])
+    assert abs(found[0][2]) > 0.01
+    assert close(found[1], found[0], 1e-6)
+
+
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("bulk", BULKS)
 @pytest.mark.parametrize("gap", [0.0, 0.2])

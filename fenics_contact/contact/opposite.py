@@ -38,7 +38,7 @@ from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.types import Array
 
-__all__ = ["IncrementalRotation", "Opposite", "OppositeState", "Parts"]
+__all__ = ["IncrementalRotation", "ObstacleMotion", "Opposite", "OppositeState", "Parts"]
 
 
 @dataclass(frozen=True)
@@ -95,11 +95,40 @@ class IncrementalRotation:
             return places
         return self.about + self.rotation.turned(places - self.about, share * self.angle)
 
+    def directions(self, vectors: Array) -> Array:
+        """Directions turned by the angle, (..., gdim)."""
+        if self.rotation is None:
+            return vectors
+        turned = self.rotation.turned(vectors.reshape(-1, vectors.shape[-1]), self.angle)
+        return turned.reshape(vectors.shape)
+
     def radius(self, places: Array) -> Array:
         """Distance of places from the axis, (n,) (length); 0 if the obstacle does not turn."""
         if self.rotation is None:
             return np.zeros(len(places))
         return np.asarray(np.linalg.norm(self.rotation.rate(places - self.about), axis=1))
+
+
+@dataclass(frozen=True)
+class ObstacleMotion:
+    """Rigid motion of an obstacle, by which points of Γc are displaced with it.
+
+    Where it puts them they meet the present obstacle as, without it, the one before the motion.
+
+    Attributes:
+        offset: Displacement of the points where `start` has them, (n_points, gdim) (length).
+        turn: Rotation of the obstacle.
+        start: Displacement of the body at the points, (n_points, gdim) (length).
+    """
+
+    offset: Array
+    turn: IncrementalRotation = IncrementalRotation()
+    start: Array | float = 0.0
+
+    def of_points(self, jump: Array) -> Array:
+        """Displacement by the motion at a displacement of the body, (n_points, gdim) (length)."""
+        moved = jump - self.start
+        return np.asarray(self.offset + (self.turn.directions(moved) - moved))
 
 
 class Opposite(ABC):
@@ -164,7 +193,7 @@ class Opposite(ABC):
         self.at_points: AnyKinematics = small
         self.committed_jump: Array = np.zeros((parts.quadrature.n_points, self._gdim))
         self.committed_angle = 0.0
-        self._displaced: Array | None = None
+        self._displaced: ObstacleMotion | None = None
 
     # ---- construction ----------------------------------------------------------------------------
 
@@ -258,21 +287,30 @@ class Opposite(ABC):
         displacement.follow()
         self.pairs.jump_map.mult(displacement.u.x.petsc_vec, self.jump.x.petsc_vec)
         if self._displaced is not None:
-            self.jump.x.array[: self._displaced.size] += self._displaced.ravel()
+            rows = self.jump.x.array[: self.committed_jump.size].reshape(-1, self._gdim)
+            rows += self._displaced.of_points(rows)
         self.jump.x.scatter_forward()
 
     @contextmanager
-    def displaced(self, by: Array) -> Iterator[None]:
-        """Let points be somewhat beside where ``u`` has them, inside of the block.
+    def displaced(self, by: Array | ObstacleMotion) -> Iterator[None]:
+        """Evaluate points at displaced positions, inside of the block.
 
         Args:
-            by: (n_points, gdim) (length).
+            by: Displacement of the points, (n_points, gdim) (length), or a motion of the obstacle.
         """
-        self._displaced = by
+        self._displaced = by if isinstance(by, ObstacleMotion) else ObstacleMotion(by)
         try:
             yield
         finally:
             self._displaced = None
+
+    def displaced_directions(self, vectors: Array) -> Array:
+        """Directions of motions of the points as they are at displaced positions.
+
+        Args:
+            vectors: (..., n_points, gdim).
+        """
+        return vectors if self._displaced is None else self._displaced.turn.directions(vectors)
 
     def present_jump(self) -> Array:
         """Displacement relative to what lies opposite, or of the body alone. Collective."""
@@ -351,6 +389,15 @@ class Opposite(ABC):
             values: Of the last evaluation.
         """
         return self.turned(self.committed_jump - values.jump)
+
+    def motion_in_increment(self, values: PointValues) -> ObstacleMotion:
+        """Motion of a rigid obstacle since the last commit. Collective.
+
+        Args:
+            values: Of the last evaluation, at the committed ``u``.
+        """
+        turn = self.rotation_in_increment(values)
+        return ObstacleMotion(self.committed_offset(values), turn, self.present_jump())
 
     def angle(self, values: PointValues) -> float:
         """By which the obstacle has turned since it began, 0 where it cannot (radians). Collective.

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
+from fenics_contact.contact.opposite import ObstacleMotion
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import agreed, gather_rows, global_max, global_min, global_sum
 from fenics_contact.systems.full import FullSystem
@@ -197,10 +198,10 @@ class Approach:
         of_bodies = which[self._motions.of_any_body()[which]]
         if len(of_bodies) and any(contact.law.has_friction for contact in full.contacts):
             along = None
-            with self._obstacles_at_start(before) as ways:
+            with self._obstacles_at_start(before) as motions:
                 self._go(np.where(full.constrained, before, aloft))
                 if self._find_rest_position(load, which):
-                    along = self._fit_obstacle_motion(which, ways)
+                    along = self._fit_obstacle_motion(which, motions)
                     for contact, jumps in zip(full.contacts, self._felt(of_bodies)[1], strict=True):
                         contact.set_down(_feeling(jumps))
             self._go(aloft)
@@ -209,25 +210,26 @@ class Approach:
         self._find_rest_position(load, which)
         self._follow_stiffness()
 
-    def _fit_obstacle_motion(self, which: Index, ways: Sequence[Array]) -> Array:
+    def _fit_obstacle_motion(self, which: Index, obstacles: Sequence[ObstacleMotion]) -> Array:
         """Fit free motions to the motion of the obstacles that bodies touch. Collective.
 
         Least squares over the points in touch.
 
         Args:
             which: Numbers of their free motions.
-            ways: For every contact the displacement of the obstacle, (n_points, gdim) (length).
+            obstacles: Motion in the increment of the obstacle of every contact.
 
         Returns:
             Coefficients of the free motions.
         """
         gram: Array = np.zeros((len(which), len(which)))
         work: Array = np.zeros(len(which))
-        for contact, jumps, way in zip(
-            self._full.contacts, self._felt(which)[1], ways, strict=True
+        for contact, jumps, motion in zip(
+            self._full.contacts, self._felt(which)[1], obstacles, strict=True
         ):
             touches = contact.values.opening <= _TOUCHING * self._full.scales.mesh_size
             weights = np.where(contact.paired & touches, contact.measure, 0.0)
+            way = motion.of_points(contact.own_displacement())
             gram += np.einsum("mqd,q,nqd->mn", jumps, weights, jumps)
             work += np.einsum("mqd,q,qd->m", jumps, weights, way)
         comm = self._full.unknowns.comm
@@ -235,22 +237,22 @@ class Approach:
         return agreed(comm, np.linalg.lstsq(gram, work, rcond=_SHARED)[0])
 
     @contextlib.contextmanager
-    def _obstacles_at_start(self, before: Array) -> Iterator[list[Array]]:
+    def _obstacles_at_start(self, before: Array) -> Iterator[list[ObstacleMotion]]:
         """Evaluate contacts with rigid obstacles where they were at the last commit. Collective.
 
         Args:
             before: As in `lead`.
 
         Yields:
-            For every contact the displacement of the obstacle, (n_points, gdim) (length).
+            Motion in the increment of the obstacle of every contact.
         """
         self._go(before)
         contacts = self._full.contacts
-        ways = [contact.opposite.committed_offset(contact.values) for contact in contacts]
+        motions = [contact.opposite.motion_in_increment(contact.values) for contact in contacts]
         with contextlib.ExitStack() as back:
-            for contact, way in zip(contacts, ways, strict=True):
-                back.enter_context(contact.opposite.displaced(way))
-            yield ways
+            for contact, motion in zip(contacts, motions, strict=True):
+                back.enter_context(contact.opposite.displaced(motion))
+            yield motions
 
     def _find_rest_position(self, load: Array, which: Index) -> bool:
         """Move bodies from here to where they rest, or to first touch. Collective.
@@ -298,6 +300,8 @@ class Approach:
         drive = global_sum(comm, fields @ load)
         most = np.abs(drive).max()
         mass = global_sum(comm, fields @ fields.T)
+        opposites = [contact.opposite for contact in self._full.contacts]
+        jumps = [o.displaced_directions(j) for o, j in zip(opposites, jumps, strict=True)]
         return _Free(which, drive / most, mass, jumps) if most > 0 else None
 
     def _move(self, which: Index, coefficients: Array) -> None:
