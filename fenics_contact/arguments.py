@@ -7,9 +7,23 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["check_cells", "check_instance", "is_number", "listed"]
+__all__ = ["check_bool", "check_cells", "check_instance", "is_number", "listed"]
 
 _CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
+
+
+def check_bool(name: str, value: Any) -> None:
+    """Refuse what is neither True nor False, of Python or NumPy.
+
+    Args:
+        name: Of the argument.
+        value: What was given.
+
+    Raises:
+        ValueError: It names the argument, what it is, and what it must be.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} is {value!r}; it must be True or False")
 
 
 def check_cells(name: str, kind: str) -> None:

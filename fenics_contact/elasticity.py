@@ -15,7 +15,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from fenics_contact.arguments import is_number
+from fenics_contact.arguments import check_bool, is_number
 
 __all__ = ["KINDS", "LinearElastic", "NeoHookean"]
 
@@ -161,6 +161,7 @@ class NeoHookean:
         pressure: Any = None,
     ) -> None:
         _check_kind(u, kind, [k for k in KINDS if k != "plane stress"])
+        check_bool("isochoric", isochoric)
         mesh = _mesh(u)
         self.u, self.kind, self.pressure = u, kind, pressure
         self.E = _coefficient(mesh, "E", E, 0.0, np.inf)

@@ -486,8 +486,6 @@ def test_bad_arguments() -> None:
         ({"slave_bodies": 2}, ["slave_bodies is 2", "list"]),
         ({"facet_tags": joined.facets}, ["together"]),
         ({"name": "joint"}, ["name is given"]),
-        ({"self_contact": "yes"}, ["self_contact is 'yes'", "True"]),
-        ({"self_contact": 1}, ["self_contact is 1", "True"]),
         ({"obstacle": fc.HalfSpace((0, 0), (0, 1))}, ["obstacle given", "create a Contact"]),
         ({"surface": None, "opposite": 2}, ["surface and opposite given"]),
         ({"kinematics": "large"}, ["'large'"]),

@@ -13,6 +13,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from fenics_contact.elasticity import NeoHookean
 from scenes.blocks import BOTTOM, TOP, Block, block
 from scenes.comparing import raised_everywhere
 from scenes.elasticity import displacement_space, strain, stress
@@ -417,6 +418,67 @@ def test_small_displacement_tolerance_out_of_range(value):
         "small_displacement_tolerance",
         "infinity",
     )
+
+
+def ball(scene: Block, value) -> None:
+    scene.contact(coulomb(), obstacle=fc.Ball((0.0, -1.0), 1.0, inside=value))
+
+
+def cylinder(scene: Block, value) -> None:
+    scene.contact(coulomb(), obstacle=fc.Cylinder((0.0, -1.0), 1.0, inside=value))
+
+
+def profile(scene: Block, value) -> None:
+    fc.RigidProfile([(0, 0), (1, 0), (0, 1)], closed=value)
+
+
+def tresca(scene: Block, value) -> None:
+    fc.Tresca(0.3, 1.0, unilateral=value)
+
+
+def foundation(scene: Block, value) -> None:
+    fc.Foundation(1e4, tension=value)
+
+
+def neo_hookean(scene: Block, value) -> None:
+    NeoHookean(scene.u, 1.0, 0.3, "plane strain", isochoric=value)
+
+
+def pairs(scene: Block, value) -> None:
+    fc.find_contact_pairs(scene.u, coulomb(), 0.1, self_contact=value)
+
+
+def problem_with(name: str) -> Callable:
+    return lambda scene, value: scene.problem(coulomb(), scene.rollers(), **{name: value})
+
+
+def estimated(scene: Block, value) -> None:
+    problem, _ = scene.problem(coulomb(), scene.rollers())
+    fc.increments(problem, scene.E, 1, 2, estimate=value)
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("value", ["no", 1])
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("inside of the Ball", ball),
+        ("inside of the Cylinder", cylinder),
+        ("closed of the RigidProfile", profile),
+        ("unilateral of the Tresca", tresca),
+        ("tension of the Foundation", foundation),
+        ("isochoric", neo_hookean),
+        ("self_contact", pairs),
+        ("fallback", problem_with("fallback")),
+        ("condensation", problem_with("condensation")),
+        ("cross_check", problem_with("cross_check")),
+        ("estimate", estimated),
+    ],
+)
+def test_neither_true_nor_false(name, call, value):
+    """Text and numbers are not taken by their truth: "no" would be true."""
+    words = f"{name} is {value!r}", "True or False"
+    raised_everywhere(lambda: call(pressed(), value), ValueError, *words)
 
 
 def test_increments_out_of_range():

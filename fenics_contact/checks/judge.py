@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from dolfinx import fem
 
+from fenics_contact.arguments import check_bool
 from fenics_contact.checks.cross_check import CrossCheck
 from fenics_contact.checks.kinematics import Linearisation, linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
@@ -47,8 +48,12 @@ class Judge:
             full: The system on all unknowns.
             motions: Rigid motions of the bodies.
             tolerance: ``small_displacement_tolerance`` of `ContactProblem`.
-            cross_check: Likewise.
+            cross_check: ``cross_check`` of `ContactProblem`.
+
+        Raises:
+            ValueError: ``cross_check`` is no bool.
         """
+        check_bool("cross_check", cross_check)
         self.small_displacement_tolerance = tolerance
         self._full, self._motions = full, motions
         self._cross_check = CrossCheck(full.contacts) if cross_check else None

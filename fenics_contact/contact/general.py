@@ -11,7 +11,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.arguments import check_bool, check_instance, is_number
 from fenics_contact.contact.contact import Contact
 from fenics_contact.joining import JoinedMesh
 from fenics_contact.laws.base import Law
@@ -156,11 +156,7 @@ def _check(
         )
     if (facet_tags is None) != (tags is None):
         raise ValueError("facet_tags and tags belong together; give both, or neither")
-    if not isinstance(self_contact, bool | np.bool_):
-        raise ValueError(
-            f"self_contact is {self_contact!r}; it must be True if a body may touch itself, or "
-            "False"
-        )
+    check_bool("self_contact", self_contact)
     own = [name for name in ("surface", "obstacle", "opposite") if name in options]
     if own:
         raise ValueError(

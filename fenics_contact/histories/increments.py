@@ -14,7 +14,7 @@ import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
-from fenics_contact.arguments import check_instance
+from fenics_contact.arguments import check_bool, check_instance
 from fenics_contact.checks.step import Step
 from fenics_contact.checks.verdict import Attempt, NotConverged
 from fenics_contact.estimates.errors import quantities
@@ -137,6 +137,7 @@ def increments(
     ):
         if not isinstance(number, int | np.integer) or number < least:
             raise ValueError(f"{name} is {number!r}; it must be an integer, at least {least}")
+    check_bool("estimate", estimate)
     states.check_mismatch(on_mismatch)
     if not isinstance(state_fields, Sequence):
         raise ValueError(

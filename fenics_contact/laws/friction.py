@@ -10,6 +10,7 @@ from typing import Any
 
 import ufl
 
+from fenics_contact.arguments import check_bool
 from fenics_contact.laws.base import (
     ContactTraction,
     Law,
@@ -341,7 +342,8 @@ class Tresca(FrictionLaw):
         direction: First principal direction of friction, as for `Coulomb`.
 
     Raises:
-        ValueError: ``modes`` is below 3, or ``direction`` is missing or unused.
+        ValueError: ``modes`` is below 3, ``direction`` is missing or unused, or ``unilateral`` is
+            no bool.
     """
 
     friction: Any
@@ -352,6 +354,15 @@ class Tresca(FrictionLaw):
     modes: int | None = None
     transverse_friction: Any = None
     direction: Any = None
+
+    def __post_init__(self) -> None:
+        """Check ``unilateral``, and the friction cone as for every friction law.
+
+        Raises:
+            ValueError: ``unilateral`` is no bool, or the friction cone is not defined.
+        """
+        super().__post_init__()
+        check_bool("unilateral of the Tresca", self.unilateral)
 
     @property
     def has_normal_stiffness(self) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 
 import ufl
 
+from fenics_contact.arguments import check_bool
 from fenics_contact.laws.base import (
     ContactTraction,
     Law,
@@ -57,11 +58,22 @@ class Foundation(Law):
         tension: Whether the foundation is bonded to the body and bears tension. If False, it acts
             only where the gap is closed; with k_t there is no potential then, because τ jumps
             where the gap closes.
+
+    Raises:
+        ValueError: ``tension`` is no bool.
     """
 
     k_n: Any
     k_t: Any = 0.0
     tension: bool = True
+
+    def __post_init__(self) -> None:
+        """Check ``tension``.
+
+        Raises:
+            ValueError: It is no bool.
+        """
+        check_bool("tension of the Foundation", self.tension)
 
     @property
     def has_tangential(self) -> bool:

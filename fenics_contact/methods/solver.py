@@ -13,7 +13,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact import compat
-from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.arguments import check_bool, check_instance, is_number
 from fenics_contact.checks.verdict import Attempt
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.contact import Contact
@@ -123,6 +123,9 @@ class Settings:
         for name, share in (("alpha", self.alpha), ("phi", self.phi)):
             if not (is_number(share) and 0.0 <= share <= 1.0):
                 raise ValueError(f"{name} is {share!r}; it must be a number between 0 and 1")
+        check_bool("fallback", self.fallback)
+        if self.condensation is not None:
+            check_bool("condensation", self.condensation)
         check_instance("prefix", self.prefix, str)
         check_instance("petsc_options", self.petsc_options, Mapping)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fenics_contact.arguments import check_bool
 from fenics_contact.obstacles.base import (
     Rotation,
     Sample,
@@ -57,6 +58,7 @@ class RigidProfile(SampledObstacle):
         rotation: Rotation | None = None,
     ) -> None:
         given = as_points("points of the RigidProfile", points)
+        check_bool("closed of the RigidProfile", closed)
         self._gdim = given.shape[1]
         ways = [v for v in (extruded, turned) if v is not None]
         if len(ways) != self._gdim - 2:

@@ -10,7 +10,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from fenics_contact.arguments import is_number
+from fenics_contact.arguments import check_bool, is_number
 from fenics_contact.obstacles.base import (
     Obstacle,
     Placement,
@@ -93,6 +93,7 @@ class Ball(Obstacle):
     def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
         """Return the gap |x - center - shift| - radius, negated inside, and the direction."""
         gdim = x.ufl_shape[0]
+        check_bool("inside of the Ball", self.inside)
         arm = x - to_ufl(as_vector("center of the Ball", self.center, gdim))
         return _round(
             arm, shift, to_ufl(as_positive("radius of the Ball", self.radius)), self.inside
@@ -132,6 +133,7 @@ class Cylinder(Obstacle):
             ValueError: ``axis`` is given in 2D or missing in 3D, or data are out of range.
         """
         gdim = x.ufl_shape[0]
+        check_bool("inside of the Cylinder", self.inside)
         arm = x - to_ufl(as_vector("point of the Cylinder", self.point, gdim))
         if gdim == 2 and self.axis is not None:
             raise ValueError(f"axis of the Cylinder is {self.axis!r}; omit it in 2D")
