@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import parallel, targets, timing
+from benchmarks import targets, timing
 from fenics_contact import plotting
 from verification import report
 
@@ -93,11 +93,8 @@ def _targets(folder: Path, met: Sequence[timing.Row]) -> list[str]:
         lines += ["![Measured values relative to their targets](benchmarks/targets.png)", ""]
     if missed:
         lines += ["## Missed targets", ""]
-        body = [
-            (r["problem"], r["quantity"], r["target"], f"{r['measured']:.3g}", r["notes"])
-            for r in missed
-        ]
-        lines += report.table(("problem", "quantity", "target", "measured", "notes"), body)
+        body = [(r["problem"], r["quantity"], r["target"], f"{r['measured']:.3g}") for r in missed]
+        lines += report.table(("problem", "quantity", "target", "measured"), body)
         lines += report.text("All targets are in [targets.csv](benchmarks/targets.csv).")
     return lines
 
@@ -110,42 +107,35 @@ def _cost(folder: Path) -> list[str]:
     """Return the cost of contact relative to one linear solve."""
     tables = {name: report.read(folder / name / f"{name}_sizes.csv") for name in SIZES}
     draw_cost(folder / "cost.png", tables)
-    body = []
-    for name, runs in SIZES.items():
-        largest = max(int(row["dofs"]) for row in tables[name])
-        rows = {row["run"]: row for row in tables[name] if int(row["dofs"]) == largest}
-        for run in runs[1:]:
-            row = rows[run]
-            numbers = (report.number(row[c]) for c in ("seconds", "linear solves"))
-            body.append((TITLES[name], row["dofs"], run, row["iterations"], *numbers))
     lines = ["## Cost of contact", "", "![Time over dofs](benchmarks/cost.png)", ""]
     lines += report.text(
         '*Time over the number of dofs, with exponents of fitted power laws. "By default": method '
         "and linear solver as this package selects them. Plain DOLFINx: a hand-written penalty "
-        "form, Newton's method with the consistent tangent.*"
+        "form, Newton's method with the consistent tangent.*",
+        "Time of the largest problems, in linear solves:",
     )
-    lines += report.table(("problem", "dofs", "run", "iterations", "time [s]", "solves"), body)
+    items = []
+    for name, runs in SIZES.items():
+        largest = max(int(row["dofs"]) for row in tables[name])
+        solves = {r["run"]: r["linear solves"] for r in tables[name] if int(r["dofs"]) == largest}
+        costs = "; ".join(f"{run} {report.number(solves[run])}" for run in runs[1:])
+        data = f"[sizes](benchmarks/{name}/{name}_sizes.csv), [runs](benchmarks/{name}/{name}.csv)"
+        items.append(f"- **{TITLES[name]}**, {largest} dofs: {costs} ({data})")
     recovered = report.read(folder / "half_cylinder/half_cylinder.csv")
     (every,) = (r for r in recovered if r["run"].endswith("default, interior in every increment"))
-    lines += report.text(
-        "With 1e5 dofs in three dimensions an increment costs less than one factorisation, which "
-        "multigrid replaces; smaller problems cost several linear solves. In the plane the default "
-        "is static condensation; recovering the interior displacement in each of the 40 increments "
-        f"raises the cost to {report.number(every['linear solves'])} linear solves. More runs: "
-        "[half_cylinder.csv](benchmarks/half_cylinder/half_cylinder.csv), "
-        "[ball.csv](benchmarks/ball/ball.csv), [tagged.csv](benchmarks/tagged/tagged.csv), and "
-        "`*_sizes.csv` beside them.",
-    )
     joint = report.read(folder / "bolted_joint/bolted_joint.csv")
     refused = [row for row in joint if row["method"].startswith("refused")]
     solved = [float(row["linear solves"]) for row in joint if row not in refused]
     costs = " and ".join(report.number(row["linear solves"]) for row in refused)
     lines += report.text(
-        "**Bolted joint** (three bodies, quadratic tetrahedra, "
-        f"{joint[0]['dofs']} dofs; [bolted_joint.csv](benchmarks/bolted_joint/bolted_joint.csv)): "
-        f"an increment costs {min(solved):.1f} to {max(solved):.1f} linear solves, the refusal of "
-        f"a load above the friction limit {costs}, on one and two ranks. **Large strains**: Newton "
-        "iterations are in [finite.csv](benchmarks/finite/finite.csv)."
+        *items,
+        "- **bolted joint**, three bodies, quadratic tetrahedra, "
+        f"{joint[0]['dofs']} dofs: {min(solved):.1f} to {max(solved):.1f} for an increment; "
+        f"{costs} for the refusal of a load above the friction limit, on one and two ranks "
+        "([all runs](benchmarks/bolted_joint/bolted_joint.csv))",
+        "Recovering the interior displacement in each of the 40 increments of the half-cylinder "
+        f"raises the cost to {report.number(every['linear solves'])} linear solves. Newton "
+        "iterations at large strains are in [finite.csv](benchmarks/finite/finite.csv).",
     )
     return lines
 
@@ -153,78 +143,66 @@ def _cost(folder: Path) -> list[str]:
 def _large(folder: Path) -> list[str]:
     """Return the largest problems."""
     rows = report.read(folder / "large/large.csv")
-    body = []
-    for dofs in dict.fromkeys(row["dofs"] for row in rows):
-        runs = {row["run"]: row for row in rows if row["dofs"] == dofs}
-        one, other = runs["linear, multigrid"], runs["contact"]
-        times = [report.number(r["seconds"]) for r in (one, other)]
-        ratio = report.number(other["linear solves (multigrid)"])
-        body.append((dofs, *times, ratio, report.number(other["GiB"]), other["solver"]))
-    head = ("dofs", "linear solve, multigrid [s]", "contact [s]", "ratio", "memory [GiB]", "solver")
+    runs = {row["dofs"]: row for row in rows if row["run"] == "contact"}
+    ratios = ", ".join(report.number(row["linear solves (multigrid)"]) for row in runs.values())
+    largest = runs[max(runs, key=int)]
     return [
         "## Large",
         "",
         *report.text(
-            "Ball on a block, μ = 0.3, one increment on one rank, defaults "
-            "([large.csv](benchmarks/large/large.csv)):"
+            "Ball on a block, μ = 0.3: an increment on one rank takes "
+            f"{ratios} times as long as one linear solve by multigrid, with {', '.join(runs)} "
+            f"dofs; the largest problem takes {report.number(largest['seconds'])} s and "
+            f"{report.number(largest['GiB'])} GiB ([large.csv](benchmarks/large/large.csv))."
         ),
-        *report.table(head, body),
     ]
 
 
 def _ranks(folder: Path) -> list[str]:
     """Return the half-cylinder on two ranks."""
     rows = report.read(folder / "ranks/ranks.csv")
-    body = []
-    for run in dict.fromkeys(row["run"] for row in rows):
-        by_ranks = {r["ranks"]: r for r in rows if (r["run"], r["dofs"]) == (run, rows[-1]["dofs"])}
-        one, two = by_ranks["1"], by_ranks["2"]
-        body.append((run, *(report.number(r["seconds"]) for r in (one, two))))
-        body[-1] += (report.number(two["speed-up"]),)
+    two = [row for row in rows if row["ranks"] == "2"]
+    gains = "; ".join(f"{row['run']} {report.number(row['speed-up'])}" for row in two)
     return [
         "## Ranks",
         "",
         *report.text(
-            f"Half-cylinder, {rows[-1]['dofs']} dofs, static condensation on one and two ranks "
-            "([ranks.csv](benchmarks/ranks/ranks.csv)):"
+            f"Speed-up of two ranks, half-cylinder, {two[0]['dofs']} dofs, static condensation: "
+            f"{gains} ([ranks.csv](benchmarks/ranks/ranks.csv))."
         ),
-        *report.table(("run", "1 rank [s]", "2 ranks [s]", "speed-up"), body),
     ]
 
 
 def _parallel(folder: Path) -> list[str]:
     """Return two ranks with multigrid, and the model of the cost."""
-    here = folder / "parallel"
-    machine = parallel.Machine(**json.loads((here / "machine.json").read_text()))
-    rows = report.read(here / "parallel_1.csv")
-    columns = ("run", "dofs", "iterations", "seconds", "speed-up", "speed-up, model")
+    rows = report.read(folder / "parallel/parallel_1.csv")
     largest = max(rows, key=lambda row: int(row["dofs"]))["dofs"]
-    two = [row for row in rows if row["ranks"] == "2" and row["dofs"] == largest]
-    body = [[_short(row[column]) for column in columns] for row in two]
-    model = report.read(here / "parallel_5.csv")
-    lines = ["## Parallel", "", "![Speed-up over ranks](benchmarks/parallel/speed_up.png)", ""]
-    lines += report.text(
-        "Two ranks compared with one, ball on a block with multigrid, and the [model of the "
-        f"cost](parallel.md#a-model-of-the-cost) with α = {machine.alpha * 1e6:.2g} µs, β = "
-        f"{machine.beta / 1e9:.3g} GB/s, γ = {machine.gamma * 1e6:.2g} µs; a memory copy takes "
-        f"{machine.bus:.2f} times as long while the other rank copies as well:"
+    gains = "; ".join(
+        f"{row['run']} {report.number(row['speed-up'])} ({report.number(row['speed-up, model'])})"
+        for row in rows
+        if row["ranks"] == "2" and row["dofs"] == largest
     )
-    lines += report.table(("run", "dofs", "iterations", "2 ranks [s]", *columns[4:]), body)
-    lines += report.text(
-        "One increment with contact, extrapolated by the model with a fast network (α = 2 µs, β = "
-        "10 GB/s, γ = 4 µs); measured were up to 332,000 dofs. *Memory*: more than 16 GiB per "
-        "rank; *too few*: fewer than 5000 dofs per rank. Idle ranks on coarse levels and load "
-        "imbalance are not included:"
-    )
-    lines += report.table(list(model[0]), [[_short(v) for v in row.values()] for row in model])
-    lines += report.text(
-        "Data: [measurements](benchmarks/parallel/parallel.csv) of three sizes, and beside them "
-        "`parallel_1.csv` (model), `parallel_2.csv` (time by operation), `parallel_3.csv` "
-        "(operations and messages per iteration), `parallel_4.csv` (speed-ups of the model), "
-        "`parallel_5.csv` (extrapolated times), `parallel_6.csv` (interfaces of the ranks with "
-        "static condensation)."
-    )
-    return lines
+    return [
+        "## Parallel",
+        "",
+        "![Speed-up over ranks](benchmarks/parallel/speed_up.png)",
+        "",
+        *report.text(
+            "*[Model of the cost](parallel.md#a-model-of-the-cost), with constants of "
+            "[this machine](benchmarks/parallel/machine.json); nothing was measured on more than "
+            "two ranks.*",
+            f"Speed-up of two ranks, ball on a block, {largest} dofs, measured and by the model: "
+            f"{gains}.",
+            "Data: [measurements](benchmarks/parallel/parallel.csv); "
+            "[model](benchmarks/parallel/parallel_1.csv), "
+            "[time by operation](benchmarks/parallel/parallel_2.csv), "
+            "[operations and messages](benchmarks/parallel/parallel_3.csv); extrapolated "
+            "[speed-ups](benchmarks/parallel/parallel_4.csv) and "
+            "[times](benchmarks/parallel/parallel_5.csv); "
+            "[interfaces of the ranks](benchmarks/parallel/parallel_6.csv) with static "
+            "condensation.",
+        ),
+    ]
 
 
 def _accuracy(folder: Path) -> list[str]:
@@ -251,14 +229,6 @@ def _accuracy(folder: Path) -> list[str]:
             "[refinement](benchmarks/adaptation/adaptation.csv).",
         ),
     ]
-
-
-def _short(value: str) -> str:
-    """Format a number to three digits, but not whole numbers and words."""
-    try:
-        return value if value.isdigit() else report.number(value)
-    except ValueError:
-        return value
 
 
 # ---- figures -------------------------------------------------------------------------------------
