@@ -106,7 +106,7 @@ def page(found: dict[str, list[Row]]) -> str:
         "rubber, pressed by up to 13 % of its height or by a force, slid by up to 1.5 widths and "
         "over the end, lifted and lowered again, and rotated; Γc on either body, ratios of facet "
         "numbers up to 20 and of moduli up to 3000. The independent solver "
-        "(`verification/present_reference.py`) intersects rays with every facet.",
+        "(`verification/sliding_reference.py`) intersects rays with every facet.",
         "- **Dissimilar bodies** (`--bodies --extreme`): ratios of moduli of 1e3 to 1e6, facets "
         "of up to 20 times the width.",
     )

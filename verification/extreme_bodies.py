@@ -22,10 +22,10 @@ from scenes.comparing import at_points
 from scenes.elasticity import displacement_space, hold
 from scenes.rubber import TIGHT, rubber
 from scenes.tags import between, either, near
-from verification import present_reference, present_scenes
+from verification import sliding_reference, sliding_scenes
 from verification.extreme_finite import NU, E, bisect, nominal, relative, solved_twice, stress
 from verification.extreme_scenes import Array, Solve, friction_law
-from verification.present_scenes import turn
+from verification.sliding_scenes import turn
 
 BOTTOM, TOP, LOWER, UPPER, LEFT, RIGHT = 1, 2, 3, 4, 5, 6
 DOWN = 0.1  # approach of the blocks
@@ -284,17 +284,17 @@ def against_solver(
     law |= {"k_t": ["number", 4 * kappa * soft], "friction": mu} if mu else {}
     upper, lower = {"body": 1, "side": "bottom"}, {"body": 0, "side": "top"}
     here, there = (upper, lower) if own == UPPER else (lower, upper)
-    obstacle = {"kind": "body", "update": "never"} | there
+    obstacle = {"kind": "body", "update_pairs": "never"} | there
     slab = {"origin": [0.0, 0.0], "size": [2.0, 1.0], "n": [n[0], 2], "E": moduli[0], "jitter": 0}
     block = {"origin": [0.6, 1.0], "size": [0.8, 0.5], "n": [n[1], 2], "E": moduli[1], "jitter": 0}
     still = {"normal": 1.0, "across": 0.0, "spin": 0.0, "steps": steps}
-    scene = {"kinematics": "present", "bulk": bulk, "layout": "two", "cell": "quadrilateral"}
+    scene = {"kinematics": "finite sliding", "bulk": bulk, "layout": "two", "cell": "quadrilateral"}
     scene |= {"degree": 1, "nu": NU, "bodies": [slab, block], "units": [1.0, 1.0]}
     scene |= {"drive": "prescribed", "contacts": [here | {"obstacle": obstacle, "law": law}]}
-    scene |= {"holds": [[0, "bottom", [0, 1], "still"], [1, "top", [0, 1], "moved"]]}
-    scene |= {"strain": 0.1, "share": 1.0, "bend": [0.0, 0.1]}
+    scene |= {"dirichlet": [[0, "bottom", [0, 1], "fixed"], [1, "top", [0, 1], "moved"]]}
+    scene |= {"strain": 0.1, "load_ratio": 1.0, "bend": [0.0, 0.1]}
     scene |= {"stages": [still | {"side": 0.0, "turn": 0.0}, still | {"side": 0.1, "turn": 0.05}]}
-    return solved_twice(scene, present_scenes.PresentMade, present_reference.model)
+    return solved_twice(scene, sliding_scenes.SlidingSetup, sliding_reference.make_problem)
 
 
 def stiff_plate(ratio: float, mu: float, n: tuple[int, int] = (8, 4), kappa: float = 10.0) -> Solve:

@@ -281,31 +281,31 @@ def against_solver(
     scene = {"kinematics": "finite", "bulk": bulk, "layout": "floor", "cell": "quadrilateral"}
     scene |= {"degree": 1, "nu": NU, "bodies": [body], "units": [1.0, 1.0], "drive": "obstacle"}
     scene |= {"contacts": [{"body": 0, "side": "bottom", "obstacle": obstacle, "law": law}]}
-    scene |= {"holds": [[0, "top", [0, 1], "still"]], "strain": 0.1, "share": 1.0}
+    scene |= {"dirichlet": [[0, "top", [0, 1], "fixed"]], "strain": 0.1, "load_ratio": 1.0}
     scene |= {"stages": stages} | change
 
-    return solved_twice(scene, finite_scenes.FiniteMade, finite_reference.model)
+    return solved_twice(scene, finite_scenes.FiniteSetup, finite_reference.make_problem)
 
 
-def solved_twice(scene: dict[str, Any], make: Any, model: Any) -> Solve:
+def solved_twice(scene: dict[str, Any], setup_class: Any, make_problem: Any) -> Solve:
     """Solve the history of a random scene; compare the forces with the independent solver.
 
     Args:
         scene: The scene, without a method.
-        make: Its class in `finite_scenes` or `present_scenes`.
-        model: The function of the independent solver.
+        setup_class: Its class in `finite_scenes` or `sliding_scenes`.
+        make_problem: The function of the independent solver.
     """
 
     def solve(method: str) -> tuple[list[fc.Step], float | None]:
-        made = make(scene | {"method": method}, MPI.COMM_WORLD)
-        problem = made.problem()
-        other, _, loads = model(scene)
-        old = [c.start() for c in other.contacts]
-        u, motion = np.zeros(other.body.places.size), np.zeros(0)
+        setup = setup_class(scene | {"method": method}, MPI.COMM_WORLD)
+        problem = setup.problem()
+        other, _, loads = make_problem(scene)
+        old = [c.initial_state() for c in other.contacts]
+        u, motion = np.zeros(other.body.nodes_x.size), np.zeros(0)
         known, steps, worst = True, [], 0.0
         for stage, given in enumerate(scene["stages"]):
             for step in fc.increments(
-                problem, lambda t, s=stage: made.apply(s, t), steps=given["steps"]
+                problem, lambda t, s=stage: setup.apply(s, t), steps=given["steps"]
             ):
                 steps.append(step)
                 if not known:
@@ -316,7 +316,7 @@ def solved_twice(scene: dict[str, Any], make: Any, model: Any) -> Solve:
                 except (finite_reference.Failed, np.linalg.LinAlgError):
                     known = False
                     continue
-                found = other.respond(u, motion, load, old)
+                found = other.evaluate(u, motion, load, old)
                 pairs = zip(other.contacts, found, old, strict=True)
                 old = [c.next_state(f, o) for c, f, o in pairs]
                 force = other.contacts[0].weights @ found[0]["traction"]

@@ -1,11 +1,10 @@
-"""The second solution with finite kinematics, and the judge that asks it.
+"""The independent solver with finite kinematics on rigid obstacles, and its comparison.
 
-What the package does by UFL, derivatives and compiled forms is made here from closed formulas at
-points, in NumPy: distances and normals of every shape, frames that move and turn, slip, the
-committed traction's turn by two reflections, the return map of `reference_solver`, rubber by its
-stress. Shared are DOLFINx's assembly of the bulk, and the numbers of the scene. Derivatives of
-tractions are differences; Newton's method with a line search goes from load to load in small steps,
-the history kept from the start of the increment.
+Distances and normals, moving and rotating frames, slip, rotation of the committed traction and the
+stress of rubber are closed formulas at points, in NumPy; the return map is that of
+`reference_solver`. Shared with the package are DOLFINx's assembly of the bulk and the scene.
+Tractions are differentiated by finite differences. Newton's method with a line search solves an
+increment in small steps, with the history of its start.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
-from verification import finite_scenes, fuzz_judge, fuzz_models
+from verification import finite_scenes, fuzz_judge, fuzz_reference
 from verification import reference_solver as reference
 from verification.reference_geometry import Body
 from verification.reference_solver import Failed
@@ -33,20 +32,21 @@ __all__ = [
     "FiniteContact",
     "FiniteJudge",
     "FiniteProblem",
-    "bulk_of",
-    "loads_of",
-    "model",
-    "rubber",
-    "shape_of",
+    "make_bulk",
+    "make_loads",
+    "make_problem",
+    "make_shape",
+    "rubber_work",
 ]
 
 Array = np.ndarray
-# Of a shape: signed distance, (n,), and minus its gradient, (n, d), at places (n, d).
-Shape = Callable[[Array], tuple[Array, Array]]
+# Signed distance, (n,), and minus its gradient, (n, d), at points (n, d).
+GapFunction = Callable[[Array], tuple[Array, Array]]
 
-# Steps of differences, by the size of the mesh: shorter than stiff springs give way.
+# Step of finite differences relative to the mesh size, below the elastic penetration.
 _DIFFERENCE = 1e-8
-# Parts into which an increment is cut, tried in turn; and softer springs to start from.
+# Numbers of parts of an increment that are tried; factors of softer springs to start from; and
+# largest number of augmentations.
 _PARTS = (4, 32)
 _SOFTER = 10.0 ** np.arange(-5, 0.1, 0.5)
 _ROUNDS = 400
@@ -55,9 +55,9 @@ _ROUNDS = 400
 # ---- shapes --------------------------------------------------------------------------------------
 
 
-def shape_of(scene: dict[str, Any], contact: dict[str, Any]) -> Shape:
-    """The shape of an obstacle by closed formulas, or by brute force over its data."""
-    given, where = contact["obstacle"], finite_scenes.place_of(scene, contact)
+def make_shape(scene: dict[str, Any], contact: dict[str, Any]) -> GapFunction:
+    """Return the gap function of an obstacle, by formulas or by brute force over its data."""
+    given, where = contact["obstacle"], finite_scenes.initial_geometry(scene, contact)
     kind, d = given["kind"], len(scene["bodies"][0]["size"])
     if contact["side"] == "right" or kind == "halfspace":
         normal = where["normal"]
@@ -68,35 +68,35 @@ def shape_of(scene: dict[str, Any], contact: dict[str, Any]) -> Shape:
             axis = np.array(given.get("axis", (0.0, 1.0, 0.0)))
             keep -= np.outer(axis, axis) / (axis @ axis)
         sign = -1.0 if kind.endswith("inside") else 1.0
-        return lambda x: _from_point((x - where["center"]) @ keep, where["radius"], sign)
+        return lambda x: _radial_gap((x - where["center"]) @ keep, where["radius"], sign)
     if kind in ("capsule", "rod"):
-        return lambda x: fuzz_models.capsule_at(x, where)
+        return lambda x: fuzz_reference.capsule_gap_at(x, where)
     if kind == "torus":
         centre = where["center"] - where["ring"] * np.eye(3)[0]
 
         def torus(x: Array) -> tuple[Array, Array]:
             arm = (x - centre) * [1.0, 1.0, 0.0]
             ring = where["ring"] * arm / np.linalg.norm(arm, axis=1)[:, None]
-            return _from_point(x - centre - ring, where["radius"], 1.0)
+            return _radial_gap(x - centre - ring, where["radius"], 1.0)
 
         return torus
     if kind in ("facets", "box"):
-        points, numbers = finite_scenes.pieces(scene, contact)
-        return _convex(points[numbers])
-    points, _ = finite_scenes.pieces(scene, contact)
-    if kind == "turned profile":  # all the way round in the half-plane, its other half mirrored
+        points, numbers = finite_scenes.obstacle_points(scene, contact)
+        return _polyhedron_gap(points[numbers])
+    points, _ = finite_scenes.obstacle_points(scene, contact)
+    if kind == "turned profile":  # closed by its mirror image
         flat = (points - where["center"])[:, [0, 2]]
-        loop = _loop(np.concatenate([flat, flat[-2:0:-1] * [-1.0, 1.0]]))
+        loop = _spline_gap(np.concatenate([flat, flat[-2:0:-1] * [-1.0, 1.0]]))
 
-        def turned(x: Array) -> tuple[Array, Array]:
+        def rotation(x: Array) -> tuple[Array, Array]:
             arm = x - where["center"]
             out = np.hypot(arm[:, 0], arm[:, 1])
             distance, normal = loop(np.column_stack([out, arm[:, 2]]))
-            way = arm[:, :2] / out[:, None]
-            return distance, np.column_stack([normal[:, :1] * way, normal[:, 1]])
+            direction = arm[:, :2] / out[:, None]
+            return distance, np.column_stack([normal[:, :1] * direction, normal[:, 1]])
 
-        return turned
-    loop = _loop(points[:, [0, -1]])
+        return rotation
+    loop = _spline_gap(points[:, [0, -1]])
     if d == 2:
         return loop
 
@@ -107,16 +107,16 @@ def shape_of(scene: dict[str, Any], contact: dict[str, Any]) -> Shape:
     return extruded
 
 
-def _from_point(arm: Array, radius: float, sign: float) -> tuple[Array, Array]:
+def _radial_gap(arm: Array, radius: float, sign: float) -> tuple[Array, Array]:
     far = np.sqrt(np.sum(arm * arm, axis=1))
     return sign * (far - radius), -sign * arm / far[:, None]
 
 
-def _loop(points: Array) -> Shape:
-    """A closed cubic spline through points, anticlockwise, over the length of the chords."""
-    closed = np.vstack([points, points[:1]])
-    knots = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1)))
-    spline = scipy.interpolate.CubicSpline(knots, closed, bc_type="periodic")
+def _spline_gap(points: Array) -> GapFunction:
+    """Return the gap function of a closed cubic spline, anticlockwise, by chord length."""
+    stick = np.vstack([points, points[:1]])
+    knots = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(stick, axis=0), axis=1)))
+    spline = scipy.interpolate.CubicSpline(knots, stick, bc_type="periodic")
     end = knots[-1]
     grid = np.linspace(0.0, end, 2000, endpoint=False)
     on = spline(grid)
@@ -137,8 +137,8 @@ def _loop(points: Array) -> Shape:
     return sample
 
 
-def _convex(corners: Array) -> Shape:
-    """A convex polygon or polyhedron by its facets, (m, d, d), outwards."""
+def _polyhedron_gap(corners: Array) -> GapFunction:
+    """Return the gap function of a convex polyhedron with outward facets, (m, d, d)."""
     d = corners.shape[2]
     if d == 2:
         edge = corners[:, 1] - corners[:, 0]
@@ -152,20 +152,22 @@ def _convex(corners: Array) -> Shape:
         height = np.einsum("nmd,md->nm", x[:, None] - corners[None, :, 0], out)
         best = height.argmax(axis=1)
         distance, normal = height[n, best], -out[best]
-        # Outside, the closest of all edges and corners, where no facet lies straight below.
-        foot = x[:, None] - height[:, :, None] * out
+        # Outside: the closest facet, edge or corner.
+        closest = x[:, None] - height[:, :, None] * out
         below = np.ones(height.shape, dtype=bool)
         arms = []
         for i in range(d if d == 3 else 1):
             a, b = corners[:, i], corners[:, (i + 1) % d]
-            way = b - a
+            direction = b - a
             if d == 3:
-                side = np.cross(way[None], foot - a)
+                side = np.cross(direction[None], closest - a)
                 below &= np.sum(side * out, axis=2) >= 0
-            share = np.sum((x[:, None] - a) * way, axis=2) / np.sum(way * way, axis=1)
+            share = np.sum((x[:, None] - a) * direction, axis=2) / np.sum(
+                direction * direction, axis=1
+            )
             if d == 2:
                 below &= (share >= 0) & (share <= 1)
-            near = a + np.clip(share, 0, 1)[:, :, None] * way
+            near = a + np.clip(share, 0, 1)[:, :, None] * direction
             arms.append(x[:, None] - near)
         arms = np.concatenate(arms, axis=1)
         far = np.linalg.norm(arms, axis=2)
@@ -189,29 +191,29 @@ def _convex(corners: Array) -> Shape:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where an obstacle is: x = R (z - about) + about + shift, from places z where it began."""
+    """Position of an obstacle: x = R (z - about) + about + shift."""
 
     turn: Array
     about: Array
     shift: Array
 
     def into(self, x: Array) -> Array:
-        """Places in the frame of the obstacle."""
+        """Return points in the frame of the obstacle."""
         return (x - self.about - self.shift) @ self.turn + self.about
 
     def out(self, z: Array) -> Array:
-        """Places in space."""
+        """Return points in space."""
         return (z - self.about) @ self.turn.T + self.about + self.shift
 
 
 @dataclass(eq=False)
 class FiniteState(reference.State):
-    """History of points; places and vectors in the frame of the obstacle.
+    """Committed state in the frame of the obstacle.
 
     Attributes:
-        jump: The closest point of the obstacle, (n, d) (length).
+        jump: Closest-point projection that is the slip reference, (n, d) (length).
         traction: τ, or with multipliers λ_t.
-        normal: n that it is across.
+        normal: Normal at the projection.
     """
 
     normal: Array | None = None
@@ -219,13 +221,13 @@ class FiniteState(reference.State):
 
 @dataclass(eq=False)
 class FiniteContact(reference.ContactModel):
-    """Γc on a rigid obstacle, at places X + u.
+    """A contact with a rigid obstacle at the deformed positions.
 
     Attributes:
-        shape: Of the obstacle where it began.
-        about: A point of the axis of its turn.
-        axis: Direction of that in space; None in the plane.
-        turns: Whether it turns.
+        shape: Gap function of the obstacle in its first position.
+        about: A point of its axis of rotation.
+        axis: Direction of the axis in space; None in the plane.
+        turns: Whether the obstacle rotates.
     """
 
     shape: Any = None
@@ -234,7 +236,7 @@ class FiniteContact(reference.ContactModel):
     turns: bool = False
 
     def pose(self, shift: Array, angle: float) -> Pose:
-        """Where the obstacle is."""
+        """Return the position of the obstacle."""
         if not self.turns:
             return Pose(np.eye(self.d), np.zeros(self.d), shift)
         if self.d == 2:
@@ -244,72 +246,80 @@ class FiniteContact(reference.ContactModel):
         turn = scipy.spatial.transform.Rotation.from_rotvec(along).as_matrix()
         return Pose(turn, self.about, shift)
 
-    def spine_at(self, shift: Any) -> Array:
-        """See `reference.ContactModel`."""
-        return shift.out(self.spine)
+    def centreline_at(self, shift: Any) -> Array:
+        """Return the centreline of a rod."""
+        return shift.out(self.centreline)
 
-    def start(self) -> FiniteState:
-        """No traction, on the obstacle where it began."""
+    def initial_state(self) -> FiniteState:
+        """Return the state without traction, on the obstacle in its first position."""
         distance, normal = self.shape(self.x)
         zero = np.zeros_like(self.x)
-        pressure = None if self.project is None else np.zeros(len(zero))
+        pressure = None if self.projection is None else np.zeros(len(zero))
         return FiniteState(self.x + distance[:, None] * normal, zero, pressure, None, normal)
 
-    def respond(self, jump: Array, shift: Any, old: Any) -> dict[str, Array]:
-        """Tractions and what they follow from; ``shift`` is a `Pose`."""
+    def evaluate(self, jump: Array, shift: Any, old: Any) -> dict[str, Array]:
+        """Return tractions and local kinematics; ``shift`` is a `Pose`."""
         pose, law = shift, self.law
         x = self.x + jump
-        distance, inward = self.shape(pose.into(x))
-        n = inward @ pose.turn.T
-        foot = x + distance[:, None] * n
+        distance, local_normal = self.shape(pose.into(x))
+        n = local_normal @ pose.turn.T
+        closest = x + distance[:, None] * n
 
         def across(vector: Array) -> Array:
             return vector - np.sum(vector * n, axis=1)[:, None] * n
 
-        step = across(foot - pose.out(old.jump))
-        before = across(_turned(old.traction @ pose.turn.T, old.normal @ pose.turn.T, n))
-        closing = -distance
-        r_n = law.normal(self.k_n, closing, old.pressure)
-        tau = law.tangential(self.k_t, n, step, before, step, r_n, closing, old.limit)
+        step = across(closest - pose.out(old.jump))
+        before = across(
+            _rotate_with_normal(old.traction @ pose.turn.T, old.normal @ pose.turn.T, n)
+        )
+        overclosure = -distance
+        r_n = law.normal_traction(self.k_n, overclosure, old.pressure)
+        tau = law.tangential_traction(self.k_t, n, step, before, step, r_n, overclosure, old.bound)
         traction = r_n[:, None] * n + tau
-        found = {"normal": n, "closing": closing, "relative": pose.into(x) - self.x, "step": step}
-        found |= {"before": before, "r_n": r_n, "tau": tau, "traction": traction}
-        found |= {"framed": tau @ pose.turn, "inward": inward, "foot": pose.into(foot)}
+        found = {"normal": n, "overclosure": overclosure, "slip": step}
+        found |= {"tau_old": before, "r_n": r_n, "tau": tau, "traction": traction}
+        found |= {"relative": pose.into(x) - self.x, "projection": pose.into(closest)}
+        found |= {"tau_local": tau @ pose.turn, "n_local": local_normal}
         return found | {"turn": pose.turn}
 
-    def seen_from(self, x: Array, pose: Pose) -> tuple[Array, Array]:
-        """Distance of places from the obstacle, and its normal there."""
-        distance, inward = self.shape(pose.into(x))
-        return distance, inward @ pose.turn.T
+    def gap_at(self, x: Array, pose: Pose) -> tuple[Array, Array]:
+        """Return gap and normal at points in space."""
+        distance, local_normal = self.shape(pose.into(x))
+        return distance, local_normal @ pose.turn.T
 
-    def at_rest(self) -> Pose:
-        """See `reference.ContactModel`."""
+    def initial_position(self) -> Pose:
+        """Return the first position of the obstacle."""
         return self.pose(np.zeros(self.d), 0.0)
 
-    def counted_from(self, found: dict[str, Array], old: Any, idle: Array) -> FiniteState:
-        """See `reference.ContactModel`."""
-        jump = np.where(idle[:, None], found["foot"], old.jump)
-        return replace(old, jump=jump, normal=np.where(idle[:, None], found["inward"], old.normal))
+    def reset_slip(self, found: dict[str, Array], old: Any, unloaded: Array) -> FiniteState:
+        """Move the slip reference of unloaded points to an evaluated state."""
+        jump = np.where(unloaded[:, None], found["projection"], old.jump)
+        return replace(
+            old, jump=jump, normal=np.where(unloaded[:, None], found["n_local"], old.normal)
+        )
 
     def augment(self, found: dict[str, Array], old: Any) -> FiniteState:
-        """One round: the multipliers that the tractions found make."""
-        pressure = self.project @ -found["r_n"] if self.law.has_normal else 0 * found["r_n"]
-        traction = self.project @ found["framed"] if self.law.slips else old.traction
-        return FiniteState(old.jump, traction, pressure, None, found["inward"])
+        """Return the state after one augmentation."""
+        pressure = self.projection @ -found["r_n"] if self.law.has_normal else 0 * found["r_n"]
+        traction = self.projection @ found["tau_local"] if self.law.has_friction else old.traction
+        return FiniteState(old.jump, traction, pressure, None, found["n_local"])
 
     def next_state(self, found: dict[str, Array], old: Any) -> FiniteState:
-        """History of the next increment; ``old`` with the multipliers it was found with."""
-        if self.project is None:
-            return FiniteState(found["foot"], found["framed"], None, None, found["inward"])
-        foot = found["foot"]
-        if self.law.slips:
-            borne = self.law.stretch(self.k_t, found["normal"], found["before"] - found["tau"])
-            foot = foot - borne @ found["turn"]
-        return FiniteState(foot, old.traction.copy(), old.pressure, None, old.normal)
+        """Return the state to commit; ``old`` has the multipliers of the solution."""
+        if self.projection is None:
+            return FiniteState(
+                found["projection"], found["tau_local"], None, None, found["n_local"]
+            )
+        reference_point = found["projection"]
+        if self.law.has_friction:
+            change = found["tau_old"] - found["tau"]
+            slip = self.law.elastic_slip(self.k_t, found["normal"], change)
+            reference_point = reference_point - slip @ found["turn"]
+        return FiniteState(reference_point, old.traction.copy(), old.pressure, None, old.normal)
 
 
-def _turned(vector: Array, before: Array, now: Array) -> Array:
-    """Vectors turned with unit normals by the smallest rotation: two half turns."""
+def _rotate_with_normal(vector: Array, before: Array, now: Array) -> Array:
+    """Rotate vectors by the smallest rotation of one normal to the other: two half turns."""
 
     def half_turn(v: Array, about: Array) -> Array:
         return 2 * np.sum(v * about, axis=1)[:, None] * about - v
@@ -325,65 +335,59 @@ def _turned(vector: Array, before: Array, now: Array) -> Array:
 
 @dataclass(eq=False)
 class FiniteLoad(reference.Load):
-    """What drives an increment, the turn of the obstacles too.
-
-    Attributes:
-        angle: Radians.
-        numbers: Of the scene: stage and load parameter.
-    """
+    """Load at the end of an increment, with the angle of the obstacle (radians)."""
 
     angle: float = 0.0
 
 
 @dataclass(eq=False)
 class FiniteProblem(reference.Problem):
-    """A body that may be nonlinear, and contacts on obstacles that move and turn.
+    """A linear or nonlinear bulk with contacts on moving and rotating obstacles.
 
     Attributes:
-        bulk: Function of u: internal forces (N,), their derivative (N, N), and whether no cell is
-            turned inside out.
+        bulk: Returns, for u, internal forces (N,), tangent (N, N), and whether no cell is inverted.
         before: Load of the last solution.
-        parts: Into how many an increment is cut, tried in turn.
+        subdivisions: Numbers of parts of an increment, tried in this order.
     """
 
     bulk: Any = None
     before: Any = None
-    parts: tuple[int, ...] = _PARTS
+    subdivisions: tuple[int, ...] = _PARTS
 
     def stiffness(self, u: Array) -> Array:
-        """K at a displacement."""
+        """Return the tangent stiffness of the bulk."""
         return self.bulk(u)[1]
 
     def shifts(self, load: Any, motion: Array) -> list[Any]:
-        """Places of the obstacles."""
+        """Return the positions of the obstacles."""
         moved = super().shifts(load, motion)
         return [c.pose(s, load.angle) for c, s in zip(self.contacts, moved, strict=True)]
 
     def residual(self, u: Array, load: Any, found: list[dict]) -> tuple[Array, Array]:
-        """Internal forces - f - contact, and force on obstacles not balanced."""
+        """Return the residual of all dofs, and that of the free obstacle motions."""
         total = self.bulk(u)[0] - load.force - sum(self.contact_force(found))
         motion = [
-            (self.contacts[c].weights @ found[c]["traction"])[i] - load.pushes[c][i]
-            for c, i in self.motions()
+            (self.contacts[c].weights @ found[c]["traction"])[i] - load.obstacle_forces[c][i]
+            for c, i in self.free_motions()
         ]
         return total, np.array(motion)
 
     def solve(
         self, u: Array, motion: Array, load: Any, old: list[Any], *, rtol: float = 1e-12
     ) -> tuple[Array, Array, list[Any]]:
-        """One increment, in parts; see `reference.Problem.solve`."""
-        for parts in self.parts:
+        """Solve one increment in parts; arguments are those of `reference.Problem.solve`."""
+        for n_parts in self.subdivisions:
             with contextlib.suppress(Failed, np.linalg.LinAlgError):
                 v, m = u, motion
-                for share in np.arange(1, parts + 1) / parts:
-                    v, m = self.increment_of(v, m, self._between(load, share), old, rtol)
+                for share in np.arange(1, n_parts + 1) / n_parts:
+                    v, m = self.equilibrate(v, m, self._interpolate_load(load, share), old, rtol)
                 break
         else:
-            v, m = self._stiffened(u, motion, load, old, rtol)
-        for _ in range(_ROUNDS if any(c.project is not None for c in self.contacts) else 0):
-            found = self.respond(v, m, load, old)
+            v, m = self._solve_with_softer_springs(u, motion, load, old, rtol)
+        for _ in range(_ROUNDS if any(c.projection is not None for c in self.contacts) else 0):
+            found = self.evaluate(v, m, load, old)
             new = [
-                c.augment(f, o) if c.project is not None else o
+                c.augment(f, o) if c.projection is not None else o
                 for c, f, o in zip(self.contacts, found, old, strict=True)
             ]
             pairs = [(a, b) for a, b in zip(new, old, strict=True) if a.pressure is not None]
@@ -393,30 +397,30 @@ class FiniteProblem(reference.Problem):
             old = new
             if change <= 1e-8 * scale + self.rounding():
                 break
-            v, m = self.increment_of(v, m, load, old, rtol)
+            v, m = self.equilibrate(v, m, load, old, rtol)
         else:
-            if any(c.project is not None for c in self.contacts):
-                raise Failed("multipliers do not settle")
+            if any(c.projection is not None for c in self.contacts):
+                raise Failed("multipliers do not converge")
         self.before = load
         return v, m, old
 
-    def _stiffened(
+    def _solve_with_softer_springs(
         self, u: Array, motion: Array, load: Any, old: list[Any], rtol: float
     ) -> tuple[Array, Array]:
-        """With softer springs first."""
+        """Solve by continuation in the contact stiffness."""
         whole = [(c.k_n, c.k_t) for c in self.contacts]
         try:
             for factor in _SOFTER:
                 for contact, (k_n, k_t) in zip(self.contacts, whole, strict=True):
                     contact.k_n, contact.k_t = factor * k_n, factor * k_t
-                u, motion = self.increment_of(u, motion, load, old, rtol)
+                u, motion = self.equilibrate(u, motion, load, old, rtol)
         finally:
             for contact, (k_n, k_t) in zip(self.contacts, whole, strict=True):
                 contact.k_n, contact.k_t = k_n, k_t
         return u, motion
 
-    def _between(self, load: Any, share: float) -> Any:
-        """Part of the way from the load before."""
+    def _interpolate_load(self, load: Any, share: float) -> Any:
+        """Return a load between the last one and this one."""
         if share == 1.0:
             return load
         first = self.before
@@ -432,80 +436,80 @@ class FiniteProblem(reference.Problem):
             force=np.array(mean("force")),
             values=np.array(mean("values")),
             shifts=mean("shifts"),
-            pushes=mean("pushes"),
+            obstacle_forces=mean("obstacle_forces"),
             angle=angle + share * (load.angle - angle),
         )
 
-    def increment_of(
+    def equilibrate(
         self, u: Array, motion: Array, load: Any, old: list[Any], rtol: float
     ) -> tuple[Array, Array]:
-        """Newton's method with a line search."""
-        free = self.motions()
+        """Solve by Newton's method with a line search."""
+        free = self.free_motions()
         fixed = np.zeros(len(u), dtype=bool)
         fixed[load.fixed] = True
-        kept = np.flatnonzero(~fixed)
+        free_dofs = np.flatnonzero(~fixed)
 
         def evaluate(v: Array, m: Array) -> tuple[Array, float, Array, bool]:
             inside, stiff, whole = self.bulk(v)
-            found = self.respond(v, m, load, old)
+            found = self.evaluate(v, m, load, old)
             forces = self.contact_force(found)
             total = inside - load.force - sum(forces)
-            rest = [
-                (self.contacts[c].weights @ found[c]["traction"])[i] - load.pushes[c][i]
+            residual = [
+                (self.contacts[c].weights @ found[c]["traction"])[i] - load.obstacle_forces[c][i]
                 for c, i in free
             ]
-            size = max(np.linalg.norm(f) for f in [*forces, load.force[kept], total[fixed]])
-            size = max([size, *(abs(load.pushes[c][i]) for c, i in free)])
-            floor = np.linalg.norm(np.abs(stiff) @ np.abs(v))
+            size = max(np.linalg.norm(f) for f in [*forces, load.force[free_dofs], total[fixed]])
+            size = max([size, *(abs(load.obstacle_forces[c][i]) for c, i in free)])
+            roundoff = np.linalg.norm(np.abs(stiff) @ np.abs(v))
             for model in self.contacts:
                 stiffest = model.weights * (model.k_n + model.k_t)
-                floor += stiffest.sum() * np.abs(model.x + model.jump(v)).max()
-            return np.concatenate([total[kept], rest]), size, floor, whole
+                roundoff += stiffest.sum() * np.abs(model.x + model.jump(v)).max()
+            return np.concatenate([total[free_dofs], residual]), size, roundoff, whole
 
-        def tangent(v: Array, m: Array, *, closed: bool) -> Array:
-            return self._tangent(v, m, load, old, kept, closed=closed)
+        def tangent(v: Array, m: Array, *, stick: bool) -> Array:
+            return self._tangent(v, m, load, old, free_dofs, stick=stick)
 
         u, motion = u.copy(), motion.copy()
         u[load.fixed] = load.values
-        rest, size, floor, whole = evaluate(u, motion)
+        residual, size, roundoff, whole = evaluate(u, motion)
         if not whole:
-            raise Failed("cells are turned inside out")
-        best, idle = (np.inf, u, motion, size, floor), 0
+            raise Failed("cells are inverted")
+        best, idle = (np.inf, u, motion, size, roundoff), 0
         for iteration in range(80):
-            norm = float(np.linalg.norm(rest))
+            norm = float(np.linalg.norm(residual))
             idle = 0 if norm < 0.9 * best[0] else idle + 1
             if norm < best[0]:
-                best = (norm, u.copy(), motion.copy(), size, floor)
-            if norm <= rtol * size or norm <= 1e-15 * floor:
+                best = (norm, u.copy(), motion.copy(), size, roundoff)
+            if norm <= rtol * size or norm <= 1e-15 * roundoff:
                 break
-            if idle > 4 and best[0] <= 1e-13 * floor:  # round-off, which falls no further
+            if idle > 4 and best[0] <= 1e-13 * roundoff:  # round-off
                 break
-            matrix = tangent(u, motion, closed=False)
-            scale = np.sqrt(np.abs(np.diag(tangent(u, motion, closed=True))))
+            matrix = tangent(u, motion, stick=False)
+            scale = np.sqrt(np.abs(np.diag(tangent(u, motion, stick=True))))
             system = matrix / scale[:, None] / scale
-            held = bool(np.isfinite(system).all() and np.linalg.cond(system) < 1e12)
-            if not held:
-                system = tangent(u, motion, closed=True) / scale[:, None] / scale
-            step = -np.linalg.solve(system, rest / scale) / scale
-            first = np.linalg.norm(rest / scale)
+            is_constrained = bool(np.isfinite(system).all() and np.linalg.cond(system) < 1e12)
+            if not is_constrained:
+                system = tangent(u, motion, stick=True) / scale[:, None] / scale
+            step = -np.linalg.solve(system, residual / scale) / scale
+            first = np.linalg.norm(residual / scale)
             share, low, high, chosen = 1.0, 0.0, np.inf, None
-            for _ in range(40 if not held else 12):
+            for _ in range(40 if not is_constrained else 12):
                 v, m = u.copy(), motion.copy()
-                v[kept] += share * step[: len(kept)]
-                m += share * step[len(kept) :]
+                v[free_dofs] += share * step[: len(free_dofs)]
+                m += share * step[len(free_dofs) :]
                 now = evaluate(v, m)
                 valid = now[3] and np.isfinite(now[0]).all()
                 if valid:
                     chosen = (v, m, now)
-                if not held:
-                    # Nothing holds the body: on until something does, by the force along the way.
-                    along, slope = now[0] @ step, rest @ step
+                if not is_constrained:
+                    # The body is unconstrained: search a zero of the force along the step.
+                    along, slope = now[0] @ step, residual @ step
                     if valid and abs(along) <= 0.3 * abs(slope):
                         break
                     low, high = (share, high) if valid and along < 0 else (low, share)
                     share = 2 * share if high == np.inf else 0.5 * (low + high)
                     continue
-                # Out of a cycle, now and then.
+                # Leaves a cycle.
                 free_pass = iteration % 9 == 8 and share < 0.5
                 if valid and (
                     free_pass or np.linalg.norm(now[0] / scale) < (1 - 0.1 * share) * first
@@ -514,56 +518,56 @@ class FiniteProblem(reference.Problem):
                 share *= 0.5
             if chosen is None:
                 break
-            u, motion, (rest, size, floor, _) = chosen
-        norm, u, motion, size, floor = best
-        if norm > 1e3 * rtol * size and norm > 1e-13 * floor:
+            u, motion, (residual, size, roundoff, _) = chosen
+        norm, u, motion, size, roundoff = best
+        if norm > 1e3 * rtol * size and norm > 1e-13 * roundoff:
             raise Failed(f"residual {norm / max(size, 1e-300):.1e} of the forces")
         return u, motion
 
     def _tangent(
-        self, v: Array, m: Array, load: Any, old: list[Any], kept: Array, *, closed: bool
+        self, v: Array, m: Array, load: Any, old: list[Any], free_dofs: Array, *, stick: bool
     ) -> Array:
-        """Derivative of what is free; ``closed``: as if springs held all points every way."""
-        d, free = self.body.d, self.motions()
-        reach = _DIFFERENCE * np.ptp(self.body.places, axis=0).max()
-        matrix = np.zeros((len(kept) + len(free),) * 2)
-        matrix[: len(kept), : len(kept)] = self.bulk(v)[1][np.ix_(kept, kept)]
+        """Return the tangent of the free unknowns; ``stick``: with all points sticking."""
+        d, free = self.body.d, self.free_motions()
+        reach = _DIFFERENCE * np.ptp(self.body.nodes_x, axis=0).max()
+        matrix = np.zeros((len(free_dofs) + len(free),) * 2)
+        matrix[: len(free_dofs), : len(free_dofs)] = self.bulk(v)[1][np.ix_(free_dofs, free_dofs)]
         shifts = self.shifts(load, m)
         for c, model in enumerate(self.contacts):
             left = np.zeros((model.x.size, len(matrix)))
-            left[:, : len(kept)] = np.kron(model.interpolation, np.eye(d))[:, kept]
+            left[:, : len(free_dofs)] = np.kron(model.interpolation, np.eye(d))[:, free_dofs]
             for k, (o, i) in enumerate(free):
                 if o == c:
-                    left[i::d, len(kept) + k] = -1.0
+                    left[i::d, len(free_dofs) + k] = -1.0
             jump = model.jump(v)
             blocks = np.zeros((len(jump), d, d))
-            if closed:
+            if stick:
                 blocks[:] = -np.eye(d) * np.maximum(model.k_n, model.k_t)[:, None, None]
             else:
                 for i in range(d):
-                    way = reach * np.eye(d)[i]
+                    direction = reach * np.eye(d)[i]
                     ends = [
-                        model.respond(jump + s * way, shifts[c], old[c])["traction"]
+                        model.evaluate(jump + s * direction, shifts[c], old[c])["traction"]
                         for s in (1, -1)
                     ]
                     blocks[:, :, i] = (ends[0] - ends[1]) / (2 * reach)
             blocks *= model.weights[:, None, None]
-            felt = np.einsum("qij,qjn->qin", blocks, left.reshape(len(jump), d, -1))
-            matrix -= left.T @ felt.reshape(left.shape)
-            for k, (o, i) in enumerate(free):  # the history moves along with the obstacle
-                if o == c and not closed:
+            coupled = np.einsum("qij,qjn->qin", blocks, left.reshape(len(jump), d, -1))
+            matrix -= left.T @ coupled.reshape(left.shape)
+            for k, (o, i) in enumerate(free):  # the slip reference moves with the obstacle
+                if o == c and not stick:
                     ends = []
                     for s in (1, -1):
                         moved = replace(shifts[c], shift=shifts[c].shift + s * reach * np.eye(d)[i])
-                        there = model.respond(jump, moved, old[c])["traction"]
-                        ends.append((model.weights[:, None] * there).ravel())
+                        traction = model.evaluate(jump, moved, old[c])["traction"]
+                        ends.append((model.weights[:, None] * traction).ravel())
                     by = (ends[0] - ends[1]) / (2 * reach)
-                    matrix[:, len(kept) + k] = -left.T @ by
+                    matrix[:, len(free_dofs) + k] = -left.T @ by
         return matrix
 
 
-def rubber(u: Any, v: Any, E: Any, nu: Any) -> Any:
-    """Virtual work of neo-Hookean rubber by its first Piola-Kirchhoff stress (UFL)."""
+def rubber_work(u: Any, v: Any, E: Any, nu: Any) -> Any:
+    """Return the virtual work of neo-Hookean rubber by its first Piola–Kirchhoff stress (UFL)."""
     d = len(u)
     F = ufl.Identity(d) + ufl.grad(u)
     J, away = ufl.det(F), ufl.inv(F).T
@@ -571,37 +575,39 @@ def rubber(u: Any, v: Any, E: Any, nu: Any) -> Any:
     return ufl.inner(shear * (F - away) + lame / 2 * (J**2 - 1) * away, ufl.grad(v))
 
 
-def model(
+def make_problem(
     scene: dict[str, Any],
 ) -> tuple[FiniteProblem, Any, Callable[[int, float], FiniteLoad]]:
-    """The second problem, and its loads by stage and load parameter. On one rank."""
-    made = finite_scenes.FiniteMade(scene, MPI.COMM_SELF, bulk=rubber)
-    body, surface = fuzz_models.body_of(made)
+    """Return the independent problem, the setup, and a function of the loads. On one rank."""
+    setup = finite_scenes.FiniteSetup(scene, MPI.COMM_SELF, bulk=rubber_work)
+    body, surface = fuzz_reference.make_body(setup)
     contacts = []
     for i, contact in enumerate(scene["contacts"]):
-        made_contact, _ = fuzz_models.contact_of(made, contact, surface(11 + i), FiniteContact)
-        made_contact.shape = shape_of(scene, contact)
-        made_contact.near = made_contact.seen_from
-        turn = made.turn(contact)
+        contact_model, _ = fuzz_reference.make_contact(
+            setup, contact, surface(11 + i), FiniteContact
+        )
+        contact_model.shape = make_shape(scene, contact)
+        contact_model.deformed_gap = contact_model.gap_at
+        turn = setup.turn(contact)
         if turn is not None:
-            made_contact.turns = True
-            made_contact.about, made_contact.axis = (
+            contact_model.turns = True
+            contact_model.about, contact_model.axis = (
                 np.array(turn[0], dtype=float),
                 None if turn[1] is None else np.array(turn[1], dtype=float),
             )
-        contacts.append(made_contact)
-    return FiniteProblem(body, contacts, bulk=bulk_of(made, body)), made, loads_of(made)
+        contacts.append(contact_model)
+    return FiniteProblem(body, contacts, bulk=make_bulk(setup, body)), setup, make_loads(setup)
 
 
-def bulk_of(made: Any, body: Body) -> Callable[[Array], tuple[Array, Array, bool]]:
-    """Of u: internal forces, their derivative, and whether no cell is turned inside out."""
-    d, V = made.d, made.V
-    nonlinear = made.scene["bulk"] == "rubber"
-    outside = made.outside()
-    tangent = ufl.derivative(made.F, made.u, ufl.TrialFunction(V))
-    inner, outer = fem.form(made.F), fem.form(tangent)
-    volume = ufl.det(ufl.Identity(d) + ufl.grad(made.u))
-    dx = ufl.Measure("dx", made.mesh, metadata={"quadrature_degree": finite_scenes.DEGREE + 2})
+def make_bulk(setup: Any, body: Body) -> Callable[[Array], tuple[Array, Array, bool]]:
+    """Return a function of u: internal forces, tangent, and whether no cell is inverted."""
+    d, V = setup.d, setup.V
+    nonlinear = setup.scene["bulk"] == "rubber"
+    outside = setup.external_force()
+    tangent = ufl.derivative(setup.F, setup.u, ufl.TrialFunction(V))
+    inner, outer = fem.form(setup.F), fem.form(tangent)
+    volume = ufl.det(ufl.Identity(d) + ufl.grad(setup.u))
+    dx = ufl.Measure("dx", setup.mesh, metadata={"quadrature_degree": finite_scenes.DEGREE + 2})
     inverted = fem.form(ufl.conditional(ufl.gt(volume, 0.0), 0.0, 1.0) * dx)
     memory: dict[bytes, Any] = {}
 
@@ -610,8 +616,8 @@ def bulk_of(made: Any, body: Body) -> Callable[[Array], tuple[Array, Array, bool
             return body.stiffness @ u, body.stiffness, True
         key = u.tobytes()
         if key not in memory:
-            # F less the loads: their part of it is assembled with them at u = 0.
-            made.u.x.array[:] = u
+            # The loads in F are removed.
+            setup.u.x.array[:] = u
             force = fem.assemble_vector(inner).array + fem.assemble_vector(outside).array
             stiff = fem.assemble_matrix(outer).to_scipy().toarray()
             memory.clear()
@@ -621,34 +627,34 @@ def bulk_of(made: Any, body: Body) -> Callable[[Array], tuple[Array, Array, bool
     return bulk
 
 
-def loads_of(made: Any) -> Callable[[int, float], FiniteLoad]:
-    """What drives the bodies, by stage and load parameter."""
-    d, V, scene = made.d, made.V, made.scene
-    outside = made.outside()
+def make_loads(setup: Any) -> Callable[[int, float], FiniteLoad]:
+    """Return the load as a function of stage and load parameter."""
+    d, V, scene = setup.d, setup.V, setup.scene
+    outside = setup.external_force()
 
     def load(stage: int, t: float) -> FiniteLoad:
-        made.apply(stage, t)
+        setup.apply(stage, t)
         values = np.zeros(V.dofmap.index_map.size_local * d)
-        for bc in made.bcs:
+        for bc in setup.bcs:
             bc.set(values)
-        dofs = np.unique(np.concatenate([bc.dof_indices()[0] for bc in made.bcs]))
-        shifts, pushes = [], []
+        dofs = np.unique(np.concatenate([bc.dof_indices()[0] for bc in setup.bcs]))
+        shifts, obstacle_forces = [], []
         for contact in scene["contacts"]:
             moving, free = contact["obstacle"].get("moving"), contact["obstacle"].get("free", ())
             shift, push = np.zeros(d), np.zeros(d)
             if moving == "displacement":
-                shift = made.shift.value.copy()
-            elif moving == "carried":
-                shift = made.carried.value.copy()
+                shift = setup.shift.value.copy()
+            elif moving == "translated":
+                shift = setup.translation.value.copy()
             elif moving == "force":
                 for i in range(d):
-                    push[i] = float(made.push[i].value) if i in free else 0.0
-                    shift[i] = 0.0 if i in free else float(made.pull[i].value)
+                    push[i] = float(setup.obstacle_force[i].value) if i in free else 0.0
+                    shift[i] = 0.0 if i in free else float(setup.obstacle_motion[i].value)
             shifts.append(shift)
-            pushes.append(push)
+            obstacle_forces.append(push)
         force = fem.assemble_vector(outside).array.copy()
-        angle = float(made.angle.value)
-        return FiniteLoad(force, dofs, values[dofs], shifts, pushes, angle)
+        angle = float(setup.angle.value)
+        return FiniteLoad(force, dofs, values[dofs], shifts, obstacle_forces, angle)
 
     return load
 
@@ -657,55 +663,55 @@ def loads_of(made: Any) -> Callable[[int, float], FiniteLoad]:
 
 
 class FiniteJudge(fuzz_judge.Judge):
-    """Takes the package's increments one by one; see `fuzz_judge.Judge`.
+    """Compares the package's increments with finite kinematics.
 
-    Energies are not made anew. With friction, rubber or curved obstacles an increment may have
-    several solutions: one that differs from that found apart is "another".
+    Energies are not compared. With friction, rubber or curved obstacles an increment may have
+    several solutions: one that differs from the independent history is "another".
     """
 
     @staticmethod
-    def _model(scene: dict[str, Any]) -> Any:
-        return model(scene)
+    def _make_problem(scene: dict[str, Any]) -> Any:
+        return make_problem(scene)
 
-    def take(self, record: dict[str, Any]) -> None:
-        """Judge one committed increment."""
+    def check_increment(self, record: dict[str, Any]) -> None:
+        """Compare one committed increment."""
         load = self._load(record["stage"], record["load"])
-        super().take(record)
-        self.problem.before = self._apart.before = load
+        super().check_increment(record)
+        self.problem.before = self._other.before = load
         whole = self.problem.bulk(self._u)[2]
         name = f"stage {record['stage']} at {record['load']:.4g}"
-        self._check(name, "inside out", 0.0 if whole else 2.0, 1.0)
+        self._check(name, "inverted cells", 0.0 if whole else 2.0, 1.0)
 
     def _with_multipliers(self, contact: Any, old: Any, record: dict[str, Any]) -> Any:
-        if contact.project is None:
+        if contact.projection is None:
             return old
-        row = self._rows(contact, record)
+        row = self._rows_of(contact, record)
         traction, normal = old.traction, old.normal
-        if contact.law.slips:
+        if contact.law.has_friction:
             traction, normal = record["lambda_t"][row], record["lambda_at"][row]
         return FiniteState(old.jump, traction, record["lambda_n"][row], None, normal)
 
-    def _bulges(self, given: dict[str, Any]) -> float:
-        """A round obstacle rises into a facet by L² / 8 R."""
-        bulges = super()._bulges(given)
+    def _flatness(self, given: dict[str, Any]) -> float:
+        """Return the deviation from planes; a round obstacle has L²/(8 R) within a facet."""
+        bulges = super()._flatness(given)
         if given["obstacle"]["kind"] in ("body", "rod"):
             return bulges
         body = self.scene["bodies"][given["body"]]
-        radius = finite_scenes.place_of(self.scene, given).get("radius", np.inf)
+        radius = finite_scenes.initial_geometry(self.scene, given).get("radius", np.inf)
         length = max(s / n for s, n in zip(body["size"][:-1], body["n"][:-1], strict=True))
         length *= self.scene["units"][0]
         return float(bulges + length**2 / (8 * radius))
 
     def _check_kinematics(self, *_: Any) -> None:
-        """Nothing is taken for small."""
+        """Check nothing: displacements are not assumed small."""
 
     def _check_energy(self, name: str, record: Any, *_: Any) -> None:
-        """Friction takes energy, by the means of tractions at both ends (as the verdict has it)."""
+        """Check nothing: energies are not compared."""
 
-    def _unique(self) -> bool:
-        plain = all(c.law.unique and not c.free for c in self.problem.contacts)
+    def _is_unique(self) -> bool:
+        plain = all(c.law.is_unique and not c.free_components for c in self.problem.contacts)
         flat = all(c["obstacle"]["kind"] == "halfspace" for c in self.scene["contacts"])
         return plain and flat and self.scene["bulk"] == "linear" and not self._slips()
 
     def _slips(self) -> bool:
-        return any(c.law.slips for c in self.problem.contacts)
+        return any(c.law.has_friction for c in self.problem.contacts)

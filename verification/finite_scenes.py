@@ -1,13 +1,11 @@
-"""Random scenes with finite kinematics: one body on rigid obstacles that move and turn.
+"""Random scenes with finite kinematics: one body on moving and rotating rigid obstacles.
 
-As in `fuzz_scenes`, whose mesh, loads and history they share, a scene is a dictionary of numbers
-that is played again as it is. It says ``"kinematics": "finite"``, its contacts lie below the body
-(and at its right), and its stages turn the obstacle below as well.
+A scene is a dictionary as in `fuzz_scenes`, with ``"kinematics": "finite"``. Contacts are at the
+bottom and the right of the body; stages also have the angle of the obstacle below ("turn").
 """
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import numpy as np
@@ -18,43 +16,43 @@ import fenics_contact as fc
 from fenics_contact.elasticity import NeoHookean
 from fenics_contact.types import Array
 from scenes.surfaces import ball, box, ring
-from verification.fuzz_made import Made, capsule, geometry
-from verification.fuzz_scenes import Scene, dice, draw_form, element, frictions
+from verification.fuzz_scenes import Scene, draw_element, draw_form, frictions, make_samplers
+from verification.fuzz_setup import SceneSetup, capsule_gap, obstacle_geometry
 
-__all__ = ["DEGREE", "KINDS", "FiniteMade", "draw", "pieces", "place_of"]
+__all__ = ["DEGREE", "KINDS", "FiniteSetup", "draw", "initial_geometry", "obstacle_points"]
 
 KINDS = (
     *("halfspace", "ball", "cylinder", "ball inside", "cylinder inside"),
     *("capsule", "torus", "profile", "turned profile", "facets", "box"),
 )
-# Of the quadrature of the nonlinear bulk, the same for both solutions.
+# Quadrature degree of the nonlinear bulk, for both solvers.
 DEGREE = 4
-# Obstacles that turn about their middle without pressing more.
+# Obstacles that may rotate about their centre without additional penetration.
 _ROUND = ("ball", "cylinder", "ball inside", "cylinder inside")
 
 
 def draw(
     seed: int, *, without: tuple[str, ...] = (), ranks: int = 1, family: int | None = None
 ) -> Scene:
-    """A random scene.
+    """Draw a random scene.
 
     Args:
-        seed: The same gives the same.
-        without: Features to leave out: "space", "rubber", "turn", "motion", "multipliers",
-            "units", "restart", "corner", "method", "accuracy", "changes", "ration", "form".
-        ranks: Kept in the scene.
-        family: See `fuzz_scenes.draw`.
+        seed: Seed that determines the scene.
+        without: Features to exclude: "space", "rubber", "turn", "motion", "multipliers",
+            "units", "restart", "corner", "method", "accuracy", "changes", "max_iterations", "form".
+        ranks: Number of ranks, stored in the scene.
+        family: Family of scenes with a common structure, as for `fuzz_scenes.draw`.
     """
     rng = np.random.default_rng([seed, 30])
-    built = rng if family is None else np.random.default_rng([family, 31])
+    structure = rng if family is None else np.random.default_rng([family, 31])
 
-    chance, pick, log, within = dice(rng, built, without)
-    space, cell, degree = element(chance, pick, 0.3)
+    chance, pick, log, within = make_samplers(rng, structure, without)
+    space, cell, degree = draw_element(chance, pick, 0.3)
     d = 3 if space else 2
     most = (2 if degree == 1 else 1) if space else (6 if degree == 1 else 4)
     kinds = [k for k in KINDS if (space or k not in ("torus", "turned profile"))]
     kind = pick("halfspace", *kinds)
-    # What is round touches more than one point only where it is pressed in.
+    # Round obstacles need a larger strain to touch more than one point.
     rounded = kind not in ("halfspace", "box") and not kind.endswith("inside")
     strain = log(-1.7, -0.6) if rounded else log(-2.7, -0.8)
     n = [int(rng.integers(1, most + 1)) for _ in range(d)]
@@ -70,30 +68,30 @@ def draw(
         law_kind = pick("polygon", "ellipse")
 
     def law() -> Scene:
-        made: Scene = {"kind": law_kind}
-        made["k_n"] = pick(["scaled", log(0, 2)], ["number", log(0.5, 3)], ["scaled", None])
+        drawn: Scene = {"kind": law_kind}
+        drawn["k_n"] = pick(["scaled", log(0, 2)], ["number", log(0.5, 3)], ["scaled", None])
         if law_kind not in ("frictionless", "tension"):
-            made["friction"] = pick(0.1, 0.3, 0.3, 0.6, 1.0, of=rng)
-            made["k_t"] = pick(["scaled", log(0, 2)], ["number", log(0, 2.5)])
+            drawn["friction"] = pick(0.1, 0.3, 0.3, 0.6, 1.0, of=rng)
+            drawn["k_t"] = pick(["scaled", log(0, 2)], ["number", log(0, 2.5)])
         if law_kind == "tresca":
-            made["pressure"] = float(f"{rng.uniform(0.1, 2) * strain:.3g}")
+            drawn["pressure"] = float(f"{rng.uniform(0.1, 2) * strain:.3g}")
         if law_kind == "polygon":
-            made["modes"] = pick(3, 4, 6, 8)
+            drawn["modes"] = pick(3, 4, 6, 8)
         if law_kind == "ellipse":
-            made |= {"transverse": pick(0.1, 0.3, 0.7, of=rng), "direction": [1.0, 0.4, 0.1]}
-        return made
+            drawn |= {"transverse": pick(0.1, 0.3, 0.7, of=rng), "direction": [1.0, 0.4, 0.1]}
+        return drawn
 
     def contact(side: str, obstacle: Scene) -> Scene:
-        made: Scene = {"body": 0, "side": side, "obstacle": obstacle, "law": law()}
+        drawn: Scene = {"body": 0, "side": side, "obstacle": obstacle, "law": law()}
         if chance(0.15):
-            made["scheme"] = "vertex"
+            drawn["scheme"] = "vertex"
         elif chance(0.15):
-            made["quadrature"] = pick(2, 3, 5)
+            drawn["quadrature"] = pick(2, 3, 5)
         if chance(0.2, "multipliers") and law_kind != "tension":
-            made["enforcement"] = "augmented"
+            drawn["enforcement"] = "augmented"
         elif chance(0.1, "accuracy") and law_kind != "tension":
-            made["accuracy"] = pick("draft", "standard", 1e-4)
-        return made
+            drawn["accuracy"] = pick("draft", "standard", 1e-4)
+        return drawn
 
     obstacle: Scene = {"kind": kind, "clearance": 0.0, "radius": log(-0.3, 0.7)}
     if chance(0.3, of=rng):
@@ -119,7 +117,7 @@ def draw(
         if chance(0.35, "motion"):
             obstacle["moving"], obstacle["free"] = "force", [d - 1]
     elif chance(0.3):
-        obstacle["moving"] = "displacement"  # aside, while the body is pressed
+        obstacle["moving"] = "displacement"  # sideways, while the body is pressed
     contacts = [contact("bottom", obstacle)]
     if chance(0.1, "corner") and drive != "force":
         contacts.append(contact("right", {"kind": "halfspace", "clearance": 0.3 * strain}))
@@ -129,11 +127,11 @@ def draw(
             wall["obstacle"].pop("moving")
 
     whole = list(range(d))
-    holds: list[list[Any]] = [[0, "top", whole, "moved" if drive == "prescribed" else "still"]]
+    conditions: list[list[Any]] = [[0, "top", whole, "moved" if drive == "prescribed" else "fixed"]]
     if drive == "force":
-        holds = [[0, "left", [0], "still"]] + ([[0, "front", [1], "still"]] if space else [])
+        conditions = [[0, "left", [0], "fixed"]] + ([[0, "front", [1], "fixed"]] if space else [])
 
-    # Stages: strain at their end, ways aside in widths of the body, angle in radians.
+    # Stages: strain at their end, sliding distance in widths of the body, angle in radians.
     far = pick(strain, strain, 0.1, 0.4, of=rng)
     most_turned = 0.5 * strain
     if turns and obstacle["turn"] == "middle":
@@ -195,9 +193,9 @@ def draw(
         "units": [1.0, 1.0],
         "drive": drive,
         "contacts": contacts,
-        "holds": holds,
+        "dirichlet": conditions,
         "strain": strain,
-        "share": 1.0,
+        "load_ratio": 1.0,
         "stages": stages,
         "cuts": pick(1, 3, 5, of=rng),
     }
@@ -212,20 +210,20 @@ def draw(
         scene["condensation"] = False
     if chance(0.1):
         scene["thickness"] = log(-2, 2)
-    if chance(0.05, "ration", of=rng):
-        scene["ration"] = int(rng.integers(4, 12))
+    if chance(0.05, "max_iterations", of=rng):
+        scene["max_iterations"] = int(rng.integers(4, 12))
     return scene | draw_form(seed, family, without)
 
 
 # ---- obstacles -----------------------------------------------------------------------------------
 
 
-def place_of(scene: Scene, contact: Scene) -> dict[str, Any]:
-    """Numbers of an obstacle where it begins, in units of length."""
+def initial_geometry(scene: Scene, contact: Scene) -> dict[str, Any]:
+    """Return the geometry of an obstacle in its first position, scaled by the unit of length."""
     body, given = scene["bodies"][contact.get("body", 0)], contact["obstacle"]
     length, d = scene["units"][0], len(body["size"])
     if given["kind"] == "rod":
-        return geometry(scene, contact)
+        return obstacle_geometry(scene, contact)
     size, kind = np.array(body["size"], dtype=float), given["kind"]
     unit = np.eye(d)
     if contact["side"] == "right":
@@ -240,13 +238,13 @@ def place_of(scene: Scene, contact: Scene) -> dict[str, Any]:
         return {"point": (corner - clearance * normal) * length, "normal": normal}
     radius = given["radius"] * max(size[:-1])
     if kind.endswith("inside"):
-        # The corners of the bottom touch the wall of the cavity.
+        # The vertices of the bottom touch the cavity.
         across = size[:-1] if kind.startswith("ball") else size[:1]
         reach = 0.5 * float(np.linalg.norm(across))
         radius = max(radius, 1.2 * reach)
         height = np.sqrt(radius**2 - reach**2) - clearance
         where = {"center": middle + height * up, "radius": radius}
-    elif kind == "capsule":  # lies along x, its middle below that of the body
+    elif kind == "capsule":  # along x, below the middle of the body
         half = 0.5 * radius * unit[0]
         centre = middle - (radius + clearance) * up
         where = {
@@ -254,10 +252,10 @@ def place_of(scene: Scene, contact: Scene) -> dict[str, Any]:
             "radius": radius,
             "ends": np.stack([centre - half, centre + half]),
         }
-    elif kind == "torus":  # the tube's middle line as large as its radius and a half
+    elif kind == "torus":
         where = {"ring": 1.5 * radius, "radius": 0.5 * radius + 0.3}
         where["center"] = middle - (where["radius"] + clearance) * up
-    elif kind == "box":  # one end below the body, the other not
+    elif kind == "box":  # with one end below the body
         low, high = np.full(d, -2.0), np.full(d, 2.0)
         low[0], low[-1], high[-1] = -3.0, -2.0, -clearance
         high[0] = 0.3 * size[0] + min(given["radius"], 1.0) * size[0] / 2
@@ -271,9 +269,9 @@ def place_of(scene: Scene, contact: Scene) -> dict[str, Any]:
     return {name: value * length for name, value in where.items()}
 
 
-def pieces(scene: Scene, contact: Scene) -> tuple[Array, Array]:
-    """Points of an obstacle from data, and of facets their numbers, outwards."""
-    given, where = contact["obstacle"], place_of(scene, contact)
+def obstacle_points(scene: Scene, contact: Scene) -> tuple[Array, Array]:
+    """Return points and, if any, outward facets of an obstacle from data."""
+    given, where = contact["obstacle"], initial_geometry(scene, contact)
     kind, d = given["kind"], len(scene["bodies"][0]["size"])
     if kind == "box":
         low, high = where["low"], where["high"]
@@ -294,25 +292,25 @@ def pieces(scene: Scene, contact: Scene) -> tuple[Array, Array]:
         t = 2 * np.pi * np.arange(n) / n
     points = np.zeros((len(t), d))
     points[:, 0], points[:, -1] = radius * np.cos(t), flat * radius * np.sin(t)
-    if kind == "turned profile":  # ends on the axis, and not only nearly
+    if kind == "turned profile":  # exactly on the axis
         points[[0, -1], 0] = 0.0
     return centre + points, np.zeros((0, d), dtype=int)
 
 
-class FiniteMade(Made):
-    """A scene as mesh, forms and constants.
+class FiniteSetup(SceneSetup):
+    """Mesh, forms, conditions and constants of a scene.
 
     Attributes:
-        angle: Of the obstacle below (radians).
+        angle: Angle of the obstacle below (radians).
     """
 
     def __init__(self, scene: Scene, comm: MPI.Comm, *, bulk: Any = None) -> None:
-        """Make it. Collective.
+        """Create it. Collective.
 
         Args:
             scene: The scene.
-            comm: Ranks.
-            bulk: Function of u, v, E and ν: density of the virtual work of rubber (UFL); by default
+            comm: Communicator.
+            bulk: Function of u, v, E and ν: virtual work of rubber per volume (UFL); by default
                 that of the package.
         """
         self._rubber = scene["bulk"] == "rubber"
@@ -321,7 +319,7 @@ class FiniteMade(Made):
         self.angle = _constant(self.mesh, 0.0)
 
     def bulk(self, E: Any, dx: ufl.Measure) -> ufl.Form:
-        """Work of the stresses with a modulus over a measure; of rubber with a rule of its own."""
+        """Return the virtual work of the stresses."""
         if not self._rubber:
             return super().bulk(E, dx)
         dx = dx(metadata={"quadrature_degree": DEGREE})
@@ -331,11 +329,11 @@ class FiniteMade(Made):
         return self.thickness * NeoHookean(self.u, E, self.nu, kind).residual(self.v, dx)
 
     def bulk_of_energy(self, E: Any, dx: ufl.Measure) -> ufl.Form:
-        """See `Made`; rubber's is the derivative of its energy anyway."""
+        """Return `bulk` as the derivative of an energy."""
         return self.bulk(E, dx) if self._rubber else super().bulk_of_energy(E, dx)
 
-    def drives(self, stage: int, t: float) -> dict[str, float]:
-        """Normal, side, across and turn at a value of the load parameter within a stage."""
+    def load_levels(self, stage: int, t: float) -> dict[str, float]:
+        """Return the load factors "normal", "side", "across" and "turn" within a stage."""
         stages = self.scene["stages"]
         zero = {"normal": 0.0, "side": 0.0, "across": 0.0, "turn": 0.0}
         before = stages[stage - 1] if stage else zero
@@ -347,11 +345,11 @@ class FiniteMade(Made):
         for contact, friction in zip(self.contacts, frictions(scene, stage), strict=False):
             if friction is not None:
                 contact.parameters["friction"].value = friction
-        now, size = self.drives(stage, t), np.array(scene["bodies"][0]["size"])
-        way = np.zeros(d)
-        way[0] = now["side"] * size[0]
+        now, size = self.load_levels(stage, t), np.array(scene["bodies"][0]["size"])
+        direction = np.zeros(d)
+        direction[0] = now["side"] * size[0]
         if d == 3:
-            way[1] = now["across"] * size[1]
+            direction[1] = now["across"] * size[1]
         down = now["normal"] * scene["strain"] * size[-1]
         up = np.eye(d)[-1]
         self.angle.value = now["turn"]
@@ -360,32 +358,34 @@ class FiniteMade(Made):
             by_body = -down * up
             moving = {c["obstacle"].get("moving") for c in scene["contacts"]}
             if not moving & {"displacement", "force"}:
-                by_body = by_body + way
+                by_body = by_body + direction
             else:
-                by_obstacle = -way
+                by_obstacle = -direction
         elif scene["drive"] == "obstacle":
-            by_obstacle = down * up - way
+            by_obstacle = down * up - direction
         else:
             pull = -now["normal"] * scene["strain"] * up
             rows = self.traction.x.array.reshape(-1, d)
             rows[self._cells] = pull * self.moduli[0]
-            by_obstacle = -way
+            by_obstacle = -direction
         for _, i, value in self.moved:
             value.value = by_body[i] * self.length
         self.shift.value[:] = by_obstacle * self.length
         area = np.prod(size[:-1]) * self.length ** (d - 1) * self.thickness.value
         force = now["normal"] * scene["strain"] * self.moduli[0] * area
         for i in range(d):
-            self.push[i].value = max(force, 0.02 * scene["strain"] * self.moduli[0] * area)
-            self.pull[i].value = by_obstacle[i] * self.length
+            self.obstacle_force[i].value = max(
+                force, 0.02 * scene["strain"] * self.moduli[0] * area
+            )
+            self.obstacle_motion[i].value = by_obstacle[i] * self.length
         self.apply_features(stage, t)
 
     def turn(self, contact: Scene) -> tuple[Array, Array | None] | None:
-        """A point of the axis, and its direction in space; None: it does not turn."""
+        """Return a point and the direction of the axis of rotation; None if there is none."""
         given = contact["obstacle"]
         if "turn" not in given:
             return None
-        where = place_of(self.scene, contact)
+        where = initial_geometry(self.scene, contact)
         if given["turn"] == "middle":
             about = where["center"]
         else:  # a point near the middle of the bottom
@@ -397,18 +397,18 @@ class FiniteMade(Made):
         return about, axis
 
     def obstacle(self, contact: Scene) -> Any:
-        """The package's obstacle."""
-        given, where, d = contact["obstacle"], place_of(self.scene, contact), self.d
+        """Return the obstacle."""
+        given, where, d = contact["obstacle"], initial_geometry(self.scene, contact), self.d
         move: dict[str, Any] = {}
         if given.get("moving") == "displacement":
             move["displacement"] = self.shift
-        elif given.get("moving") == "carried":
-            move["displacement"] = self.carried
+        elif given.get("moving") == "translated":
+            move["displacement"] = self.translation
         elif given.get("moving") == "force":
             free = given["free"]
             move["displacement"] = fc.Motion(
-                force=[self.push[i] if i in free else None for i in range(d)],
-                displacement=[None if i in free else self.pull[i] for i in range(d)],
+                force=[self.obstacle_force[i] if i in free else None for i in range(d)],
+                displacement=[None if i in free else self.obstacle_motion[i] for i in range(d)],
             )
         turn = self.turn(contact)
         if turn is not None:
@@ -426,9 +426,9 @@ class FiniteMade(Made):
             axis = None if d == 2 else given.get("axis", (0.0, 1.0, 0.0))
             return fc.Cylinder(where["center"], where["radius"], axis, inside=inside, **move)
         if kind in ("capsule", "rod", "torus"):
-            shape = _torus if kind == "torus" else capsule
+            shape = _torus if kind == "torus" else capsule_gap
             return fc.SignedDistance(lambda x: shape(self.mesh, where, x), **move)
-        points, numbers = pieces(self.scene, contact)
+        points, numbers = obstacle_points(self.scene, contact)
         if kind in ("facets", "box"):
             return fc.RigidSurface(points, numbers, **move)
         if d == 2:
@@ -438,7 +438,7 @@ class FiniteMade(Made):
         return fc.RigidProfile(points, turned=(where["center"].tolist(), (0.0, 0.0, 1.0)), **move)
 
     def options(self, contact: Scene) -> dict[str, Any]:
-        """Arguments of the contact that are not those of small displacements."""
+        """Return additional arguments of a contact."""
         return {"kinematics": "finite"}
 
 
@@ -449,30 +449,11 @@ def _constant(mesh: Any, value: Any) -> Any:
 
 
 def _torus(mesh: Any, where: dict[str, Any], x: Any) -> Any:
-    """Distance from a circle about z, less the radius of the tube (UFL)."""
-    # The circle touches below the middle of the body.
+    """Return the signed distance from a torus about z (UFL)."""
+    # The centreline passes below the middle of the body.
     centre = where["center"].copy()
     centre[0] -= where["ring"]
     c = _constant(mesh, centre)
     around, tube = (_constant(mesh, float(where[n])) for n in ("ring", "radius"))
     out = ufl.sqrt((x[0] - c[0]) ** 2 + (x[1] - c[1]) ** 2) - around
     return ufl.sqrt(out**2 + (x[2] - c[2]) ** 2) - tube
-
-
-def simpler(scene: Scene) -> list[Scene]:
-    """Scenes without what small displacements do not have."""
-    found = []
-
-    def add(change: Any) -> None:
-        other = copy.deepcopy(scene)
-        change(other)
-        if other != scene:
-            found.append(other)
-
-    add(lambda s: s.update(bulk="linear"))
-    for i in range(len(scene["stages"])):
-        add(lambda s, i=i: s["stages"][i].update(turn=0.0))
-    for i, contact in enumerate(scene["contacts"]):
-        if "turn" in contact["obstacle"]:
-            add(lambda s, i=i: s["contacts"][i]["obstacle"].pop("turn"))
-    return found

@@ -1,6 +1,6 @@
-"""Random scenes, each compared with a second solution: does anything come out silently wrong?
+"""Random scenes, compared with an independent solver, to find undetected wrong results.
 
-    docker/run python verification/fuzz.py --seed 17                  # one scene, in words
+    docker/run python verification/fuzz.py --seed 17                  # one scene
     docker/run python verification/fuzz.py --scenes 1000 --resume results.csv
     docker/run python verification/fuzz.py --scenes 200 --ranks 2 --resume results2.csv
     docker/run python verification/fuzz.py --scenes 9000 --alike 12 --resume more.csv  # faster
@@ -11,14 +11,13 @@
     docker/run python verification/fuzz.py --replay scene.json --minimise
     docker/run python verification/fuzz.py --table results.csv        # Markdown
 
-Outcomes: "right" (and "another": right by its equations, but not the solution found apart, where
-friction leaves several), "refused" (with the error's class and what it says), "wrong" (the
-package said it is solved and it is not), "crashed" (an error that is no refusal), "slow", and
-"unjudged" (the judge itself failed). What is refused is tried by each of the package's methods
-alone: one that solves it contradicts the refusal, which then is a fault of the choice between them.
+Outcomes: "right"; "another" (a solution other than the independent one, which friction permits);
+"refused" (with class and category of the error); "wrong" (accepted, but not a solution); "crashed"
+(an unexpected error); "slow" (time limit); "unjudged" (the independent solver failed). Each method
+of the package is tried alone on a refused scene.
 
-Scenes are solved in processes of their own, many in one: `mpirun` for several ranks. One that hangs
-or dies is noted, and the next process goes on behind it.
+Batches of scenes are solved in separate processes, with `mpirun` for several ranks. A scene that
+hangs or ends its process is recorded, and the next process continues after it.
 """
 
 from __future__ import annotations
@@ -46,15 +45,15 @@ from typing import Any
 
 from scenes.processes import command, environment
 
-__all__ = ["Outcome", "contradicted", "features", "minimise", "play", "table"]
+__all__ = ["Outcome", "find_solving_method", "list_features", "make_table", "minimise", "run_scene"]
 
 Scene = dict[str, Any]
 
 OUTCOMES = ("right", "another", "refused", "wrong", "crashed", "slow", "unjudged")
 FIELDS = ("seed", "ranks", "outcome", "kind", "increments", "seconds", "features", "detail", "by")
-# Methods of the package that are tried alone on what it refuses, and their iterations at most.
+# Methods that are tried alone on refused scenes, and their largest number of iterations.
 METHODS = {"newton": 100, "continuation": 100, "primal_dual": 100, "lbfgs": 1000}
-# What refusals say, by what they are about.
+# Categories of refusals by words of their texts.
 CATEGORIES = {
     "half of the radius": "too deep",
     "gone through Γc": "gone through",
@@ -68,28 +67,28 @@ CATEGORIES = {
     "too large": "too large",
     "rigid": "rigid motion",
 }
-# Whether the time was up, even if the error that came of it is another.
-_LATE: list[bool] = []
-# What is made of the fields at the points, apart from the equations.
-_REPORTED = ("reported", "energy springs", "energy dissipation", "multipliers")
-# Packages that compile forms.
-_JIT = ("ffcx", "cffi", "ufl")
-# Scenes in one process.
-_BATCH = 120
+# Not empty if the time limit was exceeded, which may surface as another error.
+_TIMED_OUT: list[bool] = []
+# Checks of results, in contrast to those of the equations.
+_DERIVED_RESULTS = ("reported", "energy springs", "energy dissipation", "multipliers")
+# Packages that compile forms, whose time does not count.
+_COMPILERS = ("ffcx", "cffi", "ufl")
+# Number of scenes in one process.
+_BATCH_SIZE = 120
 
 
 @dataclass
 class Outcome:
-    """What became of a scene.
+    """Outcome of a scene.
 
     Attributes:
         outcome: One of `OUTCOMES`.
-        kind: Of a refusal its class and category; of what is wrong the checks that failed.
-        increments: Number of increments that were solved and judged.
-        seconds: For the package and the judge.
-        detail: In words.
-        worst: Largest figure of every check, in units of what is allowed.
-        by: Of what is refused, though a method of the package solves it alone: that method's name.
+        kind: Class and category of a refusal, or the failed checks.
+        increments: Number of increments that were solved and compared.
+        seconds: Time of both solvers.
+        detail: Texts of errors and failed checks.
+        worst: Largest ratio of error to tolerance of every check.
+        by: Method that alone solves a refused scene.
     """
 
     outcome: str
@@ -104,30 +103,29 @@ class Outcome:
 # ---- one scene -----------------------------------------------------------------------------------
 
 
-class _Slow(BaseException):
-    """The time is up."""
+class _TimeLimitExceeded(BaseException):
+    """The time limit is exceeded."""
 
 
 @contextlib.contextmanager
-def _limited(seconds: float | None) -> Iterator[None]:
-    """Raise `_Slow` in the block when its processor time is up; of one rank only.
-
-    That leaves out what compilers take.
-    """
+def _time_limit(seconds: float | None) -> Iterator[None]:
+    """Raise `_TimeLimitExceeded` after some processor time without compilation, on one rank."""
     if not seconds:
         yield
         return
 
-    def late(_: int, frame: Any) -> None:
-        if any(f"/{name}/" in s.filename for s in traceback.extract_stack(frame) for name in _JIT):
-            # Half a compiled form would stop all later ones that want it.
+    def timed_out(_: int, frame: Any) -> None:
+        if any(
+            f"/{name}/" in s.filename for s in traceback.extract_stack(frame) for name in _COMPILERS
+        ):
+            # An incomplete form in the cache would block later ones.
             signal.setitimer(signal.ITIMER_PROF, 0.5)
             return
-        _LATE.append(True)
-        raise _Slow
+        _TIMED_OUT.append(True)
+        raise _TimeLimitExceeded
 
-    _LATE.clear()
-    before = signal.signal(signal.SIGPROF, late)
+    _TIMED_OUT.clear()
+    before = signal.signal(signal.SIGPROF, timed_out)
     signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield
@@ -138,14 +136,14 @@ def _limited(seconds: float | None) -> Iterator[None]:
 
 def _category(error: BaseException) -> str:
     text = str(error)
-    for words, name in CATEGORIES.items():
-        if words in text:
+    for log, name in CATEGORIES.items():
+        if log in text:
             return f"{type(error).__name__}: {name}"
     return f"{type(error).__name__}: {re.sub('[0-9.e+-]+', '#', text)[:60]}"
 
 
 def _is_refusal(error: BaseException) -> bool:
-    """Whether the package says so itself, and not something below it."""
+    """Whether the error is raised by the package, not by a library."""
     import fenics_contact as fc
 
     if isinstance(error, fc.NotConverged):
@@ -154,50 +152,50 @@ def _is_refusal(error: BaseException) -> bool:
     return isinstance(error, ValueError | TypeError) and "fenics_contact/" in last.filename
 
 
-def play(
+def run_scene(
     scene: Scene,
     comm: Any = None,
     *,
     limit: float | None = None,
-    changed: Any = None,
-    spoiled: Callable[[dict[str, Any]], None] | None = None,
+    modify: Any = None,
+    perturb: Callable[[dict[str, Any]], None] | None = None,
 ) -> Outcome:
-    """Solve a scene by the package and judge it; the outcome is that of rank 0. Collective.
+    """Solve a scene by the package and compare it; rank 0 has the outcome. Collective.
 
     Args:
         scene: The scene.
-        comm: Ranks; by default one alone.
+        comm: Communicator; by default of one rank.
         limit: Processor seconds for the package, on one rank.
-        changed: See `fuzz_made.history`.
-        spoiled: Changes a record before it is judged, to show that the judge sees it.
+        modify: Function that introduces an error, see `fuzz_setup.run_history`.
+        perturb: Changes a record before it is compared (tests).
     """
     from mpi4py import MPI
 
-    from verification import fuzz_judge, fuzz_made
+    from verification import fuzz_judge, fuzz_setup
 
-    make_scene, make_judge = fuzz_made.Made, fuzz_judge.Judge
+    setup_class, judge_class = fuzz_setup.SceneSetup, fuzz_judge.Judge
     if scene.get("kinematics") == "finite":
         from verification import finite_reference, finite_scenes
 
-        make_scene, make_judge = finite_scenes.FiniteMade, finite_reference.FiniteJudge
-    elif scene.get("kinematics") == "present":
-        from verification import present_reference, present_scenes
+        setup_class, judge_class = finite_scenes.FiniteSetup, finite_reference.FiniteJudge
+    elif scene.get("kinematics") == "finite sliding":
+        from verification import sliding_reference, sliding_scenes
 
-        make_scene, make_judge = present_scenes.PresentMade, present_reference.PresentJudge
+        setup_class, judge_class = sliding_scenes.SlidingSetup, sliding_reference.SlidingJudge
     comm = comm or MPI.COMM_SELF
     records: list[dict[str, Any]] = []
     start, outcome, kind, detail = time.perf_counter(), "right", "", []
     try:
-        with warnings.catch_warnings(), _limited(limit if comm.size == 1 else None):
-            if comm.size == 1:  # on one rank of several it would leave the others waiting
+        with warnings.catch_warnings(), _time_limit(limit if comm.size == 1 else None):
+            if comm.size == 1:  # on several ranks it would be a deadlock
                 warnings.simplefilter("error", RuntimeWarning)
-            fuzz_made.history(scene, comm, records.append, changed, make_scene)
-    except _Slow:
+            fuzz_setup.run_history(scene, comm, records.append, modify, setup_class)
+    except _TimeLimitExceeded:
         outcome = "slow"
     except Exception as error:
         outcome = "refused" if _is_refusal(error) else "crashed"
         kind = _category(error)
-        if _LATE:  # inside PETSc it comes out as PETSc's error
+        if _TIMED_OUT:  # PETSc may have raised another error
             outcome, kind = "slow", ""
         trace = traceback.extract_tb(error.__traceback__)[-1]
         detail = [str(error)[:500]]
@@ -207,67 +205,70 @@ def play(
         return Outcome(outcome, kind, len(records), 0.0, [], {})
     worst: dict[str, float] = {}
     try:
-        with warnings.catch_warnings(), _limited(3 * limit if limit and comm.size == 1 else None):
+        with (
+            warnings.catch_warnings(),
+            _time_limit(3 * limit if limit and comm.size == 1 else None),
+        ):
             warnings.simplefilter("ignore")
-            if "busy" in scene:  # the second solution knows nothing of the unrelated body
-                scene = {name: value for name, value in scene.items() if name != "busy"}
+            if "unrelated_body" in scene:
+                scene = {name: value for name, value in scene.items() if name != "unrelated_body"}
                 for record in records:
                     del record["contacts"][len(scene["contacts"]) :]
                     record["energy"] = None
-            judge = make_judge(scene) if records or outcome != "right" else None
+            judge = judge_class(scene) if records or outcome != "right" else None
             for record in records:
-                if spoiled is not None:
-                    spoiled(record)
-                judge.take(record)
+                if perturb is not None:
+                    perturb(record)
+                judge.check_increment(record)
                 if judge.wrong:
                     break
-            ahead = _ahead(scene, records)
+            ahead = _next_load(scene, records)
             if outcome in ("refused", "slow") and judge is not None and not judge.wrong and ahead:
-                kind += f" ({judge.look_ahead(*ahead)})"
+                kind += f" ({judge.try_next_load(*ahead)})"
         if judge is not None:
             worst = judge.worst
             if judge.wrong:
                 outcome = "wrong"
                 kind = ", ".join(sorted({w.split(":")[0] for w in judge.wrong}))
                 unpaired = any(c["unpaired"] for c in records[-1]["contacts"])
-                if unpaired and all(w.startswith(_REPORTED) for w in judge.wrong):
+                if unpaired and all(w.startswith(_DERIVED_RESULTS) for w in judge.wrong):
                     kind = "unpaired points: " + kind
                 detail = judge.wrong[:6]
             elif outcome == "right" and judge.another:
                 outcome, detail = "another", judge.another[:3]
             detail = detail + judge.unjudged[:2]
-    except (_Slow, Exception) as error:
+    except (_TimeLimitExceeded, Exception) as error:
         outcome, kind = "unjudged", type(error).__name__
         detail = traceback.format_exc().strip().splitlines()[-6:]
     return Outcome(outcome, kind, len(records), time.perf_counter() - start, detail, worst)
 
 
-def contradicted(scene: Scene, comm: Any = None, *, limit: float | None = None) -> str:
-    """The first method that alone solves a scene, and rightly; empty if none does. Collective.
+def find_solving_method(scene: Scene, comm: Any = None, *, limit: float | None = None) -> str:
+    """Return the first method that alone solves a refused scene, or "". Collective.
 
     Args:
-        scene: A scene that is refused.
-        comm: Ranks; by default one alone.
-        limit: As for `play`.
+        scene: The scene.
+        comm: Communicator; by default of one rank.
+        limit: Processor seconds, as for `run_scene`.
     """
-    for method, most in METHODS.items():  # no other method takes over where iterations are rationed
-        found = play(scene | {"method": method, "ration": most}, comm, limit=limit)
+    for method, most in METHODS.items():  # an iteration limit excludes a fallback
+        found = run_scene(scene | {"method": method, "max_iterations": most}, comm, limit=limit)
         outcome = found.outcome if comm is None else comm.bcast(found.outcome)
         if outcome in ("right", "another"):
             return method
     return ""
 
 
-def _ahead(scene: Scene, records: list[dict[str, Any]]) -> tuple[int, float] | None:
-    """Stage and load parameter of the next increment that was asked for."""
+def _next_load(scene: Scene, records: list[dict[str, Any]]) -> tuple[int, float] | None:
+    """Return stage and load parameter of the next increment."""
     from verification import fuzz_scenes
 
     last = (records[-1]["stage"], records[-1]["load"]) if records else (-1, 0.0)
-    return next((p for p in fuzz_scenes.path(scene) if p > (last[0], last[1] + 1e-9)), None)
+    return next((p for p in fuzz_scenes.load_path(scene) if p > (last[0], last[1] + 1e-9)), None)
 
 
-def features(scene: Scene) -> list[str]:
-    """What a scene has, for tables."""
+def list_features(scene: Scene) -> list[str]:
+    """Return the features of a scene, for tables."""
     from verification import fuzz_features
 
     found = [scene["layout"], scene["cell"], f"degree {scene['degree']}", f"drive {scene['drive']}"]
@@ -275,32 +276,37 @@ def features(scene: Scene) -> list[str]:
     for contact in scene["contacts"]:
         obstacle = contact["obstacle"]
         found += [f"law {contact['law']['kind']}", f"obstacle {obstacle['kind']}"]
-        found += [f"pairs {obstacle['update']}"] if "update" in obstacle else []
-        found += [f"moving by {obstacle['moving']}"] if "moving" in obstacle else []
+        found += [f"pairs {obstacle['update_pairs']}"] if "update_pairs" in obstacle else []
+        found += (
+            [f"moving by {obstacle['moving'].replace('translated', 'translation')}"]
+            if "moving" in obstacle
+            else []
+        )
         found += [f"turning about {obstacle['turn']}"] if "turn" in obstacle else []
         found += [f"prescribed {n}" for n in ("gap",) if n in contact]
         found += [
             f"{n} {contact[n]}" for n in ("scheme", "enforcement", "accuracy") if n in contact
         ]
         found += [f"k by {contact['law'][k][0]}" for k in ("k_n", "k_t") if contact["law"].get(k)]
-    found += [n for n in ("restart", "ration", "weight", "thickness", "bend") if n in scene]
+    found += [n for n in ("restart", "weight", "thickness", "bend") if n in scene]
+    found += ["iteration limit"] * ("max_iterations" in scene)
     found += ["friction changes"] if any("friction" in s for s in scene["stages"]) else []
     sides = {(c["body"], c["side"]) for c in scene["contacts"]}
     opposite = {(c["obstacle"].get("body"), c["obstacle"].get("side")) for c in scene["contacts"]}
     found += ["both sides"] if sides & opposite else []
     found += [f"method {scene['method']}"] if "method" in scene else []
     found += ["units"] if scene["units"] != [1.0, 1.0] else []
-    found += ["two scales"] if scene["share"] != 1.0 else []
+    found += ["two scales"] if scene["load_ratio"] != 1.0 else []
     sizes = [s["normal"] for s in scene["stages"] if s["normal"] > 0]
     found += ["levels"] if sizes and max(sizes) > 50 * min(sizes) else []
     found += fuzz_features.feature_names(scene)
-    found += _unlikeness(scene) if scene.get("kinematics") == "present" else []
+    found += _dissimilarities(scene) if scene.get("kinematics") == "finite sliding" else []
     found += ["off"] if any(s["normal"] <= 0 for s in scene["stages"]) else []
     return sorted(set(found))
 
 
-def _unlikeness(scene: Scene) -> list[str]:
-    """Of two bodies: which has facets at least four times as wide, or is 1000 times as stiff."""
+def _dissimilarities(scene: Scene) -> list[str]:
+    """Return how Γc differs, by a factor of 4 in the facet size or of 1000 in the modulus."""
     own, other = (
         scene["bodies"][side["body"]]
         for side in (scene["contacts"][0], scene["contacts"][0]["obstacle"])
@@ -314,106 +320,106 @@ def _unlikeness(scene: Scene) -> list[str]:
 # ---- many scenes ---------------------------------------------------------------------------------
 
 
-def _drawn(seed: int, arguments: argparse.Namespace, ranks: int) -> Scene:
-    """The scene of a seed, in a family with the other seeds next to it, if so asked."""
-    from verification import finite_scenes, fuzz_features, fuzz_scenes, present_scenes
+def _draw_scene(seed: int, arguments: argparse.Namespace, ranks: int) -> Scene:
+    """Draw the scene of a seed; consecutive seeds may form a family."""
+    from verification import finite_scenes, fuzz_features, fuzz_scenes, sliding_scenes
 
     family = seed // arguments.alike if arguments.alike > 1 else None
     options = {"without": tuple(arguments.without), "ranks": ranks, "family": family}
     if arguments.mixed:
         number, scene = seed if family is None else family, fuzz_scenes.draw
-        # What takes longest is in some of the families alone, and in a part of these.
+        # Expensive features occur in some of the families.
         rare = {"space": number % 8 in (0, 5), "multipliers": number % 3 == 0}
         rare |= {"method": number % 2 == 0, "fine": False}
         if number % 8 in (2, 5) and seed % 2 == 0:
             scene = finite_scenes.draw
         elif number % 8 == 7 and seed % 4 == 0:
-            scene = present_scenes.draw
+            scene = sliding_scenes.draw
             options["extreme"] = number % 16 == 7
         options["without"] += tuple(name for name, some in rare.items() if not some)
         return fuzz_features.add_features(scene(seed, **options), seed, options["without"])
     if arguments.bodies:
-        return present_scenes.draw(seed, **options, extreme=arguments.extreme)
+        return sliding_scenes.draw(seed, **options, extreme=arguments.extreme)
     return (finite_scenes if arguments.finite else fuzz_scenes).draw(seed, **options)
 
 
-def _keep_forms() -> dict[Any, Any]:
-    """Load a compiled form once in this process: FFCx reads all of its folder every time.
+def _cache_forms() -> dict[Any, Any]:
+    """Load compiled forms once per process, because FFCx lists its whole cache folder each time.
 
     Returns:
-        The forms loaded so far, by their names.
+        The loaded forms by name.
     """
     from ffcx.codegeneration import jit
 
     look_up, found = jit.get_cached_module, {}
 
-    def kept(name: str, objects: Any, folder: Any, timeout: Any) -> Any:
+    def cached(name: str, objects: Any, folder: Any, timeout: Any) -> Any:
         key = (name, str(folder))
         if key not in found:
             compiled, module = look_up(name, objects, folder, timeout)
-            if module is None:  # to be compiled now
+            if module is None:  # not compiled yet
                 return None, None
             found[key] = compiled, module
         return found[key]
 
-    jit.get_cached_module = kept
+    jit.get_cached_module = cached
     return found
 
 
-def _work(seeds: list[int], arguments: argparse.Namespace) -> None:
-    """In a process of its own, on all its ranks: play scenes, a line for each on rank 0."""
+def _run_batch(seeds: list[int], arguments: argparse.Namespace) -> None:
+    """Run scenes in this process, and print a line for each on rank 0. Collective."""
     import gc
 
     from mpi4py import MPI
 
-    forms = _keep_forms()
+    forms = _cache_forms()
     comm = MPI.COMM_WORLD
     if comm.size > 1:
-        gc.disable()  # destructors are collective: together, between scenes
+        gc.disable()  # destructors are collective
     for seed in seeds:
-        scene = _drawn(seed, arguments, comm.size)
+        scene = _draw_scene(seed, arguments, comm.size)
         if comm.rank == 0:
             print(json.dumps({"begins": seed}), flush=True)
         loaded = len(forms)
-        outcome = play(scene, comm if comm.size > 1 else None, limit=arguments.limit)
+        outcome = run_scene(scene, comm if comm.size > 1 else None, limit=arguments.limit)
         if outcome.outcome == "slow" and comm.size == 1 and len(forms) > loaded:
-            # They were compiled or loaded meanwhile.
-            outcome = play(scene, None, limit=arguments.limit)
+            # Again with compiled forms.
+            outcome = run_scene(scene, None, limit=arguments.limit)
         refused = comm.bcast(outcome.outcome == "refused" and "NotConverged" in outcome.kind)
-        if refused and "ration" not in scene:
+        if refused and "max_iterations" not in scene:
             several = comm if comm.size > 1 else None
-            outcome.by = contradicted(scene, several, limit=arguments.limit)
+            outcome.by = find_solving_method(scene, several, limit=arguments.limit)
         gc.collect()
         comm.barrier()
         if comm.rank == 0:
             print(json.dumps({"seed": seed} | vars(outcome)), flush=True)
 
 
-def _batch(seeds: list[int], arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Results of scenes solved in one process; ends early where it hangs or dies."""
-    words = ["--work", ",".join(map(str, seeds)), "--limit", arguments.limit]
-    words += ["--alike", arguments.alike] + ["--finite"] * arguments.finite
-    words += ["--bodies"] * arguments.bodies + ["--extreme"] * arguments.extreme
-    words += ["--mixed"] * arguments.mixed
-    words += [v for name in arguments.without for v in ("--without", name)]
+def _start_batch(seeds: list[int], arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Yield results of scenes solved in one process, until it ends or hangs."""
+    log = ["--work", ",".join(map(str, seeds)), "--limit", arguments.limit]
+    log += ["--alike", arguments.alike] + ["--finite"] * arguments.finite
+    log += ["--bodies"] * arguments.bodies + ["--extreme"] * arguments.extreme
+    log += ["--mixed"] * arguments.mixed
+    log += [v for name in arguments.without for v in ("--without", name)]
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
-            command(arguments.ranks, __file__, *words),
+            command(arguments.ranks, __file__, *log),
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
             env=environment() | {"OMP_NUM_THREADS": "1"},
             start_new_session=True,
         )
-        late: list[bool] = []
+        timed_out: list[bool] = []
 
         def end() -> None:
-            late.append(True)
+            timed_out.append(True)
             os.killpg(process.pid, signal.SIGKILL)
 
         begun = None
         assert process.stdout is not None
-        patience = 10 * arguments.limit + 60  # compiling included
+        patience = 10 * arguments.limit + 60  # with compilation
         watch = threading.Timer(patience, end)
         watch.start()
         try:
@@ -438,14 +444,14 @@ def _batch(seeds: list[int], arguments: argparse.Namespace) -> Iterator[dict[str
                 process.wait()
         if begun is not None:
             errors.seek(0)
-            kind = "hangs" if late else f"process ended with {process.returncode}"
+            kind = "hangs" if timed_out else f"process ended with {process.returncode}"
             text = errors.read()[-1500:].splitlines()[-12:]
-            outcome = Outcome("slow" if late else "crashed", kind, 0, patience, text, {})
+            outcome = Outcome("slow" if timed_out else "crashed", kind, 0, patience, text, {})
             yield {"seed": begun} | vars(outcome)
 
 
-def run(arguments: argparse.Namespace) -> Counter[str]:
-    """Play scenes that are not in the file of results yet, and add them."""
+def run_campaign(arguments: argparse.Namespace) -> Counter[str]:
+    """Run the scenes that are not in the file of results yet, and append them."""
     path = Path(arguments.resume)
     done = set()
     if path.exists():
@@ -456,10 +462,10 @@ def run(arguments: argparse.Namespace) -> Counter[str]:
     lock = threading.Lock()
 
     def note(found: dict[str, Any]) -> None:
-        scene = _drawn(found["seed"], arguments, arguments.ranks)
+        scene = _draw_scene(found["seed"], arguments, arguments.ranks)
         row = {n: found.get(n) for n in FIELDS} | {
             "ranks": arguments.ranks,
-            "features": "; ".join(features(scene)),
+            "features": "; ".join(list_features(scene)),
             "detail": " | ".join(found["detail"]),
             "seconds": f"{found['seconds']:.2f}",
         }
@@ -481,11 +487,11 @@ def run(arguments: argparse.Namespace) -> Counter[str]:
     def worker(own: list[int]) -> None:
         while own:
             got = set()
-            for found in _batch(own[:_BATCH], arguments):
+            for found in _start_batch(own[:_BATCH_SIZE], arguments):
                 note(found)
                 got.add(found["seed"])
             if not got:
-                raise RuntimeError(f"no scene of {own[:_BATCH]} could be started")
+                raise RuntimeError(f"no scene of {own[:_BATCH_SIZE]} could be started")
             own = [s for s in own if s not in got]
 
     threads = [
@@ -500,13 +506,13 @@ def run(arguments: argparse.Namespace) -> Counter[str]:
     return counts
 
 
-# ---- the shortest scene that fails ---------------------------------------------------------------
+# ---- minimal scenes ------------------------------------------------------------------------------
 
 
-def _simpler(scene: Scene) -> Iterator[Scene]:
-    """Scenes with one feature less."""
+def _simplifications(scene: Scene) -> Iterator[Scene]:
+    """Yield scenes with one feature less."""
 
-    def changed(change: Callable[[Scene], Any]) -> Iterator[Scene]:
+    def modify(change: Callable[[Scene], Any]) -> Iterator[Scene]:
         other = copy.deepcopy(scene)
         change(other)
         if other != scene:
@@ -514,7 +520,7 @@ def _simpler(scene: Scene) -> Iterator[Scene]:
 
     for name in (
         "restart",
-        "ration",
+        "max_iterations",
         "method",
         "condensation",
         "weight",
@@ -522,32 +528,32 @@ def _simpler(scene: Scene) -> Iterator[Scene]:
         "form",
         "bend",
         "cuts",
-        "busy",
-        "carry",
+        "unrelated_body",
+        "translation",
     ):
         if name in scene:
-            yield from changed(lambda s, n=name: s.pop(n))
-    yield from changed(lambda s: s.update(units=[1.0, 1.0]))
-    yield from changed(lambda s: s.update(share=1.0))
+            yield from modify(lambda s, n=name: s.pop(n))
+    yield from modify(lambda s: s.update(units=[1.0, 1.0]))
+    yield from modify(lambda s: s.update(load_ratio=1.0))
     n_stages = len(scene["stages"])
     for i in reversed(range(n_stages)):
         if n_stages > 1:
-            yield from changed(lambda s, i=i: s["stages"].pop(i))
-        yield from changed(lambda s, i=i: s["stages"][i].update(steps=1))
-        yield from changed(lambda s, i=i: s["stages"][i].pop("friction", None))
-        yield from changed(lambda s, i=i: s["stages"][i].update(across=0.0))
-        yield from changed(lambda s, i=i: s["stages"][i].update(side=0.0, across=0.0))
+            yield from modify(lambda s, i=i: s["stages"].pop(i))
+        yield from modify(lambda s, i=i: s["stages"][i].update(steps=1))
+        yield from modify(lambda s, i=i: s["stages"][i].pop("friction", None))
+        yield from modify(lambda s, i=i: s["stages"][i].update(across=0.0))
+        yield from modify(lambda s, i=i: s["stages"][i].update(side=0.0, across=0.0))
         for n in ("normal", "side"):
             value = float(f"{scene['stages'][i][n]:.1g}")
-            yield from changed(lambda s, i=i, n=n, v=value: s["stages"][i].update({n: v}))
+            yield from modify(lambda s, i=i, n=n, v=value: s["stages"][i].update({n: v}))
     if len(scene["contacts"]) > 1 and scene["layout"] in ("corner", "pair"):
-        yield from changed(lambda s: s["contacts"].pop())
+        yield from modify(lambda s: s["contacts"].pop())
     for i, contact in enumerate(scene["contacts"]):
         for name in ("gap", "scheme", "quadrature", "enforcement", "accuracy"):
             if name in contact:
-                yield from changed(lambda s, i=i, n=name: s["contacts"][i].pop(n))
+                yield from modify(lambda s, i=i, n=name: s["contacts"][i].pop(n))
         law, obstacle = contact["law"], contact["obstacle"]
-        yield from changed(
+        yield from modify(
             lambda s, i=i: s["contacts"][i].update(
                 law={"kind": "frictionless", "k_n": ["number", 10.0]}
             )
@@ -559,51 +565,53 @@ def _simpler(scene: Scene) -> Iterator[Scene]:
                 "k_n": ["number", 10.0],
                 "k_t": ["number", 10.0],
             }
-            yield from changed(lambda s, i=i, x=simple: s["contacts"][i].update(law=x))
+            yield from modify(lambda s, i=i, x=simple: s["contacts"][i].update(law=x))
         for k in ("k_n", "k_t"):
             if law.get(k):
-                yield from changed(
+                yield from modify(
                     lambda s, i=i, k=k: s["contacts"][i]["law"].update({k: ["number", 10.0]})
                 )
         for name in ("slope", "moving"):
             if name in obstacle:
-                yield from changed(lambda s, i=i, n=name: s["contacts"][i]["obstacle"].pop(n))
+                yield from modify(lambda s, i=i, n=name: s["contacts"][i]["obstacle"].pop(n))
         if obstacle["kind"] != "body":
             plain = {n: v for n, v in obstacle.items() if n in ("moving", "free")}
             plain |= {"kind": "halfspace", "clearance": 0.0}
-            yield from changed(lambda s, i=i, p=plain: s["contacts"][i].update(obstacle=p))
-            yield from changed(lambda s, i=i: s["contacts"][i]["obstacle"].update(clearance=0.0))
+            yield from modify(lambda s, i=i, p=plain: s["contacts"][i].update(obstacle=p))
+            yield from modify(lambda s, i=i: s["contacts"][i]["obstacle"].update(clearance=0.0))
         else:
-            yield from changed(lambda s, i=i: s["contacts"][i]["obstacle"].update(update="never"))
+            yield from modify(
+                lambda s, i=i: s["contacts"][i]["obstacle"].update(update_pairs="never")
+            )
     for b, body in enumerate(scene["bodies"]):
-        yield from changed(lambda s, b=b: s["bodies"][b].update(jitter=0))
-        yield from changed(lambda s, b=b: s["bodies"][b].update(E=1000.0))
+        yield from modify(lambda s, b=b: s["bodies"][b].update(jitter=0))
+        yield from modify(lambda s, b=b: s["bodies"][b].update(E=1000.0))
         for i, n in enumerate(body["n"]):
             for fewer in {1, n - 1}:
                 if 0 < fewer < n:
-                    yield from changed(
+                    yield from modify(
                         lambda s, b=b, i=i, f=fewer: s["bodies"][b]["n"].__setitem__(i, f)
                     )
-    for i in range(len(scene["holds"])):
-        yield from changed(lambda s, i=i: s["holds"].pop(i))
-    yield from changed(lambda s: s.update(degree=1))
-    yield from changed(lambda s: s.update(nu=0.3))
-    yield from changed(lambda s: s.update(strain=float(f"{s['strain']:.1g}")))
+    for i in range(len(scene["dirichlet"])):
+        yield from modify(lambda s, i=i: s["dirichlet"].pop(i))
+    yield from modify(lambda s: s.update(degree=1))
+    yield from modify(lambda s: s.update(nu=0.3))
+    yield from modify(lambda s: s.update(strain=float(f"{s['strain']:.1g}")))
     if scene["cell"] == "triangle":
-        yield from changed(lambda s: s.update(cell="quadrilateral"))
+        yield from modify(lambda s: s.update(cell="quadrilateral"))
     if scene["cell"] == "tetrahedron":
-        yield from changed(lambda s: s.update(cell="hexahedron"))
+        yield from modify(lambda s: s.update(cell="hexahedron"))
 
 
 def minimise(
-    scene: Scene, fails: Callable[[Scene], bool], *, seconds: float = 120.0, words: Any = None
+    scene: Scene, fails: Callable[[Scene], bool], *, seconds: float = 120.0, log: Any = None
 ) -> Scene:
-    """Drop features one at a time while ``fails`` stays true, until none can go."""
+    """Remove features of a scene one by one, as long as ``fails`` is true."""
     end = time.monotonic() + seconds
     going = True
     while going:
         going = False
-        for simpler in _simpler(scene):
+        for simpler in _simplifications(scene):
             if time.monotonic() > end:
                 return scene
             try:
@@ -612,8 +620,8 @@ def minimise(
                 stays = False
             if stays:
                 scene, going = simpler, True
-                if words:
-                    words(f"simpler: {len(json.dumps(scene))} characters")
+                if log:
+                    log(f"simpler: {len(json.dumps(scene))} characters")
                 break
     return scene
 
@@ -621,13 +629,13 @@ def minimise(
 # ---- the table -----------------------------------------------------------------------------------
 
 
-def _by(row: dict[str, str]) -> str:
-    """What solves alone what is refused, for a table; files of earlier runs do not say."""
+def _method_remark(row: dict[str, str]) -> str:
+    """Return a remark on the method that alone solves a refused scene; older files have none."""
     return f", though {row['by']} alone solves it" if row.get("by") else ""
 
 
-def table(paths: list[str]) -> str:
-    """Outcomes by feature and refusals by category, as Markdown."""
+def make_table(paths: list[str]) -> str:
+    """Return outcomes by feature, and refusals by category, in Markdown."""
     rows = []
     for path in paths:
         with open(path, newline="") as file:
@@ -648,7 +656,7 @@ def table(paths: list[str]) -> str:
         lines.append(f"| {name} | {counts.total()} | " + " | ".join(cells) + " |")
     lines += ["", "| outcome | why | scenes |", "|---|---|---|"]
     why = Counter(
-        (r["outcome"], f"{r['kind']}{_by(r)}")
+        (r["outcome"], f"{r['kind']}{_method_remark(r)}")
         for r in rows
         if r["outcome"] not in ("right", "another")
     )
@@ -657,49 +665,41 @@ def table(paths: list[str]) -> str:
 
 
 def main() -> int:
-    """The command; ends with 1 where something is wrong or crashed."""
+    """Run the command; the exit code is 1 if a scene is wrong or crashed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, help="play one scene and tell")
-    parser.add_argument("--replay", help="play the scene in a JSON file and tell")
-    parser.add_argument(
-        "--minimise", action="store_true", help="find the shortest that fails alike"
-    )
-    parser.add_argument("--scenes", type=int, default=100, help="how many")
+    parser.add_argument("--seed", type=int, help="run one scene")
+    parser.add_argument("--replay", help="run the scene in a JSON file")
+    parser.add_argument("--minimise", action="store_true", help="reduce a scene that fails")
+    parser.add_argument("--scenes", type=int, default=100, help="number of scenes")
     parser.add_argument("--start", type=int, default=0, help="first seed")
     parser.add_argument("--ranks", type=int, default=1)
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument(
         "--limit", type=float, default=10.0, help="processor seconds for the package"
     )
-    parser.add_argument("--resume", default="fuzz.csv", help="file of results, added to")
-    parser.add_argument("--without", action="append", default=[], help="a feature to leave out")
+    parser.add_argument("--resume", default="fuzz.csv", help="file of results, appended to")
+    parser.add_argument("--without", action="append", default=[], help="a feature to exclude")
     parser.add_argument(
-        "--alike", type=int, default=1, help="so many scenes in a row share their forms"
+        "--alike", type=int, default=1, help="number of consecutive scenes with common forms"
     )
-    parser.add_argument(
-        "--finite", action="store_true", help="scenes with finite kinematics; seeds of their own"
-    )
-    parser.add_argument(
-        "--bodies", action="store_true", help="of two bodies with finite kinematics; likewise"
-    )
-    parser.add_argument(
-        "--extreme", action="store_true", help="bodies as unlike as can be; with --bodies"
-    )
+    parser.add_argument("--finite", action="store_true", help="finite kinematics, rigid obstacles")
+    parser.add_argument("--bodies", action="store_true", help="finite kinematics, two bodies")
+    parser.add_argument("--extreme", action="store_true", help="dissimilar bodies, with --bodies")
     parser.add_argument(
         "--mixed", action="store_true", help="scenes of all three kinds, with additional features"
     )
-    parser.add_argument("--table", nargs="+", help="print the table of files of results")
-    parser.add_argument("--verbose", action="store_true", help="a line for every scene")
+    parser.add_argument("--table", nargs="+", help="print a table of files of results")
+    parser.add_argument("--verbose", action="store_true", help="print a line for every scene")
     parser.add_argument("--work", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.table:
-        print(table(arguments.table))
+        print(make_table(arguments.table))
         return 0
     if arguments.work:
-        _work([int(s) for s in arguments.work.split(",")], arguments)
+        _run_batch([int(s) for s in arguments.work.split(",")], arguments)
         return 0
     if arguments.seed is None and arguments.replay is None:
-        counts = run(arguments)
+        counts = run_campaign(arguments)
         return int(counts["wrong"] + counts["crashed"] > 0)
 
     from mpi4py import MPI
@@ -708,18 +708,18 @@ def main() -> int:
     if arguments.replay:
         scene = json.loads(Path(arguments.replay).read_text())
     else:
-        scene = _drawn(arguments.seed, arguments, comm.size)
-    outcome = play(scene, comm if comm.size > 1 else None, limit=None)
+        scene = _draw_scene(arguments.seed, arguments, comm.size)
+    outcome = run_scene(scene, comm if comm.size > 1 else None, limit=None)
     bad = outcome.outcome in ("wrong", "crashed", "unjudged")
     if arguments.minimise and bad and comm.size == 1:
 
         def fails(other: Scene) -> bool:
-            found = play(other, limit=arguments.limit)
+            found = run_scene(other, limit=arguments.limit)
             same = set(found.kind.split(", ")) & set(outcome.kind.split(", "))
             return found.outcome == outcome.outcome and bool(same)
 
-        scene = minimise(scene, fails, words=lambda text: print(text, file=sys.stderr))
-        outcome = play(scene)
+        scene = minimise(scene, fails, log=lambda text: print(text, file=sys.stderr))
+        outcome = run_scene(scene)
     if comm.rank == 0:
         print(json.dumps(scene))
         print(f"{outcome.outcome}: {outcome.kind} ({outcome.increments} increments)")

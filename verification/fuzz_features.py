@@ -1,11 +1,11 @@
-"""What random scenes of all kinds may have in addition, drawn by numbers of its own.
+"""Additional features of random scenes, drawn by a generator of their own.
 
-- ``"busy"``: an unrelated body in the same mesh, with loads, motions and a floor of its own. The
-  second solution is that of the scene without it.
-- an obstacle of kind ``"rod"``: a thin plate, a blade or a pin, all of them capsules, which is
-  pressed against the body, dragged past an end, or led through it.
-- ``"carry"``: a translation of all bodies and obstacles by many lengths.
-- longer ways along the surface, past the end of what lies opposite.
+- ``"unrelated_body"``: a body in the same mesh with its own loads, motions and floor, which the
+  independent solver leaves out.
+- an obstacle of kind ``"rod"``: a plate, blade or pin (a capsule) that is thinner than a facet, and
+  is pressed against the body, slid past an end, or moved through it.
+- ``"translation"``: a translation of all bodies and obstacles by many lengths.
+- sliding past the end of the opposing surface.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from verification.fuzz_scenes import Scene, dice
+from verification.fuzz_scenes import Scene, make_samplers
 
-__all__ = ["BUSY", "add_features", "feature_names", "with_busy_body"]
+__all__ = ["UNRELATED_BODIES", "add_features", "feature_names", "with_unrelated_body"]
 
-# Where unrelated bodies stand along x, in units of length.
-_PLACE = 30.0
-# What they do: E by that of the scene, motion of the top (length) or its traction by E, and whether
-# the bottom is on a floor with friction.
-BUSY: dict[str, Scene] = {
-    "led aside": {"E": 1.0, "moved": [3.0, 0.0], "floor": False},
+# Position of unrelated bodies along x, in units of length.
+_DISTANCE = 30.0
+# Unrelated bodies: E relative to the scene, motion of the top (length) or its traction relative to
+# E, and whether the bottom is on a floor with friction.
+UNRELATED_BODIES: dict[str, Scene] = {
+    "moved": {"E": 1.0, "moved": [3.0, 0.0], "floor": False},
     "rubbed": {"E": 1.0, "moved": [3.0, -1e-2], "floor": True},
     "compressed": {"E": 1.0, "moved": [0.0, -0.1], "floor": True},
     "stiff": {"E": 1e6, "moved": [0.0, -1e-2], "floor": True},
@@ -36,45 +36,45 @@ _FEW_UNKNOWNS = 2
 
 
 def add_features(scene: Scene, seed: int, without: tuple[str, ...] = ()) -> Scene:
-    """A drawn scene with additional features, each by chance.
+    """Return a copy of a scene with additional features.
 
     Args:
-        scene: The scene; it stays as it is.
-        seed: The same gives the same.
-        without: Features to leave out: "busy", "rod", "carry", "ends".
+        scene: The scene.
+        seed: Seed that determines the features.
+        without: Features to exclude: "unrelated_body", "rod", "translation", "ends".
     """
     scene = copy.deepcopy(scene)
     rng = np.random.default_rng([seed, 24])
-    chance, pick, log, within = dice(rng, rng, without)
-    rigid = scene.get("kinematics") != "present"
+    chance, pick, log, within = make_samplers(rng, rng, without)
+    rigid = scene.get("kinematics") != "finite sliding"
     if chance(0.25, "rod") and rigid and "bend" not in scene and scene["layout"] != "apart":
         _add_rod(scene, chance, pick, log, within)
     elif chance(0.4, "ends"):
-        _drag_farther(scene, within)
-    if chance(0.3, "carry") and _can_be_carried(scene):
+        _extend_sliding(scene, within)
+    if chance(0.3, "translation") and _can_be_translated(scene):
         far = log(0, 1.5) * max(b["size"][0] for b in scene["bodies"])
         angle = within(-np.pi, np.pi) if scene["drive"] != "force" else pick(0.0, np.pi)
-        scene["carry"] = [float(f"{far * f(angle):.3g}") for f in (np.cos, np.sin)]
+        scene["translation"] = [float(f"{far * f(angle):.3g}") for f in (np.cos, np.sin)]
         for contact in scene["contacts"]:
             if contact["obstacle"]["kind"] != "body":
-                contact["obstacle"].setdefault("moving", "carried")
-    if chance(0.35, "busy"):
-        scene["busy"] = pick(*BUSY)
+                contact["obstacle"].setdefault("moving", "translated")
+    if chance(0.35, "unrelated_body"):
+        scene["unrelated_body"] = pick(*UNRELATED_BODIES)
     return scene
 
 
-def _can_be_carried(scene: Scene) -> bool:
-    """Whether conditions and obstacles can lead all bodies along."""
+def _can_be_translated(scene: Scene) -> bool:
+    """Whether conditions and obstacles can move with all bodies."""
     obstacles = [c["obstacle"] for c in scene["contacts"]]
     moving = [s.get("moving") for s in obstacles]
     if "kinematics" not in scene and {s["kind"] for s in obstacles} - {"halfspace", "body"}:
-        return False  # where a curved obstacle has gone its normals are others
-    kept = {h[0] for h in scene["holds"] if 0 in h[2]}
-    return "force" not in moving and len(kept) == len(scene["bodies"])
+        return False  # normals of a moved curved obstacle change
+    bodies = {h[0] for h in scene["dirichlet"] if 0 in h[2]}
+    return "force" not in moving and len(bodies) == len(scene["bodies"])
 
 
-def _drag_farther(scene: Scene, within: Any) -> None:
-    """Ways aside up to two and a half times the width of the body, where obstacles have ends."""
+def _extend_sliding(scene: Scene, within: Any) -> None:
+    """Extend sliding to at most 2.5 widths of the body, on obstacles with ends."""
     ends = {c["obstacle"]["kind"] for c in scene["contacts"]} & {"body", "box", "facets", "capsule"}
     sides = [abs(s["side"]) for s in scene["stages"]]
     if "kinematics" not in scene or not ends or not max(sides):
@@ -85,7 +85,7 @@ def _drag_farther(scene: Scene, within: Any) -> None:
 
 
 def _add_rod(scene: Scene, chance: Any, pick: Any, log: Any, within: Any) -> None:
-    """Put a rod in the place of the obstacles, and let it be led along."""
+    """Replace the obstacles by a moving rod."""
     finite = "kinematics" in scene
     body = scene["bodies"][0]
     d, width, height = len(body["size"]), body["size"][0], body["size"][-1]
@@ -121,7 +121,7 @@ def _add_rod(scene: Scene, chance: Any, pick: Any, log: Any, within: Any) -> Non
         [(press, 0.0), (0.0, aside), (press, 0.0)],
         [(press, aside)],
     )
-    if chance(0.2):  # it comes from beside the body
+    if chance(0.2):  # it comes from the side
         sign = pick(-1.0, 1.0)
         obstacle["at"] = float(f"{0.5 - sign * (0.55 + 0.5 * (reach - width) / width):.4g}")
         obstacle["clearance"] = -depth
@@ -140,43 +140,47 @@ def _add_rod(scene: Scene, chance: Any, pick: Any, log: Any, within: Any) -> Non
             stage["turn"] = within(-1.0, 1.0) if turns else 0.0
         stages.append({n: v if n == "steps" else float(f"{v:.4g}") for n, v in stage.items()})
     scene |= {"bodies": [body], "contacts": [contact], "layout": "floor", "drive": "obstacle"}
-    scene |= {"stages": stages, "holds": [[0, "top", list(range(d)), "still"]], "share": 1.0}
+    scene |= {"dirichlet": [[0, "top", list(range(d)), "fixed"]], "load_ratio": 1.0}
+    scene["stages"] = stages
     scene["cuts"] = pick(1, 3, 5)
-    for name in ("restart", "thickness", "ration"):
+    for name in ("restart", "thickness", "max_iterations"):
         scene.pop(name, None)
 
 
 # ---- the unrelated body --------------------------------------------------------------------------
 
 
-def with_busy_body(scene: Scene) -> Scene:
-    """The scene with its unrelated body as the last one, if there is any."""
-    if "busy" not in scene:
+def with_unrelated_body(scene: Scene) -> Scene:
+    """Return the scene with its unrelated body, if any, as the last body."""
+    if "unrelated_body" not in scene:
         return scene
-    busy = BUSY[scene["busy"]]
+    unrelated = UNRELATED_BODIES[scene["unrelated_body"]]
     d, first = len(scene["bodies"][0]["size"]), scene["bodies"][0]
-    body = {"origin": [busy.get("place", _PLACE)] + [0.0] * (d - 1), "size": [1.0] * d}
-    body |= {"n": [_FEW_UNKNOWNS if d == 2 else 1] * d, "E": first["E"] * busy["E"], "jitter": 0}
+    body = {"origin": [unrelated.get("place", _DISTANCE)] + [0.0] * (d - 1), "size": [1.0] * d}
+    n = [_FEW_UNKNOWNS if d == 2 else 1] * d
+    body |= {"n": n, "E": first["E"] * unrelated["E"], "jitter": 0}
     number = len(scene["bodies"])
     found = scene | {"bodies": [*scene["bodies"], body]}
-    holds = list(scene["holds"])
-    if "moved" in busy:
-        holds.append([number, "top", list(range(d)), "busy"])
+    conditions = list(scene["dirichlet"])
+    if "moved" in unrelated:
+        conditions.append([number, "top", list(range(d)), "unrelated_body"])
     elif d == 3:
-        holds.append([number, "front", [1], "busy"])
-    if busy["floor"]:
+        conditions.append([number, "front", [1], "unrelated_body"])
+    if unrelated["floor"]:
         law = {"kind": "coulomb", "friction": 0.3, "k_n": ["scaled", 10.0], "k_t": ["scaled", 10.0]}
         floor = {"body": number, "side": "bottom", "law": law}
         floor["obstacle"] = {"kind": "halfspace", "clearance": 0.0}
         found["contacts"] = [*scene["contacts"], floor]
     if "bend" in scene:
         found["bend"] = [*scene["bend"], 0.0]
-    return found | {"holds": holds}
+    return found | {"dirichlet": conditions}
 
 
 def feature_names(scene: Scene) -> list[str]:
-    """What of this a scene has, for tables."""
-    found = [f"{n} {scene[n]}" for n in ("busy",) if n in scene] + ["busy"] * ("busy" in scene)
-    found += ["carried"] * ("carry" in scene)
+    """Return the names of additional features, for tables."""
+    found = []
+    if "unrelated_body" in scene:
+        found += ["unrelated body", f"unrelated body {scene['unrelated_body']}"]
+    found += ["translated"] * ("translation" in scene)
     shapes = [c["obstacle"]["shape"] for c in scene["contacts"] if "shape" in c["obstacle"]]
     return found + [f"rod {shape}" for shape in shapes]

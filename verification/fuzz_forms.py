@@ -1,7 +1,7 @@
-"""The bulk forms of random scenes, in the ways in which their users write them.
+"""Equivalent bulk forms of random scenes.
 
-Each is the form of the scene with coefficients by cell and plain measures (`Made.F`), which the
-second solution is made of. Cells are tagged by their body and, in it, by their half.
+Each equals the form with piecewise constant coefficients (`SceneSetup.F`), which the independent
+solver uses. Cells are tagged by body and half of the body.
 """
 
 from __future__ import annotations
@@ -15,42 +15,42 @@ from dolfinx import fem
 
 from fenics_contact.types import Array
 
-__all__ = ["written"]
+__all__ = ["make_form"]
 
 
-def written(made: Any) -> ufl.Form:
-    """The residual of a `Made` scene as the scene says. Collective."""
-    way = made.scene.get("form", "plain")
-    if way == "plain":
-        return made.F
-    mesh, (cells, moduli) = made.mesh, _materials(made)
+def make_form(setup: Any) -> ufl.Form:
+    """Return the residual in the form that the scene requires. Collective."""
+    kind = setup.scene.get("form", "plain")
+    if kind == "plain":
+        return setup.F
+    mesh, (cells, moduli) = setup.mesh, _materials(setup)
     n_own = mesh.topology.index_map(mesh.topology.dim).size_local
     data: Any = cells
-    if way == "pairs":
+    if kind == "pairs":
         own = {tag: cells.find(tag) for tag in moduli}
         data = [(tag, found[found < n_own]) for tag, found in own.items()]
     dx = ufl.Measure("dx", mesh, subdomain_data=data)
-    if way in ("loads", "beside"):
-        F = made.bulk(made.E, dx if way == "loads" else ufl.dx(mesh))
+    if kind in ("loads", "beside"):
+        F = setup.bulk(setup.E, dx if kind == "loads" else ufl.dx(mesh))
     else:
         measures = {tag: dx(tag) for tag in moduli}
-        if way == "measures":
+        if kind == "measures":
             measures = {
                 tag: ufl.Measure("dx", mesh, subdomain_data=data, subdomain_id=tag)
                 for tag in moduli
             }
-        bulk = made.bulk_of_energy if way == "energy" else made.bulk
+        bulk = setup.bulk_of_energy if kind == "energy" else setup.bulk
         F = sum(bulk(fem.Constant(mesh, E), measures[tag]) for tag, E in moduli.items())
-    return F - made.loads(dx(tuple(moduli)), ufl.ds(mesh, subdomain_data=made.tags))
+    return F - setup.loads(dx(tuple(moduli)), ufl.ds(mesh, subdomain_data=setup.tags))
 
 
-def _materials(made: Any) -> tuple[dolfinx.mesh.MeshTags, dict[int, float]]:
-    """Tags of the cells, and Young's modulus by tag (stress). Collective."""
-    mesh, d = made.mesh, made.d
-    every = np.arange(len(made.box), dtype=np.int32)
+def _materials(setup: Any) -> tuple[dolfinx.mesh.MeshTags, dict[int, float]]:
+    """Return the cell tags, and Young's modulus by tag (stress). Collective."""
+    mesh, d = setup.mesh, setup.d
+    every = np.arange(len(setup.cell_body), dtype=np.int32)
     height: Array = dolfinx.mesh.compute_midpoints(mesh, d, every).reshape(-1, 3)[:, d - 1]
-    middle = [(b["origin"][-1] + 0.5 * b["size"][-1]) * made.length for b in made.scene["bodies"]]
-    tags = (1 + 2 * made.box + (height > np.array(middle)[made.box])).astype(np.int32)
-    present = sorted(set().union(*made.comm.allgather(tags.tolist())))
+    middle = [(b["origin"][-1] + 0.5 * b["size"][-1]) * setup.length for b in setup.scene["bodies"]]
+    tags = (1 + 2 * setup.cell_body + (height > np.array(middle)[setup.cell_body])).astype(np.int32)
+    present = sorted(set().union(*setup.comm.allgather(tags.tolist())))
     cells = dolfinx.mesh.meshtags(mesh, d, every, tags)
-    return cells, {tag: float(made.moduli[(tag - 1) // 2]) for tag in present}
+    return cells, {tag: float(setup.moduli[(tag - 1) // 2]) for tag in present}

@@ -1,9 +1,9 @@
-"""Random scenes of contact as plain dictionaries; `fuzz_made` and `fuzz_models` make them.
+"""Random scenes of contact, as dictionaries that can be stored as JSON.
 
-A scene is boxes that share no node, contacts between them or with rigid obstacles, and stages of
-loads. It is JSON all through, so that an old failure can be played again whatever `draw` has become
-since. Lengths and forces are drawn in the scene's own units and scaled by ``units`` when the scene
-is made.
+A scene has boxes without common nodes, contacts between them or with rigid obstacles, Dirichlet
+conditions (body, side, components, kind) and stages of loads. `fuzz_setup` and `fuzz_reference`
+create its problems. Lengths and forces are scaled by ``units``. Stored scenes do not depend on
+`draw`.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ import numpy as np
 __all__ = [
     "FORMS",
     "LAWS",
-    "SUPPORTS",
+    "RIGID_OBSTACLES",
     "TOP",
     "Scene",
-    "dice",
     "draw",
+    "draw_element",
     "draw_form",
-    "element",
     "frictions",
-    "path",
+    "load_path",
+    "make_samplers",
 ]
 
 Scene = dict[str, Any]
@@ -41,16 +41,16 @@ LAWS = (
     "polygon",
     "ellipse",
 )
-SUPPORTS = ("halfspace", "ball", "cylinder", "obstacle", "ball inside", "cylinder inside")
-# How a bulk form is written; see `fuzz_forms`.
+RIGID_OBSTACLES = ("halfspace", "ball", "cylinder", "obstacle", "ball inside", "cylinder inside")
+# Equivalent bulk forms, see `fuzz_forms`.
 FORMS = (
     "plain",
-    "tags",  # a material for each tag of one measure, loads over several tags at once
-    "pairs",  # the same, its tags as a list of (number, cells)
-    "measures",  # a measure for each material, with one object of tags
-    "energy",  # the derivative of energies over tags
-    "loads",  # coefficients by cell and a measure with tags, which the loads are over
-    "beside",  # a plain measure beside that of the loads
+    "tags",  # one measure with a material per tag, loads on several tags
+    "pairs",  # the same with tags as a list of (number, cells)
+    "measures",  # a measure per material with common tags
+    "energy",  # derivative of energies over tags
+    "loads",  # piecewise constant coefficients, tagged measure
+    "beside",  # an untagged measure next to that of the loads
 )
 TOP = 1
 NU_MAX = 0.45
@@ -59,30 +59,30 @@ NU_MAX = 0.45
 # ---- drawing -------------------------------------------------------------------------------------
 
 
-def dice(
-    rng: np.random.Generator, built: np.random.Generator, without: tuple[str, ...]
+def make_samplers(
+    rng: np.random.Generator, structure: np.random.Generator, without: tuple[str, ...]
 ) -> tuple[
     Callable[..., bool],
     Callable[..., Any],
     Callable[[float, float], float],
     Callable[[float, float], float],
 ]:
-    """What scenes are drawn by.
+    """Return functions that draw random properties of a scene.
 
     Args:
-        rng: For numbers.
-        built: For what a scene is built of, unless another is said.
+        rng: Generator of numbers.
+        structure: Default generator of features and choices.
         without: Features that are never chosen.
 
     Returns:
-        Whether something of a probability, with a feature's name, is so; one of some values; a
-        number between two powers of ten, and one between two numbers, to three digits.
+        Draws of a feature by its probability and name; of one of several values; of a number
+        between two powers of ten; and of one between two numbers, to three digits.
     """
 
-    def chance(p: float, feature: str = "", of: np.random.Generator = built) -> bool:
+    def chance(p: float, feature: str = "", of: np.random.Generator = structure) -> bool:
         return bool(of.random() < p) and feature not in without
 
-    def pick(*values: Any, of: np.random.Generator = built) -> Any:
+    def pick(*values: Any, of: np.random.Generator = structure) -> Any:
         return values[int(of.integers(len(values)))]
 
     def log(low: float, high: float) -> float:
@@ -94,10 +94,10 @@ def dice(
     return chance, pick, log, within
 
 
-def element(
+def draw_element(
     chance: Callable[..., bool], pick: Callable[..., Any], in_space: float
 ) -> tuple[bool, str, int]:
-    """Whether a scene is in space, with this probability; its cells, and their degree."""
+    """Draw whether a scene is in space, its cell type and its degree."""
     space = chance(in_space, "space")
     cell = pick("tetrahedron", "hexahedron") if space else pick("triangle", "quadrilateral")
     return space, cell, 1 if chance(0.55) else 2
@@ -106,23 +106,22 @@ def element(
 def draw(
     seed: int, *, without: tuple[str, ...] = (), ranks: int = 1, family: int | None = None
 ) -> Scene:
-    """A random scene.
+    """Draw a random scene.
 
     Args:
-        seed: The same gives the same.
-        without: Features to leave out: "levels", "apart", "increment" (pairs anew), "units",
+        seed: Seed that determines the scene.
+        without: Features to exclude: "levels", "apart", "increment" (updated pairs), "units",
             "restart", "bend", "both", "narrow", "changes", "multipliers", "motion", "gap",
-            "ration", "space", "method", "accuracy", "form".
-        ranks: Kept in the scene.
-        family: Scenes of one family differ in their numbers, loads, methods and histories, and
-            share what they are built of, so that few forms are compiled; by default a scene is its
-            own family.
+            "max_iterations", "space", "method", "accuracy", "form".
+        ranks: Number of ranks, stored in the scene.
+        family: Scenes of one family share their structure, so that few forms are compiled; by
+            default every scene has its own.
     """
     rng = np.random.default_rng([seed, 20])
-    built = rng if family is None else np.random.default_rng([family, 21])
+    structure = rng if family is None else np.random.default_rng([family, 21])
 
-    chance, pick, log, within = dice(rng, built, without)
-    space, cell, degree = element(chance, pick, 0.35)
+    chance, pick, log, within = make_samplers(rng, structure, without)
+    space, cell, degree = draw_element(chance, pick, 0.35)
     d = 3 if space else 2
     layout = pick("floor", "floor", "floor", "corner", "pair", "pair", "pair", "tower", "apart")
     if layout == "apart" and "apart" in without:
@@ -174,61 +173,61 @@ def draw(
             kind = "tresca"
         if not space and kind in ("polygon", "ellipse"):
             kind = "coulomb"
-        made: Scene = {"kind": kind}
+        drawn: Scene = {"kind": kind}
         if kind not in ("frictionless", "foundation", "tension"):
-            made["friction"] = (
+            drawn["friction"] = (
                 pick(0.0, 0.1, 0.3, 0.3, 0.6, 1.2, of=rng) if kind not in ("ellipse",) else 0.3
             )
         if kind in ("tresca", "prescribed"):
-            made["pressure"] = float(f"{rng.uniform(0.1, 2) * strain:.3g}")
+            drawn["pressure"] = float(f"{rng.uniform(0.1, 2) * strain:.3g}")
         if kind == "polygon":
-            made["modes"] = pick(3, 4, 6, 8)
+            drawn["modes"] = pick(3, 4, 6, 8)
         if kind == "ellipse" or (kind == "polygon" and chance(0.4)):
-            made["friction"] = made["friction"] or 0.2
-            made["transverse"] = pick(0.1, 0.3, 0.7, of=rng)
-            made["direction"] = [1.0, 0.4, 0.1]
-        made["k_n"] = pick(["scaled", log(0, 2)], ["number", log(-1, 3)], ["scaled", None])
+            drawn["friction"] = drawn["friction"] or 0.2
+            drawn["transverse"] = pick(0.1, 0.3, 0.7, of=rng)
+            drawn["direction"] = [1.0, 0.4, 0.1]
+        drawn["k_n"] = pick(["scaled", log(0, 2)], ["number", log(-1, 3)], ["scaled", None])
         if kind == "prescribed":
-            made["k_n"] = None
+            drawn["k_n"] = None
         if kind != "frictionless":
-            made["k_t"] = pick(["scaled", log(0, 2)], ["number", log(-1, 3)], made["k_n"])
-            made["k_t"] = made["k_t"] or ["number", log(0, 2)]
-        return made
+            drawn["k_t"] = pick(["scaled", log(0, 2)], ["number", log(-1, 3)], drawn["k_n"])
+            drawn["k_t"] = drawn["k_t"] or ["number", log(0, 2)]
+        return drawn
 
     def contact(body: int, side: str, obstacle: Scene) -> Scene:
-        made: Scene = {"body": body, "side": side, "obstacle": obstacle, "law": law()}
+        drawn: Scene = {"body": body, "side": side, "obstacle": obstacle, "law": law()}
         springs = chance(0.1)
         if springs:
-            made["scheme"] = "vertex"
+            drawn["scheme"] = "vertex"
             for k in ("k_n", "k_t"):
-                if made["law"].get(k) and chance(0.7):
-                    made["law"][k] = ["springs", log(-1, 2)]
+                if drawn["law"].get(k) and chance(0.7):
+                    drawn["law"][k] = ["springs", log(-1, 2)]
         elif chance(0.15):
-            made["scheme"] = "vertex"
+            drawn["scheme"] = "vertex"
         elif chance(0.15):
-            made["quadrature"] = pick(2, 3, 5)
+            drawn["quadrature"] = pick(2, 3, 5)
         if chance(0.15, "gap"):
-            made["gap"] = float(f"{rng.uniform(-2, 2) * strain:.3g}")
-        if chance(0.2, "multipliers") and made["law"]["kind"] not in ("foundation", "tension"):
-            physical = any((made["law"].get(k) or [""])[0] == "springs" for k in ("k_n", "k_t"))
+            drawn["gap"] = float(f"{rng.uniform(-2, 2) * strain:.3g}")
+        if chance(0.2, "multipliers") and drawn["law"]["kind"] not in ("foundation", "tension"):
+            physical = any((drawn["law"].get(k) or [""])[0] == "springs" for k in ("k_n", "k_t"))
             if not physical:
-                made["enforcement"] = "augmented"
-        if chance(0.12, "accuracy") and "enforcement" not in made:
-            made["accuracy"] = pick("draft", "standard", "fine", 1e-4)
-        return made
+                drawn["enforcement"] = "augmented"
+        if chance(0.12, "accuracy") and "enforcement" not in drawn:
+            drawn["accuracy"] = pick("draft", "standard", "fine", 1e-4)
+        return drawn
 
     def rigid() -> Scene:
-        kind = pick("halfspace", "halfspace", "halfspace", *SUPPORTS[1:])
-        made: Scene = {"kind": kind, "clearance": 0.0}
+        kind = pick("halfspace", "halfspace", "halfspace", *RIGID_OBSTACLES[1:])
+        drawn: Scene = {"kind": kind, "clearance": 0.0}
         if chance(0.2, of=rng):
-            made["clearance"] = float(f"{rng.uniform(-0.5, 3) * strain:.3g}")
+            drawn["clearance"] = float(f"{rng.uniform(-0.5, 3) * strain:.3g}")
         if kind == "halfspace" and chance(0.3, of=rng):
-            made["slope"] = pick(0.1, -0.2, 3 * strain, of=rng)
+            drawn["slope"] = pick(0.1, -0.2, 3 * strain, of=rng)
         if kind == "obstacle":
-            made["curve"] = float(f"{rng.uniform(0, 3) * strain:.3g}")
+            drawn["curve"] = float(f"{rng.uniform(0, 3) * strain:.3g}")
         if kind not in ("halfspace", "obstacle"):
-            made["radius"] = log(0, 2)
-        return made
+            drawn["radius"] = log(0, 2)
+        return drawn
 
     contacts: list[Scene] = []
     if layout in ("floor", "corner", "apart"):
@@ -243,7 +242,7 @@ def draw(
             if degree == 1 and cell != "hexahedron" and chance(0.3, "increment")
             else "never"
         )
-        obstacle: Scene = {"kind": "body", "update": update}
+        obstacle: Scene = {"kind": "body", "update_pairs": update}
         if chance(0.6):
             contacts.append(contact(upper, "bottom", obstacle | {"body": upper - 1, "side": "top"}))
         else:
@@ -261,8 +260,8 @@ def draw(
             c["law"]["k_n"] = c["law"]["k_n"] and ["number", 20.0]
             if "k_t" in c["law"]:
                 c["law"]["k_t"] = ["number", 10.0]
-            if c["obstacle"].get("update") == "increment":
-                c["obstacle"]["update"] = "never"
+            if c["obstacle"].get("update_pairs") == "increment":
+                c["obstacle"]["update_pairs"] = "never"
     if layout == "pair" and chance(0.12, "both"):
         first = contacts[0]
         other = copy.deepcopy(first)
@@ -276,44 +275,44 @@ def draw(
     if chance(0.1):
         scene["thickness"] = log(-2, 2)
 
-    # What holds the bodies, and what drives them.
-    holds: list[list[Any]] = []
+    # Dirichlet conditions, prescribed motions and loads.
+    conditions: list[list[Any]] = []
     if layout in ("pair", "tower") and not standing:
-        holds.append([0, "bottom", list(range(d)), "still"])
+        conditions.append([0, "bottom", list(range(d)), "fixed"])
     last = n_bodies - 1
     driven = [0, 1] if layout == "apart" else [last]
     for b in driven:
         if drive == "prescribed":
-            holds.append([b, "top", list(range(d)), "moved"])
+            conditions.append([b, "top", list(range(d)), "moved"])
         elif drive == "obstacle":
-            holds.append([b, "top", list(range(d)), "still"])
+            conditions.append([b, "top", list(range(d)), "fixed"])
     if drive == "force":
         for b in range(n_bodies):
-            if [b, "bottom", list(range(d)), "still"] in holds:
+            if [b, "bottom", list(range(d)), "fixed"] in conditions:
                 continue
             if chance(0.8):
-                holds.append([b, "left", [0], "still"])
+                conditions.append([b, "left", [0], "fixed"])
             if space and chance(0.9):
-                holds.append([b, "front", [1], "still"])
-    scene["holds"] = holds
+                conditions.append([b, "front", [1], "fixed"])
+    scene["dirichlet"] = conditions
     if drive == "obstacle":
         moves = contacts[0]["obstacle"]
         if chance(0.5):
             moves["moving"] = "displacement"
         else:
-            moves["moving"] = "force"  # pressed by force, pulled by displacement
+            moves["moving"] = "force"  # pressed by a force, moved sideways
             moves["free"] = pick([d - 1], [d - 1], [0, d - 1])
 
-    # Stages: of every driven body the pressure and shear at their end, in units of strain times E.
+    # Stages: pressure and shear at their end, in units of strain times E.
     levels = [1.0]
     if chance(0.25, "levels", of=rng):
         levels = [1.0, pick(1e-2, 1e-4, 1e-6, of=rng)]
         if chance(0.3, of=rng):
             levels.reverse()
-    share = pick(1.0, 1.0, 1e-3, 1e-6, of=rng) if layout == "apart" else 1.0
+    load_ratio = pick(1.0, 1.0, 1e-3, 1e-6, of=rng) if layout == "apart" else 1.0
     stages = []
     frictions = [c["law"].get("friction", 0.3) for c in contacts]
-    grip = max(min(frictions), 0.05)
+    smallest_friction = max(min(frictions), 0.05)
     for level in levels:
         for kind in pick(
             ["press"],
@@ -335,10 +334,10 @@ def draw(
                 "both": (1.0, rng.uniform(-1, 1)),
                 "off": (0.0, 0.0),
             }[kind]
-            if drive == "force" and not any(h[1] == "left" for h in holds):
+            if drive == "force" and not any(h[1] == "left" for h in conditions):
                 side *= 0.6
             across = within(-1, 1) if space else 0.0
-            side = float(f"{side * grip * level:.3g}")
+            side = float(f"{side * smallest_friction * level:.3g}")
             stages.append(
                 {
                     "steps": int(rng.integers(1, 4)),
@@ -353,7 +352,7 @@ def draw(
                 )
             )
     scene["strain"] = strain
-    scene["share"] = share
+    scene["load_ratio"] = load_ratio
     scene["stages"] = stages
     if chance(0.15):
         scene["weight"] = log(-2, 1)  # body force
@@ -368,26 +367,26 @@ def draw(
         scene["condensation"] = False
     if chance(0.1, of=rng):
         scene["cuts"] = 4
-    if chance(0.08, "ration", of=rng):
-        scene["ration"] = int(rng.integers(3, 9))
+    if chance(0.08, "max_iterations", of=rng):
+        scene["max_iterations"] = int(rng.integers(3, 9))
     return scene | draw_form(seed, family, without)
 
 
 def draw_form(seed: int, family: int | None, without: tuple[str, ...]) -> dict[str, str]:
-    """What a scene says of its form; by numbers of its own, so that nothing else is drawn anew.
+    """Draw the bulk form of a scene, by a generator of its own.
 
     Args:
-        seed: Of the scene.
-        family: Whose scenes have one form; see `fuzz_scenes.draw`.
-        without: With "form" it is written in the plain way.
+        seed: Seed of the scene.
+        family: Family of the scene, which shares a form.
+        without: Excluded features; "form" gives the plain form.
     """
     rng = np.random.default_rng([seed if family is None else family, 23])
-    way = FORMS[int(rng.integers(len(FORMS)))]
-    return {} if way == "plain" or "form" in without else {"form": way}
+    form = FORMS[int(rng.integers(len(FORMS)))]
+    return {} if form == "plain" or "form" in without else {"form": form}
 
 
-def path(scene: Scene) -> list[tuple[int, float]]:
-    """All values of the load parameter that are asked for: stage and value in (0, 1]."""
+def load_path(scene: Scene) -> list[tuple[int, float]]:
+    """Return the increments: stage and load parameter in (0, 1]."""
     return [
         (i, (k + 1) / stage["steps"])
         for i, stage in enumerate(scene["stages"])
@@ -396,7 +395,7 @@ def path(scene: Scene) -> list[tuple[int, float]]:
 
 
 def frictions(scene: Scene, stage: int) -> list[float | None]:
-    """Friction coefficient of every contact in a stage; None without."""
+    """Return the friction coefficient of every contact in a stage, or None."""
     factor = scene["stages"][stage].get("friction", 1.0)
     given = [c["law"].get("friction") for c in scene["contacts"]]
     return [None if f is None else factor * f for f in given]

@@ -1,6 +1,6 @@
-"""Bodies, surfaces and pairs of the second solution: points, weights and normals, by brute force.
+"""Bodies, surfaces and contact pairs of the independent solver (`reference_solver`).
 
-See `reference_solver`. Numbers of nodes are those of the displacement element.
+Nodes are numbered as in the displacement element.
 """
 
 from __future__ import annotations
@@ -13,28 +13,28 @@ import basix
 import numpy as np
 from numpy.polynomial import legendre
 
-__all__ = ["Body", "Surface", "pair", "penetration", "smooth_modulus"]
+__all__ = ["Body", "Surface", "find_overlap", "find_pairs", "smooth_modulus"]
 
 Array = np.ndarray
-# Facets are covered if no more than this share of them is not.
+# Fraction of a facet that may lack an opposing facet, and reach of facets beyond their edges.
 _COVERED = 1e-6
 _OVERLAP = 1e-6
 
 
 @dataclass(eq=False)
 class Body:
-    """Mesh, element and stiffness as arrays.
+    """Mesh, displacement element and stiffness matrix as arrays.
 
     Attributes:
-        cell: Name of the cells.
-        degree: Of the displacement.
-        x: Geometry nodes of the mesh, the vertices among them, (n_vertices, d) (length).
-        vertices: Of every cell, in DOLFINx's order, (n_cells, n).
-        bent: Degree of the cells' geometry, 1 or 2.
+        cell: Cell type.
+        degree: Degree of the displacement.
+        x: Geometry nodes of the mesh, (n_vertices, d) (length).
+        vertices: Geometry nodes of every cell, in DOLFINx's order, (n_cells, n).
         nodes: Displacement nodes of every cell, (n_cells, m).
-        places: Coordinates of the displacement nodes, (n_nodes, d) (length).
-        parts: Number of the connected part that every node is in, (n_nodes,).
+        nodes_x: Coordinates of the displacement nodes, (n_nodes, d) (length).
+        body_numbers: Number of the body of every node, (n_nodes,).
         stiffness: K, (d n_nodes, d n_nodes) (force/length).
+        geometry_degree: Degree of the cells' geometry, 1 or 2.
     """
 
     cell: str
@@ -42,22 +42,22 @@ class Body:
     x: Array
     vertices: Array
     nodes: Array
-    places: Array
-    parts: Array
+    nodes_x: Array
+    body_numbers: Array
     stiffness: Array
-    bent: int = 1
+    geometry_degree: int = 1
 
     @property
     def d(self) -> int:
-        """Dimension."""
+        """Dimension of space."""
         return int(self.x.shape[1])
 
 
 class Surface:
-    """Facets with straight edges, each by its cell and its number there."""
+    """Boundary facets of a body."""
 
     def __init__(self, body: Body, facets: Sequence[tuple[int, int]]) -> None:
-        """Take facets of a body."""
+        """Store facets, given as pairs of cell and local facet number."""
         self.body, self.d = body, body.d
         self.facets = list(facets)
         kind = basix.CellType[body.cell]
@@ -74,27 +74,27 @@ class Surface:
         )
         family = basix.ElementFamily.P
         variant = basix.LagrangeVariant.gll_warped
-        self._map = basix.create_element(family, kind, body.bent, variant)
+        self._map = basix.create_element(family, kind, body.geometry_degree, variant)
         self._element = basix.create_element(family, kind, body.degree, variant)
         middle = body.x[body.vertices[self.cells]].mean(axis=1)
-        centre = self.place(*self.middles())[0]
-        normal = self._across(*self.middles())
+        centre = self.position(*self.midpoints())[0]
+        normal = self._area_vector(*self.midpoints())
         self._sign = np.sign(np.sum(normal * (centre - middle), axis=1))
 
-    def middles(self) -> tuple[Array, Array]:
-        """Every facet, and the reference coordinates of its middle."""
+    def midpoints(self) -> tuple[Array, Array]:
+        """Return the number of every facet, and the reference coordinates of its midpoint."""
         at = 1 / self.d if self.simplex else 0.5
         return np.arange(len(self.facets)), np.full((len(self.facets), self.d - 1), at)
 
-    def _in_cell(self, facet: Array, xi: Array) -> Array:
+    def _cell_coordinates(self, facet: Array, xi: Array) -> Array:
         return self._origin[facet] + np.einsum("pk,pkd->pd", xi, self._axes[facet])
 
-    def place(self, facet: Array, xi: Array, u: Array | None = None) -> tuple[Array, Array]:
-        """Coordinates, (n, d), and tangents, (n, d - 1, d), of places, displaced by u.
+    def position(self, facet: Array, xi: Array, u: Array | None = None) -> tuple[Array, Array]:
+        """Return coordinates, (n, d), and tangents, (n, d - 1, d), of points displaced by u.
 
-        That is of all dofs, or has the displacements of the cells' nodes, (n, m, d).
+        u has all dofs, or the displacements of the nodes of every point's cell, (n, m, d).
         """
-        inside = self._in_cell(facet, xi)
+        inside = self._cell_coordinates(facet, xi)
         table = _tabulate(self._map, 1, inside)
         corners = self.body.x[self.body.vertices[self.cells[facet]]]
         x = np.einsum("pk,pkd->pd", table[0], corners)
@@ -107,49 +107,49 @@ class Surface:
         return x, np.einsum("pkj,pjd->pkd", self._axes[facet], slope)
 
     def local(self, facet: Array, u: Array) -> Array:
-        """Displacements of the nodes of the facets' cells, (n, m, d)."""
+        """Return the displacements of the nodes of the facets' cells, (n, m, d)."""
         return u.reshape(-1, self.d)[self.body.nodes[self.cells[facet]]]
 
     def shapes(self, facet: Array, xi: Array) -> Array:
-        """Values of the shape functions of these nodes at places, (n, m)."""
-        return _tabulate(self._element, 0, self._in_cell(facet, xi))[0]
+        """Return the shape functions of these nodes at points, (n, m)."""
+        return _tabulate(self._element, 0, self._cell_coordinates(facet, xi))[0]
 
-    def _across(self, facet: Array, xi: Array, u: Array | None = None) -> Array:
-        tangents = self.place(facet, xi, u)[1]
+    def _area_vector(self, facet: Array, xi: Array, u: Array | None = None) -> Array:
+        tangents = self.position(facet, xi, u)[1]
         if self.d == 2:
             return np.column_stack([tangents[:, 0, 1], -tangents[:, 0, 0]])
         return np.cross(tangents[:, 0], tangents[:, 1])
 
     def normal(self, facet: Array, xi: Array, u: Array | None = None) -> Array:
-        """Outward unit normals, (n, d)."""
-        across = self._across(facet, xi, u) * self._sign[facet][:, None]
+        """Return outward unit normals, (n, d)."""
+        across = self._area_vector(facet, xi, u) * self._sign[facet][:, None]
         return across / np.linalg.norm(across, axis=1, keepdims=True)
 
     def interpolation(self, facet: Array, xi: Array) -> Array:
-        """From values at the nodes to those at places: (n, n_nodes)."""
+        """Return the interpolation matrix from nodes to points, (n, n_nodes)."""
         table = self.shapes(facet, xi)
-        matrix = np.zeros((len(facet), len(self.body.places)))
+        matrix = np.zeros((len(facet), len(self.body.nodes_x)))
         for row, (f, values) in enumerate(zip(facet, table, strict=False)):
             matrix[row, self.body.nodes[self.cells[f]]] += values
         return matrix
 
     def corners(self, u: Array | None = None) -> Array:
-        """Corners in cyclic order, (n_facets, n_corners, d)."""
+        """Return the corners in cyclic order, (n_facets, n_corners, d)."""
         at = np.vstack([np.zeros(self.d - 1), np.eye(self.d - 1)])
         if self.d == 3 and not self.simplex:
             at = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
         every = np.arange(len(self.facets))
-        places = [self.place(every, np.tile(p, (len(every), 1)), u)[0] for p in at]
-        return np.stack(places, axis=1)
+        found = [self.position(every, np.tile(p, (len(every), 1)), u)[0] for p in at]
+        return np.stack(found, axis=1)
 
     def lengths(self) -> Array:
-        """The longest way between two corners of every facet (length)."""
+        """Return the largest distance of two corners of every facet (length)."""
         corners = self.corners()
-        apart = corners[:, :, None] - corners[:, None, :]
-        return np.linalg.norm(apart, axis=3).max(axis=(1, 2), initial=0.0)
+        offset = corners[:, :, None] - corners[:, None, :]
+        return np.linalg.norm(offset, axis=3).max(axis=(1, 2), initial=0.0)
 
-    def rule(self, degree: int, scheme: str) -> tuple[Array, Array, Array]:
-        """Facet, reference coordinates and weight (length^(d-1)) of every point of Γc."""
+    def quadrature(self, degree: int, scheme: str) -> tuple[Array, Array, Array]:
+        """Return facet, reference coordinates and weight (length^(d-1)) of quadrature points."""
         kind = {2: "interval", 3: "triangle" if self.simplex else "quadrilateral"}[self.d]
         if scheme == "vertex":
             points = basix.geometry(basix.CellType[kind])
@@ -159,11 +159,11 @@ class Surface:
             points, weights = basix.make_quadrature(basix.CellType[kind], degree)
         facet = np.repeat(np.arange(len(self.facets)), len(points))
         xi = np.tile(points, (len(self.facets), 1))
-        size = np.linalg.norm(self._across(facet, xi), axis=1)
+        size = np.linalg.norm(self._area_vector(facet, xi), axis=1)
         return facet, xi, np.tile(weights, len(self.facets)) * size
 
-    def heights(self) -> tuple[Array, Array]:
-        """Height of the cell over every facet, and the facet's size."""
+    def cell_heights(self) -> tuple[Array, Array]:
+        """Return the height of the cell at every facet, and the size of the facet."""
         kind = basix.CellType[self.body.cell]
         middle = basix.geometry(kind).mean(axis=0, keepdims=True)
         slope = self._map.tabulate(1, middle)[1:, 0, :, 0]
@@ -171,23 +171,23 @@ class Surface:
         for c in self.cells:
             jacobian = slope @ self.body.x[self.body.vertices[c]]
             volume.append(abs(np.linalg.det(jacobian)) * basix.cell.volume(kind))
-        size = np.linalg.norm(self._across(*self.middles()), axis=1)
+        size = np.linalg.norm(self._area_vector(*self.midpoints()), axis=1)
         size = size * (0.5 if self.d == 3 and self.simplex else 1.0)
         return (self.d if self.simplex else 1) * np.array(volume) / size, size
 
-    def meet(
+    def intersect(
         self, facet: Array, start: Array, ray: Array, u: Array | None = None
     ) -> tuple[Array, Array, Array]:
-        """Where rays meet facets, pair by pair: coordinates, signed distance, whether they do."""
-        xi = self.middles()[1][facet]
+        """Intersect rays with facets: reference coordinates, signed distance, whether they meet."""
+        xi = self.midpoints()[1][facet]
         distance, bad = np.zeros(len(facet)), np.zeros(len(facet), dtype=bool)
         moving = np.arange(len(facet))
         for _ in range(30):
             moved = u if u is None or u.ndim < 3 else u[moving]
-            x, tangents = self.place(facet[moving], xi[moving], moved)
-            way = ray[moving]
-            system = np.concatenate([np.swapaxes(tangents, 1, 2), -way[:, :, None]], axis=2)
-            rest = x - start[moving] - distance[moving, None] * way
+            x, tangents = self.position(facet[moving], xi[moving], moved)
+            direction = ray[moving]
+            system = np.concatenate([np.swapaxes(tangents, 1, 2), -direction[:, :, None]], axis=2)
+            rest = x - start[moving] - distance[moving, None] * direction
             size = np.prod(np.linalg.norm(system, axis=1), axis=1)
             flat = np.abs(np.linalg.det(system)) < 1e-12 * size
             bad[moving[flat]] = True
@@ -200,7 +200,7 @@ class Surface:
             moving = moving[(change >= 1e-14) & ~flat]
             if not len(moving):
                 break
-        x, tangents = self.place(facet, xi, u)
+        x, tangents = self.position(facet, xi, u)
         size = np.linalg.norm(tangents, axis=2).max(axis=1)
         met = ~bad & (np.linalg.norm(x - start - distance[:, None] * ray, axis=1) < 1e-9 * size)
         met &= np.all(xi >= -_OVERLAP, axis=1)
@@ -208,43 +208,43 @@ class Surface:
         return xi, distance, met
 
     def nearest(
-        self, start: Array, ray: Array, reach: float, u: Array | None
+        self, start: Array, ray: Array, max_distance: float, u: Array | None
     ) -> tuple[Array, Array]:
-        """The nearest facet that looks back along each ray, -1 without; coordinates on it."""
+        """Return the closest facet that faces each ray, or -1, and reference coordinates on it."""
         n, m = len(start), len(self.facets)
         facet = np.tile(np.arange(m), n)
-        xi, distance, met = self.meet(facet, np.repeat(start, m, 0), np.repeat(ray, m, 0), u)
-        looks = np.sum(self.normal_moved(facet, xi, u) * np.repeat(ray, m, 0), axis=1) < 0
-        far = np.where(met & looks & (np.abs(distance) <= reach), np.abs(distance), np.inf)
+        xi, distance, met = self.intersect(facet, np.repeat(start, m, 0), np.repeat(ray, m, 0), u)
+        facing = np.sum(self.deformed_normal(facet, xi, u) * np.repeat(ray, m, 0), axis=1) < 0
+        far = np.where(met & facing & (np.abs(distance) <= max_distance), np.abs(distance), np.inf)
         best = far.reshape(n, m).argmin(axis=1)
         row = np.arange(n) * m + best
         return np.where(np.isfinite(far[row]), best, -1), xi[row]
 
-    def normal_moved(self, facet: Array, xi: Array, u: Array | None) -> Array:
-        """Outward normals of the displaced facets, not of unit length."""
-        return self._across(facet, xi, u) * self._sign[facet][:, None]
+    def deformed_normal(self, facet: Array, xi: Array, u: Array | None) -> Array:
+        """Return outward normals of the deformed facets, not of unit length."""
+        return self._area_vector(facet, xi, u) * self._sign[facet][:, None]
 
 
 def _tabulate(element: Any, derivatives: int, points: Array) -> Array:
-    """Tabulate, also at no points at all, where basix aborts: (n_tables, n_points, dim)."""
+    """Tabulate an element, (n_tables, n_points, dim), also at zero points, where Basix aborts."""
     if len(points):
         return element.tabulate(derivatives, points)[..., 0]
     return np.zeros((1 + derivatives * points.shape[1], 0, element.dim))
 
 
 def smooth_modulus(surface: Surface, modulus: Array, facet: Array, xi: Array) -> Array:
-    """E/h at points of Γc, smoothed over four facets; see `accuracy.modulus_over_height`.
+    """Return E/h at points of Γc, smoothed over four facets as in `accuracy.modulus_over_height`.
 
     Args:
         surface: Γc.
-        modulus: Young's modulus by every facet (stress).
+        modulus: Young's modulus at every facet (stress).
         facet: Facet of every point.
         xi: Reference coordinates of every point.
 
     Returns:
         (n_points,) (stress/length).
     """
-    height, size = surface.heights()
+    height, size = surface.cell_heights()
     d = surface.d
     kind = {2: "interval", 3: "triangle" if surface.simplex else "quadrilateral"}[d]
     element = basix.create_element(basix.ElementFamily.P, basix.CellType[kind], 1)
@@ -256,7 +256,7 @@ def smooth_modulus(surface: Surface, modulus: Array, facet: Array, xi: Array) ->
     for f, own in enumerate(numbered):
         length = 4.0 * size[f] ** (1 / (d - 1))
         every = np.full(len(points), f)
-        tangents = surface.place(every, points)[1]
+        tangents = surface.position(every, points)[1]
         for q, weight in enumerate(weights):
             metric = tangents[q] @ tangents[q].T
             area = weight * np.sqrt(np.linalg.det(metric))
@@ -273,76 +273,76 @@ def smooth_modulus(surface: Surface, modulus: Array, facet: Array, xi: Array) ->
 # ---- pairs of surfaces ---------------------------------------------------------------------------
 
 
-def pair(
-    here: Surface,
-    there: Surface,
+def find_pairs(
+    slave: Surface,
+    master: Surface,
     points: tuple[Array, Array],
     *,
-    reach: float = np.inf,
+    max_distance: float = np.inf,
     u: Array | None = None,
 ) -> tuple[Array, Array, Array]:
-    """What lies opposite the points of Γc; see the docstring of the package's ``pairing``.
+    """Return the contact pairs of the points of Γc, as the package's ``pairing`` defines them.
 
     Args:
-        here: Γc.
-        there: The opposite surface.
+        slave: Γc.
+        master: The opposing surface.
         points: Facet and reference coordinates of every point.
-        reach: Largest distance.
-        u: Displacement at which to pair; none: undeformed.
+        max_distance: Largest distance (length).
+        u: Displacement at which pairs are found; None: undeformed.
 
     Returns:
-        Interpolation of the opposite displacement, (n_points, n_nodes); the distance in the
-        undeformed bodies, (n_points,); whether there is an opposite, (n_points,).
+        Interpolation matrix of the opposing displacement, (n_points, n_nodes); the gap in the
+        undeformed bodies, (n_points,); and whether a point is paired, (n_points,).
     """
     facet, xi = points
-    normal = here.normal(facet, xi)
-    hit, where = there.nearest(here.place(facet, xi, u)[0], normal, reach, u)
+    normal = slave.normal(facet, xi)
+    hit, where = master.nearest(slave.position(facet, xi, u)[0], normal, max_distance, u)
     paired = hit >= 0
     gap = np.zeros(len(facet))
     gap[paired] = np.sum(
-        (there.place(hit[paired], where[paired])[0] - here.place(facet, xi)[0][paired])
+        (master.position(hit[paired], where[paired])[0] - slave.position(facet, xi)[0][paired])
         * normal[paired],
         axis=1,
     )
-    matrix = np.zeros((len(facet), len(here.body.places)))
-    matrix[paired] = there.interpolation(hit[paired], where[paired])
-    for f in range(len(here.facets)):
+    matrix = np.zeros((len(facet), len(slave.body.nodes_x)))
+    matrix[paired] = master.interpolation(hit[paired], where[paired])
+    for f in range(len(slave.facets)):
         own = np.flatnonzero(facet == f)
         if not paired[own].all():
             continue
-        pieces, weights = _pieces(here, there, f, u)
+        pieces, weights = _cut_quadrature(slave, master, f, u)
         if not len(pieces):
             continue
         f_pieces = np.full(len(pieces), f)
-        ray = here.normal(f_pieces, pieces)
-        met, at = there.nearest(here.place(f_pieces, pieces, u)[0], ray, reach, u)
+        ray = slave.normal(f_pieces, pieces)
+        met, at = master.nearest(slave.position(f_pieces, pieces, u)[0], ray, max_distance, u)
         if np.any(met < 0):
             continue
-        basis = _polynomials(here, len(own))
+        basis = _complete_polynomials(slave, len(own))
         left, at_points = basis(pieces), basis(xi[own])
         gram = left.T @ (weights[:, None] * left)
         project = at_points @ np.linalg.solve(gram, left.T * weights)
-        matrix[own] = project @ there.interpolation(met, at)
+        matrix[own] = project @ master.interpolation(met, at)
     return matrix, gap, paired
 
 
-def penetration(here: Surface, there: Surface, u: Array, weight: float) -> float:
-    """∫ of the penetration of ``here``, seen from it, by rays from many points."""
-    facet, xi, weights = here.rule(8, "default")
-    normal = here.normal(facet, xi)
-    hit, where = there.nearest(here.place(facet, xi)[0], normal, np.inf, None)
+def find_overlap(surface: Surface, opposite: Surface, u: Array, weight: float) -> float:
+    """Integrate the penetration of a surface into the opposing one along its normals."""
+    facet, xi, weights = surface.quadrature(8, "default")
+    normal = surface.normal(facet, xi)
+    hit, where = opposite.nearest(surface.position(facet, xi)[0], normal, np.inf, None)
     met = hit >= 0
     facet, xi, normal, weights = facet[met], xi[met], normal[met], weights[met]
-    ends = there.place(hit[met], where[met])[0] - here.place(facet, xi)[0]
-    moved = there.place(hit[met], where[met], u)[0] - here.place(facet, xi, u)[0]
+    ends = opposite.position(hit[met], where[met])[0] - surface.position(facet, xi)[0]
+    moved = opposite.position(hit[met], where[met], u)[0] - surface.position(facet, xi, u)[0]
     gap = np.sum(ends * normal, axis=1)
-    # What lies behind from the start is another surface.
-    near = gap > -0.3 * np.ptp(here.body.x, axis=0).max()
+    # A surface that is far behind in the undeformed configuration is another side of the body.
+    near = gap > -0.3 * np.ptp(surface.body.x, axis=0).max()
     return float(weight * weights[near] @ np.maximum(-np.sum(moved * normal, axis=1)[near], 0.0))
 
 
-def _polynomials(surface: Surface, n_points: int) -> Any:
-    """Legendre polynomials that span the largest complete space that so many points carry."""
+def _complete_polynomials(surface: Surface, n_points: int) -> Any:
+    """Return Legendre polynomials of the largest complete space with at most so many members."""
     d = surface.d
     if d == 2:
         return lambda s: legendre.legvander(2 * s[:, 0] - 1, n_points - 1)
@@ -364,44 +364,46 @@ def _polynomials(surface: Surface, n_points: int) -> Any:
     return basis
 
 
-def _pieces(here: Surface, there: Surface, f: int, u: Array | None) -> tuple[Array, Array]:
-    """Places on facet f, and weights, on the pieces into which the opposite facets cut it."""
-    corners, others = here.corners(u)[f], there.corners(u)
-    mean = here.normal(*here.middles())[f]
-    looks = there.normal(*there.middles()) @ mean < 0
+def _cut_quadrature(
+    slave: Surface, master: Surface, f: int, u: Array | None
+) -> tuple[Array, Array]:
+    """Return points on facet f and weights, on its intersections with the opposing facets."""
+    corners, others = slave.corners(u)[f], master.corners(u)
+    mean = slave.normal(*slave.midpoints())[f]
+    facing = master.normal(*master.midpoints()) @ mean < 0
     points, weights = [], []
-    if here.d == 2:
-        rule, shares = basix.make_quadrature(basix.CellType.interval, 12)
+    if slave.d == 2:
+        quadrature, shares = basix.make_quadrature(basix.CellType.interval, 12)
         origin, edge = corners[0], corners[1] - corners[0]
         covered = 0.0
-        for other in others[looks]:
+        for other in others[facing]:
             ends = np.clip((other - origin) @ edge / (edge @ edge), 0, 1)
             low, high = ends.min(), ends.max()
             if high - low > 1e-9:
                 covered += high - low
-                points.append(origin + (low + (high - low) * rule) * edge)
+                points.append(origin + (low + (high - low) * quadrature) * edge)
                 weights.append((high - low) * shares)
     else:
-        rule, shares = basix.make_quadrature(basix.CellType.triangle, 12)
+        quadrature, shares = basix.make_quadrature(basix.CellType.triangle, 12)
         first = corners[1] - corners[0]
         first = first - (first @ mean) * mean
         first /= np.linalg.norm(first)
         plane = np.column_stack([first, np.cross(mean, first)])
         window = _anticlockwise((corners - corners[0]) @ plane)
         size, covered = _area(window), 0.0
-        for other in others[looks]:
+        for other in others[facing]:
             ring = _clip(_anticlockwise((other - corners[0]) @ plane), window)
             for i in range(1, len(ring) - 1):
                 edges = np.array([ring[i] - ring[0], ring[i + 1] - ring[0]])
                 twice = np.linalg.det(edges)
                 covered += 0.5 * twice / size
                 if twice > 1e-9 * size:
-                    points.append(corners[0] + (ring[0] + rule @ edges) @ plane.T)
+                    points.append(corners[0] + (ring[0] + quadrature @ edges) @ plane.T)
                     weights.append(twice * shares)
     if abs(covered - 1) > _COVERED or not points:
-        return np.zeros((0, here.d - 1)), np.zeros(0)
+        return np.zeros((0, slave.d - 1)), np.zeros(0)
     flat = np.concatenate(points)
-    xi, _, _ = here.meet(np.full(len(flat), f), flat, np.tile(mean, (len(flat), 1)), u)
+    xi, _, _ = slave.intersect(np.full(len(flat), f), flat, np.tile(mean, (len(flat), 1)), u)
     return xi, np.concatenate(weights)
 
 
@@ -415,7 +417,7 @@ def _anticlockwise(ring: Array) -> Array:
 
 
 def _clip(ring: Array, window: Array) -> Array:
-    """Intersection of two convex polygons."""
+    """Return the intersection of two convex polygons."""
     for start, end in zip(window, np.roll(window, -1, axis=0), strict=False):
         along, found = end - start, []
         side = [along[0] * (p[1] - start[1]) - along[1] * (p[0] - start[0]) for p in ring]

@@ -1,7 +1,4 @@
-"""Laws of the second solution, at points, as the package's docstrings define them.
-
-See `reference_solver`.
-"""
+"""Contact laws of the independent solver (`reference_solver`), evaluated at points in NumPy."""
 
 from __future__ import annotations
 
@@ -12,19 +9,19 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Law", "dot", "nearest_in_polygon"]
+__all__ = ["Law", "dot", "project_onto_polygon"]
 
 Array = np.ndarray
 
 
 @dataclass
 class Law:
-    """A law by its numbers; see the package's ``laws``.
+    """A contact law given by its parameters, which are those of the package's ``laws``.
 
     Attributes:
         kind: "frictionless", "coulomb", "tresca" or "foundation".
-        friction, pressure, transverse, modes, direction: As there.
-        tension, unilateral: As there.
+        friction, pressure, transverse, modes, direction: Parameters of `Coulomb` and `Tresca`.
+        tension, unilateral: Parameters of `Foundation` and `Tresca`.
     """
 
     kind: str
@@ -35,39 +32,41 @@ class Law:
     direction: Sequence[float] | None = None
     tension: bool = False
     unilateral: bool = True
-    _frame: tuple[Any, ...] = field(default=(None, ()), init=False, repr=False, compare=False)
+    _cached_basis: tuple[Any, ...] = field(
+        default=(None, ()), init=False, repr=False, compare=False
+    )
 
     @property
-    def slips(self) -> bool:
-        """Whether there is friction."""
+    def has_friction(self) -> bool:
+        """Whether points can slip."""
         return self.kind in ("coulomb", "tresca")
 
     @property
     def has_normal(self) -> bool:
-        """Whether the pressure answers the gap."""
+        """Whether r_n depends on the gap."""
         return self.kind != "tresca" or self.unilateral
 
     @property
-    def unique(self) -> bool:
-        """Whether the tractions follow from a convex potential: an increment has one solution."""
+    def is_unique(self) -> bool:
+        """Whether tractions derive from a convex potential, so that an increment is unique."""
         if self.kind == "foundation":
             return self.tension
         return self.kind != "coulomb" or self.friction == 0.0
 
-    def normal(self, k_n: Array, closing: Array, pressure: Array | None) -> Array:
-        """r_n from u_n - s; ``pressure``: multiplier."""
+    def normal_traction(self, k_n: Array, overclosure: Array, pressure: Array | None) -> Array:
+        """Return r_n for the overclosure u_n - s and the multiplier ``pressure``, if any."""
         if not self.has_normal:
-            return np.full(closing.shape, -self.pressure, dtype=closing.dtype)
-        elastic = k_n * closing + (0.0 if pressure is None else pressure)
+            return np.full(overclosure.shape, -self.pressure, dtype=overclosure.dtype)
+        elastic = k_n * overclosure + (0.0 if pressure is None else pressure)
         if self.tension:
             return -elastic
         return -np.where(elastic.real > 0, elastic, 0)
 
-    def frame(self, n: Array) -> tuple[Array, ...]:
-        """Unit tangents, (n, d) each: in space along the direction and across it."""
-        if n is not self._frame[0]:  # normals are the same ones until the obstacle moves
-            self._frame = n, self._tangents(n)
-        return self._frame[1]
+    def tangent_basis(self, n: Array) -> tuple[Array, ...]:
+        """Return unit tangents, (n, d) each; in space along and across the friction direction."""
+        if n is not self._cached_basis[0]:  # the array is the same until the obstacle moves
+            self._cached_basis = n, self._tangents(n)
+        return self._cached_basis[1]
 
     def _tangents(self, n: Array) -> tuple[Array, ...]:
         if n.shape[1] == 2:
@@ -81,104 +80,107 @@ class Law:
         first = first / np.sqrt(np.sum(first * first, axis=1))[:, None]
         return first, np.cross(n, first)
 
-    def tangential(
+    def tangential_traction(
         self,
         k_t: Array,
         n: Array,
-        step: Array,
-        old: Array,
-        total: Array,
+        slip_increment: Array,
+        old_traction: Array,
+        displacement: Array,
         r_n: Array,
-        closing: Array,
-        given: Array | None,
+        overclosure: Array,
+        prescribed_bound: Array | None,
     ) -> Array:
-        """τ from Δu_t, the old τ and u_t, all (n, d); ``given``: limit of friction.
+        """Return τ for Δu_t, the committed τ and u_t, all (n, d).
 
-        Δu_t, u_t, r_n and the closing may have one more axis, the first.
+        Δu_t, u_t, r_n and the overclosure may have an additional first axis.
+        ``prescribed_bound`` replaces the friction bound of the law.
         """
         if self.kind == "foundation":
-            tau = -k_t[:, None] * total
-            return tau if self.tension else np.where((closing.real > 0)[..., None], tau, 0)
-        if not self.slips:
-            return np.zeros_like(step)
-        limit = (
+            tau = -k_t[:, None] * displacement
+            return tau if self.tension else np.where((overclosure.real > 0)[..., None], tau, 0)
+        if not self.has_friction:
+            return np.zeros_like(slip_increment)
+        bound = (
             -self.friction * r_n
             if self.kind == "coulomb"
             else 0 * r_n + self.friction * self.pressure
         )
-        if given is not None:
-            limit = 0 * r_n + given
+        if prescribed_bound is not None:
+            bound = 0 * r_n + prescribed_bound
         if n.shape[1] == 2:
-            (tangent,) = self.frame(n)
-            trial = dot(old - k_t[:, None] * step, tangent)
-            value = np.where(trial.real > limit.real, limit, trial)
-            value = np.where(trial.real < -limit.real, -limit, value)
+            (tangent,) = self.tangent_basis(n)
+            trial = dot(old_traction - k_t[:, None] * slip_increment, tangent)
+            value = np.where(trial.real > bound.real, bound, trial)
+            value = np.where(trial.real < -bound.real, -bound, value)
             return value[..., None] * tangent
-        first, second = self.frame(n)
+        first, second = self.tangent_basis(n)
         ratio = 1.0 if self.transverse is None else self.transverse / self.friction
-        # The limit is a circle or polygon in σ = (τ₁, τ₂/r), and K_t is k_t diag(1, r²).
+        # The cone is a circle or polygon in σ = (τ₁, τ₂/r), and K_t is k_t diag(1, r²).
         trial = np.stack(
             [
-                dot(old, first) - k_t * dot(step, first),
-                dot(old, second) / ratio - k_t * ratio * dot(step, second),
+                dot(old_traction, first) - k_t * dot(slip_increment, first),
+                dot(old_traction, second) / ratio - k_t * ratio * dot(slip_increment, second),
             ],
             axis=-1,
         )
         if self.modes is not None:
-            sigma = nearest_in_polygon(trial, limit, self.modes)
+            sigma = project_onto_polygon(trial, bound, self.modes)
         else:
-            sigma = _nearest_in_circle(trial, limit)
+            sigma = _project_onto_circle(trial, bound)
         return sigma[..., :1] * first + ratio * sigma[..., 1:] * second
 
     def stiffness(self, k_t: Array, n: Array) -> Array:
-        """K_t, (n, d, d)."""
+        """Return the tangential stiffness K_t, (n, d, d)."""
         d = n.shape[1]
         if self.transverse is None:
             return k_t[:, None, None] * (np.eye(d) - n[:, :, None] * n[:, None, :])
-        first, second = self.frame(n)
+        first, second = self.tangent_basis(n)
         ratio = (self.transverse / self.friction) ** 2
         both = (
             first[:, :, None] * first[:, None, :] + ratio * second[:, :, None] * second[:, None, :]
         )
         return k_t[:, None, None] * both
 
-    def stretch(self, k_t: Array, n: Array, tau: Array) -> Array:
-        """K_t⁻¹ τ, (n, d)."""
+    def elastic_slip(self, k_t: Array, n: Array, tau: Array) -> Array:
+        """Return the elastic slip K_t⁻¹ τ, (n, d)."""
         along = k_t[:, None, None] * n[:, :, None] * n[:, None, :]
         return np.linalg.solve(self.stiffness(k_t, n) + along, tau[..., None])[..., 0]
 
 
 def dot(one: Array, other: Array) -> Array:
-    """Scalar products of vectors, which are the last axis; complex ones are not conjugated."""
+    """Return scalar products along the last axis, without conjugation of complex vectors."""
     return np.einsum("...i,...i->...", one, other)
 
 
-def _nearest_in_circle(trial: Array, limit: Array) -> Array:
+def _project_onto_circle(trial: Array, bound: Array) -> Array:
     size = np.sqrt(dot(trial, trial))
-    out = size.real > limit.real
-    return np.where(out[..., None], (limit / np.where(out, size, 1.0))[..., None] * trial, trial)
+    out = size.real > bound.real
+    return np.where(out[..., None], (bound / np.where(out, size, 1.0))[..., None] * trial, trial)
 
 
 @functools.cache
-def _sides(modes: int) -> tuple[Array, Array, float]:
-    """Of a regular polygon: normals and directions of the sides, (modes, 2); half of a side."""
+def _polygon_sides(modes: int) -> tuple[Array, Array, float]:
+    """Return normals and directions of a polygon's sides, (modes, 2), and half of their length."""
     angles = 2 * np.pi * np.arange(modes) / modes
     normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return normals, np.stack([-normals[:, 1], normals[:, 0]], axis=1), float(np.tan(np.pi / modes))
 
 
-def nearest_in_polygon(trial: Array, limit: Array, modes: int) -> Array:
-    """The nearest point of the polygon: of all its sides' nearest points the nearest one."""
-    normals, along, half = _sides(modes)
-    limit = limit[..., None]
-    inside = np.all((trial @ normals.T).real <= limit.real, axis=-1)
+def project_onto_polygon(trial: Array, bound: Array, modes: int) -> Array:
+    """Return the closest point of a regular polygon, from the closest points of all its sides."""
+    normals, along, half = _polygon_sides(modes)
+    bound = bound[..., None]
+    inside = np.all((trial @ normals.T).real <= bound.real, axis=-1)
     if np.all(inside):
-        return trial + 0 * limit
-    y, end = trial @ along.T, half * limit
+        return trial + 0 * bound
+    y, end = trial @ along.T, half * bound
     y = np.where(y.real > end.real, end, y)
     y = np.where(y.real < -end.real, -end, y)
-    places = limit[..., None] * normals + y[..., None] * along
-    # By |place|² - 2 place·trial: of a trial far outside, the squared distances are all the same.
-    nearest = (dot(places, places) - 2 * dot(places, trial[..., None, :])).real.argmin(axis=-1)
-    found = np.take_along_axis(places, nearest[..., None, None], axis=-2)[..., 0, :]
+    candidates = bound[..., None] * normals + y[..., None] * along
+    # By |x|² - 2 x·trial, because squared distances from a trial far outside lose all digits.
+    nearest = (dot(candidates, candidates) - 2 * dot(candidates, trial[..., None, :])).real.argmin(
+        axis=-1
+    )
+    found = np.take_along_axis(candidates, nearest[..., None, None], axis=-2)[..., 0, :]
     return np.where(inside[..., None], trial, found)

@@ -1,12 +1,9 @@
-"""A second solution of frictional contact in plain NumPy, to judge the package by.
+"""An independent solver for frictional contact in NumPy, with which the package is compared.
 
-It shares nothing with the package but DOLFINx's stiffness and load vector: points, weights and
-normals of Γc, pairs of surfaces and L2 projection (`reference_geometry`), laws (`reference_laws`),
-history, condensation and solver (here) are made anew, dense and by brute force, for problems of
-some hundred unknowns. What is solved is what the package's docstrings define: laws at quadrature
-points (`laws`), obstacles (`obstacles`), pairs (`pairing`), multipliers (`multipliers`).
-
-Arrays are those of one rank. Numbers of nodes are those of the displacement element.
+It shares only DOLFINx's stiffness matrix and load vector with the package. Quadrature points,
+normals, contact pairs and L2 projection (`reference_geometry`), contact laws (`reference_laws`),
+history, static condensation and Newton's method are implemented again, with dense matrices, for
+some hundred unknowns on one rank. Nodes are numbered as in the displacement element.
 """
 
 from __future__ import annotations
@@ -26,10 +23,10 @@ from verification.reference_laws import Law, dot
 __all__ = ["ContactModel", "Failed", "Load", "Problem", "State"]
 
 Array = np.ndarray
-# Step of the derivatives by complex numbers: exact, whatever its size.
-_STEP = 1e-60
-# Systems whose condition is better than its inverse are solved by elimination.
-_WELL = 1e-8
+# Step of complex-step derivatives, which have no truncation error.
+_COMPLEX_STEP = 1e-60
+# Reciprocal condition number above which a system is solved by LU, not by least squares.
+_MIN_RCOND = 1e-8
 
 
 # ---- a contact -----------------------------------------------------------------------------------
@@ -37,184 +34,187 @@ _WELL = 1e-8
 
 @dataclass(eq=False)
 class State:
-    """What a contact keeps from one increment to the next.
+    """Committed state of a contact.
 
     Attributes:
-        jump: Displacement relative to the obstacle that Δu_t counts from, (n, d) (length).
+        jump: Slip reference: the relative displacement at which Δu_t = 0, (n, d) (length).
         traction: τ, or with multipliers λ_t, (n, d) (stress).
         pressure: λ_n, (n,) (stress); None without multipliers.
-        limit: Of friction, where it is taken for given, (n,) (stress).
+        friction_bound: Prescribed friction bound, (n,) (stress); None: that of the law.
     """
 
     jump: Array
     traction: Array
     pressure: Array | None = None
-    limit: Array | None = None
+    bound: Array | None = None
 
 
 @dataclass(eq=False)
 class ContactModel:
-    """Γc, its obstacle and its law at points.
+    """A contact at quadrature points.
 
     Attributes:
-        place: Function of the shift of the obstacle, (d,): gap (n,) and unit normal (n, d).
-        interpolation: From node values to the body's displacement, less the opposite one,
-            (n_points, n_nodes).
-        weights: (n,).
-        k_n, k_t: Stiffness at the points, (n,).
+        x: Quadrature points of the undeformed Γc, (n, d) (length).
+        gap_function: Returns gap (n,) and unit normal (n, d) for an obstacle displacement (d,).
+        interpolation: Matrix from nodes to the displacement jump, (n, n_nodes).
+        weights: Quadrature weights, (n,).
+        k_n, k_t: Contact stiffness, (n,).
         law: The law.
-        paired: Points that may carry tractions, (n,).
-        free: Components of the obstacle's motion that follow from the force on it.
-        project: L2 projection of the multipliers, (n, n); None without multipliers.
-        repair: Pairs the points anew at a displacement; None where pairs stay.
-        back: ∫ of the penetration as the opposite surface sees it at a displacement; None where
-            the obstacle is rigid.
-        here: Γc.
-        facet: On it, of every point.
-        near: Function of places (n, d) and where the obstacle is: distance (n,) and minus its
-            gradient (n, d); None where the obstacle is no rigid shape.
-        radius: Of a round obstacle, whose round-off gaps have (length).
-        spine: Middle line of a rod where it began, (n, d); None of other obstacles.
-        anew: Function of u: interpolation, gap and pairs of bodies where they have moved to; None
-            where the obstacle is rigid.
+        paired: Whether points may carry tractions, (n,).
+        free_components: Components of the obstacle's motion that are unknowns.
+        projection: L2 projection of the multipliers, (n, n); None without multipliers.
+        update_pairs: Updates the pairs for a displacement; None if pairs are fixed.
+        opposite_penetration: Integrates the penetration on the opposing surface for a
+            displacement; None on a rigid obstacle.
+        slave: Γc.
+        facet: Facet of every point.
+        deformed_gap: Returns gap and normal at points (n, d) for an obstacle displacement; None
+            if the obstacle is no rigid shape.
+        radius: Radius of a round obstacle, for its round-off (length).
+        centreline: Centreline of a rod in its first position, (n, d); None for other obstacles.
+        current_pairs: Returns interpolation, gap and pairs of deformed bodies for u; None on a
+            rigid obstacle.
     """
 
     x: Array
-    place: Any
+    gap_function: Any
     interpolation: Array
     weights: Array
     k_n: Array
     k_t: Array
     law: Law
     paired: Array
-    free: tuple[int, ...] = ()
-    project: Array | None = None
-    repair: Any = None
-    back: Any = None
-    here: Any = None
+    free_components: tuple[int, ...] = ()
+    projection: Array | None = None
+    update_pairs: Any = None
+    overlap: Any = None
+    slave: Any = None
     facet: Any = None
-    near: Any = None
+    deformed_gap: Any = None
     radius: float = 0.0
-    spine: Any = None
-    anew: Any = None
-    _placed: tuple[Any, ...] = field(default=(None, b"", ()), init=False, repr=False)
+    centreline: Any = None
+    current_pairs: Any = None
+    _cached_gap: tuple[Any, ...] = field(default=(None, b"", ()), init=False, repr=False)
 
     @property
     def d(self) -> int:
         """Dimension."""
         return int(self.x.shape[1])
 
-    def start(self) -> State:
-        """No traction, no slip."""
+    def initial_state(self) -> State:
+        """Return the state without traction and slip."""
         zero = np.zeros_like(self.x)
-        return State(zero, zero, None if self.project is None else np.zeros(len(zero)))
+        return State(zero, zero, None if self.projection is None else np.zeros(len(zero)))
 
     def jump(self, u: Array) -> Array:
-        """Displacement of the body, less that of the opposite one, (n, d)."""
+        """Return the displacement jump, (n, d)."""
         return self.interpolation @ u.reshape(-1, self.d)
 
-    def placed(self, shift: Array) -> tuple[Array, Array]:
-        """Gap and normal; the same arrays until the obstacle moves or the pairs change."""
+    def gap_and_normal(self, shift: Array) -> tuple[Array, Array]:
+        """Return gap and normal; the arrays are reused until obstacle or pairs change."""
         if np.iscomplexobj(shift):
-            return self.place(shift)
-        if self._placed[0] is not self.place or self._placed[1] != shift.tobytes():
-            self._placed = self.place, shift.tobytes(), self.place(shift)
-        return self._placed[2]
+            return self.gap_function(shift)
+        if self._cached_gap[0] is not self.gap_function or self._cached_gap[1] != shift.tobytes():
+            self._cached_gap = self.gap_function, shift.tobytes(), self.gap_function(shift)
+        return self._cached_gap[2]
 
-    def respond(self, jump: Array, shift: Array, old: State) -> dict[str, Array]:
-        """Tractions and what they follow from; of one jump (n, d), or of several, (m, n, d)."""
-        gap, n = self.placed(shift)
+    def evaluate(self, jump: Array, shift: Array, old: State) -> dict[str, Array]:
+        """Return tractions and local kinematics for one jump (n, d), or for several, (m, n, d)."""
+        gap, n = self.gap_and_normal(shift)
         relative = jump - shift
 
-        def across(vector: Array) -> Array:
+        def tangential(vector: Array) -> Array:
             return vector - dot(vector, n)[..., None] * n
 
-        closing = dot(jump, n) - gap
-        step, before = across(relative - old.jump), across(old.traction)
-        total = across(relative) if self.law.kind == "foundation" else relative
-        r_n = self.law.normal(self.k_n, closing, old.pressure)
-        tau = self.law.tangential(self.k_t, n, step, before, total, r_n, closing, old.limit)
+        overclosure = dot(jump, n) - gap
+        step, before = tangential(relative - old.jump), tangential(old.traction)
+        total = tangential(relative) if self.law.kind == "foundation" else relative
+        r_n = self.law.normal_traction(self.k_n, overclosure, old.pressure)
+        tau = self.law.tangential_traction(
+            self.k_t, n, step, before, total, r_n, overclosure, old.bound
+        )
         r_n, tau = np.where(self.paired, r_n, 0), np.where(self.paired[:, None], tau, 0)
         traction = r_n[..., None] * n + tau
         return {
             "normal": n,
-            "closing": closing,
+            "overclosure": overclosure,
             "relative": relative,
-            "step": step,
-            "before": before,
+            "slip": step,
+            "tau_old": before,
             "r_n": r_n,
             "tau": tau,
             "traction": traction,
         }
 
     def derivatives(
-        self, jump: Array, shift: Array, old: State, moves: Sequence[int] | None = None
+        self, jump: Array, shift: Array, old: State, motion_columns: Sequence[int] | None = None
     ) -> tuple[Array, Array]:
-        """∂t/∂jump, (n, d, d), and ∂t/∂shift, (n, d, m); the last index is the component.
-
-        ``moves``: components of the shift that are asked for; by default all of them.
-        """
-        turns = 1j * _STEP * np.eye(self.d)
-        found = self.respond(jump + turns[:, None], shift, old)["traction"]
-        by_jump = np.moveaxis(found.imag, 0, 2) / _STEP
-        by_shift = np.zeros((len(jump), self.d, self.d if moves is None else len(moves)))
-        for k, i in enumerate(range(self.d) if moves is None else moves):
-            found = self.respond(jump + 0j, shift + turns[i], old)["traction"]
-            by_shift[:, :, k] = found.imag / _STEP
+        """Return ∂t/∂jump, (n, d, d), and ∂t/∂shift, (n, d, m) for m components of the shift."""
+        steps = 1j * _COMPLEX_STEP * np.eye(self.d)
+        found = self.evaluate(jump + steps[:, None], shift, old)["traction"]
+        by_jump = np.moveaxis(found.imag, 0, 2) / _COMPLEX_STEP
+        by_shift = np.zeros(
+            (len(jump), self.d, self.d if motion_columns is None else len(motion_columns))
+        )
+        for k, i in enumerate(range(self.d) if motion_columns is None else motion_columns):
+            found = self.evaluate(jump + 0j, shift + steps[i], old)["traction"]
+            by_shift[:, :, k] = found.imag / _COMPLEX_STEP
         return by_jump, by_shift
 
-    def at_rest(self) -> Any:
-        """Where the obstacle began, as `respond` takes it."""
+    def initial_position(self) -> Any:
+        """Return the first position of the obstacle, as an argument of `evaluate`."""
         return np.zeros(self.d)
 
-    def spine_at(self, shift: Any) -> Array:
-        """The middle line of a rod, (n, d)."""
-        return self.spine + shift
+    def centreline_at(self, shift: Any) -> Array:
+        """Return the centreline of a rod, (n, d)."""
+        return self.centreline + shift
 
-    def counted_from(self, found: dict[str, Array], old: Any, idle: Array) -> Any:
-        """History with slip of some points, (n,), counted from a state that is not committed."""
-        return replace(old, jump=np.where(idle[:, None], found["relative"], old.jump))
+    def reset_slip(self, found: dict[str, Array], old: Any, unloaded: Array) -> Any:
+        """Move the slip reference of unloaded points, (n,), to an evaluated state."""
+        return replace(old, jump=np.where(unloaded[:, None], found["relative"], old.jump))
 
     def augment(self, found: dict[str, Array], old: State) -> State:
-        """One round: the multipliers that the tractions found make."""
-        assert self.project is not None
-        pressure = self.project @ -found["r_n"] if self.law.has_normal else 0 * found["r_n"]
-        traction = self.project @ found["tau"] if self.law.slips else old.traction
+        """Return the state after one augmentation."""
+        assert self.projection is not None
+        pressure = self.projection @ -found["r_n"] if self.law.has_normal else 0 * found["r_n"]
+        traction = self.projection @ found["tau"] if self.law.has_friction else old.traction
         return State(old.jump, traction, pressure)
 
     def next_state(self, found: dict[str, Array], old: State) -> State:
-        """History of the next increment; ``old`` with the multipliers it was found with."""
-        if self.project is None:
+        """Return the state to commit; ``old`` has the multipliers of the solution."""
+        if self.projection is None:
             return State(found["relative"].copy(), found["tau"].copy())
         jump = found["relative"]
-        if self.law.slips:
-            borne = found["before"] - found["tau"]
-            jump = jump - self.law.stretch(self.k_t, found["normal"], borne)
+        if self.law.has_friction:
+            change = found["tau_old"] - found["tau"]
+            jump = jump - self.law.elastic_slip(self.k_t, found["normal"], change)
         return State(jump, old.traction.copy(), old.pressure)
 
-    def stored(self, found: dict[str, Array]) -> float:
-        """Energy of the springs, of penalty enforcement."""
+    def stored_energy(self, found: dict[str, Array]) -> float:
+        """Return the energy of the contact springs (penalty enforcement)."""
         w, law = self.weights * self.paired, self.law
         if law.kind == "foundation":
-            across = (
+            tangential = (
                 found["relative"]
                 - np.sum(found["relative"] * found["normal"], axis=1)[:, None] * found["normal"]
             )
-            energy = -found["r_n"] * found["closing"] - np.sum(found["tau"] * across, axis=1)
+            energy = -found["r_n"] * found["overclosure"] - np.sum(
+                found["tau"] * tangential, axis=1
+            )
             return float(w @ energy / 2)
         energy = found["r_n"] ** 2 / (2 * self.k_n) if law.has_normal else 0 * found["r_n"]
-        if law.slips:
-            stretch = law.stretch(self.k_t, found["normal"], found["tau"])
+        if law.has_friction:
+            stretch = law.elastic_slip(self.k_t, found["normal"], found["tau"])
             energy = energy + np.sum(found["tau"] * stretch, axis=1) / 2
         return float(w @ energy)
 
-    def dissipated(self, found: dict[str, Array]) -> float:
-        """Work of friction on the slip of the increment, of penalty enforcement."""
-        if not self.law.slips:
+    def dissipated_energy(self, found: dict[str, Array]) -> float:
+        """Return the friction dissipation of the increment (penalty enforcement)."""
+        if not self.law.has_friction:
             return 0.0
-        stretch = self.law.stretch(self.k_t, found["normal"], found["tau"] - found["before"])
+        stretch = self.law.elastic_slip(self.k_t, found["normal"], found["tau"] - found["tau_old"])
         return float(
-            -(self.weights * self.paired) @ np.sum(found["tau"] * (found["step"] + stretch), axis=1)
+            -(self.weights * self.paired) @ np.sum(found["tau"] * (found["slip"] + stretch), axis=1)
         )
 
 
@@ -223,139 +223,141 @@ class ContactModel:
 
 @dataclass(eq=False)
 class Load:
-    """What drives an increment.
+    """Load at the end of an increment.
 
     Attributes:
         force: Load vector, (N,) (force).
-        fixed: Prescribed unknowns.
-        values: Theirs (length).
-        shifts: Of every contact the prescribed displacement of its obstacle, (d,); zero where free.
-        pushes: Of every contact the force on its obstacle, (d,).
+        fixed: Dirichlet dofs.
+        values: Their values (length).
+        shifts: Prescribed displacement of the obstacle of every contact, (d,); 0 if free.
+        obstacle_forces: Force on the obstacle of every contact, (d,).
     """
 
     force: Array
     fixed: Array
     values: Array
     shifts: list[Array]
-    pushes: list[Array]
+    obstacle_forces: list[Array]
 
 
 class Failed(RuntimeError):
-    """No solution was found here."""
+    """The independent solver has not found a solution."""
 
 
-class Reduced:
-    """A linear problem on the unknowns of Γc and the free motions, the others eliminated.
+class CondensedSystem:
+    """A linear bulk after static condensation onto n dofs of Γc and m free obstacle motions.
 
-    It holds while the pairs and the prescribed unknowns are the same.
+    It is valid for one set of pairs and Dirichlet dofs.
 
     Attributes:
-        kept, inner: Numbers of the unknowns of Γc that are free, n, and of those eliminated.
-        stiffness: Of these n unknowns, then of m free motions, (n + m, n + m).
-        closed: With all of Γc closed and sticking, to hold what nothing holds yet.
-        scale: Root of the diagonal of that.
-        maps: Of every contact, from the n unknowns to jumps, (n_points d, n).
-        left: From all n + m unknowns to jumps less shifts, (n_points d, n + m).
-        moves: Of every contact the columns of its motions there, and their components.
+        retained, eliminated: Retained dofs, n, and eliminated ones.
+        stiffness: Condensed stiffness, (n + m, n + m).
+        stick_stiffness: Condensed stiffness with all points sticking, which is regular.
+        scale: Square root of the diagonal of that.
+        maps: Matrix from the n dofs to the jump of every contact, (n_points d, n).
+        operators: Matrix D from all n + m unknowns to the relative displacement of every contact.
+        motion_columns: Columns of the free motions of every contact, and their components.
     """
 
     def __init__(self, problem: Problem, fixed: Array) -> None:
-        """Eliminate what is neither on Γc nor prescribed."""
-        d, stiff = problem.body.d, problem.body.stiffness
+        """Eliminate the free dofs that no contact couples."""
+        d, K = problem.body.d, problem.body.stiffness
         self._fixed = fixed
         self._pairs = [c.interpolation for c in problem.contacts]
-        felt, held = np.zeros(len(stiff), dtype=bool), np.zeros(len(stiff), dtype=bool)
+        coupled, constrained = (np.zeros(len(K), dtype=bool), np.zeros(len(K), dtype=bool))
         for pairs in self._pairs:
-            felt |= np.repeat(np.any(pairs != 0, axis=0), d)
-        held[fixed] = True
-        self.kept, self.inner = np.flatnonzero(felt & ~held), np.flatnonzero(~felt & ~held)
-        self._dragged = stiff[:, fixed]
-        schur = stiff[np.ix_(self.kept, self.kept)]
-        if len(self.inner):
-            self._factor = scipy.linalg.cho_factor(stiff[np.ix_(self.inner, self.inner)])
-            self._across = stiff[np.ix_(self.inner, self.kept)]
-            self._recover = scipy.linalg.cho_solve(self._factor, self._across)
-            schur = schur - self._across.T @ self._recover
-        free = problem.motions()
+            coupled |= np.repeat(np.any(pairs != 0, axis=0), d)
+        constrained[fixed] = True
+        self.retained = np.flatnonzero(coupled & ~constrained)
+        self.eliminated = np.flatnonzero(~coupled & ~constrained)
+        self._K_fixed = K[:, fixed]
+        schur = K[np.ix_(self.retained, self.retained)]
+        if len(self.eliminated):
+            self._factor = scipy.linalg.cho_factor(K[np.ix_(self.eliminated, self.eliminated)])
+            self._coupling = K[np.ix_(self.eliminated, self.retained)]
+            self._extension = scipy.linalg.cho_solve(self._factor, self._coupling)
+            schur = schur - self._coupling.T @ self._extension
+        free = problem.free_motions()
         self.stiffness = scipy.linalg.block_diag(schur, np.zeros((len(free),) * 2))
-        self.closed = self.stiffness.copy()
-        self.maps, self.left, self.moves, self._ties = [], [], [], []
+        self.stick_stiffness = self.stiffness.copy()
+        self.maps, self.operators, self.motion_columns, self._fixed_jumps = ([], [], [], [])
         for c, model in enumerate(problem.contacts):
             whole = np.kron(model.interpolation, np.eye(d))
-            mine = [len(self.kept) + k for k, (o, _) in enumerate(free) if o == c]
+            mine = [len(self.retained) + k for k, (o, _) in enumerate(free) if o == c]
             axes = [i for o, i in free if o == c]
-            left = np.zeros((model.x.size, len(self.stiffness)))
-            left[:, : len(self.kept)] = whole[:, self.kept]
-            left[:, mine] = -np.tile(np.eye(d)[:, axes], (len(model.x), 1))
-            self.maps.append(whole[:, self.kept])
-            self.left.append(left)
-            self.moves.append((mine, axes))
-            self._ties.append(whole[:, fixed])
+            D = np.zeros((model.x.size, len(self.stiffness)))
+            D[:, : len(self.retained)] = whole[:, self.retained]
+            D[:, mine] = -np.tile(np.eye(d)[:, axes], (len(model.x), 1))
+            self.maps.append(whole[:, self.retained])
+            self.operators.append(D)
+            self.motion_columns.append((mine, axes))
+            self._fixed_jumps.append(whole[:, fixed])
             springs = np.where(model.k_t > 0, model.k_t, model.k_n)
             springs = model.weights * np.maximum(model.k_n, springs)
-            self.closed += left.T @ (np.repeat(springs, d)[:, None] * left)
-        self.scale = np.sqrt(np.maximum(np.abs(np.diag(self.closed)), 1e-300))
-        self._sizes = np.abs(self.stiffness), [np.abs(left) for left in self.left]
+            self.stick_stiffness += D.T @ (np.repeat(springs, d)[:, None] * D)
+        self.scale = np.sqrt(np.maximum(np.abs(np.diag(self.stick_stiffness)), 1e-300))
+        self._sizes = (np.abs(self.stiffness), [np.abs(D) for D in self.operators])
         self._load: Load | None = None
 
-    def holds(self, problem: Problem, fixed: Array) -> bool:
-        """Whether it is still this problem."""
+    def is_valid_for(self, problem: Problem, fixed: Array) -> bool:
+        """Whether pairs and Dirichlet dofs are unchanged."""
         pairs = zip(problem.contacts, self._pairs, strict=True)
         return all(c.interpolation is p for c, p in pairs) and np.array_equal(fixed, self._fixed)
 
-    def take(self, load: Load) -> tuple[Array, list[Array]]:
-        """Forces on the n + m unknowns; jumps of what is prescribed alone, of every contact."""
+    def condense_load(self, load: Load) -> tuple[Array, list[Array]]:
+        """Return the condensed load, and the jumps due to the Dirichlet values alone."""
         if load is not self._load:
-            right = load.force - self._dragged @ load.values
-            force = right[self.kept]
-            if len(self.inner):
-                self._first = scipy.linalg.cho_solve(self._factor, right[self.inner])
-                force = force - self._across.T @ self._first
-            pushes = [load.pushes[c][i] for c, (_, axes) in enumerate(self.moves) for i in axes]
-            self._taken = np.concatenate([force, pushes]), [t @ load.values for t in self._ties]
+            right = load.force - self._K_fixed @ load.values
+            force = right[self.retained]
+            if len(self.eliminated):
+                self._interior = scipy.linalg.cho_solve(self._factor, right[self.eliminated])
+                force = force - self._coupling.T @ self._interior
+            axes = [(c, i) for c, (_, own) in enumerate(self.motion_columns) for i in own]
+            force = np.concatenate([force, [load.obstacle_forces[c][i] for c, i in axes]])
+            self._reduced = force, [t @ load.values for t in self._fixed_jumps]
             self._load = load
-        return self._taken
+        return self._reduced
 
-    def fill(self, u: Array, kept: Array) -> None:
-        """Set the kept unknowns, and those eliminated, of the load taken last."""
-        u[self.kept] = kept
-        if len(self.inner):
-            u[self.inner] = self._first - self._recover @ kept
+    def recover(self, u: Array, retained: Array) -> None:
+        """Set the retained dofs in u, and recover the eliminated ones for the last load."""
+        u[self.retained] = retained
+        if len(self.eliminated):
+            u[self.eliminated] = self._interior - self._extension @ retained
 
-    def floor(self, z: Array, forces: list[Array]) -> float:
-        """Size of all that the residual is summed of: rounding is a share of this."""
-        stiff, left = self._sizes
-        total = stiff @ np.abs(z)
-        for across, force in zip(left, forces, strict=True):
-            total += np.abs(force) @ across
+    def roundoff(self, z: Array, forces: list[Array]) -> float:
+        """Return the norm of the terms of the residual, to which its round-off is relative."""
+        K, D = self._sizes
+        total = K @ np.abs(z)
+        for tangential, force in zip(D, forces, strict=True):
+            total += np.abs(force) @ tangential
         return _norm(total)
 
-    def step(self, matrix: Array, rest: Array) -> Array:
-        """Newton's step; that of closed springs where nothing holds the bodies."""
+    def step(self, matrix: Array, residual: Array) -> Array:
+        """Return the Newton step; with the sticking stiffness if the tangent is singular."""
         system = matrix / self.scale[:, None] / self.scale
-        right = -rest / self.scale
+        right = -residual / self.scale
         size = np.abs(system).sum(axis=0).max(initial=0.0)
         factor, order, singular = scipy.linalg.lapack.dgetrf(system)
-        if not singular and scipy.linalg.lapack.dgecon(factor, size)[0] > _WELL:
+        if not singular and scipy.linalg.lapack.dgecon(factor, size)[0] > _MIN_RCOND:
             return scipy.linalg.lapack.dgetrs(factor, order, right)[0] / self.scale
         if np.linalg.cond(system) > 1e13:
-            system = self.closed / self.scale[:, None] / self.scale
+            system = self.stick_stiffness / self.scale[:, None] / self.scale
         return np.linalg.lstsq(system, right, rcond=1e-15)[0] / self.scale
 
 
 @dataclass(eq=False)
 class Trial:
-    """A place of Newton's method.
+    """A trial state of Newton's method.
 
     Attributes:
-        z: The n + m unknowns of `Reduced`.
-        rest: Residual of these.
+        z: The n + m unknowns of `CondensedSystem`.
+        residual: Residual of these.
         size: The largest force.
-        jumps, shifts, forces: Of every contact.
+        jumps, shifts, forces: Jump, obstacle displacement and force of every contact.
     """
 
     z: Array
-    rest: Array
+    residual: Array
     size: float
     jumps: list[Array]
     shifts: list[Array]
@@ -366,8 +368,8 @@ def _norm(vector: Array) -> float:
     return math.sqrt(vector @ vector)
 
 
-def _change(new: list[State], old: list[State]) -> tuple[float, float]:
-    """Largest change of multipliers, and the largest of them (stress)."""
+def _multiplier_change(new: list[State], old: list[State]) -> tuple[float, float]:
+    """Return the largest change of multipliers, and the largest multiplier (stress)."""
     change = scale = 0.0
     for a, b in zip(new, old, strict=True):
         if a.pressure is not None:
@@ -379,190 +381,189 @@ def _change(new: list[State], old: list[State]) -> tuple[float, float]:
 
 @dataclass(eq=False)
 class Problem:
-    """A linear bulk and contacts, dense.
+    """A linear bulk with contacts.
 
     Attributes:
         body: The bulk.
         contacts: The contacts.
-        far: How far all bodies are carried (length), of which gaps have a round-off.
+        largest_translation: Translation of all bodies, for the round-off of gaps (length).
     """
 
     body: Body
     contacts: list[ContactModel]
-    far: float = 0.0
-    _reduced: Reduced | None = field(default=None, init=False, repr=False)
+    largest_translation: float = 0.0
+    _condensed: CondensedSystem | None = field(default=None, init=False, repr=False)
 
-    def motions(self) -> list[tuple[int, int]]:
-        """Contact and component of every free motion."""
-        return [(c, i) for c, m in enumerate(self.contacts) for i in m.free]
+    def free_motions(self) -> list[tuple[int, int]]:
+        """Return contact and component of every free obstacle motion."""
+        return [(c, i) for c, m in enumerate(self.contacts) for i in m.free_components]
 
     def shifts(self, load: Load, motion: Array) -> list[Array]:
-        """Displacements of the obstacles."""
+        """Return the displacements of the obstacles."""
         shifts = [np.array(s, dtype=motion.dtype) for s in load.shifts]
-        for value, (c, i) in zip(motion, self.motions(), strict=False):
+        for value, (c, i) in zip(motion, self.free_motions(), strict=False):
             shifts[c][i] = value
         return shifts
 
-    def respond(self, u: Array, motion: Array, load: Load, old: list[State]) -> list[dict]:
-        """Tractions of all contacts."""
+    def evaluate(self, u: Array, motion: Array, load: Load, old: list[State]) -> list[dict]:
+        """Evaluate all contacts."""
         shifts = self.shifts(load, motion)
         return [
-            c.respond(c.jump(u), s, o) for c, s, o in zip(self.contacts, shifts, old, strict=True)
+            c.evaluate(c.jump(u), s, o) for c, s, o in zip(self.contacts, shifts, old, strict=True)
         ]
 
     def contact_force(self, found: list[dict]) -> list[Array]:
-        """Force of every contact on the bodies, (N,) each."""
+        """Return the force of every contact on the bodies, (N,) each."""
         return [
             (c.interpolation.T @ (c.weights[:, None] * f["traction"])).ravel()
             for c, f in zip(self.contacts, found, strict=True)
         ]
 
     def stiffness(self, u: Array) -> Array:
-        """K, that at a displacement."""
+        """Return the tangent stiffness of the bulk."""
         return self.body.stiffness
 
     def residual(self, u: Array, load: Load, found: list[dict]) -> tuple[Array, Array]:
-        """K u - f - contact on all unknowns, and force on obstacles not balanced."""
+        """Return the residual of all dofs, and that of the free obstacle motions."""
         total = self.body.stiffness @ u - load.force - sum(self.contact_force(found))
         motion = [
-            (self.contacts[c].weights @ found[c]["traction"])[i] - load.pushes[c][i]
-            for c, i in self.motions()
+            (self.contacts[c].weights @ found[c]["traction"])[i] - load.obstacle_forces[c][i]
+            for c, i in self.free_motions()
         ]
         return total, np.array(motion)
 
     def solve(
         self, u: Array, motion: Array, load: Load, old: list[State], *, rtol: float = 1e-12
     ) -> tuple[Array, Array, list[State]]:
-        """One increment.
+        """Solve one increment, with augmentations if there are multipliers.
 
         Args:
-            u: Where to start.
-            motion: Likewise.
-            load: At the end of the increment.
-            old: History.
+            u: Initial guess of the displacement.
+            motion: Initial guess of the free motions.
+            load: Load at the end of the increment.
+            old: Committed states.
             rtol: Residual relative to the forces.
 
         Returns:
-            u, motions, and the history with the multipliers that belong to the solution.
+            u, motions, and the committed states with the multipliers of the solution.
 
         Raises:
-            Failed: Nothing was found.
+            Failed: The iteration does not converge.
         """
-        if all(c.project is None for c in self.contacts):
-            return *self.increment_of(u, motion, load, old, rtol), old
+        if all(c.projection is None for c in self.contacts):
+            return *self.equilibrate(u, motion, load, old, rtol), old
         for _ in range(3000):
-            u, motion = self.increment_of(u, motion, load, old, rtol)
-            found = self.respond(u, motion, load, old)
+            u, motion = self.equilibrate(u, motion, load, old, rtol)
+            found = self.evaluate(u, motion, load, old)
             new = [
-                c.augment(f, o) if c.project is not None else o
+                c.augment(f, o) if c.projection is not None else o
                 for c, f, o in zip(self.contacts, found, old, strict=True)
             ]
-            change, scale = _change(new, old)
+            change, scale = _multiplier_change(new, old)
             old = new
             if change <= 1e-9 * scale + self.rounding():
                 return u, motion, old
-        raise Failed("multipliers do not settle")
+        raise Failed("multipliers do not converge")
 
     def rounding(self) -> float:
-        """Of tractions, by how far bodies are carried (stress)."""
-        stiff = max(float((c.k_n + c.k_t).max()) for c in self.contacts)
-        return 16 * float(np.finfo(float).eps) * stiff * self.far
+        """Return the round-off of tractions due to the translation of the bodies (stress)."""
+        K = max(float((c.k_n + c.k_t).max()) for c in self.contacts)
+        return 16 * float(np.finfo(float).eps) * K * self.largest_translation
 
-    def increment_of(
+    def equilibrate(
         self, u: Array, motion: Array, load: Load, old: list[State], rtol: float
     ) -> tuple[Array, Array]:
-        """Newton's method; where it fails, from where limits of friction have been led to rest."""
+        """Solve by Newton's method; after a failure start from a fixed point of Tresca problems."""
         try:
             return self._newton(u, motion, load, old, rtol)
         except (Failed, np.linalg.LinAlgError) as failure:
-            if all(c.law.unique for c in self.contacts):
+            if all(c.law.is_unique for c in self.contacts):
                 raise
             last = failure
-        pressures = [np.zeros(len(c.x)) for c in self.contacts]
+        old_pressures = [np.zeros(len(c.x)) for c in self.contacts]
         for attempt in range(25):
             frozen = [
-                replace(o, limit=c.law.friction * p if c.law.kind == "coulomb" else None)
-                for c, o, p in zip(self.contacts, old, pressures, strict=True)
+                replace(o, bound=c.law.friction * p if c.law.kind == "coulomb" else None)
+                for c, o, p in zip(self.contacts, old, old_pressures, strict=True)
             ]
             u, motion = self._newton(u, motion, load, frozen, rtol)
-            found = self.respond(u, motion, load, frozen)
-            pressures = [-f["r_n"] for f in found]
+            found = self.evaluate(u, motion, load, frozen)
+            old_pressures = [-f["r_n"] for f in found]
             if attempt in (2, 5, 10, 24):
                 with contextlib.suppress(Failed):
                     return self._newton(u, motion, load, old, rtol)
         raise last
 
-    def _reduce(self, fixed: Array) -> Reduced:
-        if self._reduced is None or not self._reduced.holds(self, fixed):
-            self._reduced = Reduced(self, fixed)
-        return self._reduced
+    def _condense(self, fixed: Array) -> CondensedSystem:
+        if self._condensed is None or not self._condensed.is_valid_for(self, fixed):
+            self._condensed = CondensedSystem(self, fixed)
+        return self._condensed
 
-    def _tangent(self, reduced: Reduced, at: Trial, old: list[State]) -> Array:
-        """Derivative of the residual."""
-        d, matrix = self.body.d, reduced.stiffness.copy()
+    def _tangent(self, condensed: CondensedSystem, at: Trial, old: list[State]) -> Array:
+        """Return the derivative of the condensed residual."""
+        d, matrix = self.body.d, condensed.stiffness.copy()
         for c, model in enumerate(self.contacts):
-            mine, axes = reduced.moves[c]
+            mine, axes = condensed.motion_columns[c]
             by_jump, by_shift = model.derivatives(at.jumps[c], at.shifts[c], old[c], axes)
-            w, maps = model.weights[:, None, None], reduced.maps[c]
-            felt = ((w * by_jump) @ maps.reshape(-1, d, maps.shape[1])).reshape(maps.shape)
-            matrix[:, : maps.shape[1]] -= reduced.left[c].T @ felt
+            w, maps = model.weights[:, None, None], condensed.maps[c]
+            coupled = ((w * by_jump) @ maps.reshape(-1, d, maps.shape[1])).reshape(maps.shape)
+            matrix[:, : maps.shape[1]] -= condensed.operators[c].T @ coupled
             if mine:
                 turned = (w * by_shift).reshape(-1, len(axes))
-                matrix[:, mine] -= reduced.left[c].T @ turned
+                matrix[:, mine] -= condensed.operators[c].T @ turned
         return matrix
 
     def _newton(
         self, u: Array, motion: Array, load: Load, old: list[State], rtol: float
     ) -> tuple[Array, Array]:
-        """Newton's method on the unknowns of Γc, the others eliminated."""
-        reduced = self._reduce(load.fixed)
-        outside, rigid = reduced.take(load)
-        d, n = self.body.d, len(reduced.kept)
-        given = _norm(outside[:n])
+        """Solve the condensed equations by Newton's method with a line search."""
+        condensed = self._condense(load.fixed)
+        outside, rigid = condensed.condense_load(load)
+        d, n = self.body.d, len(condensed.retained)
+        load_norm = _norm(outside[:n])
 
         def evaluate(z: Array) -> Trial:
-            inside = reduced.stiffness @ z
-            rest, size = inside - outside, max(given, _norm(inside))
+            inside = condensed.stiffness @ z
+            residual, size = inside - outside, max(load_norm, _norm(inside))
             shifts, jumps, forces = self.shifts(load, z[n:]), [], []
             for c, model in enumerate(self.contacts):
-                jump = (reduced.maps[c] @ z[:n] + rigid[c]).reshape(-1, d)
-                traction = model.respond(jump, shifts[c], old[c])["traction"]
+                jump = (condensed.maps[c] @ z[:n] + rigid[c]).reshape(-1, d)
+                traction = model.evaluate(jump, shifts[c], old[c])["traction"]
                 force = (model.weights[:, None] * traction).ravel()
-                total = force @ reduced.left[c]
-                rest -= total
+                total = force @ condensed.operators[c]
+                residual -= total
                 size = max(size, _norm(total[:n]))
                 jumps.append(jump)
                 forces.append(force)
-            return Trial(z, rest, size, jumps, shifts, forces)
+            return Trial(z, residual, size, jumps, shifts, forces)
 
-        convex = not self.motions() and all(
-            c.law.unique or (o.limit is not None and c.law.kind == "coulomb")
+        convex = not self.free_motions() and all(
+            c.law.is_unique or (o.bound is not None and c.law.kind == "coulomb")
             for c, o in zip(self.contacts, old, strict=True)
         )
-        now = evaluate(np.concatenate([u[reduced.kept], motion]))
+        now = evaluate(np.concatenate([u[condensed.retained], motion]))
         best, since = (np.inf, now), 0
         for iteration in range(200):
-            norm = _norm(now.rest)
+            norm = _norm(now.residual)
             if norm < best[0]:
                 since = iteration if norm < 0.5 * best[0] else since
                 best = (norm, now)
-            if norm <= rtol * now.size or norm <= 1e-14 * reduced.floor(now.z, now.forces):
+            if norm <= rtol * now.size or norm <= 1e-14 * condensed.roundoff(now.z, now.forces):
                 break
             if iteration > since + 40:
                 break
-            step = reduced.step(self._tangent(reduced, now, old), now.rest)
-            share, slope = 1.0, now.rest @ step
+            step = condensed.step(self._tangent(condensed, now, old), now.residual)
+            share, slope = 1.0, now.residual @ step
             low, high = (0.0, slope), None
-            first = _norm(now.rest / reduced.scale)
-            # The paper's line search: the energy, of laws that have one, is least where its slope
-            # along the step is zero. Nothing holds an open body: the share is doubled until
-            # something does.
+            first = _norm(now.residual / condensed.scale)
+            # The line search of the paper looks for a zero of the energy's slope along the step.
+            # The step is doubled as long as an unconstrained body has not met its obstacle.
             for _ in range(60):
                 trial, tried = evaluate(now.z + share * step), share
-                lower = _norm(trial.rest / reduced.scale) < (1 - 0.1 * share) * first
+                lower = _norm(trial.residual / condensed.scale) < (1 - 0.1 * share) * first
                 if lower and not convex:
                     break
-                along = trial.rest @ step
+                along = trial.residual @ step
                 if abs(along) <= 0.3 * abs(slope):
                     break
                 if along < 0:
@@ -578,9 +579,9 @@ class Problem:
                 share = 1.0 if iteration % 18 == 8 else 0.37  # out of a cycle
             now = trial if share == tried else evaluate(now.z + share * step)
         norm, now = best
-        if norm > 1e3 * rtol * now.size and norm > 1e-12 * reduced.floor(now.z, now.forces):
+        if norm > 1e3 * rtol * now.size and norm > 1e-12 * condensed.roundoff(now.z, now.forces):
             raise Failed(f"residual {norm / max(now.size, 1e-300):.1e} of the forces")
         u = u.copy()
         u[load.fixed] = load.values
-        reduced.fill(u, now.z[:n])
+        condensed.recover(u, now.z[:n])
         return u, now.z[n:].copy()

@@ -1,9 +1,8 @@
-"""Random scenes of two bodies with finite kinematics: a block on a slab, pressed, dragged, turned.
+"""Random scenes of two bodies with finite sliding: a block pressed on a slab, slid and rotated.
 
-As in `fuzz_scenes`, whose mesh and history they share, a scene is a dictionary of numbers that is
-played again as it is. It says ``"kinematics": "present"``. The slab is held at its bottom, the
-block at its top, by amounts that are prescribed or pressed by a force; the block may rock, and both
-may be turned together.
+A scene is a dictionary as in `fuzz_scenes`, with ``"kinematics": "finite sliding"``. The bottom of
+the slab is fixed; the top of the block is moved, or pressed by a force. Stages also have the angle
+of the block ("turn") and that of both bodies together ("spin").
 """
 
 from __future__ import annotations
@@ -14,11 +13,11 @@ import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
-from verification.finite_scenes import FiniteMade
-from verification.fuzz_made import Made
-from verification.fuzz_scenes import Scene, dice, draw_form, element
+from verification.finite_scenes import FiniteSetup
+from verification.fuzz_scenes import Scene, draw_element, draw_form, make_samplers
+from verification.fuzz_setup import SceneSetup
 
-__all__ = ["PresentMade", "draw", "turn"]
+__all__ = ["SlidingSetup", "draw", "turn"]
 
 Array = np.ndarray
 
@@ -31,25 +30,25 @@ def draw(
     family: int | None = None,
     extreme: bool = False,
 ) -> Scene:
-    """A random scene.
+    """Draw a random scene.
 
     Args:
-        seed: The same gives the same.
-        without: Features to leave out: "space", "rubber", "bend", "spin", "rock", "multipliers",
-            "units", "restart", "method", "ration", "edge", "stiff", "fine", "form".
-        ranks: Kept in the scene.
-        family: See `fuzz_scenes.draw`.
-        extreme: The same scene, its bodies as unlike as `_unlike` makes them.
+        seed: Seed that determines the scene.
+        without: Features to exclude: "space", "rubber", "bend", "spin", "rock", "multipliers",
+            "units", "restart", "method", "max_iterations", "edge", "stiff", "fine", "form".
+        ranks: Number of ranks, stored in the scene.
+        family: Family of scenes with a common structure, as for `fuzz_scenes.draw`.
+        extreme: Whether the bodies are made dissimilar by `_make_dissimilar`.
     """
     rng = np.random.default_rng([seed, 40])
-    built = rng if family is None else np.random.default_rng([family, 41])
+    structure = rng if family is None else np.random.default_rng([family, 41])
 
-    chance, pick, log, within = dice(rng, built, without)
-    space, cell, degree = element(chance, pick, 0.2)
+    chance, pick, log, within = make_samplers(rng, structure, without)
+    space, cell, degree = draw_element(chance, pick, 0.2)
     d = 3 if space else 2
     strain = log(-3, -0.9)
 
-    # The slab, and on it the block; either may be the finer or the stiffer one.
+    # Either of slab and block may have the finer mesh or the higher modulus.
     most = 2 if space else (8 if degree == 1 else 5)
     coarse = int(rng.integers(1, 3))
     fine = int(rng.integers(2, most + 1))
@@ -82,7 +81,8 @@ def draw(
     upper = {"body": 1, "side": "bottom"}
     lower = {"body": 0, "side": "top"}
     own, other = (upper, lower) if chance(0.6) else (lower, upper)
-    contact: Scene = own | {"obstacle": {"kind": "body", "update": "never"} | other, "law": law}
+    contact: Scene = own | {"law": law}
+    contact["obstacle"] = {"kind": "body", "update_pairs": "never"} | other
     if chance(0.2):
         contact["quadrature"] = pick(2, 3, 5)
     if chance(0.2, "multipliers"):
@@ -90,11 +90,11 @@ def draw(
 
     drive = "force" if chance(0.2) else "prescribed"
     whole = list(range(d))
-    holds: list[list[Any]] = [[0, "bottom", whole, "still"]]
-    holds.append([1, "top", whole[:-1] if drive == "force" else whole, "moved"])
+    conditions: list[list[Any]] = [[0, "bottom", whole, "fixed"]]
+    conditions.append([1, "top", whole[:-1] if drive == "force" else whole, "moved"])
     scene: Scene = {
         "seed": seed,
-        "kinematics": "present",
+        "kinematics": "finite sliding",
         "bulk": "rubber" if chance(0.6, "rubber") else "linear",
         "layout": "two",
         "cell": cell,
@@ -105,15 +105,15 @@ def draw(
         "units": [1.0, 1.0],
         "drive": drive,
         "contacts": [contact],
-        "holds": holds,
+        "dirichlet": conditions,
         "strain": strain,
-        "share": 1.0,
+        "load_ratio": 1.0,
         "cuts": pick(1, 3, 5, of=rng),
     }
     if chance(0.4, "bend") and cell != "hexahedron":
         scene["bend"] = [within(-0.05, 0.05), within(0.0, 0.15)]
 
-    # Stages: strain of the block, ways aside in its widths, and angles (radians) at their end.
+    # Stages: strain of the block, sliding distance in its widths, and angles (radians).
     far = pick(strain, 0.1, 0.5, of=rng)
     if chance(0.2, "edge", of=rng):
         far = 1.5
@@ -144,7 +144,7 @@ def draw(
         }[name]
         if name in ("turn", "both"):
             rock += strain * rng.uniform(-1, 1) * rocks
-            # Turned farther, a linear body swells.
+            # A linear body swells by rotation.
             spin += rng.uniform(-1.5, 1.5) * spins * (1.0 if scene["bulk"] == "rubber" else 0.2)
         stages.append(
             {
@@ -166,18 +166,18 @@ def draw(
         scene["method"] = pick("newton", "lbfgs", "continuation", of=rng)
     if chance(0.1):
         scene["thickness"] = log(-2, 2)
-    if chance(0.05, "ration", of=rng):
-        scene["ration"] = int(rng.integers(4, 12))
+    if chance(0.05, "max_iterations", of=rng):
+        scene["max_iterations"] = int(rng.integers(4, 12))
     if extreme:
-        _unlike(scene, np.random.default_rng([seed, 42]))
+        _make_dissimilar(scene, np.random.default_rng([seed, 42]))
     return scene | draw_form(seed, family, without)
 
 
-def _unlike(scene: Scene, rng: np.random.Generator) -> None:
-    """Facets of one body up to twenty times as wide as the other's, a modulus up to 1e6 times.
+def _make_dissimilar(scene: Scene, rng: np.random.Generator) -> None:
+    """Make facets up to 20 times as wide as the others, and moduli up to 1e6 times as large.
 
-    Which is which is left to chance. The block is nearly as wide as the slab, so that twenty times
-    as fine is no more cells than the second solution bears; of degree 2 ten, and in space four.
+    The block is nearly as wide as the slab, to limit the number of cells. The ratio is 10 for
+    degree 2, and 4 in space.
     """
     slab, block = scene["bodies"]
     wide, room = block["size"], slab["size"][0]
@@ -193,65 +193,65 @@ def _unlike(scene: Scene, rng: np.random.Generator) -> None:
 
 
 def turn(d: int, angle: float) -> Array:
-    """Matrix of a turn about the axis out of the plane of x and the height."""
+    """Return the matrix of a rotation in the plane of x and the height."""
     c, s = np.cos(angle), np.sin(angle)
     found = np.eye(d)
     found[0, 0], found[0, -1], found[-1, 0], found[-1, -1] = c, -s, s, c
     return found
 
 
-class PresentMade(FiniteMade):
-    """A scene as mesh, forms and constants."""
+class SlidingSetup(FiniteSetup):
+    """Mesh, forms, conditions and constants of a scene."""
 
     def __init__(self, scene: Scene, comm: MPI.Comm, *, bulk: Any = None) -> None:
-        """Make it; see `FiniteMade`. Collective."""
+        """Create it, with the arguments of `FiniteSetup`. Collective."""
         super().__init__(scene, comm, bulk=bulk)
-        self._held: list[tuple[int, Any]] = []
-        if scene["drive"] == "prescribed":  # places by turns take functions
-            self.bcs = list(self.busy_bcs)
-            for body, side, *_ in scene["holds"]:
+        self._moved_bodies: list[tuple[int, Any]] = []
+        if scene["drive"] == "prescribed":  # rotations need functions
+            self.bcs = list(self.unrelated_bcs)
+            for body, side, *_ in scene["dirichlet"]:
                 value = fem.Function(self.V)
                 facets = self.facets_of(body, side)
                 dofs = fem.locate_dofs_topological(self.V, self.d - 1, facets)
                 self.bcs.append(fem.dirichletbc(value, dofs))
-                self._held.append((body, value))
+                self._moved_bodies.append((body, value))
 
-    def drives(self, stage: int, t: float) -> dict[str, float]:
-        """See `FiniteMade`; the turn of the block, and that of both as well."""
+    def load_levels(self, stage: int, t: float) -> dict[str, float]:
+        """Return the load factors within a stage, with the angles "turn" and "spin"."""
         stages = self.scene["stages"]
-        now = super().drives(stage, t)
+        now = super().load_levels(stage, t)
         before = stages[stage - 1]["spin"] if stage else 0.0
         return now | {"spin": before + t * (stages[stage]["spin"] - before)}
 
     def apply(self, stage: int, t: float) -> None:
         """Set all loads."""
-        scene, d, now = self.scene, self.d, self.drives(stage, t)
+        scene, d, now = self.scene, self.d, self.load_levels(stage, t)
         slab, block = scene["bodies"][:2]
-        way = np.zeros(d)
-        way[0] = now["side"] * block["size"][0]
+        direction = np.zeros(d)
+        direction[0] = now["side"] * block["size"][0]
         if d == 3:
-            way[1] = now["across"] * block["size"][1]
+            direction[1] = now["across"] * block["size"][1]
         down = now["normal"] * scene["strain"]
         if scene["drive"] == "force":
             rows = self.traction.x.array.reshape(-1, d)
-            rows[self._cells] = -down * min(self.moduli[: self.n_own]) * np.eye(d)[-1]
+            rows[self._cells] = -down * min(self.moduli[: self.n_scene_bodies]) * np.eye(d)[-1]
             for _, i, value in self.moved:
-                value.value = way[i] * self.length
+                value.value = direction[i] * self.length
             self.apply_features(stage, t)
             return
-        way[-1] = -down * block["size"][-1]
+        direction[-1] = -down * block["size"][-1]
         middle = 0.5 * np.array(slab["size"]) * self.length
         pivot = (np.array(block["origin"]) + 0.5 * np.array(block["size"])) * self.length
         whole, own = turn(d, now["spin"]), turn(d, now["turn"])
         x = self.V.tabulate_dof_coordinates()[:, :d]
         self.apply_features(stage, t)
-        for body, value in self._held:
+        for body, value in self._moved_bodies:
             place = x
             if body == 1:
-                place = pivot + (x - pivot) @ own.T + way * self.length
-            moved = middle + (place - middle) @ whole.T + self.carried.value - x
+                place = pivot + (x - pivot) @ own.T + direction * self.length
+            moved = middle + (place - middle) @ whole.T + self.translation.value - x
             value.x.array[:] = moved.ravel()
 
     def obstacle(self, contact: Scene) -> Any:
-        """The package's obstacle."""
-        return Made.obstacle(self, contact)
+        """Return the opposing body."""
+        return SceneSetup.obstacle(self, contact)

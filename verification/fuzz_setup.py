@@ -1,4 +1,4 @@
-"""Random scenes as problems of the package, and the history that it makes of them."""
+"""Random scenes as problems of the package, and their solution."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from fenics_contact.types import Array
 from verification import fuzz_features, fuzz_forms
 from verification.fuzz_scenes import TOP, Scene, frictions
 
-__all__ = ["Made", "capsule", "geometry", "history", "tag_of"]
+__all__ = ["SceneSetup", "capsule_gap", "obstacle_geometry", "run_history", "tag_of"]
 
 
-def _arrays(scene: Scene) -> tuple[Array, Array, Array]:
-    """Vertices, cells in DOLFINx's order, and the box of every cell."""
+def _mesh_arrays(scene: Scene) -> tuple[Array, Array, Array]:
+    """Return vertices, cells in DOLFINx's order, and the body of every cell."""
     d = len(scene["bodies"][0]["size"])
     length = scene["units"][0]
     points, cells, boxes, first = [], [], [], 0
@@ -61,8 +61,8 @@ def _arrays(scene: Scene) -> tuple[Array, Array, Array]:
     return np.concatenate(points), np.concatenate(cells).astype(np.int64), np.concatenate(boxes)
 
 
-def _quadratic(cell: str, x: Array, cells: Array, boxes: Array) -> tuple[Array, Array, Array]:
-    """The same mesh with nodes of degree 2."""
+def _make_quadratic(cell: str, x: Array, cells: Array, boxes: Array) -> tuple[Array, Array, Array]:
+    """Return the mesh with geometry of degree 2."""
     element = basix.ufl.element("Lagrange", cell, 1, shape=(x.shape[1],))
     straight = dolfinx.mesh.create_mesh(MPI.COMM_SELF, cells=cells, x=x, e=ufl.Mesh(element))
     nodes = fem.functionspace(straight, ("Lagrange", 2))
@@ -80,7 +80,7 @@ _SIDES = {
 
 
 def tag_of(scene: Scene, body: int, side: str) -> int:
-    """Tag of a side: contacts are 11, 12 …; what lies opposite 21, 22 …; loaded tops `TOP`."""
+    """Return the tag of a side: 11, 12, … for Γc; 21, 22, … for opposing sides; `TOP`."""
     for i, contact in enumerate(scene["contacts"]):
         if (contact["body"], contact["side"]) == (body, side):
             return 11 + i
@@ -91,38 +91,37 @@ def tag_of(scene: Scene, body: int, side: str) -> int:
     return TOP if side == "top" else 100 + 10 * body + list(_SIDES).index(side)
 
 
-class Made:
-    """A scene as mesh, forms and constants, on any number of ranks.
+class SceneSetup:
+    """Mesh, forms, conditions and constants of a scene, on any number of ranks.
 
     Attributes:
-        n_own: Number of bodies of the scene; an unrelated one comes after them.
-        carried: Translation of all bodies and obstacles of the scene.
-        F: The residual with coefficients by cell and plain measures; the package gets it as the
-            scene says that it is written (`fuzz_forms.written`).
-        set_down: Where slip is counted from anew in this increment, by the names of contacts:
-            "rigid", whether bodies were set down, "u" (see `_displacement`), "jump", the
-            displacement relative to the obstacle at the points, (n_points, d), and "idle", at which
-            of them slip is counted from there, (n_points,).
+        n_scene_bodies: Number of bodies without the unrelated one, which is the last.
+        translation: Translation of all bodies and obstacles of the scene.
+        F: The residual with piecewise constant coefficients; the package gets an equivalent form
+            (`fuzz_forms.make_form`).
+        slip_resets: New slip references of this increment by contact: "rigid", whether bodies were
+            positioned; "u", see `_gather_displacement`; "jump" at the points, (n_points, d); and
+            "unloaded", the points that it applies to, (n_points,).
     """
 
     def __init__(self, scene: Scene, comm: MPI.Comm) -> None:
-        """Make mesh, bulk form and conditions. Collective."""
-        self.n_own = len(scene["bodies"])
-        scene = fuzz_features.with_busy_body(scene)
+        """Create mesh, bulk form and conditions. Collective."""
+        self.n_scene_bodies = len(scene["bodies"])
+        scene = fuzz_features.with_unrelated_body(scene)
         self.scene, self.comm = scene, comm
-        self.set_down: dict[str, dict[str, Any]] = {}
+        self.slip_resets: dict[str, dict[str, Any]] = {}
         self.length, self.force = scene["units"]
-        x, cells, boxes = _arrays(scene)
+        x, cells, boxes = _mesh_arrays(scene)
         self.d = d = x.shape[1]
         bent = any(scene.get("bend", ()))
         if bent:
-            x, cells, boxes = _quadratic(scene["cell"], x, cells, boxes)
+            x, cells, boxes = _make_quadratic(scene["cell"], x, cells, boxes)
         element = basix.ufl.element("Lagrange", scene["cell"], 1 + bent, shape=(d,))
         element = ufl.Mesh(element)
         mine = slice(None) if comm.rank == 0 else slice(0, 0)
         self.mesh = dolfinx.mesh.create_mesh(comm, cells=cells[mine], x=x[mine], e=element)
-        self.box = boxes[self.mesh.topology.original_cell_index]
-        self.tags = self._tagged()
+        self.cell_body = boxes[self.mesh.topology.original_cell_index]
+        self.tags = self._make_tags()
         if bent:
             self._bend()
         self.stress = self.force / self.length ** (d - 1)
@@ -132,10 +131,10 @@ class Made:
         piecewise = fem.functionspace(self.mesh, ("DG", 0))
         vectors = fem.functionspace(self.mesh, ("DG", 0, (d,)))
         self.E = fem.Function(piecewise)
-        n_cells = len(self.box)
+        n_cells = len(self.cell_body)
         moduli = np.array([b["E"] for b in scene["bodies"]]) * self.stress
         self.moduli = moduli
-        self.E.x.array[piecewise.dofmap.list[:n_cells, 0]] = moduli[self.box]
+        self.E.x.array[piecewise.dofmap.list[:n_cells, 0]] = moduli[self.cell_body]
         self.traction, self.weight = fem.Function(vectors), fem.Function(vectors)
         self._cells = vectors.dofmap.list[:n_cells, 0]
         self.nu = fem.Constant(self.mesh, scene["nu"])
@@ -144,10 +143,10 @@ class Made:
         self.F = self.bulk(self.E, dx) - self.loads(dx, ds)
         self.bcs: list[fem.DirichletBC] = []
         self.moved: list[fem.Constant] = []
-        self._still: list[tuple[int, fem.Constant]] = []
-        self._busy: list[tuple[int, fem.Constant]] = []
-        self.busy_bcs: list[fem.DirichletBC] = []
-        for body, side, components, how in scene["holds"]:
+        self._fixed: list[tuple[int, fem.Constant]] = []
+        self._unrelated: list[tuple[int, fem.Constant]] = []
+        self.unrelated_bcs: list[fem.DirichletBC] = []
+        for body, side, components, how in scene["dirichlet"]:
             facets = self.facets_of(body, side)
             for i in components:
                 value = fem.Constant(self.mesh, 0.0)
@@ -156,73 +155,73 @@ class Made:
                 self.bcs.append(fem.dirichletbc(value, dofs, space))
                 if how == "moved":
                     self.moved.append((body, i, value))
-                elif how == "still":
-                    self._still.append((i, value))
+                elif how == "fixed":
+                    self._fixed.append((i, value))
                 else:
-                    self._busy.append((i, value))
-                    self.busy_bcs.append(self.bcs[-1])
+                    self._unrelated.append((i, value))
+                    self.unrelated_bcs.append(self.bcs[-1])
         self.contacts: list[fc.Contact] = []
         self.shift = fem.Constant(self.mesh, np.zeros(d))
-        self.carried = fem.Constant(self.mesh, np.zeros(d))
-        self.push = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
-        self.pull = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
+        self.translation = fem.Constant(self.mesh, np.zeros(d))
+        self.obstacle_force = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
+        self.obstacle_motion = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
 
     def energy(self, E: Any, dx: ufl.Measure) -> ufl.Form:
-        """Elastic energy of a linear body."""
+        """Return the elastic energy of a linear body."""
         strain, nu = ufl.sym(ufl.grad(self.u)), self.nu
         lame = E * nu / ((1 + nu) * (1 - 2 * nu))
         density = E / (1 + nu) * ufl.inner(strain, strain) + lame * ufl.tr(strain) ** 2
         return self.thickness / 2 * density * dx
 
     def bulk_of_energy(self, E: Any, dx: ufl.Measure) -> ufl.Form:
-        """`bulk` as the derivative of `energy`."""
+        """Return `bulk` as the derivative of `energy`."""
         return ufl.derivative(self.energy(E, dx), self.u, self.v)
 
     def bulk(self, E: Any, dx: ufl.Measure) -> ufl.Form:
-        """Work of the stresses with a modulus over a measure."""
+        """Return the virtual work of the stresses."""
         strain, nu = ufl.sym(ufl.grad(self.u)), self.nu
         lame = E * nu / ((1 + nu) * (1 - 2 * nu))
         stress = E / (1 + nu) * strain + lame * ufl.tr(strain) * ufl.Identity(self.d)
         return self.thickness * ufl.inner(stress, ufl.sym(ufl.grad(self.v))) * dx
 
     def loads(self, dx: ufl.Measure, ds: ufl.Measure) -> ufl.Form:
-        """Work of the loads, by measures of all cells and of all tagged facets."""
+        """Return the virtual work of the loads."""
         on_top = self.thickness * ufl.dot(self.traction, self.v) * ds(TOP)
         return on_top + self.thickness * ufl.dot(self.weight, self.v) * dx
 
-    def outside(self) -> fem.Form:
-        """Forces of the loads: what of -F is left without displacements."""
+    def external_force(self) -> fem.Form:
+        """Return the compiled form of the loads, -F at u = 0."""
         return fem.form(-ufl.replace(self.F, {self.u: fem.Function(self.V)}))
 
     def facets_of(self, body: int, side: str) -> Array:
-        """Facets of a side of a body; tops share a tag."""
+        """Return the facets of a side of a body; loaded tops share a tag."""
         facets = self.tags.find(tag_of(self.scene, body, side))
-        return facets[np.isin(self.cell_of(facets), np.flatnonzero(self.box == body))]
+        return facets[np.isin(self.cells_of(facets), np.flatnonzero(self.cell_body == body))]
 
     def _bend(self) -> None:
-        """Move the nodes of bodies up by a parabola over x."""
+        """Bend the bodies by a parabola over x."""
         x = self.mesh.geometry.x
-        done = np.zeros(len(x), dtype=bool)
+        on_increment = np.zeros(len(x), dtype=bool)
         for b, (body, rise) in enumerate(
             zip(self.scene["bodies"], self.scene["bend"], strict=True)
         ):
-            nodes = np.unique(compat.geometry_dofmap(self.mesh)[self.box == b])
-            nodes = nodes[~done[nodes]]
-            done[nodes] = True
+            nodes = np.unique(compat.geometry_dofmap(self.mesh)[self.cell_body == b])
+            nodes = nodes[~on_increment[nodes]]
+            on_increment[nodes] = True
             middle = (body["origin"][0] + 0.5 * body["size"][0]) * self.length
             width = body["size"][0] * self.length
             x[nodes, self.d - 1] += rise * width * (2 * (x[nodes, 0] - middle) / width) ** 2
 
-    def cell_of(self, facets: Array) -> Array:
-        """One of the cells of every facet."""
+    def cells_of(self, facets: Array) -> Array:
+        """Return a cell of every facet."""
         to_cell = self.mesh.topology.connectivity(self.d - 1, self.d)
         return np.array([to_cell.links(f)[0] for f in facets], dtype=int)
 
-    def _tagged(self) -> dolfinx.mesh.MeshTags:
+    def _make_tags(self) -> dolfinx.mesh.MeshTags:
         mesh, d = self.mesh, self.d
         mesh.topology.create_connectivity(d - 1, d)
         exterior = dolfinx.mesh.exterior_facet_indices(mesh.topology)
-        box = self.box[self.cell_of(exterior)]
+        box = self.cell_body[self.cells_of(exterior)]
         middle = dolfinx.mesh.compute_midpoints(mesh, d - 1, exterior)[:, :d] / self.length
         values = np.zeros(len(exterior), dtype=np.int32)
         for b, body in enumerate(self.scene["bodies"]):
@@ -230,15 +229,15 @@ class Made:
                 if d == 2 and side == "front":
                     continue
                 at = body["origin"][axis] + end * body["size"][axis]
-                here = (box == b) & (np.abs(middle[:, axis] - at) < 1e-8)
-                values[here] = tag_of(self.scene, b, side)
-        kept = values > 0
-        return dolfinx.mesh.meshtags(mesh, d - 1, exterior[kept], values[kept])
+                on_side = (box == b) & (np.abs(middle[:, axis] - at) < 1e-8)
+                values[on_side] = tag_of(self.scene, b, side)
+        tagged = values > 0
+        return dolfinx.mesh.meshtags(mesh, d - 1, exterior[tagged], values[tagged])
 
     # ---- loads -------------------------------------------------------------------------------
 
-    def drives(self, stage: int, t: float) -> dict[str, float]:
-        """Normal, side and across at a value of the load parameter within a stage."""
+    def load_levels(self, stage: int, t: float) -> dict[str, float]:
+        """Return the load factors "normal", "side" and "across" within a stage."""
         stages = self.scene["stages"]
         zero = {"normal": 0.0, "side": 0.0, "across": 0.0}
         before = stages[stage - 1] if stage else zero
@@ -250,69 +249,70 @@ class Made:
         for contact, friction in zip(self.contacts, frictions(scene, stage), strict=False):
             if friction is not None:
                 contact.parameters["friction"].value = friction
-        now = self.drives(stage, t)
-        way = np.zeros(d)
-        way[0], way[-1] = now["side"], -now["normal"]
+        now = self.load_levels(stage, t)
+        direction = np.zeros(d)
+        direction[0], direction[-1] = now["side"], -now["normal"]
         if d == 3:
-            way[1] = now["across"]
-        strain, driven = scene["strain"], self.driven()
+            direction[1] = now["across"]
+        strain, loaded_bodies = scene["strain"], self.loaded_bodies()
         tractions = np.zeros((len(scene["bodies"]), d))
         pulled = scene["drive"] == "force"
-        for k, b in enumerate(driven):
-            share = scene["share"] if k else 1.0
+        for k, b in enumerate(loaded_bodies):
+            share = scene["load_ratio"] if k else 1.0
             if pulled:
-                tractions[b] = way * strain * self.moduli[b] * share
-        self.traction.x.array.reshape(-1, d)[self._cells] = tractions[self.box]
+                tractions[b] = direction * strain * self.moduli[b] * share
+        self.traction.x.array.reshape(-1, d)[self._cells] = tractions[self.cell_body]
         heavy = np.zeros(d)
         heavy[-1] = -scene.get("weight", 0.0) * strain * self.stress / self.length
         heavy = heavy * (t if stage == 0 else 1.0)
-        own = (self.box < self.n_own)[:, None]
+        own = (self.cell_body < self.n_scene_bodies)[:, None]
         self.weight.x.array.reshape(-1, d)[self._cells] = np.where(own, heavy, 0.0)
         for body, i, value in self.moved:
-            share = scene["share"] if driven.index(body) else 1.0
+            share = scene["load_ratio"] if loaded_bodies.index(body) else 1.0
             size = scene["bodies"][body]["size"][-1] * self.length
-            value.value = way[i] * strain * size * share
+            value.value = direction[i] * strain * size * share
         if scene["drive"] == "obstacle":
             size = scene["bodies"][0]["size"][-1] * self.length
-            self.shift.value[:] = -way * strain * size
+            self.shift.value[:] = -direction * strain * size
             area = np.prod(scene["bodies"][0]["size"][:-1]) * self.length ** (d - 1)
             for i in range(d):
-                self.push[i].value = -way[i] * strain * self.moduli[0] * area
-                self.pull[i].value = -way[i] * strain * size
+                self.obstacle_force[i].value = -direction[i] * strain * self.moduli[0] * area
+                self.obstacle_motion[i].value = -direction[i] * strain * size
         self.apply_features(stage, t)
 
     def apply_features(self, stage: int, t: float) -> None:
-        """Carry all bodies and obstacles along, and keep the unrelated body busy."""
+        """Translate all bodies and obstacles, and load the unrelated body."""
         d, scene = self.d, self.scene
-        self.carried.value[:] = 0.0
-        if "carry" in scene:
+        self.translation.value[:] = 0.0
+        if "translation" in scene:
             share = (stage + t) / len(scene["stages"]) * self.length
-            self.carried.value[[0, d - 1]] = share * np.array(scene["carry"])
-        for i, value in self._still:
-            value.value = self.carried.value[i]
+            self.translation.value[[0, d - 1]] = share * np.array(scene["translation"])
+        for i, value in self._fixed:
+            value.value = self.translation.value[i]
         for _, i, value in self.moved:
-            value.value += self.carried.value[i]
-        self.shift.value[:] += self.carried.value
-        if "busy" not in scene:
+            value.value += self.translation.value[i]
+        self.shift.value[:] += self.translation.value
+        if "unrelated_body" not in scene:
             return
-        # Up and down, the same at the same place of the load path.
-        busy, share = fuzz_features.BUSY[scene["busy"]], abs(np.sin(1.3 * (stage + t)))
-        way, load = np.zeros(d), np.zeros(d)
-        way[[0, d - 1]] = busy.get("moved", [0.0, 0.0])
-        load[[0, d - 1]] = busy.get("load", [0.0, 0.0])
-        for i, value in self._busy:
-            value.value = share * way[i] * self.length
+        # A function of the position on the load path.
+        unrelated = fuzz_features.UNRELATED_BODIES[scene["unrelated_body"]]
+        share = abs(np.sin(1.3 * (stage + t)))
+        direction, load = np.zeros(d), np.zeros(d)
+        direction[[0, d - 1]] = unrelated.get("moved", [0.0, 0.0])
+        load[[0, d - 1]] = unrelated.get("load", [0.0, 0.0])
+        for i, value in self._unrelated:
+            value.value = share * direction[i] * self.length
         rows = self.traction.x.array.reshape(-1, d)
-        rows[self._cells[self.box == self.n_own]] = share * load * self.moduli[-1]
+        rows[self._cells[self.cell_body == self.n_scene_bodies]] = share * load * self.moduli[-1]
 
-    def driven(self) -> list[int]:
-        """Numbers of the bodies that the loads act on."""
-        return [0, 1] if self.scene["layout"] == "apart" else [self.n_own - 1]
+    def loaded_bodies(self) -> list[int]:
+        """Return the numbers of the loaded bodies."""
+        return [0, 1] if self.scene["layout"] == "apart" else [self.n_scene_bodies - 1]
 
     # ---- the package -------------------------------------------------------------------------
 
     def surfaces(self) -> list[fc.ContactSurface]:
-        """Γc of every contact."""
+        """Return Γc of every contact."""
         return [
             fc.ContactSurface(
                 self.mesh,
@@ -325,7 +325,7 @@ class Made:
         ]
 
     def law(self, contact: Scene) -> Any:
-        """The package's law."""
+        """Return the contact law."""
         law, unit = contact["law"], self.stress / self.length
         body = self.scene["bodies"][contact["body"]]
 
@@ -345,29 +345,31 @@ class Made:
             return fc.Frictionless(**k)
         if kind in ("foundation", "tension"):
             return fc.Foundation(**k, tension=kind == "tension")
-        shape = {n: law[m] for n, m in _SHAPE.items() if m in law}
+        shape = {n: law[m] for n, m in _CONE_PARAMETERS.items() if m in law}
         if kind in ("tresca", "prescribed"):
             pressure = law["pressure"] * body["E"] * self.stress
             return fc.Tresca(law["friction"], pressure, **k, unilateral=kind == "tresca")
         return fc.Coulomb(law["friction"], **k, **shape)
 
     def obstacle(self, contact: Scene) -> Any:
-        """The package's obstacle."""
+        """Return the obstacle."""
         given = contact["obstacle"]
         if given["kind"] == "body":
             tag = tag_of(self.scene, given["body"], given["side"])
-            return fc.DeformableBody(self.tags, tag, update_pairs=given["update"])
-        where = geometry(self.scene, contact)
+            return fc.DeformableBody(self.tags, tag, update_pairs=given["update_pairs"])
+        where = obstacle_geometry(self.scene, contact)
         shift = None
         if given.get("moving") == "displacement":
             shift = self.shift
-        elif given.get("moving") == "carried":
-            shift = self.carried
+        elif given.get("moving") == "translated":
+            shift = self.translation
         elif given.get("moving") == "force":
             free = given["free"]
             shift = fc.Motion(
-                force=[self.push[i] if i in free else None for i in range(self.d)],
-                displacement=[None if i in free else self.pull[i] for i in range(self.d)],
+                force=[self.obstacle_force[i] if i in free else None for i in range(self.d)],
+                displacement=[
+                    None if i in free else self.obstacle_motion[i] for i in range(self.d)
+                ],
             )
         kind = given["kind"].split()[0]
         if kind == "halfspace":
@@ -381,7 +383,7 @@ class Made:
                 gap + curve * (x[0] - middle) ** 2, direction, displacement=shift
             )
         if kind == "rod":
-            return fc.SignedDistance(lambda x: capsule(self.mesh, where, x), displacement=shift)
+            return fc.SignedDistance(lambda x: capsule_gap(self.mesh, where, x), displacement=shift)
         inside = given["kind"].endswith("inside")
         if kind == "ball":
             return fc.Ball(where["center"], where["radius"], inside=inside, displacement=shift)
@@ -391,11 +393,11 @@ class Made:
         )
 
     def options(self, contact: Scene) -> dict[str, Any]:
-        """More arguments of a contact."""
+        """Return additional arguments of a contact."""
         return {}
 
     def problem(self) -> fc.ContactProblem:
-        """The package's problem. Collective."""
+        """Create the problem. Collective."""
         contacts = []
         for i, (c, surface) in enumerate(zip(self.scene["contacts"], self.surfaces(), strict=True)):
             gap = c.get("gap")
@@ -414,40 +416,40 @@ class Made:
                 )
             )
         for contact in contacts:
-            _note_set_down(self, contact)
+            _record_slip_resets(self, contact)
         self.contacts = contacts
         options, scene = {}, self.scene
-        if "ration" in scene:
-            options["snes_max_it"] = scene["ration"]
+        if "max_iterations" in scene:
+            options["snes_max_it"] = scene["max_iterations"]
         return fc.ContactProblem(
-            fuzz_forms.written(self),
+            fuzz_forms.make_form(self),
             self.u,
             bcs=self.bcs,
             contacts=contacts,
             method=scene.get("method"),
             condensation=scene.get("condensation"),
             petsc_options=options,
-            fallback="ration" not in scene,
+            fallback="max_iterations" not in scene,
         )
 
 
-def capsule(mesh: dolfinx.mesh.Mesh, where: dict[str, Any], x: Any) -> Any:
-    """Distance from a segment, less the radius; of a rod in space in the plane across y (UFL)."""
+def capsule_gap(mesh: dolfinx.mesh.Mesh, where: dict[str, Any], x: Any) -> Any:
+    """Return the distance from a capsule; in space from an extruded one along y (UFL)."""
     low, high = (np.array(end, dtype=float) for end in where["ends"])
     arm = x - fem.Constant(mesh, low)
     if (high != low).any():
-        way = fem.Constant(mesh, high - low)
-        along = ufl.dot(arm, way) / ufl.dot(way, way)
-        arm = arm - ufl.max_value(0.0, ufl.min_value(1.0, along)) * way
+        direction = fem.Constant(mesh, high - low)
+        along = ufl.dot(arm, direction) / ufl.dot(direction, direction)
+        arm = arm - ufl.max_value(0.0, ufl.min_value(1.0, along)) * direction
     parts = [arm[i] for i in range(len(low)) if where.get("flat", np.ones(len(low)))[i]]
     return ufl.sqrt(sum(part**2 for part in parts)) - fem.Constant(mesh, float(where["radius"]))
 
 
-_SHAPE = {"modes": "modes", "transverse_friction": "transverse", "direction": "direction"}
+_CONE_PARAMETERS = {"modes": "modes", "transverse_friction": "transverse", "direction": "direction"}
 
 
-def geometry(scene: Scene, contact: Scene) -> dict[str, Any]:
-    """Numbers of a rigid obstacle, in units of length."""
+def obstacle_geometry(scene: Scene, contact: Scene) -> dict[str, Any]:
+    """Return the geometry of a rigid obstacle, scaled by the unit of length."""
     body, given = scene["bodies"][contact["body"]], contact["obstacle"]
     length, d = scene["units"][0], len(body["size"])
     low = np.array(body["origin"], dtype=float)
@@ -462,7 +464,7 @@ def geometry(scene: Scene, contact: Scene) -> dict[str, Any]:
         slope = given.get("slope", 0.0)
         normal = up - slope * np.eye(d)[0]
         normal /= np.linalg.norm(normal)
-        # The plane touches the lower corner of the bottom.
+        # The plane touches the lower vertex of the bottom.
         corner = low + (size[0] * np.eye(d)[0] if slope > 0 else 0.0)
         return {"point": (corner - clearance * normal) * length, "normal": normal}
     if given["kind"] == "obstacle":
@@ -493,63 +495,65 @@ def geometry(scene: Scene, contact: Scene) -> dict[str, Any]:
     return {"center": (middle + height * up) * length, "radius": radius * length}
 
 
-# ---- what the package makes of it ----------------------------------------------------------------
+# ---- solution ------------------------------------------------------------------------------------
 
 
-def gathered(comm: MPI.Comm, rows: Array) -> Array:
-    """Rows of all ranks on all ranks."""
+def gather_rows(comm: MPI.Comm, rows: Array) -> Array:
+    """Gather the rows of all ranks on all ranks."""
     return np.concatenate(comm.allgather(np.asarray(rows)))
 
 
-def _nodes(made: Made) -> tuple[Array, Array]:
-    """Box and place of the owned displacement nodes."""
-    dofmap = made.V.dofmap
+def _nodes(setup: SceneSetup) -> tuple[Array, Array]:
+    """Return body and coordinates of the owned displacement nodes."""
+    dofmap = setup.V.dofmap
     n = dofmap.index_map.size_local
     box = np.full(n + dofmap.index_map.num_ghosts, -1)
-    box[dofmap.list[: len(made.box)]] = made.box[:, None]
-    return box[:n], made.V.tabulate_dof_coordinates()[:n, : made.d]
+    box[dofmap.list[: len(setup.cell_body)]] = setup.cell_body[:, None]
+    return box[:n], setup.V.tabulate_dof_coordinates()[:n, : setup.d]
 
 
-def _displacement(made: Made) -> np.ndarray:
-    """Box, place and displacement of all nodes, (n_nodes, 1 + 2 d). Collective."""
-    box, x = _nodes(made)
-    u = made.u.x.array.reshape(-1, made.d)[: len(box)]
-    return gathered(made.comm, np.column_stack([box, x, u]))
+def _gather_displacement(setup: SceneSetup) -> np.ndarray:
+    """Return body, coordinates and displacement of all nodes, (n_nodes, 1 + 2 d). Collective."""
+    box, x = _nodes(setup)
+    u = setup.u.x.array.reshape(-1, setup.d)[: len(box)]
+    return gather_rows(setup.comm, np.column_stack([box, x, u]))
 
 
-def _note_set_down(made: Made, contact: fc.Contact) -> None:
-    """Let a scene know where slip at a contact is counted from anew, and why."""
+def _record_slip_resets(setup: SceneSetup, contact: fc.Contact) -> None:
+    """Record the calls by which a contact moves its slip reference."""
 
-    def noting(method: Any, *, rigid: bool) -> Any:
-        def noted(*given: Any, **options: Any) -> None:
-            if rigid and not any(made.comm.allgather(bool(given[0].any()))):
-                method(*given, **options)  # of other bodies
+    def wrap(method: Any, *, rigid: bool) -> Any:
+        def wrapped(*given: Any, **options: Any) -> None:
+            if rigid and not any(setup.comm.allgather(bool(given[0].any()))):
+                method(*given, **options)  # other bodies are positioned
                 return
-            idle = given[0] & (contact.history.values("normal_traction") == 0.0) if rigid else True
-            idle = np.broadcast_to(idle, len(contact.points))
-            columns = [contact.points, contact.values.jump, idle]
-            rows = gathered(made.comm, np.column_stack(columns))
-            made.set_down[contact.name] = {
+            unloaded = (
+                given[0] & (contact.history.values("normal_traction") == 0.0) if rigid else True
+            )
+            unloaded = np.broadcast_to(unloaded, len(contact.points))
+            columns = [contact.points, contact.values.jump, unloaded]
+            rows = gather_rows(setup.comm, np.column_stack(columns))
+            setup.slip_resets[contact.name] = {
                 "rigid": rigid,
-                "u": _displacement(made),
-                "jump": rows[:, made.d : 2 * made.d],
-                "idle": rows[:, -1] > 0,
+                "u": _gather_displacement(setup),
+                "jump": rows[:, setup.d : 2 * setup.d],
+                "unloaded": rows[:, -1] > 0,
             }
             method(*given, **options)
 
-        return noted
+        return wrapped
 
-    contact.set_down = noting(contact.set_down, rigid=True)  # type: ignore[method-assign]
-    contact.count_slip_from_here = noting(  # type: ignore[method-assign]
+    contact.set_down = wrap(contact.set_down, rigid=True)  # type: ignore[method-assign]
+    contact.count_slip_from_here = wrap(  # type: ignore[method-assign]
         contact.count_slip_from_here, rigid=False
     )
 
 
-def _record(
-    made: Made, problem: fc.ContactProblem, step: Any, stage: int, t: float
+def _make_record(
+    setup: SceneSetup, problem: fc.ContactProblem, step: Any, stage: int, t: float
 ) -> dict[str, Any]:
-    """What of a committed step is judged. Collective."""
-    comm, d = made.comm, made.d
+    """Return the results of a committed step that are compared. Collective."""
+    comm, d = setup.comm, setup.d
     contacts = []
     for contact in problem.contacts:
         columns = [contact.points, contact.measure, contact.pressure, contact.tangential_traction]
@@ -559,7 +563,7 @@ def _record(
                 columns.append(contact.multipliers.fields.values("traction"))
                 if "normal" in contact.multipliers.fields:
                     columns.append(contact.multipliers.fields.values("normal"))
-        rows = gathered(comm, np.column_stack(columns))
+        rows = gather_rows(comm, np.column_stack(columns))
         r = step.contacts[contact.name]
         contacts.append(
             {
@@ -580,13 +584,13 @@ def _record(
                 "motion": {i: float(c.value) for i, c in contact.free_motion.items()},
                 "unpaired": contact.n_unpaired,
                 "error": contact.accuracy.error if contact.accuracy else None,
-                "set_down": made.set_down.get(contact.name),
+                "slip_reset": setup.slip_resets.get(contact.name),
             }
         )
     return {
         "stage": stage,
         "load": t,
-        "u": _displacement(made),
+        "u": _gather_displacement(setup),
         "contacts": contacts,
         "energy": step.energy,
         "rtol": problem.accuracy.rtol if problem.accuracy else 1e-9,
@@ -597,26 +601,26 @@ def _record(
     }
 
 
-def history(
+def run_history(
     scene: Scene,
     comm: MPI.Comm,
-    done: Callable[[dict[str, Any]], None],
-    changed: Any = None,
-    make: type[Made] = Made,
+    on_increment: Callable[[dict[str, Any]], None],
+    modify: Any = None,
+    setup_class: type[SceneSetup] = SceneSetup,
 ) -> None:
-    """Solve a scene by the package; ``done`` gets every committed increment. Collective.
+    """Solve a scene by the package. Collective.
 
     Args:
         scene: The scene.
-        comm: Ranks.
-        done: Called on all of them.
-        changed: Function of the `Made` scene and its problem, to spoil them (tests).
-        make: What makes the scene.
+        comm: Communicator.
+        on_increment: Called with the record of every committed increment, on all ranks.
+        modify: Function of setup and problem that introduces an error (tests).
+        setup_class: Class of the setup.
     """
-    made = make(scene, comm)
-    problem = made.problem()
-    if changed is not None:
-        changed(made, problem)
+    setup = setup_class(scene, comm)
+    problem = setup.problem()
+    if modify is not None:
+        modify(setup, problem)
     stop, number = scene.get("restart"), 0
     with tempfile.TemporaryDirectory() as folder:
         folder = comm.bcast(folder)
@@ -624,15 +628,15 @@ def history(
             file = Path(folder) / f"stage{stage}.npz"
 
             def steps(
-                made: Made,
+                setup: SceneSetup,
                 problem: Any,
                 stage: int = stage,
                 n: int = what["steps"],
                 file: Any = file,
             ) -> Any:
                 def apply(t: float) -> None:
-                    made.set_down.clear()
-                    made.apply(stage, t)
+                    setup.slip_resets.clear()
+                    setup.apply(stage, t)
 
                 return fc.increments(
                     problem,
@@ -642,16 +646,16 @@ def history(
                     checkpoint=file if stop is not None else None,
                 )
 
-            run = steps(made, problem)
+            run = steps(setup, problem)
             while True:
                 step = next(run, None)
                 if step is None:
                     break
-                done(_record(made, problem, step, stage, step.load))
+                on_increment(_make_record(setup, problem, step, stage, step.load))
                 number += 1
                 if number == stop:
                     run.close()
-                    made = make(scene, comm)
-                    problem = made.problem()
-                    run = steps(made, problem)
+                    setup = setup_class(scene, comm)
+                    problem = setup.problem()
+                    run = steps(setup, problem)
         comm.barrier()
