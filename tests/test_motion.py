@@ -55,7 +55,7 @@ def test_given_force_and_given_displacement_are_two_ways_to_one_state(cell, meth
 
 
 def test_newton_converges_quadratically_with_a_turning_normal():
-    """The normals of a ball turn as it moves: the tangent knows it, or Newton takes long."""
+    """The tangent has the derivative of the normal of a ball with respect to its motion."""
     motion = fc.Motion(force=(0.5, 5.0))
     _, problem, contact = pressed(
         "quadrilateral", fc.Coulomb(1.0, k_n=2e4, k_t=1e4), motion, "newton"
@@ -64,8 +64,8 @@ def test_newton_converges_quadratically_with_a_turning_normal():
     problem.commit()
     contact.applied_force[0] = 0.6
     step = problem.solve()
-    # Without the derivative of the normal the error falls by a factor, to 1e-9 in many steps.
-    assert step.iterations <= 5
+    # Measured: 1 iteration, and 3 without the derivative of the normal.
+    assert step.iterations <= 2
     assert close(contact.resultants().force, [0.6, 5.0], 1e-8)
 
 

@@ -84,8 +84,8 @@ def test_it_ends_soon_and_says_why(method):
 
         words = "overload: along the rotation about z", "Try a smaller load, more friction"
         raised_everywhere(solve, fc.NotConverged, *words)
-        # The limits of the methods in turn are several hundred: it is told before they are met.
-        assert failed[0].iterations < 300
+        # Measured: 8 to 87, Tresca's law by alternation 0; without limit analysis at least 230.
+        assert failed[0].iterations < 180
 
 
 @pytest.mark.each
@@ -176,9 +176,9 @@ NOT_HELD = {
 def test_rubber_that_nothing_holds_any_more(what, kinematics):
     """Pressed against a ceiling by a body force of 5, then let fall, or pushed by too much.
 
-    The error names the motion, what the load is along it and what contact bears of that at most,
-    0 or μ N = 0.3 · 10: statics. One failure of Newton's method, 20 iterations that do not lower
-    the residual after the first few, is enough to look.
+    The error names the motion, the load along it, and the largest contact force along it, by
+    statics: 0 or μ N = 0.3 · 10. It is raised after the first failure of Newton's method, which
+    stops after 14 iterations without a lower residual.
     """
     scene = rubber("quadrilateral", n=(8, 4))
     force = fem.Constant(scene.mesh, np.array([0.0, 5.0]))
@@ -196,6 +196,7 @@ def test_rubber_that_nothing_holds_any_more(what, kinematics):
     problem.snes.setMonitor(lambda snes, iteration, norm: made.append(iteration))
     force.value[:], text = NOT_HELD[what]
     raised_everywhere(problem.solve, ValueError, text)
+    # Measured: 18 residuals in all cases; a second attempt would have at least 14 more.
     assert len(made) <= 30
 
 
@@ -230,8 +231,8 @@ def test_blocks_on_both_sides_do_not_hide_an_overload():
     """A block squeezed by two others, with nothing else to hold it, is pushed by 2 % too much.
 
     Under a tenth of what squeezed it before, its multipliers fluctuate by more than their tolerance
-    while it runs away, and by less than friction lacks. 1265 iterations here; 2495 if all rounds go
-    on to the tolerance.
+    while it runs away, and by less than friction lacks. Measured: 1255 iterations; 6995 if the
+    augmentations continue to the tolerance.
     """
     modulus, height = 1000.0, 0.5
 

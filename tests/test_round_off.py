@@ -51,7 +51,7 @@ def test_a_soft_block_on_a_stiff_slab(stiffness, carried, options):
     6 %. The tolerance is 1e-9 of the forces; displacements of 10 have a round-off of 1e-15, of
     1e-2 by which the block is pressed.
     """
-    expected, _ = pressed(stiffness, 0.0, **options)
+    expected, still = pressed(stiffness, 0.0, **options)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         found, step = pressed(stiffness, carried, **options)
@@ -61,8 +61,8 @@ def test_a_soft_block_on_a_stiff_slab(stiffness, carried, options):
     said = [str(w.message) for w in caught if "round-off of its displacements" in str(w.message)]
     assert len(said) == len(inexact)
     assert bool(inexact) == (stiffness > 1e7)
-    # Newton's method stops at round-off; where it is not known, only at its limit of 100.
-    assert step.iterations <= 20
+    # Translation costs no iterations. Measured: 3 of 3 by Newton's method, 2 or 3 of 7 by L-BFGS.
+    assert step.iterations <= still.iterations + 1
 
 
 def test_a_stiff_slab_that_nothing_else_holds():
