@@ -9,6 +9,7 @@ import numpy as np
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import gather_rows, global_sum
+from fenics_contact.types import Array
 
 __all__ = ["ActiveSetMonitor"]
 
@@ -23,21 +24,22 @@ class ActiveSetMonitor:
 
     Attributes:
         idle: Looks since the residual last fell.
-        first: Residual at the first look; 0: there was none.
+        tractions: Of every contact at the first look, (n_points, gdim) (stress).
     """
 
     def __init__(self, contacts: Sequence[Contact]) -> None:
         """Take the contacts to look at."""
         self._contacts = contacts
         n = sum(c.quadrature.n_points for c in contacts)
-        self.idle, self._best, self.first = 0, np.inf, 0.0
+        self.idle, self._best = 0, np.inf
+        self.tractions: list[Array] = []
         self._status = np.full(n, -1, dtype=np.int8)
         self._changes = np.zeros(n, dtype=np.int64)
         self._seen = np.zeros((len(Status), n), dtype=np.bool_)
 
     def start(self) -> None:
         """Forget what was seen."""
-        self.idle, self._best, self.first = 0, np.inf, 0.0
+        self.idle, self._best, self.tractions = 0, np.inf, []
         self._status[:], self._changes[:], self._seen[:] = -1, 0, False
 
     def note(self, residual: float) -> None:
@@ -48,7 +50,8 @@ class ActiveSetMonitor:
         """
         if not self._contacts:
             return
-        self.first = self.first or residual
+        if not self.tractions:
+            self.tractions = [c.values.total_traction for c in self._contacts]
         status = np.concatenate([c.status for c in self._contacts])
         seen = status == np.arange(len(Status))[:, None]
         if residual < _FALL * self._best:

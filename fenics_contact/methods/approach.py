@@ -126,8 +126,10 @@ class Approach:
                 self._follow_stiffness()
                 return False
             self._go(here)
-        if len(which):
-            self._set_down(load, before, which)
+        # Groups of coupled bodies come to rest apart, and those without load stay.
+        for group in np.unique(groups[which]):
+            if load_size[group] > 0:
+                self._set_down(load, before, which[groups[which] == group])
         return first or bool(idle.any())
 
     def _carried(self, chosen: Mask) -> Array | None:

@@ -7,13 +7,12 @@ that the same scene takes the same iterations in any units.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from itertools import chain
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
+from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.methods.active_set_monitor import ActiveSetMonitor
 from fenics_contact.methods.limit_analysis import Overload, find_overload
@@ -32,9 +31,8 @@ __all__ = ["Equations"]
 # An open point keeps this share of its stiffness in H₀: enough that a body held by contact alone
 # stays held when its whole surface is open, too little to be felt as a wrong tangent.
 _OPEN_SHARE = 1e-3
-# Share of the contact stiffness of all of Γc, where an iteration begins in which a body is let go:
-# with a hundredth a pin that comes out of its hub by itself flew on by 0.7 % of the way.
-_LET_GO = 0.1
+# The least share with which a tangent is regularised: on a mode without any force nothing is left.
+_LEAST_SHARE = 1e-6
 # An unknown with less than this share of the stiffness of its body has none.
 _FELT = 1e-12
 
@@ -248,7 +246,7 @@ class Equations:
     def assemble_tangent(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
         """The consistent tangent of bulk and contact at ``x``. Collective."""
         self.evaluate(x)
-        self.assemble(matrix, self.holding_tangents())
+        self.assemble(matrix, self.regularised_tangents())
 
     def evaluate(self, x: PETSc.Vec) -> None:
         """Evaluate bulk and contacts at ``x``, where the residual was computed last. Collective."""
@@ -264,48 +262,32 @@ class Equations:
         """Whether the closed points hold all free motions. Collective."""
         return self.motions.is_constrained(self.full.operators)
 
-    def holding_tangents(self) -> Iterable[PETSc.Mat]:
-        """`tangents`, or more where they would let a body go anywhere. Collective."""
-        if self.is_constrained() and not self._touches():
-            # Where all slips, what nothing but friction holds is loose along Γc.
-            stick = self.motions.points_to_pin(self.full.operators)
-            if stick is None:
-                return self.tangents()
-            # By the share of the forces that is not in balance yet: a mode that friction leaves
-            # free, and curvature does not, converges quadratically.
-            share = min(1.0, float(self.norms.excess(1.0)[: self.norms.n_bodies].max()))
-            return chain(self.tangents(), self._springs([(0.0, share * p) for p in stick]))
-        if self._driven():
-            # H₀ of the whole surface, as for the start of the quasi-Newton iteration.
-            return self.stiffnesses(everywhere=True)
-        # A body is let go, and springs back the less the firmer it is held. By the same springs to
-        # the end the residual would fall linearly: they weaken as it falls.
-        left = self.norms.total / self.watch.first if self.watch.first else 1.0
-        share = _LET_GO * float(np.sqrt(min(1.0, left)))
-        weak = [(share, share)] * len(self.contacts)
-        return chain(self.tangents(), self._springs(weak))
+    def regularised_tangents(self) -> Iterator[PETSc.Mat]:
+        """`tangents`, regularised where contact leaves a rigid-body mode free. Collective.
 
-    def _driven(self) -> bool:
-        """Whether the load on the free motions is felt beside the residual. Collective."""
-        load = self.motions.generalised_load(self.full.load)
-        return bool(load.max(initial=0.0) > _OPEN_SHARE * self.norms.total)
-
-    def _touches(self) -> bool:
-        """Whether points that are closed bear next to nothing of the load on the free motions.
-
-        Those of a body that was set down are closed by round-off, some of many. Collective.
+        Open points of the bodies concerned get the stiffness of closed ones, slipping points the
+        secant stiffness of friction: a step along the mode goes as far as they have slipped. Both
+        are multiplied by the share of the forces on the mode that is not in balance: with it the
+        regularisation vanishes, and convergence stays superlinear (Levenberg-Marquardt).
         """
+        yield from self.tangents()
+        if not len(self.motions.free):
+            return
+        # Of a body that was positioned round-off closes some of many points.
         load = self.motions.generalised_load(self.full.load)
-        if not load.any():
-            return False
-        return bool(np.any(self.full.contact_force_sizes() < _OPEN_SHARE * load))
-
-    def _springs(
-        self, shares: Iterable[tuple[npt.ArrayLike, npt.ArrayLike]]
-    ) -> Iterator[PETSc.Mat]:
-        """By every contact's share of its normal and its tangential stiffness at the points."""
-        for operator, (normal, tangential) in zip(self.system.operators, shares, strict=True):
-            yield operator.springs(operator.contact.springs(normal, tangential))
+        idle = self.full.contact_force_sizes() < _OPEN_SHARE * load
+        first = self.watch.tractions or [c.values.total_traction for c in self.contacts]
+        share, is_open = self.motions.imbalance(self.full.operators, self.full.load, first, idle)
+        if np.isnan(share).all():
+            return
+        share = np.where(np.isnan(share), 0.0, np.maximum(share, _LEAST_SHARE))
+        for number, operator in enumerate(self.system.operators):
+            contact, group = operator.contact, self.full.scales.group_of_points(number)
+            at_open = np.where((contact.status == Status.OPEN) & is_open[group], share[group], 0.0)
+            tangential = np.where(
+                contact.status == Status.SLIP, share[group] * _secant(contact), at_open
+            )
+            yield operator.springs(contact.springs(at_open, tangential))
 
     def tangents(self) -> Iterator[PETSc.Mat]:
         """Consistent tangents of the contacts, which are evaluated. Collective."""
@@ -349,3 +331,13 @@ class Equations:
         found = global_max(self._comm, added[felt] / bulk[felt])
         self._hardness = given, found
         return found
+
+
+def _secant(contact: Contact) -> Array:
+    """Secant stiffness of friction by that of sticking points, (n_points,)."""
+    values = contact.values
+    stuck = values.old_traction - np.einsum(
+        "qij,qj->qi", values.tangential_stiffness, values.increment
+    )
+    borne, trial = (np.linalg.norm(v, axis=1) for v in (values.traction, stuck))
+    return np.where(trial > 0, borne / np.where(trial > 0, trial, 1.0), 1.0)

@@ -490,6 +490,7 @@ class Solver:
         equations = self.equations
         reason, attempts = int(_REASONS.DIVERGED_LINEAR_SOLVE), []
         factored = self.starts.factored
+        equations.watch.start()
         start: Array = np.divide(self.starts.choose(ahead, rate, cold), equations.length)
         methods, goes_on = [self.method], self.may_go_on()
         if goes_on:

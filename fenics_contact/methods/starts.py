@@ -209,7 +209,7 @@ class Starts:
             for contact in full.contacts:
                 contact.evaluate()
             matrix = equations.matrix(True)
-            equations.assemble(matrix, equations.holding_tangents())
+            equations.assemble(matrix, equations.regularised_tangents())
         assert full.stiffness is not None
         full.stiffness.mult(change, image)
         tractions = None if anew else self._tractions()

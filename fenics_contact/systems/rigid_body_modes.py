@@ -12,7 +12,7 @@ from petsc4py import PETSc
 from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import agreed, gather_rows, global_sum
+from fenics_contact.parallel import agreed, global_sum
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.systems.modes import rigid_motions
@@ -296,37 +296,54 @@ class RigidBodyModes:
             self._holding, self._holders = bearing, weakref.WeakSet(operators)
         return held
 
-    def points_to_pin(self, operators: Sequence[ContactOperator]) -> list[Mask] | None:
-        """Which points to hold, of those that slip, lest tangents let a body go. Collective.
+    def imbalance(
+        self,
+        operators: Sequence[ContactOperator],
+        load: Array,
+        tractions: Sequence[Array],
+        idle: Mask,
+    ) -> tuple[Array, Mask]:
+        """Share of the forces on modes that contact leaves free that is not in balance. Collective.
 
-        The tangent of friction is none along it. As few as can be, of those that bear most. Motions
-        by which obstacles turn are not looked at.
+        The tangent of friction is none along the friction of a slipping point. Modes by which
+        obstacles turn are not looked at.
 
         Args:
             operators: Of evaluated contacts, over all unknowns.
+            load: External forces at this rank's unknowns (force).
+            tractions: Of every contact where the iteration began, (n_points, gdim) (stress): what
+                is let go bears less and less, and is compared with what it bore.
+            idle: Groups of coupled parts of which all modes count as free, (n_groups,).
 
         Returns:
-            A mask of the points of each; None: nothing lets a body go.
+            The largest share of the free modes of every group, 0 to 1, or NaN where it has none,
+            (n_groups,); and which groups have modes that would be free if no point slipped.
         """
-        rows, ways = self.straight(), []
+        share, rows = np.full(self._scales.n_groups, np.nan), self.straight()
+        if not len(rows):
+            return share, idle
+        groups = self.groups()[rows]
         loose = self.unconstrained(operators, rows, closed_only=True, slips=True)
-        if not len(loose):
-            return None
-        for operator in operators:
-            contact, modes = operator.contact, self.at_points(operator)[rows]
-            along = np.einsum("lm,mqd,qd->ql", loose, modes, _slip(contact))
-            bears = contact.measure * np.abs(contact.values.normal_traction)
-            ways.append(np.sqrt(bears)[:, None] * along)
-        numbers = np.cumsum([0] + [len(way) for way in ways])
-        hold = np.zeros(numbers[-1], dtype=bool)
-        felt = gather_rows(self.comm, np.concatenate(ways))
-        _, most, order = scipy.linalg.qr(felt.T, mode="economic", pivoting=True)
-        sizes = np.abs(np.diag(most))
-        few = order[: len(sizes)][sizes > _FELT * sizes.max(initial=0.0)]
-        first = sum(self.comm.allgather(len(hold))[: self.comm.rank])
-        mine = agreed(self.comm, few) - first
-        hold[mine[(mine >= 0) & (mine < len(hold))]] = True
-        return np.split(hold, numbers[1:-1])
+        if not len(loose) and not idle.any():
+            return share, idle
+        stuck = self.unconstrained(operators, rows, closed_only=True)
+        open_groups = idle.copy()
+        open_groups[groups[np.argmax(np.abs(stuck), axis=1)]] = True
+        loose = np.concatenate([loose, np.eye(len(rows))[idle[groups]]])
+        resultant = loose @ self.load_resultant(load, ())[0]
+        borne = np.zeros((3, len(loose)))
+        for operator, first in zip(operators, tractions, strict=True):
+            contact = operator.contact
+            modes = np.einsum("lm,mqd->lqd", loose, self.at_points(operator)[rows])
+            work, then = (
+                np.einsum("lqd,qd->lq", modes, t) for t in (contact.values.total_traction, first)
+            )
+            borne += np.stack([work, np.abs(work), np.abs(then)]) @ contact.measure
+        work, *sizes = global_sum(self.comm, borne)
+        size = np.max([np.abs(resultant), *sizes], axis=0)
+        left = np.where(size > 0.0, np.abs(resultant + work), 0.0) / np.where(size > 0.0, size, 1.0)
+        np.fmax.at(share, groups[np.argmax(np.abs(loose), axis=1)], np.minimum(left, 1.0))
+        return share, open_groups
 
     def unconstrained(
         self,
@@ -367,8 +384,15 @@ class RigidBodyModes:
             gram += tangential_gram(contact, modes, weights)
         gram, area = global_sum(self.comm, gram), global_sum(self.comm, area)
         scale = 1 / np.sqrt(np.where(area > 0, area, 1.0))
-        sizes, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-        return agreed(self.comm, (vectors * scale[:, None])[:, sizes < _FELT].T)
+        gram *= np.outer(scale, scale)
+        loose, groups = [np.zeros((0, n_free))], self.groups()[rows]
+        for group in np.unique(groups):  # no vector is of several
+            mine = np.flatnonzero(groups == group)
+            sizes, vectors = np.linalg.eigh(gram[np.ix_(mine, mine)])
+            found = np.zeros((np.count_nonzero(sizes < _FELT), n_free))
+            found[:, mine] = (vectors * scale[mine, None])[:, sizes < _FELT].T
+            loose.append(found)
+        return agreed(self.comm, np.concatenate(loose))
 
     def straight(self) -> Index:
         """Numbers of the free motions but for those by which obstacles turn."""
@@ -419,7 +443,8 @@ class RigidBodyModes:
     def generalised_load(self, load: Array) -> Array:
         """The largest of the `resultants` of a load, by size, (n_groups,) (force). Collective."""
         largest: Array = np.zeros(self._scales.n_groups)
-        np.maximum.at(largest, self.groups()[self.straight()], np.abs(self.resultants(load)))
+        resultants = self.load_resultant(load, ())[0]
+        np.maximum.at(largest, self.groups()[self.straight()], np.abs(resultants))
         return largest
 
 
