@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy.sparse.csgraph
 import scipy.spatial
 import scipy.spatial.distance
 
@@ -219,14 +220,16 @@ class Judge:
     def _check_slip_resets(self, name: str, record: dict[str, Any], load: Any) -> None:
         """Move the slip reference to where the package has moved it, and check this state.
 
-        In it contact just touches; bodies that were positioned have moved rigidly, without deeper
-        penetration; and the points whose reference moves were unloaded.
+        In it the first contact of coupled bodies just touches; bodies that were positioned have
+        moved rigidly, without deeper penetration; and the points whose reference moves were
+        unloaded.
         """
         problem, old = self.problem, list(self._state)
         # Bodies are positioned on obstacles in their committed positions.
         load = self._before["load"] if self._before else self._load(0, 0.0)
         size = np.ptp(problem.body.nodes_x, axis=0).max()
-        before = self._u
+        before, groups = self._u, self._groups()
+        touching = np.full(len(groups), -np.inf)  # largest overclosure at first touch by group
         for i, record_i in enumerate(record["contacts"]):
             reported, model = record_i["slip_reset"], problem.contacts[i]
             if reported is None:
@@ -250,8 +253,8 @@ class Judge:
                 self._check(name, "positioning gap", -deeper, _POSITION * size)
             else:
                 found = self._first_touch(model, record_i, u, old[i])
-                miss = abs(found["overclosure"][model.paired].max())
-                self._check(name, "first touch", miss, _POSITION * size)
+                overclosure = found["overclosure"][model.paired].max()
+                touching[groups[i]] = max(touching[groups[i]], overclosure)
             unloaded = reported["unloaded"][self._rows_of(model, record_i)]
             if self._before is not None:
                 traction = np.abs(self._before["found"][i]["r_n"])
@@ -266,6 +269,16 @@ class Judge:
             else:
                 other = self._first_touch(own, record_i, u, state)
             self._other_state[i] = own.reset_slip(other, state, unloaded)
+        for miss in np.abs(touching[touching > -np.inf]):
+            self._check(name, "first touch", float(miss), _POSITION * size)
+
+    def _groups(self) -> Array:
+        """Return the group of coupled bodies of every contact."""
+        contacts, n = self.scene["contacts"], len(self.scene["bodies"])
+        bodies = [(c["body"], c["obstacle"].get("body", c["body"])) for c in contacts]
+        graph = scipy.sparse.coo_matrix((np.ones(len(bodies)), np.transpose(bodies)), (n, n))
+        _, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
+        return np.asarray(group[[body for body, _ in bodies]])
 
     def _first_touch(
         self, model: Any, record: dict[str, Any], u: Array, old: Any
