@@ -202,9 +202,15 @@ class System(ABC):
     def terms(self, state: Array) -> Array:
         """Size of what K u sums up in each row, whose round-off is left in it (force).
 
-        With finite kinematics contact sums up places in the place of displacements. Collective.
+        With finite kinematics contact sums up places in the place of displacements, between two
+        bodies the displacements of both. Collective.
         """
-        return np.asarray(self.diagonal * (np.abs(state) + self._coordinates()))
+        size = np.abs(state)
+        for operator in self.operators:
+            if not operator.contact.rigid:
+                touched = operator.touched
+                size[touched] = global_max(self.unknowns.comm, size[touched])
+        return np.asarray(self.diagonal * (size + self._coordinates()))
 
     def _coordinates(self) -> Array:
         """Largest coordinate of a finite contact at what it touches, 0 elsewhere. Collective."""
