@@ -429,7 +429,7 @@ class SceneSetup:
             method=scene.get("method"),
             condensation=scene.get("condensation"),
             petsc_options=options,
-            fallback="max_iterations" not in scene,
+            fallback=scene.get("fallback", "max_iterations" not in scene),
         )
 
 

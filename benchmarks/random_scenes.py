@@ -1,0 +1,168 @@
+"""The default against every method without fallback, on random scenes.
+
+    python benchmarks/random_scenes.py               # 400 small, 60 finite and 40 two-body scenes
+    python benchmarks/random_scenes.py --short       # 8 of each
+    python benchmarks/random_scenes.py --only small  # one kind
+
+The scenes are those of ``verification/``: small displacements without cuts, and with finite
+kinematics, on rigid obstacles and between two bodies, with one cut. Nothing is said of the method,
+the condensation or the linear solver. An increment counts if the verification accepts it; a scene
+is complete if all its increments are. The table has the complete scenes of every method, the
+iterations of those, and processor time; the CSV has a row for every scene and method. Requirement:
+the default completes at least as many scenes as the best single method, in at most 1.1 of its
+iterations on the scenes that both complete.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from mpi4py import MPI
+
+import fenics_contact as fc
+from benchmarks import timing
+from verification import finite_scenes, fuzz_scenes, fuzz_setup, sliding_scenes
+
+Scene = dict[str, Any]
+# What scenes say of the solution is left out, and what the methods alone cannot take.
+LEFT_OUT = ("multipliers", "motion", "accuracy", "method", "max_iterations", "restart", "units")
+SAID = ("method", "max_iterations", "restart", "condensation")
+# Scenes of a family share compiled forms.
+FAMILY = 8
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of scenes.
+
+    Attributes:
+        draw: Draws a scene, from its seed and its family.
+        setup: Creates mesh, contacts and problem.
+        methods: Methods that may be had.
+        scenes: Their number.
+        first: First seed.
+        cuts: Number of times that an increment may be halved.
+    """
+
+    draw: Callable[[int, int], Scene]
+    setup: type[fuzz_setup.SceneSetup]
+    methods: tuple[str, ...]
+    scenes: int
+    first: int
+    cuts: int
+
+
+def draw_small(seed: int, family: int) -> Scene:
+    """Small displacements."""
+    return fuzz_scenes.draw(seed, without=(*LEFT_OUT, "increment"), family=family)
+
+
+def draw_finite(seed: int, family: int) -> Scene:
+    """Finite kinematics on rigid obstacles."""
+    return finite_scenes.draw(seed, family=family)
+
+
+def draw_bodies(seed: int, family: int) -> Scene:
+    """Finite kinematics between two bodies."""
+    return sliding_scenes.draw(seed, family=family)
+
+
+FINITE = ("newton", "continuation")
+KINDS = {
+    "small": Kind(
+        draw_small,
+        fuzz_setup.SceneSetup,
+        (*FINITE, "lbfgs", "primal_dual"),
+        400,
+        940000,
+        0,
+    ),
+    "finite": Kind(draw_finite, finite_scenes.FiniteSetup, FINITE, 60, 2000, 1),
+    "bodies": Kind(draw_bodies, sliding_scenes.SlidingSetup, FINITE, 40, 3000, 1),
+}
+
+
+def outcomes(name: str, kind: Kind, scenes: int) -> Iterator[timing.Row]:
+    """Solve scenes by the default and by every method alone: a row for each. Collective."""
+    for seed in range(kind.first, kind.first + scenes):
+        drawn = kind.draw(seed, seed // FAMILY) | {"cuts": kind.cuts}
+        scene = {key: value for key, value in drawn.items() if key not in SAID}
+        for method in ("default", *kind.methods):
+            alone = {} if method == "default" else {"method": method, "fallback": False}
+            iterations: list[int] = []
+
+            def count(record: dict[str, Any], made: list[int] = iterations) -> None:
+                made.append(record["iterations"])
+
+            start = time.process_time()
+            try:
+                fuzz_setup.run_history(scene | alone, MPI.COMM_WORLD, count, setup_class=kind.setup)
+                outcome = "complete"
+            except fc.NotConverged:
+                outcome = "refused"
+            except ValueError:  # refused input, or not for this method
+                outcome = "not taken"
+            yield {
+                "kind": name,
+                "seed": seed,
+                "method": method,
+                "outcome": outcome,
+                "iterations": sum(iterations),
+                "seconds": time.process_time() - start,
+            }
+
+
+def summary(rows: list[timing.Row]) -> list[timing.Row]:
+    """Return complete scenes and iterations of every kind and method."""
+    table = []
+    for kind, method in dict.fromkeys((row["kind"], row["method"]) for row in rows):
+        mine = [row for row in rows if (row["kind"], row["method"]) == (kind, method)]
+        complete = {row["seed"]: row["iterations"] for row in mine if row["outcome"] == "complete"}
+        default = {
+            row["seed"]: row["iterations"]
+            for row in rows
+            if (row["kind"], row["method"], row["outcome"]) == (kind, "default", "complete")
+        }
+        both = complete.keys() & default.keys()
+        table.append(
+            {
+                "kind": kind,
+                "method": method,
+                "scenes": len(mine),
+                "complete": len(complete),
+                "not taken": sum(row["outcome"] == "not taken" for row in mine),
+                "iterations": sum(complete.values()),
+                "default, same scenes": sum(default[seed] for seed in both),
+                "same scenes": sum(complete[seed] for seed in both),
+                "seconds": sum(row["seconds"] for row in mine),
+            }
+        )
+    return table
+
+
+def main() -> None:
+    """Solve the scenes and write rows and table."""
+    parser = timing.parser(__doc__, "random_scenes")
+    parser.add_argument("--only", choices=KINDS, help="one kind of scenes")
+    parser.add_argument("--scenes", type=int, help="number of scenes of each kind")
+    parser.add_argument("--start", type=int, default=0, help="added to the first seeds")
+    arguments = parser.parse_args()
+    logging.getLogger("fenics_contact").setLevel(logging.ERROR)
+    warnings.simplefilter("ignore")
+    rows = []
+    for name, kind in KINDS.items():
+        if arguments.only in (None, name):
+            scenes = arguments.scenes or (FAMILY if arguments.short else kind.scenes)
+            shifted = Kind(**{**vars(kind), "first": kind.first + arguments.start})
+            rows += outcomes(name, shifted, scenes)
+    timing.write(arguments.output, "scenes", "Random scenes", rows)
+    timing.write(arguments.output, "methods", "The default and its methods alone", summary(rows))
+
+
+if __name__ == "__main__":
+    main()
