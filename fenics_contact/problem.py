@@ -14,7 +14,7 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact.arguments import is_number, listed
+from fenics_contact.arguments import check_bool, is_number, listed
 from fenics_contact.checks.energy import EnergyState
 from fenics_contact.checks.given import (
     check_contacts,
@@ -375,6 +375,7 @@ class ContactProblem:
                 the load.
         """
         start = time.perf_counter()
+        check_bool("recover_interior", recover_interior)
         self._check_committed()
         self._check_histories()
         first, self._fresh = self._fresh, False
