@@ -305,8 +305,7 @@ class RigidBodyModes:
     ) -> tuple[Array, Mask]:
         """Share of the forces on modes that contact leaves free that is not in balance. Collective.
 
-        The tangent of friction is none along the friction of a slipping point. Modes by which
-        obstacles turn are not looked at.
+        The tangent of friction is none along the friction of a slipping point.
 
         Args:
             operators: Of evaluated contacts, over all unknowns.
@@ -319,10 +318,8 @@ class RigidBodyModes:
             The largest share of the free modes of every group, 0 to 1, or NaN where it has none,
             (n_groups,); and which groups have modes that would be free if no point slipped.
         """
-        share, rows = np.full(self._scales.n_groups, np.nan), self.straight()
-        if not len(rows):
-            return share, idle
-        groups = self.groups()[rows]
+        share, rows = np.full(self._scales.n_groups, np.nan), np.arange(len(self.free))
+        groups = self.groups()
         loose = self.unconstrained(operators, rows, closed_only=True, slips=True)
         if not len(loose) and not idle.any():
             return share, idle
@@ -330,11 +327,11 @@ class RigidBodyModes:
         open_groups = idle.copy()
         open_groups[groups[np.argmax(np.abs(stuck), axis=1)]] = True
         loose = np.concatenate([loose, np.eye(len(rows))[idle[groups]]])
-        resultant = loose @ self.load_resultant(load, ())[0]
+        resultant = loose @ global_sum(self.comm, self._free_fields @ load)
         borne = np.zeros((3, len(loose)))
         for operator, first in zip(operators, tractions, strict=True):
             contact = operator.contact
-            modes = np.einsum("lm,mqd->lqd", loose, self.at_points(operator)[rows])
+            modes = np.einsum("lm,mqd->lqd", loose, self.at_points(operator))
             work, then = (
                 np.einsum("lqd,qd->lq", modes, t) for t in (contact.values.total_traction, first)
             )
