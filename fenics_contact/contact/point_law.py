@@ -50,6 +50,18 @@ class PointTangent:
     by_shift: Array | None = None
     spun: Array | None = None
 
+    def scaled(self, factor: Array) -> PointTangent:
+        """The derivatives times a factor at each point, (n_points,)."""
+
+        def times(values: Array) -> Array:
+            return values * factor.reshape(-1, *[1] * (values.ndim - 1))
+
+        return PointTangent(
+            times(self.by_jump),
+            None if self.by_shift is None else times(self.by_shift),
+            None if self.spun is None else times(self.spun),
+        )
+
 
 class PointLaw:
     """What a law makes of displacements at the points.

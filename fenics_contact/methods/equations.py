@@ -23,7 +23,7 @@ from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.hierarchy import Hierarchy
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.system import System
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Mask
 
 __all__ = ["Equations"]
 
@@ -265,29 +265,36 @@ class Equations:
     def regularised_tangents(self) -> Iterator[PETSc.Mat]:
         """`tangents`, regularised where contact leaves a rigid-body mode free. Collective.
 
-        Open points of the bodies concerned get the stiffness of closed ones, slipping points the
-        secant stiffness of friction: a step along the mode goes as far as they have slipped. Both
-        are multiplied by the share of the forces on the mode that is not in balance: with it the
+        Slipping points of the bodies concerned get the secant stiffness of friction under the
+        present pressure, with which a step along the mode goes as far as they have slipped; open
+        points get the stiffness of closed ones, where slipping points would not hold the body if
+        they stuck. Both by the share of the forces on the mode that is not in balance: with it the
         regularisation vanishes, and convergence stays superlinear (Levenberg-Marquardt).
         """
-        yield from self.tangents()
-        if not len(self.motions.free):
-            return
-        # Of a body that was positioned round-off closes some of many points.
-        load = self.motions.generalised_load(self.full.load)
-        idle = self.full.contact_force_sizes() < _OPEN_SHARE * load
-        first = self.watch.tractions or [c.values.total_traction for c in self.contacts]
-        share, is_open = self.motions.imbalance(self.full.operators, self.full.load, first, idle)
+        share, is_open = self._imbalance()
         if np.isnan(share).all():
+            yield from self.tangents()
             return
         share = np.where(np.isnan(share), 0.0, np.maximum(share, _LEAST_SHARE))
         for number, operator in enumerate(self.system.operators):
             contact, group = operator.contact, self.full.scales.group_of_points(number)
-            at_open = np.where((contact.status == Status.OPEN) & is_open[group], share[group], 0.0)
-            tangential = np.where(
-                contact.status == Status.SLIP, share[group] * _secant(contact), at_open
-            )
-            yield operator.springs(contact.springs(at_open, tangential))
+            slips = np.where(contact.status == Status.SLIP, share[group], 0.0)
+            opens = np.where((contact.status == Status.OPEN) & is_open[group], share[group], 0.0)
+            tangent = contact.acting.tangent().scaled(1.0 - slips)
+            yield operator.steadied(operator.tangent(tangent))
+            secant = slips * _secant(contact)
+            yield operator.springs(contact.springs(opens + slips, opens + secant))
+
+    def _imbalance(self) -> tuple[Array, Mask]:
+        """`RigidBodyModes.imbalance` at the evaluated state. Collective."""
+        full = self.full
+        if not len(self.motions.free):
+            return np.full(full.scales.n_groups, np.nan), np.zeros(full.scales.n_groups, np.bool_)
+        # Of a body that was positioned round-off closes some of many points.
+        load = self.motions.generalised_load(full.load)
+        idle = full.contact_force_sizes() < _OPEN_SHARE * load
+        first = self.watch.tractions or [c.values.total_traction for c in self.contacts]
+        return self.motions.imbalance(full.operators, full.load, first, idle)
 
     def tangents(self) -> Iterator[PETSc.Mat]:
         """Consistent tangents of the contacts, which are evaluated. Collective."""
