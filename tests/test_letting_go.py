@@ -15,6 +15,7 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic, NeoHookean
 from fenics_contact.systems.ejected_bodies import find_ejected_bodies
+from scenes.beside import Beside, Box
 from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block_mesh, dimension
 from scenes.bodies import Bodies, boxes
 from scenes.comparing import close, gathered
@@ -310,3 +311,24 @@ def test_a_body_that_is_thrown_out_is_told_of():
         found = find_ejected_bodies(problem.full, problem.motions, forces, before)
         assert [name.split(",")[0] for name in found] == names
         assert all(close(np.array(ways), [2.0, 0.0], 1e-12) for ways in found.values())
+
+
+@pytest.mark.parametrize("bulk", ["linear", "rubber"])
+@pytest.mark.parametrize("way", [0.003, 0.1])
+def test_a_block_lifted_off_a_moving_floor(way, bulk):
+    """In one increment: friction may take the block along, by at most the floor's way.
+
+    Reference: the interval. The consistent tangent extrapolates friction beyond the loss of
+    pressure, which threw the block the other way by six times that of the floor.
+    """
+    scene = Beside({"block": Box()}, rubber=bulk == "rubber")
+    up, shift = scene.bodies.constant(), fem.Constant(scene.bodies.mesh, np.zeros(2))
+    scene.hold("block", TOP, 1, value=up)
+    floor = fc.HalfSpace((0, 0), (0, 1), shift)
+    contact = scene.contact("block", BOTTOM, floor, fc.Coulomb(0.3), kinematics="finite")
+    problem = scene.problem(contact)
+    for up.value, shift.value[0] in ((-0.01, 0.0), (0.05, way)):
+        problem.solve()
+        problem.commit()
+    place = gathered(COMM, contact.own_displacement())[:, 0]
+    assert place.min() > -1e-3 * way and place.max() < 1.001 * way

@@ -127,9 +127,16 @@ class Approach:
                 return False
             self._go(here)
         # Groups of coupled bodies come to rest apart, and those without load stay.
+        positioned = np.zeros(len(idle), dtype=np.bool_)
         for group in np.unique(groups[which]):
             if load_size[group] > 0:
+                positioned |= groups == group
                 self._set_down(load, before, which[groups[which] == group])
+        if carried is not None and positioned.any():  # the others are carried beside them
+            here = full.state()
+            self._move(np.arange(len(idle)), np.where(positioned, 0.0, carried))
+            self.carried = full.state()
+            self._go(here)
         return first or bool(idle.any())
 
     def _carried(self, chosen: Mask) -> Array | None:
@@ -153,7 +160,7 @@ class Approach:
                 way, _ = contact.opposite.carried(points, points.total_traction)
             if not contact.law.has_tangential:
                 jumps = np.sum(jumps * points.normal, axis=2, keepdims=True) * points.normal
-            weights = contact.measure * np.abs(points.arrays["normal_traction"])
+            weights = contact.measure * np.abs(contact.history.values("normal_traction"))
             jumps = np.where(chosen[:, None, None], jumps, 0.0)
             gram += np.einsum("mqd,q,nqd->mn", jumps, weights, jumps)
             work += np.einsum("mqd,q,qd->m", jumps, weights, way)
@@ -417,18 +424,50 @@ class Approach:
             angles = turns.T @ ways
             bounds += [angles, -angles]
             most += [np.full(2 * len(angles), turn / far)]
+        matrix, ends = np.concatenate(bounds), np.concatenate(most) if most else np.zeros(0)
         # What was let go, obstacles may have moved into: it goes out, or no deeper where it cannot.
         for deep in (gaps, np.maximum(gaps, _INTO)):
-            found = scipy.optimize.linprog(
-                -work,
-                A_ub=np.concatenate(bounds),
-                b_ub=np.concatenate([deep, *most]),
-                bounds=(None, None),
-                options={
-                    "primal_feasibility_tolerance": 1e-10,
-                    "dual_feasibility_tolerance": 1e-10,
-                },
-            )
-            if found.status == 0 or gaps.min() >= 0:
+            limit = np.concatenate([deep, ends])
+            found = _linear_programme(-work, matrix, limit)
+            if found is not None or gaps.min() >= 0:
                 break
-        return far * (ways @ agreed(comm, found.x)) if found.status == 0 else None
+        if found is None:
+            return None
+        return far * (ways @ agreed(comm, _least_motion(work, matrix, limit, found)))
+
+
+def _linear_programme(cost: Array, matrix: Array, limit: Array) -> Array | None:
+    """Minimise cost @ x where matrix @ x <= limit; None: there is no such x, or no least cost."""
+    found = scipy.optimize.linprog(
+        cost,
+        A_ub=matrix,
+        b_ub=limit,
+        bounds=(None, None),
+        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+    )
+    return found.x if found.status == 0 else None
+
+
+def _least_motion(work: Array, matrix: Array, limit: Array, found: Array) -> Array:
+    """Of all solutions with the work of one that was found the one of least coefficients.
+
+    A body without load, which others may push, is free to go anywhere that gaps permit: it stays.
+
+    Args:
+        work: Of the load on the coefficients, (n,).
+        matrix: As in `_linear_programme`.
+        limit: Likewise.
+        found: The solution, (n,).
+    """
+    n, unit = len(work), np.eye(len(work))
+    most = work @ found
+    rows = [
+        np.hstack([matrix, np.zeros_like(matrix)]),
+        np.hstack([unit, -unit]),
+        np.hstack([-unit, -unit]),
+        np.concatenate([-work, np.zeros(n)])[None],
+    ]
+    ends = np.concatenate([limit, np.zeros(2 * n), [-most + _FELT * abs(most)]])
+    cost = np.concatenate([np.zeros(n), np.ones(n)])
+    least = _linear_programme(cost, np.concatenate(rows), ends)
+    return found if least is None else least[:n]

@@ -32,8 +32,8 @@ class Method(ABC):
     """A way to solve equations from a start: on the main SNES, or an `OwnMethod`."""
 
     @classmethod
-    def main_options(cls, *, linear_bulk: bool) -> Mapping[str, Any]:
-        """Options of the main SNES, for a linear bulk or another; by default none of its own."""
+    def main_options(cls) -> Mapping[str, Any]:
+        """Options of the main SNES; by default none of its own."""
         return {}
 
     @abstractmethod
@@ -162,7 +162,11 @@ class InnerSnes:
 
     def solve(self) -> tuple[int, int]:
         """Iterations and reason, from ``solution`` of the equations on. Collective."""
-        return self._callbacks.solve(self.snes, self._equations.solution)
+        iterations, reason = self._callbacks.solve(self.snes, self._equations.solution)
+        # The line search `cp`, by option, takes a step across the residual, F·y = 0, for the end.
+        if reason == _REASONS.CONVERGED_FNORM_ABS:
+            reason = int(_REASONS.DIVERGED_LINE_SEARCH)
+        return iterations, reason
 
     def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         self._equations.residual(x, f)
@@ -243,20 +247,16 @@ class Newton(SnesMethod):
         self._sizes: Array | None = None  # of the correction and the residual at the iterate
 
     @classmethod
-    def main_options(cls, *, linear_bulk: bool) -> Mapping[str, Any]:
-        """See `Method.main_options`.
-
-        With a nonlinear bulk steps are halved until `_level` falls.
-        """
-        options: dict[str, Any] = {"snes_type": "newtonls", "snes_max_it": 100}
-        if not linear_bulk:
-            options |= {
-                "snes_linesearch_type": "bt",
-                "snes_linesearch_order": 1,
-                "snes_linesearch_alpha": 0.0,
-                "snes_linesearch_max_it": 40,
-            }
-        return options
+    def main_options(cls) -> Mapping[str, Any]:
+        """See `Method.main_options`: steps are halved until `_level` falls."""
+        return {
+            "snes_type": "newtonls",
+            "snes_max_it": 100,
+            "snes_linesearch_type": "bt",
+            "snes_linesearch_order": 1,
+            "snes_linesearch_alpha": 0.0,
+            "snes_linesearch_max_it": 40,
+        }
 
     def attach(self, *, consistent: bool) -> None:
         """See `SnesMethod.attach`; a line search gets its level function."""
@@ -301,8 +301,4 @@ class Newton(SnesMethod):
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`."""
-        iterations, reason = self._callbacks.solve(self.snes, self._equations.solution)
-        # `cp` takes a step across the residual, F·y = 0, for the end of all: see `_COMMON`.
-        if reason == _REASONS.CONVERGED_FNORM_ABS:
-            reason = int(_REASONS.DIVERGED_LINE_SEARCH)
-        return iterations, reason
+        return self._callbacks.solve(self.snes, self._equations.solution)

@@ -43,7 +43,7 @@ class QuasiNewton(SnesMethod):
         self._refreshed = False
 
     @classmethod
-    def main_options(cls, *, linear_bulk: bool) -> Mapping[str, Any]:
+    def main_options(cls) -> Mapping[str, Any]:
         """See `Method.main_options`."""
         return {
             "snes_type": "qn",

@@ -583,8 +583,7 @@ class Solver:
 
     def _main_options(self) -> dict[str, Any]:
         """Those of the main SNES, where the caller says nothing."""
-        linear_bulk = self._full.bulk.linear
-        return {**_COMMON, **METHODS[self.method].main_options(linear_bulk=linear_bulk)}
+        return {**_COMMON, **METHODS[self.method].main_options()}
 
     # ---- the neighbourhood of a solution ---------------------------------------------------------
 
