@@ -378,7 +378,11 @@ class RigidObstacleProbe:
         """See `Probe`: of an obstacle that neither turns nor changes its shape."""
         known = np.array_equal(self._shape, self._sampler.shape) and not contact.opposite.turns
         moved = self._at(contact.values.x + contact.values.jump) - self._z
-        clear = _DEPTH_RESOLUTION * self._places.size[self._facet] + self._distance
+        size = self._places.size[self._facet]
+        clear = _DEPTH_RESOLUTION * size + self._distance
+        # What has entered the body may go deeper.
+        inside = _dot(np.nan_to_num(self._toward), self._outward(self._facet, self.points)) < 0
+        clear -= np.where(inside, _ALLOWED_BEFORE * size, 0.0)
         known = known and bool(np.all(np.linalg.norm(moved, axis=1) <= clear))
         # A point may have come to the opposite side of what is thinner.
         turned = _dot(contact.values.normal, self._law_normal) < _OPPOSITE_SIDES
@@ -397,6 +401,10 @@ class RigidObstacleProbe:
         )
         size = places.size[self._facet]
         allowed = _allowed(deep, planes, size, size)
+        # Deeper in a flat cell it may be nearer to another surface, and `_entered_before` would not
+        # know through which one it came.
+        most = np.where(deep > 0, np.inf, places.facets.heights()[self._facet] / 2)
+        allowed = np.minimum(allowed, most)
         return self._protrusion(allowed, size), allowed
 
     def _protrusion(self, allowed: Array, size: Array) -> Array:
