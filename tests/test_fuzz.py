@@ -112,13 +112,13 @@ def test_methods_are_tried_on_a_refused_scene(monkeypatch):
 
 
 @serial
-def test_a_line_search_that_stops_without_progress_is_no_solution():
-    """PETSc's line search stops if F·y = 0, here with a residual as large as the forces."""
+def test_an_iteration_without_progress_is_no_solution():
+    """Where it stops the residual is as large as the forces."""
     name = "an obstacle constrained by a prescribed pressure alone"
     scene = next(e["scene"] for e in SCENES["regressions"] if e["name"] == name)
     outcome = solve(scene | {"method": "newton"})
     assert outcome.outcome == "refused"
-    assert "Tried: newton: no progress (0 iterations). " in outcome.detail[0]
+    assert "Tried: newton: no progress (" in outcome.detail[0]
     outcome = solve(scene)
     assert outcome.outcome == "refused"
     assert "converged (" not in outcome.detail[0]

@@ -162,11 +162,7 @@ class InnerSnes:
 
     def solve(self) -> tuple[int, int]:
         """Iterations and reason, from ``solution`` of the equations on. Collective."""
-        iterations, reason = self._callbacks.solve(self.snes, self._equations.solution)
-        # The line search `cp`, by option, takes a step across the residual, F·y = 0, for the end.
-        if reason == _REASONS.CONVERGED_FNORM_ABS:
-            reason = int(_REASONS.DIVERGED_LINE_SEARCH)
-        return iterations, reason
+        return self._callbacks.solve(self.snes, self._equations.solution)
 
     def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         self._equations.residual(x, f)
@@ -301,4 +297,8 @@ class Newton(SnesMethod):
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`."""
-        return self._callbacks.solve(self.snes, self._equations.solution)
+        iterations, reason = self._callbacks.solve(self.snes, self._equations.solution)
+        # The line search `cp`, by option, takes a step across the residual, F·y = 0, for the end.
+        if reason == _REASONS.CONVERGED_FNORM_ABS:
+            reason = int(_REASONS.DIVERGED_LINE_SEARCH)
+        return iterations, reason

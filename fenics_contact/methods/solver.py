@@ -202,7 +202,11 @@ class Solver:
         self._full.linear_kind = self._choose_linear_solver()
         self._set_system()
         self.method = settings.method or self._choose_method()
-        options.set(self._main_options(), prefix)
+        snes_type = options.get(prefix + "snes_type")
+        main_options = self._main_options()
+        if snes_type not in (None, main_options.get("snes_type")):
+            main_options |= _COMMON  # the line search is for the type of the method
+        options.set(main_options, prefix)
         snes_type = options.get(prefix + "snes_type")
         if snes_type is not None and snes_type not in _SNES_TYPES:
             raise ValueError(
