@@ -303,7 +303,7 @@ def test_arrays_that_are_none_of_a_state(what, how, saved):
     COMM.barrier()
     made = Press(wall=True)
     call = lambda: next(made.increments(checkpoint=saved))  # noqa: E731
-    missing = ["it has no numbers"] * ((what, how) == ("numbers", "none"))
+    missing = ["it lacks numbers"] * ((what, how) == ("numbers", "none"))
     raised_everywhere(call, ValueError, str(saved), *missing)
     assert made.problem.increment == 0 and not np.any(owned(made.scene.u))
     assert [float(c.value) for c in made.push] == [0.0, 0.0]
