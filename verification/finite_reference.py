@@ -629,7 +629,7 @@ def make_bulk(setup: Any, body: Body) -> Callable[[Array], tuple[Array, Array, b
 
 def make_loads(setup: Any) -> Callable[[int, float], FiniteLoad]:
     """Return the load as a function of stage and load parameter."""
-    d, V, scene = setup.d, setup.V, setup.scene
+    d, V = setup.d, setup.V
     outside = setup.external_force()
 
     def load(stage: int, t: float) -> FiniteLoad:
@@ -638,20 +638,7 @@ def make_loads(setup: Any) -> Callable[[int, float], FiniteLoad]:
         for bc in setup.bcs:
             bc.set(values)
         dofs = np.unique(np.concatenate([bc.dof_indices()[0] for bc in setup.bcs]))
-        shifts, obstacle_forces = [], []
-        for contact in scene["contacts"]:
-            moving, free = contact["obstacle"].get("moving"), contact["obstacle"].get("free", ())
-            shift, push = np.zeros(d), np.zeros(d)
-            if moving == "displacement":
-                shift = setup.shift.value.copy()
-            elif moving == "translated":
-                shift = setup.translation.value.copy()
-            elif moving == "force":
-                for i in range(d):
-                    push[i] = float(setup.obstacle_force[i].value) if i in free else 0.0
-                    shift[i] = 0.0 if i in free else float(setup.obstacle_motion[i].value)
-            shifts.append(shift)
-            obstacle_forces.append(push)
+        shifts, obstacle_forces = setup.obstacle_loads()
         force = fem.assemble_vector(outside).array.copy()
         angle = float(setup.angle.value)
         return FiniteLoad(force, dofs, values[dofs], shifts, obstacle_forces, angle)

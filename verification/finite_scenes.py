@@ -16,7 +16,7 @@ import fenics_contact as fc
 from fenics_contact.elasticity import NeoHookean
 from fenics_contact.types import Array
 from scenes.surfaces import ball, box, ring
-from verification.fuzz_scenes import Scene, draw_element, draw_form, frictions, make_samplers
+from verification.fuzz_scenes import Scene, draw_element, draw_form, make_samplers
 from verification.fuzz_setup import SceneSetup, capsule_gap, obstacle_geometry
 
 __all__ = ["DEGREE", "KINDS", "FiniteSetup", "draw", "initial_geometry", "obstacle_points"]
@@ -304,6 +304,8 @@ class FiniteSetup(SceneSetup):
         angle: Angle of the obstacle below (radians).
     """
 
+    LEVELS = (*SceneSetup.LEVELS, "turn")
+
     def __init__(self, scene: Scene, comm: MPI.Comm, *, bulk: Any = None) -> None:
         """Create it. Collective.
 
@@ -332,19 +334,10 @@ class FiniteSetup(SceneSetup):
         """Return `bulk` as the derivative of an energy."""
         return self.bulk(E, dx) if self._rubber else super().bulk_of_energy(E, dx)
 
-    def load_levels(self, stage: int, t: float) -> dict[str, float]:
-        """Return the load factors "normal", "side", "across" and "turn" within a stage."""
-        stages = self.scene["stages"]
-        zero = {"normal": 0.0, "side": 0.0, "across": 0.0, "turn": 0.0}
-        before = stages[stage - 1] if stage else zero
-        return {n: before[n] + t * (stages[stage][n] - before[n]) for n in zero}
-
     def apply(self, stage: int, t: float) -> None:
         """Set all loads."""
         scene, d = self.scene, self.d
-        for contact, friction in zip(self.contacts, frictions(scene, stage), strict=False):
-            if friction is not None:
-                contact.parameters["friction"].value = friction
+        self.set_friction(stage)
         now, size = self.load_levels(stage, t), np.array(scene["bodies"][0]["size"])
         direction = np.zeros(d)
         direction[0] = now["side"] * size[0]

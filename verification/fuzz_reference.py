@@ -72,7 +72,7 @@ def make_problem(
 ) -> tuple[reference.Problem, SceneSetup, Callable[[int, float], reference.Load]]:
     """Return the independent problem, the setup, and a function of the loads. On one rank."""
     setup = SceneSetup(scene, MPI.COMM_SELF)
-    d, outside = setup.d, setup.external_force()
+    outside = setup.external_force()
     body, surface = make_body(setup)
     contacts = [
         _make_contact(
@@ -91,22 +91,7 @@ def make_problem(
         for bc in setup.bcs:
             bc.set(values)
         dofs = np.unique(np.concatenate([np.zeros(0, dtype=np.int32), *fixed]))
-        shifts, pushes = [], []
-        for contact in scene["contacts"]:
-            moving = contact["obstacle"].get("moving")
-            shift, push = np.zeros(d), np.zeros(d)
-            if moving == "displacement":
-                shift = setup.shift.value.copy()
-            elif moving == "translated":
-                shift = setup.translation.value.copy()
-            elif moving == "force":
-                for i in range(d):
-                    if i in contact["obstacle"]["free"]:
-                        push[i] = float(setup.obstacle_force[i].value)
-                    else:
-                        shift[i] = float(setup.obstacle_motion[i].value)
-            shifts.append(shift)
-            pushes.append(push)
+        shifts, pushes = setup.obstacle_loads()
         return reference.Load(
             fem.assemble_vector(outside).array.copy(), dofs, values[dofs], shifts, pushes
         )

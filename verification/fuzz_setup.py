@@ -99,10 +99,13 @@ class SceneSetup:
         translation: Translation of all bodies and obstacles of the scene.
         F: The residual with piecewise constant coefficients; the package gets an equivalent form
             (`fuzz_forms.make_form`).
+        LEVELS: Names of the load factors that the stages of a scene have.
         slip_resets: New slip references of this increment by contact: "rigid", whether bodies were
             positioned; "u", see `_gather_displacement`; "jump" at the points, (n_points, d); and
             "unloaded", the points that it applies to, (n_points,).
     """
+
+    LEVELS: tuple[str, ...] = ("normal", "side", "across")
 
     def __init__(self, scene: Scene, comm: MPI.Comm) -> None:
         """Create mesh, bulk form and conditions. Collective."""
@@ -237,18 +240,40 @@ class SceneSetup:
     # ---- loads -------------------------------------------------------------------------------
 
     def load_levels(self, stage: int, t: float) -> dict[str, float]:
-        """Return the load factors "normal", "side" and "across" within a stage."""
+        """Return the load factors `LEVELS` within a stage."""
         stages = self.scene["stages"]
-        zero = {"normal": 0.0, "side": 0.0, "across": 0.0}
+        zero = dict.fromkeys(self.LEVELS, 0.0)
         before = stages[stage - 1] if stage else zero
         return {n: before[n] + t * (stages[stage][n] - before[n]) for n in zero}
+
+    def set_friction(self, stage: int) -> None:
+        """Set the friction coefficients that change in a stage."""
+        for contact, friction in zip(self.contacts, frictions(self.scene, stage), strict=False):
+            if friction is not None:
+                contact.parameters["friction"].value = friction
+
+    def obstacle_loads(self) -> tuple[list[Array], list[Array]]:
+        """Return displacement of and force on the obstacle of every contact, (gdim,) each."""
+        shifts, forces = [], []
+        for contact in self.scene["contacts"]:
+            moving, free = contact["obstacle"].get("moving"), contact["obstacle"].get("free", ())
+            shift, force = np.zeros(self.d), np.zeros(self.d)
+            if moving == "displacement":
+                shift = self.shift.value.copy()
+            elif moving == "translated":
+                shift = self.translation.value.copy()
+            elif moving == "force":
+                for i in range(self.d):
+                    force[i] = float(self.obstacle_force[i].value) if i in free else 0.0
+                    shift[i] = 0.0 if i in free else float(self.obstacle_motion[i].value)
+            shifts.append(shift)
+            forces.append(force)
+        return shifts, forces
 
     def apply(self, stage: int, t: float) -> None:
         """Set all loads."""
         scene, d = self.scene, self.d
-        for contact, friction in zip(self.contacts, frictions(scene, stage), strict=False):
-            if friction is not None:
-                contact.parameters["friction"].value = friction
+        self.set_friction(stage)
         now = self.load_levels(stage, t)
         direction = np.zeros(d)
         direction[0], direction[-1] = now["side"], -now["normal"]

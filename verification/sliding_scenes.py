@@ -203,6 +203,8 @@ def turn(d: int, angle: float) -> Array:
 class SlidingSetup(FiniteSetup):
     """Mesh, forms, conditions and constants of a scene."""
 
+    LEVELS = (*FiniteSetup.LEVELS, "spin")
+
     def __init__(self, scene: Scene, comm: MPI.Comm, *, bulk: Any = None) -> None:
         """Create it, with the arguments of `FiniteSetup`. Collective."""
         super().__init__(scene, comm, bulk=bulk)
@@ -215,13 +217,6 @@ class SlidingSetup(FiniteSetup):
                 dofs = fem.locate_dofs_topological(self.V, self.d - 1, facets)
                 self.bcs.append(fem.dirichletbc(value, dofs))
                 self._moved_bodies.append((body, value))
-
-    def load_levels(self, stage: int, t: float) -> dict[str, float]:
-        """Return the load factors within a stage, with the angles "turn" and "spin"."""
-        stages = self.scene["stages"]
-        now = super().load_levels(stage, t)
-        before = stages[stage - 1]["spin"] if stage else 0.0
-        return now | {"spin": before + t * (stages[stage]["spin"] - before)}
 
     def apply(self, stage: int, t: float) -> None:
         """Set all loads."""
