@@ -3,14 +3,14 @@
 import fenics_contact.compat  # noqa: F401  # first: it refuses releases that are too old
 from fenics_contact import elasticity
 from fenics_contact._version import __version__
-from fenics_contact.checks.step import Step
-from fenics_contact.checks.verdict import ForceBalance, NotConverged, Verdict
+from fenics_contact.checks.verdict import ForceBalance, Verdict
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.general import find_contact_pairs
 from fenics_contact.contact.values import Resultants, Status, ZoneExtent
 from fenics_contact.estimates.adaptation import AdaptationLevel, adapt
 from fenics_contact.estimates.errors import ErrorBudget, estimate_errors
+from fenics_contact.failure import NotConverged
 from fenics_contact.histories import checkpoint
 from fenics_contact.histories.increments import increments
 from fenics_contact.histories.report import report
@@ -44,6 +44,7 @@ from fenics_contact.problem import ContactProblem
 from fenics_contact.results import output, plotting
 from fenics_contact.results.animation import Animation
 from fenics_contact.results.writer import Writer
+from fenics_contact.step import Step
 from fenics_contact.surface.surface import ContactSurface
 from fenics_contact.systems.operator import ContactOperator
 

@@ -24,16 +24,18 @@ from fenics_contact.checks.given import (
     find_displacement,
 )
 from fenics_contact.checks.judge import Judge
-from fenics_contact.checks.step import Step
-from fenics_contact.checks.verdict import Attempt, NotConverged, Verdict
+from fenics_contact.checks.verdict import Verdict
 from fenics_contact.contact.contact import Contact
+from fenics_contact.failure import NotConverged
 from fenics_contact.methods.approach import Approach
+from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
 from fenics_contact.methods.first_touch import FirstTouch
 from fenics_contact.methods.load_balance import LoadBalance
 from fenics_contact.methods.solver import Settings, Solver
 from fenics_contact.parallel import fail_together, global_max, warn
 from fenics_contact.state import State, Trial
+from fenics_contact.step import Step
 from fenics_contact.systems import linear
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.committed import CommittedState

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fenics_contact as fc
-from fenics_contact.checks.verdict import Attempt
+from fenics_contact.methods.attempt import Attempt
 from scenes.elasticity import stress
 from scenes.rubbing import Rub
 

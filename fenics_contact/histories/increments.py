@@ -15,14 +15,15 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from fenics_contact.arguments import check_bool, check_instance
-from fenics_contact.checks.step import Step
-from fenics_contact.checks.verdict import Attempt, NotConverged
 from fenics_contact.estimates.errors import quantities
+from fenics_contact.failure import NotConverged
 from fenics_contact.histories import checkpoint as states
 from fenics_contact.histories.progress import Bar
 from fenics_contact.histories.table import Table
+from fenics_contact.methods.attempt import Attempt
 from fenics_contact.parallel import collective_errors, warn
 from fenics_contact.problem import ContactProblem
+from fenics_contact.step import Step
 from fenics_contact.types import Array
 
 __all__ = ["increments"]

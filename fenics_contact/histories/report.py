@@ -16,7 +16,6 @@ import numpy as np
 from dolfinx import fem
 
 from fenics_contact.arguments import check_instance, is_number
-from fenics_contact.checks.step import Step
 from fenics_contact.contact.contact import Contact
 from fenics_contact.estimates.errors import ErrorBudget
 from fenics_contact.histories import table
@@ -27,6 +26,7 @@ from fenics_contact.parallel import collective_errors, global_max
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import drawing, files, plotting
 from fenics_contact.results.obstacles import shapes_of
+from fenics_contact.step import Step
 from fenics_contact.types import Array
 
 __all__ = ["report"]

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from fenics_contact.checks.step import Step
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Resultants
 from fenics_contact.parallel import collective_errors
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import files
+from fenics_contact.step import Step
 
 __all__ = [
     "AXES",

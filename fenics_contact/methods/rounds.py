@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fenics_contact.checks.verdict import Attempt
+from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.method import OVERLOADED
 from fenics_contact.parallel import global_sum

@@ -14,11 +14,11 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.arguments import check_bool, check_instance, is_number
-from fenics_contact.checks.verdict import Attempt
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.methods.alternating import Alternation
+from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.kept import Kept

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from fenics_contact.arguments import check_instance, is_number
-from fenics_contact.checks.step import Step
 from fenics_contact.parallel import collective_errors
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import drawing, files
 from fenics_contact.results.obstacles import ObstacleShape, box_about, shapes_of
 from fenics_contact.results.writer import facet_status
+from fenics_contact.step import Step
 from fenics_contact.types import Array
 
 __all__ = ["Animation"]

@@ -18,7 +18,6 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from fenics_contact.arguments import check_instance, is_number
-from fenics_contact.checks.step import Step
 from fenics_contact.compiling import compile_expression
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
@@ -27,6 +26,7 @@ from fenics_contact.problem import ContactProblem
 from fenics_contact.results import files, vtu
 from fenics_contact.results.drawing import von_mises
 from fenics_contact.results.obstacles import ObstacleShape, box_about
+from fenics_contact.step import Step
 from fenics_contact.surface.facet_values import facet_values
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.types import Array

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fenics_contact.checks.energy import Energy
-from fenics_contact.checks.verdict import Attempt, Verdict
+from fenics_contact.checks.verdict import Verdict
 from fenics_contact.contact.values import Resultants
 from fenics_contact.markup import shown
+from fenics_contact.methods.attempt import Attempt
 from fenics_contact.types import Array
 
 __all__ = ["Step"]

@@ -1,0 +1,85 @@
+"""The error of an increment without a verified solution, and what to try."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fenics_contact.checks.verdict import Verdict
+from fenics_contact.methods.attempt import Attempt
+
+__all__ = ["NotConverged"]
+
+
+class NotConverged(RuntimeError):
+    """An increment has no verified solution; u and history are unchanged.
+
+    Args:
+        increment: Number of the increment.
+        reason: SNES reason of the last attempt.
+        verdict: Verification of the last state.
+        attempts: The attempts, in their order.
+        prefix: Prefix of the problem's PETSc options.
+        stiffnesses: Names of the stiffness parameters that may be lowered, the first one first.
+
+    Attributes:
+        increment: Number of the increment, from 1.
+        reason: SNES reason of the last attempt (negative: diverged; positive: SNES converged, but
+            the verification failed).
+        iterations: Number of SNES iterations of all attempts.
+        verdict: Verification of the last state.
+        attempts: The attempts, in their order.
+    """
+
+    def __init__(
+        self,
+        increment: int,
+        reason: int,
+        verdict: Verdict,
+        attempts: Sequence[Attempt] = (),
+        *,
+        prefix: str = "contact_",
+        stiffnesses: Sequence[str] = ("k_t", "k_n"),
+    ) -> None:
+        self.increment, self.reason, self.verdict = increment, reason, verdict
+        self.attempts = tuple(attempts)
+        self.iterations = sum(attempt.iterations for attempt in attempts)
+        what = "; ".join(verdict.failures) or "the last state passes the verification"
+        tried = ". ".join(str(attempt) for attempt in attempts)
+        super().__init__(
+            f"increment {increment} did not converge: SNES reason {reason} after {self.iterations} "
+            f"iterations; {what}; the forces have magnitude {verdict.force:.3e}. Tried: {tried}. "
+            + _advice(reason, verdict, attempts, stiffnesses)
+            + f"; -{prefix}snes_monitor shows the iterations"
+        )
+
+
+# How `Overload.in_words` begins; smaller increments do not help.
+_OVERLOAD = "overload:"
+_OF_A_LAW = (
+    "The equations hold, but the contact law does not: check that contact_traction, friction_bound "
+    "and normal_potential of a user-defined law are consistent"
+)
+_OF_A_STATE_NOT_FINITE = (
+    "The last state is not finite (NaN or inf): tractions and their derivatives of a user-defined "
+    "law must be finite at every gap and slip; a root, or a power below 1, has no derivative at 0. "
+    "Otherwise try smaller increments"
+)
+_OF_OVERLOAD = (
+    "Try a smaller load, more friction, or a Dirichlet condition that constrains this motion"
+)
+
+
+def _advice(
+    reason: int, verdict: Verdict, attempts: Sequence[Attempt], stiffnesses: Sequence[str]
+) -> str:
+    """What to try, by what went wrong."""
+    if reason > 0 and verdict.only_laws_fail:
+        return _OF_A_LAW
+    if attempts and attempts[-1].outcome.startswith(_OVERLOAD):
+        return _OF_OVERLOAD
+    if reason > 0:  # a lower stiffness would help the iteration, which has converged
+        return "Try what the failed checks say, or smaller increments"
+    if not verdict.is_finite:
+        return _OF_A_STATE_NOT_FINITE
+    lower = [f"a lower {name}" for name in stiffnesses]
+    return "Try " + ", then ".join([", ".join(["smaller increments", *lower[:-1]]), *lower[-1:]])

@@ -1,0 +1,27 @@
+"""What was tried to solve an increment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["Attempt"]
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """An attempt to solve an increment by one method.
+
+    Attributes:
+        method: A method of `ContactProblem`; or "cut", if `increments` halved the increment.
+        iterations: Number of SNES iterations.
+        outcome: "converged", or the reason of the failure in words.
+    """
+
+    method: str
+    iterations: int
+    outcome: str
+
+    def __str__(self) -> str:
+        """Return method, outcome and iterations in words."""
+        iterations = f"{self.iterations} iteration{'s' if self.iterations != 1 else ''}"
+        return f"{self.method}: {self.outcome} ({iterations})"
