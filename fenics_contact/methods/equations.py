@@ -60,6 +60,8 @@ class Equations:
         by_cycle: Whether H₀ is a V-cycle, which serves for its matrix as for the tangent.
         hierarchy: Its levels.
         factorisations: Of sparse matrices, counted.
+        free_parts: Bodies and free obstacles in a group of which contact left a rigid-body mode free
+            in the consistent tangent that was assembled last, (n_parts,).
         overload: By what the load outdid friction where `friction_needed` looked last, if it did.
     """
 
@@ -86,6 +88,7 @@ class Equations:
         self.solvers: dict[bool, PETSc.KSP] = {}
         self.by_cycle, self.hierarchy = False, Hierarchy()
         self.factorisations = 0
+        self.free_parts: Mask = np.zeros(len(full.scales.group), np.bool_)
         self.overload: Overload | None = None
         self._matrices: dict[bool, PETSc.Mat] = {}
         self._filled: set[bool] = set()
@@ -272,10 +275,12 @@ class Equations:
         regularisation vanishes, and convergence stays superlinear (Levenberg-Marquardt).
         """
         share, is_open = self._imbalance()
-        if np.isnan(share).all():
+        free = ~np.isnan(share)
+        self.free_parts = free[self.full.scales.group]
+        if not free.any():
             yield from self.tangents()
             return
-        share = np.where(np.isnan(share), 0.0, np.maximum(share, _LEAST_SHARE))
+        share = np.where(free, np.maximum(share, _LEAST_SHARE), 0.0)
         for number, operator in enumerate(self.system.operators):
             contact, group = operator.contact, self.full.scales.group_of_points(number)
             slips = np.where(contact.status == Status.SLIP, share[group], 0.0)
