@@ -1,11 +1,12 @@
 """The default against every method without fallback, on random scenes.
 
-    python benchmarks/random_scenes.py               # 400 small, 60 finite and 40 two-body scenes
+    python benchmarks/random_scenes.py               # 600 scenes
     python benchmarks/random_scenes.py --short       # 8 of each
     python benchmarks/random_scenes.py --only small  # one kind
 
-The scenes are those of ``verification/``: small displacements without cuts, and with finite
-kinematics, on rigid obstacles and between two bodies, with one cut. Nothing is said of the method,
+The scenes are those of ``verification/``: small displacements without cuts, some of them with more
+cells and with stiffer contact, and with finite kinematics, on rigid obstacles and between two
+bodies, with one cut. Nothing is said of the method,
 the condensation or the linear solver. An increment counts if the verification accepts it; a scene
 is complete if all its increments are. The table has the complete scenes of every method, the
 iterations of those, and processor time; the CSV has a row for every scene and method. Requirement:
@@ -62,6 +63,25 @@ def draw_small(seed: int, family: int) -> Scene:
     return fuzz_scenes.draw(seed, without=(*LEFT_OUT, "increment"), family=family)
 
 
+def draw_fine(seed: int, family: int, stiffer: float = 1.0) -> Scene:
+    """Small displacements, four times the cells along every edge, twice in space."""
+    scene = draw_small(seed, family)
+    for body in scene["bodies"]:
+        body["n"] = [n * (4 if len(body["n"]) == 2 else 2) for n in body["n"]]
+    for contact in scene["contacts"]:
+        law = contact["law"]
+        for name in ("k_n", "k_t"):
+            unit, value = law.get(name) or (None, None)
+            if stiffer > 1.0 and unit in ("scaled", "number"):
+                law[name] = ["scaled", stiffer * (value or 10.0)]
+    return scene
+
+
+def draw_stiff(seed: int, family: int) -> Scene:
+    """The same, contact 30 times as stiff, by E/h."""
+    return draw_fine(seed, family, stiffer=30.0)
+
+
 def draw_finite(seed: int, family: int) -> Scene:
     """Finite kinematics on rigid obstacles."""
     return finite_scenes.draw(seed, family=family)
@@ -73,15 +93,11 @@ def draw_bodies(seed: int, family: int) -> Scene:
 
 
 FINITE = ("newton", "continuation")
+SMALL = (*FINITE, "lbfgs", "primal_dual")
 KINDS = {
-    "small": Kind(
-        draw_small,
-        fuzz_setup.SceneSetup,
-        (*FINITE, "lbfgs", "primal_dual"),
-        400,
-        940000,
-        0,
-    ),
+    "small": Kind(draw_small, fuzz_setup.SceneSetup, SMALL, 400, 940000, 0),
+    "fine": Kind(draw_fine, fuzz_setup.SceneSetup, SMALL, 50, 945000, 0),
+    "stiff": Kind(draw_stiff, fuzz_setup.SceneSetup, SMALL, 50, 945000, 0),
     "finite": Kind(draw_finite, finite_scenes.FiniteSetup, FINITE, 60, 2000, 1),
     "bodies": Kind(draw_bodies, sliding_scenes.SlidingSetup, FINITE, 40, 3000, 1),
 }
