@@ -43,7 +43,8 @@ class NotConverged(RuntimeError):
         self.increment, self.reason, self.verdict = increment, reason, verdict
         self.attempts = tuple(attempts)
         self.iterations = sum(attempt.iterations for attempt in attempts)
-        what = "; ".join(verdict.failures) or "the last state passes the verification"
+        failures = [*verdict.failures, *_round_off(verdict)]
+        what = "; ".join(failures) or "the last state passes the verification"
         tried = ". ".join(str(attempt) for attempt in attempts)
         super().__init__(
             f"increment {increment} did not converge: SNES reason {reason} after {self.iterations} "
@@ -51,6 +52,16 @@ class NotConverged(RuntimeError):
             + _advice(reason, verdict, attempts, stiffnesses)
             + f"; -{prefix}snes_monitor shows the iterations"
         )
+
+
+def _round_off(verdict: Verdict) -> list[str]:
+    """What passes, and may be why the rest does not: round-off hides the equilibrium of a body."""
+    return [
+        f"the forces on {name} have a residual with a round-off of {balance.round_off:.3e}: its "
+        "stiffness, or its rigid-body displacement, is too large relative to the forces"
+        for name, balance in verdict.equations.items()
+        if balance.holds(2.0) and balance.round_off > balance.tolerance
+    ]
 
 
 # How `Overload.in_words` begins; smaller increments do not help.
