@@ -301,6 +301,7 @@ def test_options_reach_the_levels():
     """What the caller gives for solvers inside of solvers holds, and is not left behind."""
     before = PETSc.Options().getAll()
     made = Rub(
+        method="lbfgs",
         linear_solver="multigrid",
         petsc_options={"mg_levels_pc_type": "jacobi", "mg_levels_ksp_max_it": 3},
         mesh={"n": 16},

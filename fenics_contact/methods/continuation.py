@@ -2,11 +2,11 @@
 
 Newton's method finds the solution of soft contact from far away, and that of stiff contact from the
 solution of one that is a little softer: the points that are closed, stick and slip are nearly those
-of the next one, and for a given status the equations are linear, or nearly so. Where a step of the
-stiffness does not succeed, a smaller one may. Where none does, the branch of solutions may end, as
-it can with friction, and the alternation finds another. Soft contact that cannot bear the load says
-nothing of stiffer contact, which given displacements squeeze more: it is passed over. A start that
-is as near to the solution as that of a softer problem would be is not softened.
+of the next one, and for a given status the equations are linear, or nearly so. Where it fails the
+primal-dual method is tried from the same start, if the equations are for it; where a step of the
+stiffness does not succeed, a smaller one may. Soft contact that has no solution says nothing of
+stiffer contact, which given displacements squeeze more: it is passed over. A start that is as near
+to the solution as that of a softer problem would be is not softened.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact import compat
-from fenics_contact.methods.method import OVERLOADED, InnerSnes, OwnMethod, Tools
+from fenics_contact.methods.method import InnerSnes, OwnMethod, Tools
 
 __all__ = ["Continuation"]
 
@@ -38,7 +38,7 @@ _OPTIONS = {
 # Factor of the stiffness from one problem to the next, and the least that is tried.
 _FACTOR = 10.0
 _LEAST_FACTOR = 1.2
-# Newton iterations in all before it is given up; what it solves takes 600 at most.
+# Iterations in all before it is given up; what it solves takes 600 at most.
 _MAX_ITERATIONS = 1000
 # Residual of the softer problems, as a share of the forces: they are starts, not results.
 _COARSE = 1e-3
@@ -55,17 +55,17 @@ class Continuation(OwnMethod):
     def __init__(self, tools: Tools) -> None:
         """Set up SNES; the matrix is that of the consistent tangent. Collective."""
         equations = self._equations = tools.equations
-        self._otherwise = tools.others["alternating"]
         solver = tools.linear_solver(equations.symmetric(True))
         both = tools.prefix, "continuation_"
         self._newton = InnerSnes(equations, tools.defaults, both, _OPTIONS, solver, consistent=True)
         self.snes = self._newton.snes
+        self._otherwise = tools.others["primal_dual"]
         self.by_newton = False
         self._coarse = 0.0
         self._whole: list[float] = []  # of each contact
 
     def solve(self) -> tuple[int, int]:
-        """See `Method.solve`. Iterations are Newton's, in all."""
+        """See `Method.solve`. Iterations are those of all stiffnesses."""
         equations = self._equations
         this: Continuation = weakref.proxy(self)
         self._newton.attach(
@@ -78,44 +78,29 @@ class Continuation(OwnMethod):
         near = soft < 1.0 and equations.solved(_COARSE)
         share = 1.0 if near else soft
         iterations, solved, factor, kept = 0, 0.0, _FACTOR, equations.solution.copy()
-        passed_over = False  # whether ``kept`` is no solution at ``solved``
         try:
-            while True:
+            while iterations <= _MAX_ITERATIONS:
                 self._soften(share)
                 made, reason = self._solve_one()
                 iterations += made
                 self.by_newton = reason > 0
-                if reason <= 0:
-                    kept.copy(equations.solution)
-                    if near:
-                        near, share = False, soft
-                        continue
-                    if solved and not passed_over and factor > _LEAST_FACTOR:
-                        factor = np.sqrt(factor)
-                        share = min(1.0, factor * solved)
-                        continue
-                    factor = _FACTOR
-                    share = min(1.0, factor * solved) if solved else share
-                    if share == 1.0 or not passed_over:
-                        self._soften(share)
-                        made, reason = self._otherwise.solve()
-                        iterations += made
-                        logger.debug("alternated at %.3g of stiffness: reason %d", share, reason)
-                        passed_over = reason == OVERLOADED and share < 1.0
-                    if passed_over:
-                        kept.copy(equations.solution)
-                        solved = share
-                        share = min(1.0, factor * solved)
-                        continue
-                passed_over = False
-                if reason <= 0 or share == 1.0:
+                if share == 1.0 and (reason > 0 or not (near or solved)):
                     return iterations, reason
-                if iterations > _MAX_ITERATIONS:
-                    return iterations, int(PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT)
-                logger.debug("%.3g of the stiffness, %d iterations so far", share, iterations)
-                solved = share
-                equations.solution.copy(kept)
-                share = min(1.0, factor * solved)
+                if reason > 0:
+                    logger.debug("%.3g of the stiffness, %d iterations so far", share, iterations)
+                    solved = share
+                    equations.solution.copy(kept)
+                else:
+                    kept.copy(equations.solution)
+                    if solved:
+                        factor = np.sqrt(factor)
+                if factor < _LEAST_FACTOR:
+                    return iterations, reason
+                if near:
+                    near, share = False, soft
+                else:
+                    share = min(1.0, factor * (solved or share))
+            return iterations, int(PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT)
         finally:
             self._soften(1.0)
             equations.forget_h0()
@@ -127,9 +112,17 @@ class Continuation(OwnMethod):
         self._coarse = _COARSE if share < 1.0 else 0.0
 
     def _solve_one(self) -> tuple[int, int]:
-        """Iterations and reason of Newton's method for the present stiffness. Collective."""
-        self._equations.watch.start()
-        return self._newton.solve()
+        """Iterations and reason for the present stiffness. Collective."""
+        equations = self._equations
+        equations.watch.start()
+        start = equations.solution.copy()
+        made, reason = self._newton.solve()
+        if reason <= 0 and self._otherwise.suits:
+            start.copy(equations.solution)
+            more, reason = self._otherwise.solve()
+            made += more
+        start.destroy()
+        return made, reason
 
     def _test(self) -> int:
         reasons = PETSc.SNES.ConvergedReason

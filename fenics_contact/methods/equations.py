@@ -60,8 +60,8 @@ class Equations:
         by_cycle: Whether H₀ is a V-cycle, which serves for its matrix as for the tangent.
         hierarchy: Its levels.
         factorisations: Of sparse matrices, counted.
-        free_parts: Bodies and free obstacles in a group of which contact left a rigid-body mode free
-            in the consistent tangent that was assembled last, (n_parts,).
+        free_parts: Bodies and free obstacles of groups with a rigid-body mode that contact left
+            free in the consistent tangent assembled last, (n_parts,).
         overload: By what the load outdid friction where `friction_needed` looked last, if it did.
     """
 

@@ -34,7 +34,7 @@ _FELL, _NOTHING = 0.2, 1e-10
 
 def solve_in_rounds(
     equations: Equations,
-    iterate: Callable[[float, bool, bool], tuple[int, list[Attempt]]],
+    iterate: Callable[[float, bool], tuple[int, list[Attempt]]],
     ahead: float,
     stiffness_changed: bool,
     load_before: Array,
@@ -45,9 +45,8 @@ def solve_in_rounds(
 
     Args:
         equations: What is solved.
-        iterate: A solution, from a start by how much of an increment is ahead, by whether the
-            bulk's tangent has changed, and by whether friction could not bear the load in the last
-            round: its reason as SNES has it, and what was tried.
+        iterate: A solution, from a start by how much of an increment is ahead, and by whether the
+            bulk's tangent has changed: its reason as SNES has it, and what was tried.
         ahead: Size of the increment in units of the last one.
         stiffness_changed: Whether the bulk's tangent is another one than in the last increment.
         load_before: External forces at this rank's unknowns in the committed state (force).
@@ -57,16 +56,16 @@ def solve_in_rounds(
     """
     augmented = [c for c in equations.contacts if c.multipliers is not None]
     if not augmented:
-        return *iterate(ahead, stiffness_changed, False), 1
+        return *iterate(ahead, stiffness_changed), 1
     _shrink(equations, load_before)
     attempts: list[Attempt] = []
-    exact = overloaded = False
+    exact = False
     # The first solutions need not be better than the multipliers they are found with.
     equations.round_rtol = _FIRST_ROUND
     try:
         for number in range(1, _MAX_ROUNDS + 1):
             start = equations.system.state()
-            reason, tried = iterate(ahead, stiffness_changed, overloaded)
+            reason, tried = iterate(ahead, stiffness_changed)
             _append(attempts, tried)
             overloaded = reason == OVERLOADED
             if reason <= 0 and not overloaded:
