@@ -300,7 +300,8 @@ class Newton(SnesMethod):
             return 1.0
         enough = 1.0 - _DECREASE * self._step
         self._step /= 2
-        return float(np.min(sizes / self._sizes) / enough) ** 2
+        level = float(np.min(sizes / self._sizes)) / enough
+        return level * level  # infinite where it overflows
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`."""
