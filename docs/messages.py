@@ -20,7 +20,8 @@ HOLE = "…"
 # More ways than this to fill a hole are left open.
 _MOST = 4
 # Functions whose strings are parts of a verdict, and of what is told of an attempt.
-_VERDICT, _ATTEMPT = {"failures"}, {"chattering", "in_words"}
+_VERDICT = {"failures", "hidden_by_round_off", "limit_point"}
+_ATTEMPT = {"chattering", "in_words"}
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class NotConverged(RuntimeError):
         self.increment, self.reason, self.verdict = increment, reason, verdict
         self.attempts = tuple(attempts)
         self.iterations = sum(attempt.iterations for attempt in attempts)
-        failures = [*verdict.failures, *_round_off(verdict)]
+        failures = [*verdict.failures, *hidden_by_round_off(verdict)]
         what = "; ".join(failures) or "the last state passes the verification"
         tried = ". ".join(str(attempt) for attempt in attempts)
         super().__init__(
@@ -53,8 +53,13 @@ class NotConverged(RuntimeError):
             + f"; -{prefix}snes_monitor shows the iterations"
         )
 
+    def add(self, remark: str) -> None:
+        """Append a remark to the text, if it is not empty."""
+        if remark:
+            self.args = (f"{self.args[0]}; {remark}",)
 
-def _round_off(verdict: Verdict) -> list[str]:
+
+def hidden_by_round_off(verdict: Verdict) -> list[str]:
     """What passes, and may be why the rest does not: round-off hides the equilibrium of a body."""
     return [
         f"the forces on {name} have a residual with a round-off of {balance.round_off:.3e}: its "

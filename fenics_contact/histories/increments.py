@@ -21,7 +21,7 @@ from fenics_contact.histories import checkpoint as states
 from fenics_contact.histories.progress import Bar
 from fenics_contact.histories.table import Table
 from fenics_contact.methods.attempt import Attempt
-from fenics_contact.parallel import collective_errors, warn
+from fenics_contact.parallel import collective_errors, global_sum, warn
 from fenics_contact.problem import ContactProblem
 from fenics_contact.step import Step
 from fenics_contact.types import Array
@@ -32,6 +32,9 @@ logger = logging.getLogger("fenics_contact")
 
 # Increments in a row without failure after which a cut one may grow again.
 _PATIENCE = 2
+# Towards a maximum of the load the displacement per load grows as 1/√(distance): from this factor
+# on, by the mean of the history, a maximum is named where increments fail.
+_LIMIT_POINT = 2.0
 # Load parameters that differ by no more than this, relative to the way, are the same.
 _SAME = 1e-9
 
@@ -338,6 +341,7 @@ def _history(
                 failed += failure.attempts
                 if at.cuts == max_cuts:
                     failure.attempts = tuple(failed)
+                    failure.add(at.limit_point())
                     problem.complete()
                     raise
                 at.cut(abs(goal - at.load))
@@ -351,7 +355,7 @@ def _history(
                     )
                 continue
             problem.commit()
-            at.advance(goal)
+            at.advance(goal, problem)
             halves = halves[1:]
             found = None
             if estimate and not halves:
@@ -563,6 +567,9 @@ class _Progress:
         largest: Largest size of the next one, infinite where none was cut.
         cuts: How often increments have been halved and not doubled since.
         successes: Increments since the last halving or doubling.
+        change: Norm of the change of the unknowns in the last increment (length).
+        way: Sum of these over all increments.
+        travelled: Sum of the sizes of all increments.
     """
 
     load: float
@@ -570,16 +577,37 @@ class _Progress:
     largest: float = np.inf
     cuts: float = 0
     successes: float = 0
+    change: float = 0.0
+    way: float = 0.0
+    travelled: float = 0.0
 
     def cut(self, tried: float) -> None:
         self.largest, self.cuts, self.successes = tried / 2, self.cuts + 1, 0
 
-    def advance(self, goal: float) -> None:
+    def advance(self, goal: float, problem: ContactProblem) -> None:
+        """Take note of the increment that was committed. Collective."""
         self.last, self.load = goal - self.load, goal
+        change = problem.state.change
+        assert change is not None
+        squares = global_sum(problem.u.function_space.mesh.comm, float(change @ change))
+        self.change = float(np.sqrt(squares))
+        self.way += self.change
+        self.travelled += abs(self.last)
         self.successes += 1
         if self.cuts and self.successes >= _PATIENCE:
             self.cuts, self.successes = self.cuts - 1, 0
             self.largest = 2 * self.largest if self.cuts else np.inf
+
+    def limit_point(self) -> str:
+        """What to try where the load seems to have a maximum; empty where it does not."""
+        if not self.change * self.travelled > _LIMIT_POINT * self.way * abs(self.last):
+            return ""
+        grown = self.change * self.travelled / (self.way * abs(self.last))
+        return (
+            f"displacements per load are {grown:.2g} times the mean of this history: the load may "
+            "have a maximum here (a limit point, as in snap-through or separation); prescribe a "
+            "displacement instead of a force"
+        )
 
 
 def _setter(load: fem.Constant | Callable[[float], None]) -> Callable[[float], None]:

@@ -1,0 +1,97 @@
+"""A load that has a maximum: the error says so, and by displacement it is passed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from ufl.core.expr import Expr
+
+import fenics_contact as fc
+from fenics_contact.laws.base import ContactTraction, Law, PointKinematics
+from scenes.blocks import TOP, block
+from scenes.comparing import raised_everywhere
+
+pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
+PEAK, REACH = 2.0, 0.01
+
+
+@dataclass(frozen=True)
+class Separation(Law):
+    """r_n = e t₀ (g/d) exp(-g/d): it pulls with t₀ at most, at the gap d (Xu and Needleman)."""
+
+    strength: float
+    reach: float
+
+    @property
+    def has_tension(self) -> bool:
+        """It pulls where open."""
+        return True
+
+    def contact_traction(
+        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
+    ) -> ContactTraction:
+        """Of the gap alone."""
+        x = kinematics.gap / parameters["reach"]
+        opening, penetration = ufl.max_value(kinematics.gap, 0), ufl.max_value(-kinematics.gap, 0)
+        pull = np.e * parameters["strength"] * x * ufl.exp(-x)
+        return ContactTraction(pull, opening, penetration)
+
+    def normal_potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
+        """Its derivative by the gap is r_n."""
+        d = parameters["reach"]
+        return -np.e * parameters["strength"] * (kinematics.gap + d) * ufl.exp(-kinematics.gap / d)
+
+
+def pulled(by):
+    """A block of the size 1 that is glued to the floor, and pulled at its top by "force" or not."""
+    scene = block("quadrilateral", n=2, E=1e3, nu=0.0, up=0.0)
+    led = fem.Constant(scene.mesh, 0.0)
+    bcs = [] if by == "force" else [scene.hold(TOP, 1, led)]
+    options = {"small_displacement_tolerance": np.inf}
+    problem, contact = scene.problem(Separation(PEAK, REACH), [*scene.rollers(), *bcs], **options)
+
+    def load(value):
+        scene.load(up=value) if by == "force" else setattr(led, "value", value)
+
+    return problem, contact, load
+
+
+def test_a_force_ends_at_the_maximum():
+    """Closed form: the load that area and strength can bear, to the least increment, 0.25/64."""
+    problem, _, load = pulled("force")
+    reached = []
+
+    def history():
+        for step in fc.increments(problem, load, 0.0, 2.5, steps=10):
+            reached.append(step.load)
+
+    raised_everywhere(history, fc.NotConverged, "limit point", "prescribe a displacement")
+    assert PEAK - 2 * 0.25 / 64 <= reached[-1] <= PEAK
+
+
+def test_a_displacement_passes_it():
+    """Closed form: column and glue in series, p = u/(1/E) - g = r_n(g), before and behind."""
+    problem, _, load = pulled("displacement")
+    forces = []
+    for step in fc.increments(problem, load, 0.0, 5 * REACH, steps=25):
+        force = step.contacts["contact"].force[1]
+        gap = step.load + force / 1e3  # the force on the block is downwards
+        assert -force == pytest.approx(np.e * PEAK * gap / REACH * np.exp(-gap / REACH), rel=1e-6)
+        forces.append(-force)
+    assert max(forces) == pytest.approx(PEAK, rel=2e-2) and forces[-1] < 0.3 * PEAK
+
+
+def test_what_fails_before_is_no_maximum():
+    """Without iterations nothing converges, wherever the load is: nothing is said of a maximum."""
+    problem, _, load = pulled("force")
+    history = fc.increments(problem, load, 0.0, 1.0, steps=4)
+    next(history)
+    problem.solver.main.max_it = 0
+    with pytest.raises(fc.NotConverged) as caught:
+        list(history)
+    assert "limit point" not in str(caught.value)
