@@ -78,7 +78,7 @@ def draw_fine(seed: int, family: int, stiffer: float = 1.0) -> Scene:
 
 
 def draw_stiff(seed: int, family: int) -> Scene:
-    """The same, contact 30 times as stiff, by E/h."""
+    """The same, contact of 30 times the stiffness that is drawn, always by E/h."""
     return draw_fine(seed, family, stiffer=30.0)
 
 

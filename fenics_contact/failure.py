@@ -56,7 +56,7 @@ class NotConverged(RuntimeError):
     def add(self, remark: str) -> None:
         """Append a remark to the text, if it is not empty."""
         if remark:
-            self.args = (f"{self.args[0]}; {remark}",)
+            self.args = (f"{self.args[0]}. {remark}",)
 
 
 def hidden_by_round_off(verdict: Verdict) -> list[str]:

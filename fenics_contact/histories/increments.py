@@ -355,7 +355,7 @@ def _history(
                     )
                 continue
             problem.commit()
-            at.advance(goal, problem)
+            at.advance(goal, problem if step.complete and not behind else None)
             halves = halves[1:]
             found = None
             if estimate and not halves:
@@ -567,9 +567,9 @@ class _Progress:
         largest: Largest size of the next one, infinite where none was cut.
         cuts: How often increments have been halved and not doubled since.
         successes: Increments since the last halving or doubling.
-        change: Norm of the change of the unknowns in the last increment (length).
-        way: Sum of these over all increments.
-        travelled: Sum of the sizes of all increments.
+        change: Norm of the change of the unknowns in the last increment; 0 if it is unknown.
+        way: Sum of these.
+        travelled: Sum of the sizes of the increments where it is known.
     """
 
     load: float
@@ -584,15 +584,20 @@ class _Progress:
     def cut(self, tried: float) -> None:
         self.largest, self.cuts, self.successes = tried / 2, self.cuts + 1, 0
 
-    def advance(self, goal: float, problem: ContactProblem) -> None:
-        """Take note of the increment that was committed. Collective."""
-        self.last, self.load = goal - self.load, goal
-        change = problem.state.change
-        assert change is not None
-        squares = global_sum(problem.u.function_space.mesh.comm, float(change @ change))
-        self.change = float(np.sqrt(squares))
-        self.way += self.change
-        self.travelled += abs(self.last)
+    def advance(self, goal: float, problem: ContactProblem | None) -> None:
+        """Take note of the increment that was committed. Collective.
+
+        Args:
+            goal: Load parameter at its end.
+            problem: Whose; None if the interior displacement was not up to date at both ends.
+        """
+        self.last, self.load, self.change = goal - self.load, goal, 0.0
+        if problem is not None and problem.state.change is not None:
+            change = problem.state.change
+            squares = global_sum(problem.u.function_space.mesh.comm, float(change @ change))
+            self.change = float(np.sqrt(squares))
+            self.way += self.change
+            self.travelled += abs(self.last)
         self.successes += 1
         if self.cuts and self.successes >= _PATIENCE:
             self.cuts, self.successes = self.cuts - 1, 0
@@ -604,7 +609,7 @@ class _Progress:
             return ""
         grown = self.change * self.travelled / (self.way * abs(self.last))
         return (
-            f"displacements per load are {grown:.2g} times the mean of this history: the load may "
+            f"Displacements per load are {grown:.2g} times the mean of this history: the load may "
             "have a maximum here (a limit point, as in snap-through or separation); prescribe a "
             "displacement instead of a force"
         )

@@ -110,7 +110,7 @@ class Callbacks:
         snes: PETSc.SNES,
         residual: Callable[[PETSc.Vec, PETSc.Vec], None],
         vector: PETSc.Vec,
-        measure: Callable[[PETSc.Vec], float],
+        measure: Callable[[PETSc.Vec, PETSc.Vec], float],
     ) -> None:
         """Give the line search of SNES a measure of the residual that it is to lower.
 
@@ -118,13 +118,13 @@ class Callbacks:
             snes: The solver.
             residual: As for `attach`.
             vector: For the residual, not that of SNES.
-            measure: Of a residual that is finite.
+            measure: Of x and a residual there that is finite.
         """
 
         def level(_: Any, x: PETSc.Vec) -> float:
             self._compute(residual, x, vector)
             finite = np.isfinite(vector.norm())
-            return float(self._run(measure, vector, otherwise=np.nan)) if finite else np.nan
+            return float(self._run(measure, x, vector, otherwise=np.nan)) if finite else np.nan
 
         snes.setObjective(level)
 

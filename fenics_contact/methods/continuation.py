@@ -49,7 +49,7 @@ class Continuation(OwnMethod):
 
     Attributes:
         snes: Newton's method for one stiffness, prefix "continuation_" behind the problem's.
-        by_newton: Whether that found the last solution.
+        by_newton: Whether there was a solution the last time.
     """
 
     def __init__(self, tools: Tools) -> None:
@@ -81,7 +81,7 @@ class Continuation(OwnMethod):
         try:
             while iterations <= _MAX_ITERATIONS:
                 self._soften(share)
-                made, reason = self._solve_one()
+                made, reason = self._solve_one(softer=solved > 0.0 or share < 1.0)
                 iterations += made
                 self.by_newton = reason > 0
                 if share == 1.0 and (reason > 0 or not (near or solved)):
@@ -111,13 +111,17 @@ class Continuation(OwnMethod):
             contact.stiffness_factor.value = share * whole
         self._coarse = _COARSE if share < 1.0 else 0.0
 
-    def _solve_one(self) -> tuple[int, int]:
-        """Iterations and reason for the present stiffness. Collective."""
+    def _solve_one(self, *, softer: bool) -> tuple[int, int]:
+        """Iterations and reason for the present stiffness. Collective.
+
+        Args:
+            softer: Whether the start is, or the problem: else the primal-dual method had its turn.
+        """
         equations = self._equations
         equations.watch.start()
         start = equations.solution.copy()
         made, reason = self._newton.solve()
-        if reason <= 0 and self._otherwise.suits:
+        if reason <= 0 and softer and self._otherwise.suits:
             start.copy(equations.solution)
             more, reason = self._otherwise.solve()
             made += more

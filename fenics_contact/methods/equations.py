@@ -60,8 +60,8 @@ class Equations:
         by_cycle: Whether H₀ is a V-cycle, which serves for its matrix as for the tangent.
         hierarchy: Its levels.
         factorisations: Of sparse matrices, counted.
-        free_parts: Bodies and free obstacles of groups with a rigid-body mode that contact left
-            free in the consistent tangent assembled last, (n_parts,).
+        free_parts: Bodies and free obstacles of groups with a rigid-body mode along which the
+            consistent tangent assembled last is regularised, (n_parts,).
         overload: By what the load outdid friction where `friction_needed` looked last, if it did.
     """
 

@@ -14,6 +14,7 @@ from petsc4py import PETSc
 from fenics_contact.methods.callbacks import Callbacks
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.options import Defaults
+from fenics_contact.parallel import global_sum
 from fenics_contact.systems import linear
 from fenics_contact.types import Array
 
@@ -245,7 +246,7 @@ class Newton(SnesMethod):
         """See `SnesMethod`."""
         super().__init__(equations, snes, gives_up)
         self._sizes: Array | None = None  # of the correction and the residual at the iterate
-        self._step = 1.0  # length of the step that is tried
+        self._iterate: Array = np.zeros(0)
 
     @classmethod
     def main_options(cls) -> Mapping[str, Any]:
@@ -270,15 +271,15 @@ class Newton(SnesMethod):
             self.snes,
             lambda x, f: this._compute_residual(x, f),
             self._equations.function.duplicate(),
-            lambda f: this._level(f),
+            lambda x, f: this._level(x, f),
         )
 
     def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
         super()._compute_jacobian(x, J)
         self._sizes = None
 
-    def _level(self, f: PETSc.Vec) -> float:
-        """min(|J⁻¹f| / |J⁻¹f₀|, |f| / |f₀|)² of a trial residual f. Collective.
+    def _level(self, x: PETSc.Vec, f: PETSc.Vec) -> float:
+        """min(|J⁻¹f| / |J⁻¹f₀|, |f| / |f₀|)² of a residual f at a trial x. Collective.
 
         J is the tangent and f₀ the residual of the iterate from which the line search starts, where
         it asks first. The first ratio is the natural level function (P. Deuflhard, Newton Methods
@@ -296,10 +297,12 @@ class Newton(SnesMethod):
         sizes = np.array([correction.norm() if found else np.inf, f.norm()])
         correction.destroy()
         if self._sizes is None:
-            self._sizes, self._step = sizes, 1.0
+            self._sizes, self._iterate = sizes, x.array_r.copy()
             return 1.0
-        enough = 1.0 - _DECREASE * self._step
-        self._step /= 2
+        # Nor is the first step that is tried the whole one where that is too long.
+        moved = np.sum((x.array_r - self._iterate) ** 2)
+        share = np.sqrt(global_sum(self._equations.full.unknowns.comm, moved)) / self._sizes[0]
+        enough = 1.0 - _DECREASE * min(1.0, float(share))
         level = float(np.min(sizes / self._sizes)) / enough
         return level * level  # infinite where it overflows
 

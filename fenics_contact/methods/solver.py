@@ -289,13 +289,13 @@ class Solver:
         return obstacle is None
 
     def _choose_method(self) -> str:
-        """Newton's method, on displacements and tractions by multigrid, or L-BFGS.
+        """Newton's method, or by multigrid the primal-dual one, or L-BFGS.
 
-        By multigrid the former took 5 to 38 iterations in each increment of a dragged ball, on
-        16 and 24 cells a side, and 0.9 to 1.1 times the time of L-BFGS at k_n = 10 E/h, 0.5 at 100,
-        and 0.2 or less at 1000. L-BFGS is for the other laws there, and for linear bodies in space
-        on all unknowns, where a tangent costs dozens of iterations with an older one. Bodies that
-        contact alone holds L-BFGS leaves where its H₀ lets them drift.
+        By multigrid the primal-dual method took 4 to 38 iterations in each increment of a dragged
+        ball, on 16 and 24 cells a side, and 0.9 to 1.1 times the time of L-BFGS at k_n = 10 E/h,
+        0.5 at 100, and 0.2 or less at 1000. L-BFGS is for what that is not for, and for linear
+        bodies in space on all unknowns, where a tangent costs dozens of iterations with an older
+        one. Bodies that contact alone holds L-BFGS leaves where its H₀ lets them drift.
         """
         full = self._full
         if self.condensed or not full.bulk.linear:
@@ -519,7 +519,7 @@ class Solver:
         """What is tried after a failure, in this order, if loads can be balanced. Collective.
 
         Minimisation problems, which tell whether friction can bear the load, come first where the
-        pressures at the start say that it cannot: those where a method has failed tell nothing.
+        pressures at the start say that it cannot; pressures of a failed iterate tell nothing.
 
         Raises:
             ValueError: Contact cannot balance the load on a nonlinear body (`LoadBalance.check`),
@@ -538,7 +538,7 @@ class Solver:
             LoadBalance(equations.motions).check(self._full.load, self._full.operators)
         if not goes_on:
             return []
-        overloaded = equations.friction_needed() > 1.0
+        overloaded = 1.0 < equations.friction_needed() < np.inf  # infinite: nothing is borne yet
         order = (_DIAGNOSIS, *_FALLBACKS) if overloaded else (*_FALLBACKS, _DIAGNOSIS)
         return [name for name in order if name != self.method and self.methods[name].suits]
 
