@@ -43,6 +43,7 @@ class NotConverged(RuntimeError):
         self.increment, self.reason, self.verdict = increment, reason, verdict
         self.attempts = tuple(attempts)
         self.iterations = sum(attempt.iterations for attempt in attempts)
+        self._remarks: list[str] = []
         failures = [*verdict.failures, *hidden_by_round_off(verdict)]
         what = "; ".join(failures) or "the last state passes the verification"
         tried = ". ".join(str(attempt) for attempt in attempts)
@@ -55,8 +56,11 @@ class NotConverged(RuntimeError):
 
     def add(self, remark: str) -> None:
         """Append a remark to the text, if it is not empty."""
-        if remark:
-            self.args = (f"{self.args[0]}. {remark}",)
+        self._remarks += [remark] * bool(remark)
+
+    def __str__(self) -> str:
+        """Return the text with its remarks."""
+        return ". ".join([super().__str__(), *self._remarks])
 
 
 def hidden_by_round_off(verdict: Verdict) -> list[str]:
