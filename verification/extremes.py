@@ -602,8 +602,8 @@ def page(rows: list[Row]) -> str:
     lines += ["![Effect of the contact stiffness](extremes-stiffness.png)", ""]
     lines += report.text(
         "*Left: SNES iterations of one increment, of all attempts. With μ = 0.3 and k_n h/E of 1e4 "
-        "or more the direct methods mostly fail from the unloaded state, and continuation in the "
-        "contact stiffness takes over. Right: a penalty ε = E\\*/(k_n a) changes Hertz's peak "
+        "or more Newton's method and L-BFGS mostly fail from the unloaded state, and other methods "
+        "take over. Right: a penalty ε = E\\*/(k_n a) changes Hertz's peak "
         "pressure by at most ε (contact half-width a); for ε > 1 the contact behaves as an elastic "
         "foundation, whose peak pressure is then the reference. The mesh has ten cells in a; 1 % "
         "is allowed for it.*"

@@ -538,7 +538,7 @@ class Solver:
             LoadBalance(equations.motions).check(self._full.load, self._full.operators)
         if not goes_on:
             return []
-        overloaded = 1.0 < equations.friction_needed() < np.inf  # infinite: nothing is borne yet
+        overloaded = equations.friction_needed() > 1.0
         order = (_DIAGNOSIS, *_FALLBACKS) if overloaded else (*_FALLBACKS, _DIAGNOSIS)
         return [name for name in order if name != self.method and self.methods[name].suits]
 
