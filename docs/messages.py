@@ -20,7 +20,7 @@ HOLE = "…"
 # More ways than this to fill a hole are left open.
 _MOST = 4
 # Functions whose strings are parts of a verdict, and of what is told of an attempt.
-_VERDICT = {"failures", "hidden_by_round_off", "limit_point"}
+_VERDICT = {"failures", "hidden_by_round_off", "limit_point", "round_off_in_words"}
 _ATTEMPT = {"chattering", "in_words"}
 
 

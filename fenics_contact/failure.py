@@ -66,10 +66,9 @@ class NotConverged(RuntimeError):
 def hidden_by_round_off(verdict: Verdict) -> list[str]:
     """What passes, and may be why the rest does not: round-off hides the equilibrium of a body."""
     return [
-        f"the forces on {name} have a residual with a round-off of {balance.round_off:.3e}: its "
-        "stiffness, or its rigid-body displacement, is too large relative to the forces"
+        f"the forces on {name} have a residual {balance.round_off_in_words}"
         for name, balance in verdict.equations.items()
-        if balance.holds(2.0) and balance.round_off > balance.tolerance
+        if balance.holds(2.0) and balance.hides_balance
     ]
 
 

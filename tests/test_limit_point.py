@@ -53,17 +53,17 @@ def pulled(by):
     led = fem.Constant(scene.mesh, 0.0)
     bcs = [] if by == "force" else [scene.hold(TOP, 1, led)]
     options = {"small_displacement_tolerance": np.inf}
-    problem, contact = scene.problem(Separation(PEAK, REACH), [*scene.rollers(), *bcs], **options)
+    problem, _ = scene.problem(Separation(PEAK, REACH), [*scene.rollers(), *bcs], **options)
 
     def load(value):
         scene.load(up=value) if by == "force" else setattr(led, "value", value)
 
-    return problem, contact, load
+    return problem, load
 
 
 def test_a_force_ends_at_the_maximum():
     """Closed form: the load that area and strength can bear, to the least increment, 0.25/64."""
-    problem, _, load = pulled("force")
+    problem, load = pulled("force")
     reached = []
 
     def history():
@@ -76,7 +76,7 @@ def test_a_force_ends_at_the_maximum():
 
 def test_a_displacement_passes_it():
     """Closed form: column and glue in series, p = u/(1/E) - g = r_n(g), before and behind."""
-    problem, _, load = pulled("displacement")
+    problem, load = pulled("displacement")
     forces = []
     for step in fc.increments(problem, load, 0.0, 5 * REACH, steps=25):
         force = step.contacts["contact"].force[1]
@@ -88,7 +88,7 @@ def test_a_displacement_passes_it():
 
 def test_what_fails_before_is_no_maximum():
     """Without iterations nothing converges, wherever the load is: nothing is said of a maximum."""
-    problem, _, load = pulled("force")
+    problem, load = pulled("force")
     history = fc.increments(problem, load, 0.0, 1.0, steps=4)
     next(history)
     problem.solver.main.max_it = 0

@@ -65,12 +65,20 @@ class ForceBalance:
     def __str__(self) -> str:
         """Return residual, tolerance and forces in words."""
         found = f"{self.residual:.3e} above {self.tolerance:.3e}, of forces of {self.force:.3e}"
-        if self.round_off > self.tolerance:
-            found += (
-                f", with a round-off of {self.round_off:.3e}: its stiffness, or its rigid-body "
-                "displacement, is too large relative to the forces"
-            )
-        return found
+        return found + (f", {self.round_off_in_words}" if self.hides_balance else "")
+
+    @property
+    def hides_balance(self) -> bool:
+        """Whether the round-off of the internal forces is above the tolerance."""
+        return self.round_off > self.tolerance
+
+    @property
+    def round_off_in_words(self) -> str:
+        """The round-off, and where it comes from, in words."""
+        return (
+            f"with a round-off of {self.round_off:.3e}: its stiffness, or its rigid-body "
+            "displacement, is too large relative to the forces"
+        )
 
 
 @dataclass(frozen=True)

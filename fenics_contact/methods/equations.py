@@ -229,19 +229,20 @@ class Equations:
             matrix: What to fill.
             contacts: Contact's part, used up.
         """
+        filled = {c for c, m in self._matrices.items() if m.handle == matrix.handle}
+        if True in filled:  # unless ``contacts``, made while the matrix is filled, are regularised
+            self.free_parts = np.zeros_like(self.free_parts)
         self.factorisations += self.system.fill(matrix, contacts)
         self.has_round_off = True
         if self.system.pattern_changes:
             # A factorisation of another pattern is no start, whatever the matrix says, and levels
             # do not follow: there may be other unknowns in contact, too.
             self.hierarchy = Hierarchy()
-            for consistent, mine in self._matrices.items():
-                if mine.handle == matrix.handle:
-                    self.solvers[consistent].reset()
-                    self.solvers[consistent].setOperators(matrix)
-        mine = {c for c, m in self._matrices.items() if m.handle == matrix.handle}
-        self._filled |= mine
-        if self.by_cycle and False in mine:
+            for consistent in filled:
+                self.solvers[consistent].reset()
+                self.solvers[consistent].setOperators(matrix)
+        self._filled |= filled
+        if self.by_cycle and False in filled:
             stiffness, operators = self.full.stiffness, self.full.operators
             assert stiffness is not None
             self.hierarchy.follow(self.solvers[False], matrix, stiffness, operators)

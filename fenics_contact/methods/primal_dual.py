@@ -154,7 +154,6 @@ class PrimalDual(OwnMethod):
         f.scale(self._damping)
 
     def _assemble(self, matrix: PETSc.Mat) -> None:
-        self._equations.free_parts[:] = False  # nothing is regularised
         tangents = (p.operator.tangent(PointTangent(p.tangent)) for p in self._points)
         self._equations.assemble(matrix, tangents)
 
