@@ -14,9 +14,10 @@ import pytest
 import fenics_contact as fc
 from fenics_contact.types import Array
 from scenes.beside import Beside, Box
-from scenes.blocks import BOTTOM, TOP
+from scenes.blocks import BOTTOM, LEFT, TOP
 from scenes.comparing import close, raised_everywhere
 
+TIMES = np.linspace(0.25, 2.0, 8)
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(300)]
 WAYS = [
     {},
@@ -89,3 +90,38 @@ def test_a_stiff_slab_that_nothing_else_holds():
     high, low = between(1.0)
     assert close(high + low, 0 * high, 1e-8 * np.linalg.norm(high), scale=1.0)
     raised_everywhere(lambda: between(1e12), fc.NotConverged, "with a round-off of")
+
+
+@pytest.mark.each
+@pytest.mark.parametrize("E", [1.0, 2e11])
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+def test_a_load_that_a_sine_leaves_at_its_zeros(kinematics, E):
+    """1e-16 of its amplitude, on a body led by 0.3, is no load: as with a load of 0.
+
+    It was compared with itself, and refused. What is left of it changes forces by round-off of
+    those before: 1e-12 of them.
+    """
+
+    def forces(loads):
+        scene = Beside({"block": Box()}, E=E)
+        load, along = scene.bodies.constant(0.0), scene.bodies.constant(0.0)
+        scene.load("block", TOP, 1, load)
+        scene.hold("block", LEFT, 0, value=along)
+        scene.hold("block", LEFT, 1)
+        floor = fc.HalfSpace((0, -1e-3), (0, 1))
+        contact = scene.contact("block", BOTTOM, floor, fc.Coulomb(0.3), kinematics=kinematics)
+        problem = scene.problem(contact, small_displacement_tolerance=np.inf)
+        found = []
+        for time, value in zip(TIMES, loads, strict=True):
+            load.value, along.value = -1e-2 * E * value, 0.3 * time
+            problem.solve()
+            problem.commit()
+            found.append(contact.resultants().force)
+        return np.array(found)
+
+    sine = np.sin(np.pi * TIMES)
+    exact = np.where(np.isclose(sine, 0.0), 0.0, sine)
+    assert np.any((sine != 0) & (exact == 0))
+    found, expected = forces(sine), forces(exact)
+    assert np.abs(expected).max() > 1e-3 * E
+    assert np.abs(found - expected).max() <= 1e-12 * np.abs(expected).max()

@@ -106,6 +106,7 @@ class Parts:
         pairs: Sequence[Index],
         held: Mask,
         motions: Sequence[int],
+        sizes: Array,
     ) -> None:
         """Collect. Collective.
 
@@ -119,12 +120,15 @@ class Parts:
                 (n_pairs, 2); a body on a rigid obstacle is paired with itself.
             held: Which bodies Dirichlet conditions hold against every rigid motion, (n_bodies,).
             motions: Of every free obstacle the number of its contact.
+            sizes: Stiffness times size of every body, (n_bodies,) (force).
         """
         self._comm, self.label, self._touched = comm, label, touched
         self.n_bodies = len(bodies)
         self._bodies: Labels | int = label if len(bodies) > 1 else 0
         self.names = [*bodies, *contacts]
         self._motions, self._pairs, self._held = list(motions), pairs, held
+        # Loads that move no digit of a held body: those that a sine leaves at its zeros.
+        self._no_load = np.where(held, _ROUND_OFF * np.append(sizes, np.zeros(len(motions))), 0.0)
 
     def norms(
         self,
@@ -171,7 +175,8 @@ class Parts:
                 np.minimum.at(row, one, round_off[other])
         acts = pushes > np.maximum(exact, _UNLOADED_FORCE_RATIO * force)
         # A displacement that nothing holds may grow without bounds, and would excuse anything.
-        limited = (loads > 0) | (acts.any(axis=0) & ~self._held)
+        loaded = loads > self._no_load
+        limited = loaded | (acts.any(axis=0) & ~self._held)
         floor = np.where(limited, np.minimum(round_off, MOST_EXCUSED * force), round_off)
         floor = np.maximum(floor, _LEAST)
         floors = np.where(acts, np.minimum(round_off, MOST_EXCUSED * pushes), round_off)
@@ -181,7 +186,7 @@ class Parts:
             for pairs, *rows in zip(self._pairs, own, pushes, floors, blurs, strict=True)
         ]
         of_contacts = np.reshape(sides, (len(contacts), 4)).T
-        acted_on = (loads > 0) | acts.any(axis=0)
+        acted_on = loaded | acts.any(axis=0)
         of_bodies = np.array([left, force, floor, np.where(acted_on, round_off, 0.0)])
         residual, force, floor, round_off = np.concatenate([of_bodies, of_contacts], axis=1)
         return Norms(residual, force, floor, round_off, n)

@@ -132,6 +132,7 @@ class System(ABC):
                 [scales.pairs(o, i, self.label) for i, o in enumerate(self.operators)],
                 scales.held,
                 [c for c, _ in moving],
+                scales.force,
             )
             self._parts = pairings, parts
         return self._parts[1]
