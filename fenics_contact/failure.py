@@ -20,6 +20,7 @@ class NotConverged(RuntimeError):
         attempts: The attempts, in their order.
         prefix: Prefix of the problem's PETSc options.
         stiffnesses: Names of the stiffness parameters that may be lowered, the first one first.
+        driven: Whether a force drives an obstacle.
 
     Attributes:
         increment: Number of the increment, from 1.
@@ -39,6 +40,7 @@ class NotConverged(RuntimeError):
         *,
         prefix: str = "contact_",
         stiffnesses: Sequence[str] = ("k_t", "k_n"),
+        driven: bool = False,
     ) -> None:
         self.increment, self.reason, self.verdict = increment, reason, verdict
         self.attempts = tuple(attempts)
@@ -50,7 +52,7 @@ class NotConverged(RuntimeError):
         super().__init__(
             f"increment {increment} did not converge: SNES reason {reason} after {self.iterations} "
             f"iterations; {what}; the forces have magnitude {verdict.force:.3e}. Tried: {tried}. "
-            + _advice(reason, verdict, attempts, stiffnesses)
+            + _advice(reason, verdict, attempts, stiffnesses, driven=driven)
             + f"; -{prefix}snes_monitor shows the iterations"
         )
 
@@ -87,9 +89,19 @@ _OF_OVERLOAD = (
     "Try a smaller load, more friction, or a Dirichlet condition that constrains this motion"
 )
 
+_OF_A_FORCE = (
+    "prescribe the displacement of the obstacle instead of the force on it, which may have a "
+    "maximum, as in a snap fit"
+)
+
 
 def _advice(
-    reason: int, verdict: Verdict, attempts: Sequence[Attempt], stiffnesses: Sequence[str]
+    reason: int,
+    verdict: Verdict,
+    attempts: Sequence[Attempt],
+    stiffnesses: Sequence[str],
+    *,
+    driven: bool,
 ) -> str:
     """What to try, by what went wrong."""
     if reason > 0 and verdict.only_laws_fail:
@@ -101,4 +113,5 @@ def _advice(
     if not verdict.is_finite:
         return _OF_A_STATE_NOT_FINITE
     lower = [f"a lower {name}" for name in stiffnesses]
-    return "Try " + ", then ".join([", ".join(["smaller increments", *lower[:-1]]), *lower[-1:]])
+    tries = ", then ".join([", ".join(["smaller increments", *lower[:-1]]), *lower[-1:]])
+    return f"Try {tries}" + (f", or {_OF_A_FORCE}" if driven else "")

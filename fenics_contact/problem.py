@@ -545,6 +545,7 @@ class ContactProblem:
             attempts,
             prefix=self.prefix,
             stiffnesses=[name for name in ("k_t", "k_n") if name in told],
+            driven=any(contact.applied_force for contact in self.contacts),
         )
 
     def _may_lag(self) -> bool:

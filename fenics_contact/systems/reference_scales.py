@@ -27,7 +27,7 @@ from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["ReferenceScales", "body_of_points"]
 
-# Contact forces, by stiffness times size of a body, that are round-off.
+# Forces, by stiffness times size of a body, that are round-off.
 _NO_FORCE = 1e-12
 
 
@@ -185,6 +185,13 @@ class ReferenceScales:
     def is_unloaded(self, force: Array) -> Mask:
         """Which bodies bear no force but round-off, by the sum of sizes of the forces on each."""
         return np.asarray(force <= _NO_FORCE * self.force)
+
+    @property
+    def round_off_of_groups(self) -> Array:
+        """Largest force on a group of coupled parts that is round-off, (n_groups,) (force)."""
+        found = np.zeros(self.n_groups)
+        np.maximum.at(found, self.group[: self.n_bodies], _NO_FORCE * self.force)
+        return found
 
     @property
     def n_groups(self) -> int:

@@ -302,8 +302,8 @@ class RigidBodyModes:
         load: Array,
         tractions: Sequence[Array],
         idle: Mask,
-    ) -> tuple[Array, Mask]:
-        """Share of the forces on modes that contact leaves free that is not in balance. Collective.
+    ) -> tuple[Array, Array, Mask]:
+        """Forces on modes that contact leaves free that are not in balance. Collective.
 
         The tangent of friction is none along the friction of a slipping point.
 
@@ -315,14 +315,16 @@ class RigidBodyModes:
             idle: Groups of coupled parts of which all modes count as free, (n_groups,).
 
         Returns:
-            The largest share of the free modes of every group, 0 to 1, or NaN where it has none,
+            The largest share of all forces on a free mode of every group, 0 to 1, or NaN where it
+            has none, (n_groups,); the largest of these forces, 0 where it is round-off,
             (n_groups,); and which groups have modes that would be free if no point slipped.
         """
         share, rows = np.full(self._scales.n_groups, np.nan), np.arange(len(self.free))
+        force = np.zeros(len(share))
         groups = self.groups()
         loose = self.unconstrained(operators, rows, closed_only=True, slips=True)
         if not len(loose) and not idle.any():
-            return share, idle
+            return share, force, idle
         stuck = self.unconstrained(operators, rows, closed_only=True)
         open_groups = idle.copy()
         open_groups[groups[np.argmax(np.abs(stuck), axis=1)]] = True
@@ -338,9 +340,12 @@ class RigidBodyModes:
             borne += np.stack([work, np.abs(work), np.abs(then)]) @ contact.measure
         work, *sizes = global_sum(self.comm, borne)
         size = np.max([np.abs(resultant), *sizes], axis=0)
-        left = np.where(size > 0.0, np.abs(resultant + work), 0.0) / np.where(size > 0.0, size, 1.0)
-        np.fmax.at(share, groups[np.argmax(np.abs(loose), axis=1)], np.minimum(left, 1.0))
-        return share, open_groups
+        left = np.where(size > 0.0, np.abs(resultant + work), 0.0)
+        of_modes = groups[np.argmax(np.abs(loose), axis=1)]
+        np.fmax.at(share, of_modes, np.minimum(left / np.where(size > 0.0, size, 1.0), 1.0))
+        np.fmax.at(force, of_modes, left / np.abs(loose).max(axis=1))
+        force[force <= self._scales.round_off_of_groups] = 0.0
+        return share, force, open_groups
 
     def unconstrained(
         self,
