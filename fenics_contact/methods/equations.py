@@ -292,7 +292,7 @@ class Equations:
             opens = np.where((contact.status == Status.OPEN) & is_open[group], share[group], 0.0)
             opens *= closing[number]
             tangent = contact.acting.tangent().scaled(1.0 - slips)
-            yield operator.steadied(operator.tangent(tangent))
+            yield operator.tangent(tangent)
             secant = slips * _secant(contact)
             yield operator.springs(contact.springs(opens + slips, opens + secant))
 
@@ -338,7 +338,7 @@ class Equations:
 
     def tangents(self) -> Iterator[PETSc.Mat]:
         """Consistent tangents of the contacts, which are evaluated. Collective."""
-        return (operator.steadied(operator.tangent()) for operator in self.system.operators)
+        return (operator.tangent() for operator in self.system.operators)
 
     def stiffnesses(self, *, everywhere: bool) -> Iterator[PETSc.Mat]:
         """The shares αK_n + φK_t of the contacts, as evaluated.

@@ -18,7 +18,6 @@ from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.point_law import PointTangent
-from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_sum
 from fenics_contact.systems.products import PointProduct
 from fenics_contact.systems.unknowns import Selection, Unknowns
@@ -249,41 +248,6 @@ class ContactOperator:
         """
         arms = np.asarray(self.contact.opposite.turning_rate() / self._length, dtype=np.float64)
         return arms if self.within is None else np.where(self.within[:, None], arms, 0.0)
-
-    def steadied(self, tangent: PETSc.Mat) -> PETSc.Mat:
-        """Regularise the rotation dof of a tangent where all points slip. Collective.
-
-        Friction does not depend on the angle then, and the tangent is singular. The dof gets the
-        stiffness with which a Newton step removes the slip of those points that the residual moment
-        rotates back; if there are none, the stiffness of all loaded points if they stuck.
-
-        Args:
-            tangent: Result of `tangent` at the evaluated state, which is modified.
-        """
-        contact, comm = self.contact, self.unknowns.comm
-        if self._turn is None or not contact.law.has_friction:
-            return tangent
-        values, arms, area = contact.values, self._arms(), contact.area
-        closed = contact.status != Status.OPEN
-        sums = [
-            np.count_nonzero(contact.status == Status.STICK),
-            np.sum(area[:, None] * arms * values.total_traction),
-            (area * closed) @ np.einsum("qi,qij,qj->q", arms, values.tangential_stiffness, arms),
-        ]
-        n, moment, stiffness = (float(v) for v in global_sum(comm, sums))
-        if n > 0:
-            return tangent
-        left = contact.motions[-1].force - moment
-        slip = np.sum(arms * values.increment, axis=1)
-        weight = area * contact.pressure * (closed & (slip * left > 0))
-        ways = [weight @ slip, weight @ np.sum(values.tangential(arms) ** 2, axis=1)]
-        way, size = (float(v) for v in global_sum(comm, ways))
-        if way * left > 0 and size > 0:
-            stiffness = left * size / way
-        if self.unknowns.has_motions_here:
-            tangent.setValue(self._turn, self._turn, stiffness, PETSc.InsertMode.ADD_VALUES)
-        tangent.assemble()
-        return tangent
 
     def rolling(self) -> float:
         """Return the change of the rotation unknown for the least slip. Collective.
