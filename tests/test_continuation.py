@@ -28,7 +28,7 @@ def test_the_same_solution(cell, degree):
         scene, problem, contact = pressed(cell, law, method, degree=degree, n=3, side=0.06)
         step = problem.solve()
         assert [attempt.method for attempt in step.attempts] == [method]
-        assert contact.stiffness_factor.value == 1.0
+        assert contact.inputs.stiffness_factor.value == 1.0
         states.append(nodal(scene.u))
     assert close(*states, 1e-6)
 
@@ -93,7 +93,7 @@ def test_without_a_fallback_it_fails_and_says_why(caplog):
         assert "contact chatters" in text and "16 points keep changing between" in text
     x = float(attempt.outcome.split("at (")[1].split(",")[0])
     assert 0.25 < x < 0.75
-    assert contact.stiffness_factor.value == 1.0
+    assert contact.inputs.stiffness_factor.value == 1.0
 
 
 def test_every_failure_is_logged(caplog):

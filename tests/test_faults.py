@@ -60,7 +60,7 @@ def survives(made, call, kind, *words):
     raised_everywhere(call, kind, *words)
     assert identical(snapshot(made), before)
     assert made.problem.increment == increment
-    assert made.contact.stiffness_factor.value == 1.0
+    assert made.contact.inputs.stiffness_factor.value == 1.0
 
 
 def told(error):

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fenics_contact.contact.choices import is_regularised
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_min, global_sum, longest
@@ -63,13 +64,13 @@ class LinearSprings:
             direction = normal - ratio[:, None] * tangential
             k_n = np.where(closed, contact.normal_stiffness, 0.0)
             stiffness += k_n[:, None, None] * np.einsum("qi,qj->qij", direction, normal)
-            if contact.regularised:
+            if is_regularised(contact.law):
                 along = -np.sum(borne * normal, axis=1)
                 stretch += (along / contact.normal_stiffness)[:, None] * normal
         if law.has_tangential:
             k_t, stick = contact.tangential_stiffness, status == Status.STICK
             stiffness += np.where(stick[:, None, None], k_t, 0.0)
-            if contact.regularised:
+            if is_regularised(contact.law):
                 # K_t has no inverse along the normal, where nothing acts: any stiffness will do.
                 along = np.einsum("q,qi,qj->qij", values.parameters["k_t"], normal, normal)
                 side = values.tangential(borne)
@@ -197,7 +198,7 @@ def _borne_by_springs(contact: Contact) -> Array:
     As far as displacements of Γc can answer it. Zero where the stiffness is physical. Collective.
     """
     law, values = contact.law, contact.values
-    if not contact.regularised:
+    if not is_regularised(contact.law):
         return np.zeros_like(values.x)
     pressure: Array = np.zeros(len(values.x))
     if law.has_normal_stiffness:

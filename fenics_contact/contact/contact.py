@@ -18,7 +18,6 @@ from fenics_contact.contact.acting import ActingLaw
 from fenics_contact.contact.choices import (
     enforcement_of,
     is_finite,
-    is_regularised,
     opposite_of,
 )
 from fenics_contact.contact.inputs import FreeMotion, Inputs, varies
@@ -211,7 +210,7 @@ class Contact(PointResults):
             opposite=opposite,
         )
         if modulus is not None:
-            self.set_modulus(modulus)
+            self.inputs.set_modulus(modulus)
         self.gap_prescribed = gap is not None
 
         fields = {"opening": 0, "penetration": 0, "normal_traction": 0}
@@ -281,7 +280,7 @@ class Contact(PointResults):
                 f"{self.name}: the boundary form cannot couple Γc to the dofs of the opposing body;"
                 " use ContactProblem, or a ContactOperator"
             )
-        if self.needs_modulus:
+        if self.inputs.needs_modulus:
             raise ValueError(
                 f"{self.name}: k_n or k_t is a multiple of E/h, and E is not known; give "
                 "Contact(modulus=...) or k_n and k_t in stress/length, or use ContactProblem, "
@@ -372,16 +371,6 @@ class Contact(PointResults):
         return self.inputs.constants
 
     @property
-    def weight(self) -> ufl.core.expr.Expr:
-        """Factor of the surface measure (UFL)."""
-        return self.inputs.weight
-
-    @property
-    def stiffness_factor(self) -> fem.Constant:
-        """Factor of k_n and k_t: 1, except during continuation in the stiffness."""
-        return self.inputs.stiffness_factor
-
-    @property
     def free_motion(self) -> dict[int, fem.Constant]:
         """Unknown components of the obstacle's displacement, by number of the component.
 
@@ -408,24 +397,6 @@ class Contact(PointResults):
     def motions(self) -> list[FreeMotion]:
         """All unknown motions of the obstacle: displacements, then the angle."""
         return self.inputs.motions
-
-    @property
-    def needs_modulus(self) -> bool:
-        """Whether a stiffness is `RelativeStiffness` and `set_modulus` was not called yet."""
-        return self.inputs.needs_modulus
-
-    def set_modulus(self, modulus: Any) -> None:
-        """Set Young's modulus E of `RelativeStiffness`. Collective.
-
-        Args:
-            modulus: A number, or a function with one value per cell (stress).
-        """
-        self.inputs.set_modulus(modulus)
-
-    @property
-    def regularised(self) -> bool:
-        """Whether the stiffness regularises rigid contact, and is not that of a physical layer."""
-        return is_regularised(self.law)
 
     def check_input(self) -> None:
         """Check that all parameters are finite and in range at every point of Γc. Collective.

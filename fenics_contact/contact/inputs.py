@@ -314,7 +314,11 @@ class Inputs:
         return self._scale is not None and not self._scale_known
 
     def set_modulus(self, modulus: Any) -> None:
-        """See `Contact.set_modulus`."""
+        """Set Young's modulus E of `RelativeStiffness`. Collective.
+
+        Args:
+            modulus: A number, or a function with one value per cell (stress).
+        """
         if self._scale is None:
             return
         if not isinstance(modulus, fem.Function):

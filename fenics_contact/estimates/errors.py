@@ -363,7 +363,7 @@ class _Smoothed:
     def __init__(self, problem: ContactProblem, stress: Any, strain: Any) -> None:
         """Smooth. Collective."""
         mesh = problem.u.function_space.mesh
-        weight = problem.contacts[0].weight if problem.contacts else 1.0
+        weight = problem.contacts[0].inputs.weight if problem.contacts else 1.0
         degree = problem.displacement.degree
         dx = ufl.dx(mesh, metadata={"quadrature_degree": 2 * degree})
         self.stress, smooth_strain = _smoothed(mesh, [stress, strain], degree, weight, dx)

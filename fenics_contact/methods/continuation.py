@@ -71,7 +71,7 @@ class Continuation(OwnMethod):
         self._newton.attach(
             lambda x, J: this._equations.assemble_tangent(x, J), lambda: this._test()
         )
-        self._whole = [float(c.stiffness_factor.value) for c in equations.contacts]
+        self._whole = [float(c.inputs.stiffness_factor.value) for c in equations.contacts]
         soft = min(1.0, 1.0 / max(equations.hardness(), 1.0))
         # From a start as near as they are solved to, softer problems only lead away.
         equations.residual(equations.solution, equations.function)
@@ -108,7 +108,7 @@ class Continuation(OwnMethod):
     def _soften(self, share: float) -> None:
         """Let the contacts have a share of the stiffness they came with."""
         for contact, whole in zip(self._equations.contacts, self._whole, strict=True):
-            contact.stiffness_factor.value = share * whole
+            contact.inputs.stiffness_factor.value = share * whole
         self._coarse = _COARSE if share < 1.0 else 0.0
 
     def _solve_one(self, *, softer: bool) -> tuple[int, int]:

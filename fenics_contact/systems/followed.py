@@ -30,14 +30,14 @@ class FollowedModulus:
             contacts: Of the problem.
         """
         self._bulk, self._displacement = bulk, displacement
-        self._contacts = [c for c in contacts if c.needs_modulus]
+        self._contacts = [c for c in contacts if c.inputs.needs_modulus]
         self.present: fem.Function | None = None
         self.measure()
 
     def measure(self) -> None:
         """Let stiffnesses follow E of the bulk form as it is now. Collective."""
         if self._contacts:
-            weight = self._contacts[0].weight
+            weight = self._contacts[0].inputs.weight
             self.put_back(cell_modulus(self._bulk.tangent_form, self._displacement, weight))
 
     def put_back(self, modulus: fem.Function | None) -> None:
@@ -45,4 +45,4 @@ class FollowedModulus:
         self.present = modulus
         if modulus is not None:
             for contact in self._contacts:
-                contact.set_modulus(modulus)
+                contact.inputs.set_modulus(modulus)
