@@ -34,11 +34,10 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.point_law import PointTangent
 from fenics_contact.contact.values import PointValues
 from fenics_contact.methods.method import InnerSnes, OwnMethod, Tools
-from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.types import Array
 
-__all__ = ["PrimalDual", "suits_primal_dual"]
+__all__ = ["PrimalDual"]
 
 logger = logging.getLogger("fenics_contact")
 
@@ -101,7 +100,9 @@ class PrimalDual(OwnMethod):
     @property
     def suits(self) -> bool:
         """See `OwnMethod.suits`."""
-        return suits_primal_dual(self._equations.full)
+        full = self._equations.full
+        rubs = any(contact.law.has_friction for contact in full.contacts)
+        return rubs and full.bulk.linear and all(_suits(contact) for contact in full.contacts)
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`."""
@@ -156,12 +157,6 @@ class PrimalDual(OwnMethod):
     def _assemble(self, matrix: PETSc.Mat) -> None:
         tangents = (p.operator.tangent(PointTangent(p.tangent)) for p in self._points)
         self._equations.assemble(matrix, tangents)
-
-
-def suits_primal_dual(full: FullSystem) -> bool:
-    """Whether the method is for these: friction by springs, of a linear bulk."""
-    rubs = any(contact.law.has_friction for contact in full.contacts)
-    return rubs and full.bulk.linear and all(_suits(contact) for contact in full.contacts)
 
 
 def _suits(contact: Contact) -> bool:
