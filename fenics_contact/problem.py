@@ -544,7 +544,7 @@ class ContactProblem:
             attempts,
             prefix=self.prefix,
             stiffnesses=[name for name in ("k_t", "k_n") if name in told],
-            driven=any(contact.applied_force for contact in self.contacts),
+            driven=any(m.force and not m.turns for c in self.contacts for m in c.motions),
         )
 
     def _may_lag(self) -> bool:

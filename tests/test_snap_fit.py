@@ -7,14 +7,14 @@ import pytest
 
 import fenics_contact as fc
 from scenes.beside import Beside, Box
-from scenes.blocks import LEFT, TOP
+from scenes.blocks import LEFT, RIGHT, TOP
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 RADIUS, SLOPE, WAY = 2.0, 0.5, 0.5
 
 
 def pushed(by, loads, *, friction):
-    """A disc is pushed along x up a rising cantilever; force and place at every load, (n, 2)."""
+    """A disc is pushed along x up a rising cantilever; force, place and iterations, (3, n)."""
 
     def rising(x):
         return np.column_stack([x[:, 0], x[:, 1] + SLOPE * x[:, 0]])
@@ -55,3 +55,56 @@ def test_by_force_as_by_displacement(friction):
     assert np.abs(found - forces).max() <= 1e-8 * forces.max()
     assert np.abs(places - ways).max() <= 1e-6 * WAY
     assert iterations.max() <= 40  # 33, where continuation is needed; 5 to 9 elsewhere
+
+
+def step_of(gap, force, parked=()):
+    """How far the first Newton step moves a tool above an arm, driven by a force along y (length).
+
+    ``parked``: gap of a wall beside the arm, which the tool does not move.
+    """
+    scene = Beside({"arm": Box(size=(1.0, 1.0), n=(4, 4))}, E=1e3)
+    scene.hold("arm", LEFT, 0)
+    scene.hold("arm", LEFT, 1)
+    motion = fc.Motion(force=(None, force), displacement=(0.0, None))
+    tool = fc.HalfSpace((0.0, 1.0 + gap), (0, -1), displacement=motion)
+    contacts = [scene.contact("arm", TOP, tool, fc.Frictionless(), name="tool")]
+    if parked:
+        wall = fc.HalfSpace((1.0 + parked[0], 0.0), (-1, 0))
+        contacts.append(scene.contact("arm", RIGHT, wall, fc.Frictionless(), name="parked"))
+    problem = scene.problem(*contacts, condensation=False, method="newton")
+    equations = problem.solver.equations
+    equations.system.begin(problem.present_load())
+    x = equations.solution
+    x.array[:] = problem.full.state() / equations.length
+    equations.residual(x, equations.function)
+    matrix = equations.matrix(True)
+    equations.assemble_tangent(x, matrix)
+    change = equations.function.duplicate()
+    equations.solvers[True].setOperators(matrix)
+    equations.solvers[True].solve(-equations.function, change)
+    here = equations.system.unknowns.motions(change.array_r * equations.length)
+    return float(here[0])
+
+
+@pytest.mark.parametrize("gap", [1e-2, 1e-6])
+@pytest.mark.parametrize("parked", [(), (1e-7,)], ids=["alone", "beside a nearer one"])
+def test_a_step_goes_through_twice_the_gap(gap, parked):
+    """A tool above the arm, pressed down: its step is twice its gap, whatever else is how near.
+
+    To 1e-3, for the arm yields by force/E, and a closed point bears the force; and to the gap by
+    the size of the mesh, within twice of which any step ends.
+    """
+    moved = step_of(gap, -1e-7, parked)
+    assert moved == pytest.approx(-2 * gap, rel=1e-3 + gap)
+
+
+def test_a_step_away_from_what_is_near():
+    """A tool driven away from an arm meets nothing, and goes no further than twice the mesh."""
+    moved = step_of(1e-6, 1e-7)
+    assert 0 < moved <= 2 * np.sqrt(2) * (1 + 1e-6)
+
+
+def test_a_force_beyond_what_the_arm_bears():
+    """The error says to prescribe the displacement instead."""
+    with pytest.raises(fc.NotConverged, match="displacement of the obstacle instead of the force"):
+        pushed("force", [1.0], friction=0.2)

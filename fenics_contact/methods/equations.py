@@ -33,8 +33,6 @@ __all__ = ["Equations"]
 _OPEN_SHARE = 1e-3
 # The least share with which a tangent is regularised: on a mode without any force nothing is left.
 _LEAST_SHARE = 1e-6
-# Gaps by the size of the mesh that are taken for no smaller: their cubes do not overflow.
-_LEAST_GAP = 1e-64
 # An unknown with less than this share of the stiffness of its body has none.
 _FELT = 1e-12
 
@@ -274,62 +272,33 @@ class Equations:
         Slipping points of the bodies concerned get the secant stiffness of friction under the
         present pressure, with which a step along the mode goes as far as they have slipped, by the
         share of the forces on the mode that is not in balance. Open points get the stiffness with
-        which it goes as far as the nearest of them is open, where slipping points would not hold
-        the body if they stuck. With what is not in balance the regularisation vanishes, and
-        convergence stays superlinear (Levenberg-Marquardt).
+        which it closes the nearest gap (`RigidBodyModes.imbalance`), where slipping points would
+        not hold the body if they stuck. With what is not in balance the regularisation vanishes,
+        and convergence stays superlinear (Levenberg-Marquardt).
         """
-        share, force, is_open = self._imbalance()
+        share, is_open, closing = self._imbalance()
         free = ~np.isnan(share)
         self.free_parts = free[self.full.scales.group]
         if not free.any():
             yield from self.tangents()
             return
         share = np.where(free, np.maximum(share, _LEAST_SHARE), 0.0)
-        closing = self._closing(force)
         for number, operator in enumerate(self.system.operators):
             contact, group = operator.contact, self.full.scales.group_of_points(number)
             slips = np.where(contact.status == Status.SLIP, share[group], 0.0)
             opens = np.where((contact.status == Status.OPEN) & is_open[group], share[group], 0.0)
-            opens *= closing[number]
+            opens = np.where((opens > 0) & (closing[number] < 1.0), closing[number], opens)
             tangent = contact.acting.tangent().scaled(1.0 - slips)
             yield operator.tangent(tangent)
             secant = slips * _secant(contact)
             yield operator.springs(contact.springs(opens + slips, opens + secant))
 
-    def _closing(self, force: Array) -> list[Array]:
-        """Secant stiffness of open points by that of closed ones. Collective.
-
-        Springs of it bear the force if each is stretched by its gap, the nearest ones most of it.
-
-        Args:
-            force: What is not in balance, of every group of coupled parts (force).
-
-        Returns:
-            By contact, (n_points,), at most 1.
-        """
-        scales, points = self.full.scales, []
-        total: Array = np.zeros(scales.n_groups)
-        for number, contact in enumerate(self.contacts):
-            group, gap = scales.group_of_points(number), contact.gap / self.length
-            apart = (contact.status == Status.OPEN) & (gap > 0.0) & (force[group] > 0.0)
-            near = np.where(apart, 1.0 / np.where(apart, np.maximum(gap, _LEAST_GAP), 1.0), 0.0)
-            points.append((apart, near, group, contact.area * contact.values.normal_stiffness))
-            total += np.bincount(group, near**2, minlength=len(total))
-        total = scales.global_sum(total)
-        force = np.divide(force, self.length * total, where=total > 0, out=np.zeros_like(total))
-        found = []
-        for apart, near, group, closed in points:
-            shares = np.ones_like(near)
-            np.divide(force[group] * near**3, closed, where=apart & (closed > 0), out=shares)
-            found.append(np.minimum(shares, 1.0))
-        return found
-
-    def _imbalance(self) -> tuple[Array, Array, Mask]:
+    def _imbalance(self) -> tuple[Array, Mask, list[Array]]:
         """`RigidBodyModes.imbalance` at the evaluated state. Collective."""
         full = self.full
         if not len(self.motions.free):
-            nothing = np.zeros(full.scales.n_groups)
-            return np.full_like(nothing, np.nan), nothing, np.zeros_like(nothing, np.bool_)
+            free = np.full(full.scales.n_groups, np.nan)
+            return free, np.zeros_like(free, np.bool_), []
         # Of a body that was positioned round-off closes some of many points.
         load = self.motions.generalised_load(full.load)
         idle = full.contact_force_sizes() < _OPEN_SHARE * load

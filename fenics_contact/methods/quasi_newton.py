@@ -135,7 +135,9 @@ class QuasiNewton(SnesMethod):
             return False
         self._refreshed = True
         tangent = not equations.has_potential and equations.is_constrained()
-        parts = equations.tangents() if tangent else equations.stiffnesses(everywhere=False)
+        parts = equations.stiffnesses(everywhere=False)
+        if tangent:
+            parts = equations.regularised_tangents()
         consistent = tangent and not equations.by_cycle
         self._clear_pairs(consistent=consistent)
         equations.assemble(equations.matrix(consistent), parts)

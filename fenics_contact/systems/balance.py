@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["MOST_EXCUSED", "Labels", "Norms", "Parts", "by_body"]
@@ -104,9 +105,8 @@ class Parts:
         contacts: Sequence[str],
         touched: Sequence[npt.NDArray[np.int32]],
         pairs: Sequence[Index],
-        held: Mask,
+        scales: ReferenceScales,
         motions: Sequence[int],
-        sizes: Array,
     ) -> None:
         """Collect. Collective.
 
@@ -118,17 +118,14 @@ class Parts:
             touched: Unknowns of this rank that a contact feels or acts on, for every contact.
             pairs: Bodies and obstacles that a contact presses on each other, for every contact,
                 (n_pairs, 2); a body on a rigid obstacle is paired with itself.
-            held: Which bodies Dirichlet conditions hold against every rigid motion, (n_bodies,).
+            scales: Reference scales of the bodies.
             motions: Of every free obstacle the number of its contact.
-            sizes: Stiffness times size of every body, (n_bodies,) (force).
         """
         self._comm, self.label, self._touched = comm, label, touched
         self.n_bodies = len(bodies)
         self._bodies: Labels | int = label if len(bodies) > 1 else 0
         self.names = [*bodies, *contacts]
-        self._motions, self._pairs, self._held = list(motions), pairs, held
-        # Loads that move no digit of a held body: those that a sine leaves at its zeros.
-        self._no_load = np.where(held, _ROUND_OFF * np.append(sizes, np.zeros(len(motions))), 0.0)
+        self._motions, self._pairs, self._scales = list(motions), pairs, scales
 
     def norms(
         self,
@@ -175,8 +172,11 @@ class Parts:
                 np.minimum.at(row, one, round_off[other])
         acts = pushes > np.maximum(exact, _UNLOADED_FORCE_RATIO * force)
         # A displacement that nothing holds may grow without bounds, and would excuse anything.
-        loaded = loads > self._no_load
-        limited = loaded | (acts.any(axis=0) & ~self._held)
+        held = self._scales.held
+        # What a sine leaves of a load at its zeros, and moves no digit where conditions hold all.
+        none = np.append(_ROUND_OFF * self._scales.least_force, np.zeros(len(self._motions)))
+        loaded = loads > np.where(held, none, 0.0)
+        limited = loaded | (acts.any(axis=0) & ~held)
         floor = np.where(limited, np.minimum(round_off, MOST_EXCUSED * force), round_off)
         floor = np.maximum(floor, _LEAST)
         floors = np.where(acts, np.minimum(round_off, MOST_EXCUSED * pushes), round_off)

@@ -46,6 +46,7 @@ class ReferenceScales:
         mesh_size: Diagonal of the bounding box of all bodies (length).
         stiffness: Largest entry of a body on the diagonal of the bulk's tangent, (n_bodies,)
             (force/length).
+        least_force: Smallest such entry, but those that are none, times size, (n_bodies,) (force).
         group: Number of the group of coupled parts that a part belongs to, (n_parts,).
         touching: Which bodies a contact touches, with the pairs at the start of the increment,
             (n_contacts, n_bodies).
@@ -89,6 +90,7 @@ class ReferenceScales:
         n_nodes = global_sum(self._comm, np.bincount(mine, minlength=n_bodies))
         self.cell_size = np.asarray(self.size / n_nodes ** (1 / d), dtype=np.float64)
         self.stiffness: Array = np.ones(n_bodies)
+        self.least_force: Array = np.zeros(n_bodies)
         self.group: Index = np.arange(n_bodies + n_motions)
         self.touching: Mask = np.zeros((len(contacts), n_bodies), dtype=np.bool_)
         self.unloaded: Mask = np.ones(n_bodies, dtype=np.bool_)
@@ -116,9 +118,12 @@ class ReferenceScales:
             stiffness: Over all unknowns, without conditions.
         """
         diagonal = stiffness.getDiagonal()
-        largest = self.largest(np.where(self._moves, diagonal.array_r, 0.0))
+        entries = np.where(self._moves, diagonal.array_r, 0.0)
         diagonal.destroy()
+        largest = self.largest(entries)
+        inverse = self.largest(1.0 / np.where(entries > 0.0, entries, np.inf))
         self.stiffness = np.where(largest > 0, largest, 1.0)
+        self.least_force = self.size / np.where(inverse > 0, inverse, np.inf)
 
     def largest(self, values: Array) -> Array:
         """Largest absolute value of every body, at its unknowns, (n_bodies,). Collective."""
@@ -188,10 +193,10 @@ class ReferenceScales:
 
     @property
     def round_off_of_groups(self) -> Array:
-        """Largest force on a group of coupled parts that is round-off, (n_groups,) (force)."""
-        found = np.zeros(self.n_groups)
-        np.maximum.at(found, self.group[: self.n_bodies], _NO_FORCE * self.force)
-        return found
+        """Force on a group of coupled parts that is round-off, of its softest body, (n_groups,)."""
+        found = np.full(self.n_groups, np.inf)
+        np.minimum.at(found, self.group[: self.n_bodies], _NO_FORCE * self.force)
+        return np.where(np.isfinite(found), found, 0.0)
 
     @property
     def n_groups(self) -> int:

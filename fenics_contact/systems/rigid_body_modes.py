@@ -29,6 +29,10 @@ __all__ = ["RigidBodyModes", "tangential_gram"]
 _FREE = 1e-12
 _FELT = 1e-10
 _BALANCED = 1e-8
+# Gaps that a step goes through along a mode that is open: half of it touches, as well.
+_BEYOND = 2.0
+# Gaps by the size of the mesh that are taken for no smaller: their cubes do not overflow.
+_LEAST_GAP = 1e-64
 
 
 class RigidBodyModes:
@@ -302,7 +306,7 @@ class RigidBodyModes:
         load: Array,
         tractions: Sequence[Array],
         idle: Mask,
-    ) -> tuple[Array, Array, Mask]:
+    ) -> tuple[Array, Mask, list[Array]]:
         """Forces on modes that contact leaves free that are not in balance. Collective.
 
         The tangent of friction is none along the friction of a slipping point.
@@ -315,20 +319,20 @@ class RigidBodyModes:
             idle: Groups of coupled parts of which all modes count as free, (n_groups,).
 
         Returns:
-            The largest share of all forces on a free mode of every group, 0 to 1, or NaN where it
-            has none, (n_groups,); the largest of these forces, 0 where it is round-off,
-            (n_groups,); and which groups have modes that would be free if no point slipped.
+            The largest share of the forces on a free mode of every group, 0 to 1, or NaN where it
+            has none, (n_groups,); which groups have modes that would be free if no point slipped;
+            and by contact what `_closing` returns for the mode with the largest of these forces.
         """
         share, rows = np.full(self._scales.n_groups, np.nan), np.arange(len(self.free))
-        force = np.zeros(len(share))
         groups = self.groups()
         loose = self.unconstrained(operators, rows, closed_only=True, slips=True)
         if not len(loose) and not idle.any():
-            return share, force, idle
+            return share, idle, [np.ones(o.contact.quadrature.n_points) for o in operators]
         stuck = self.unconstrained(operators, rows, closed_only=True)
         open_groups = idle.copy()
         open_groups[groups[np.argmax(np.abs(stuck), axis=1)]] = True
         loose = np.concatenate([loose, np.eye(len(rows))[idle[groups]]])
+        loose /= np.abs(loose).max(axis=1)[:, None]
         resultant = loose @ global_sum(self.comm, self._free_fields @ load)
         borne = np.zeros((3, len(loose)))
         for operator, first in zip(operators, tractions, strict=True):
@@ -340,12 +344,61 @@ class RigidBodyModes:
             borne += np.stack([work, np.abs(work), np.abs(then)]) @ contact.measure
         work, *sizes = global_sum(self.comm, borne)
         size = np.max([np.abs(resultant), *sizes], axis=0)
-        left = np.where(size > 0.0, np.abs(resultant + work), 0.0)
+        left = np.where(size > 0.0, resultant + work, 0.0)
         of_modes = groups[np.argmax(np.abs(loose), axis=1)]
-        np.fmax.at(share, of_modes, np.minimum(left / np.where(size > 0.0, size, 1.0), 1.0))
-        np.fmax.at(force, of_modes, left / np.abs(loose).max(axis=1))
-        force[force <= self._scales.round_off_of_groups] = 0.0
-        return share, force, open_groups
+        shares = np.minimum(np.abs(left) / np.where(size > 0.0, size, 1.0), 1.0)
+        np.fmax.at(share, of_modes, shares)
+        force = np.zeros(len(share))
+        ways = np.zeros((len(share), len(rows)))
+        for group in np.unique(of_modes):
+            mine = np.flatnonzero(of_modes == group)
+            most = mine[np.argmax(np.abs(left[mine]))]
+            force[group], ways[group] = abs(left[most]), np.sign(left[most]) * loose[most]
+        return share, open_groups, self._closing(operators, force, ways)
+
+    def _closing(
+        self, operators: Sequence[ContactOperator], force: Array, ways: Array
+    ) -> list[Array]:
+        """Secant stiffness of open points, with which a force closes the nearest gap. Collective.
+
+        Springs k = F near³/(2 w² Σ near²) bear the force F on a mode that approaches the points by
+        w if it goes twice as far as each is open, the nearest ones most of it; near = w/gap. Half
+        of the step, which a line search takes next, touches, too. All points get as much as ends
+        any step within twice the size of the mesh, and all are in series with the stiffness of
+        closed points, which then bear the force.
+
+        Args:
+            operators: Of evaluated contacts, over all unknowns.
+            force: On a free mode of every group, (n_groups,) (force).
+            ways: The mode, in free motions, along the force, (n_groups, n_free).
+
+        Returns:
+            By contact, by the stiffness of a closed point, 0 to 1, (n_points,); 1 where there is no
+            gap, or no force that is more than round-off.
+        """
+        scales, points = self._scales, []
+        sums: Array = np.zeros((2, len(force)))
+        force = np.where(force > scales.round_off_of_groups, force, 0.0)
+        for number, operator in enumerate(operators):
+            contact, values = operator.contact, operator.contact.values
+            group, gap = scales.group_of_points(number), contact.gap / scales.mesh_size
+            closed = contact.area * values.normal_stiffness
+            apart = (contact.status == Status.OPEN) & (gap > 0.0) & (closed * force[group] > 0.0)
+            gap = np.where(apart, np.maximum(gap, _LEAST_GAP), 1.0)
+            along = np.einsum("mqd,qd->qm", self.at_points(operator), values.normal)
+            approach = np.maximum(np.sum(ways[group] * along, axis=1), 0.0)
+            near = np.where(apart, approach, 0.0) / gap
+            sums[0] += np.bincount(group, near**2, minlength=len(force))
+            sums[1] += np.bincount(group, apart, minlength=len(force))
+            points.append((apart, near / gap**2, group, np.where(apart, closed, 1.0)))
+        squares, counts = scales.global_sum(sums)
+        by_near = force / (_BEYOND * scales.mesh_size * np.where(squares > 0, squares, 1.0))
+        by_all = force / (_BEYOND * scales.mesh_size * np.maximum(counts, 1.0))
+        found = []
+        for apart, near, group, closed in points:
+            stiffness = by_near[group] * near + by_all[group]
+            found.append(np.where(apart, stiffness / (stiffness + closed), 1.0))
+        return found
 
     def unconstrained(
         self,

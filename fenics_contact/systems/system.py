@@ -130,9 +130,8 @@ class System(ABC):
                 [c.name for c in self.contacts],
                 touched,
                 [scales.pairs(o, i, self.label) for i, o in enumerate(self.operators)],
-                scales.held,
+                scales,
                 [c for c, _ in moving],
-                scales.force,
             )
             self._parts = pairings, parts
         return self._parts[1]
