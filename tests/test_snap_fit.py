@@ -57,17 +57,19 @@ def test_by_force_as_by_displacement(friction):
     assert iterations.max() <= 40  # 33, where continuation is needed; 5 to 9 elsewhere
 
 
-def step_of(gap, force, parked=()):
+def step_of(gap, force, parked=(), *, along=None):
     """How far the first Newton step moves a tool above an arm, driven by a force along y (length).
 
-    ``parked``: gap of a wall beside the arm, which the tool does not move.
+    ``parked``: gap of a wall beside the arm, which the tool does not move. ``along``: a force along
+    x on the tool, which is led there otherwise.
     """
     scene = Beside({"arm": Box(size=(1.0, 1.0), n=(4, 4))}, E=1e3)
     scene.hold("arm", LEFT, 0)
     scene.hold("arm", LEFT, 1)
-    motion = fc.Motion(force=(None, force), displacement=(0.0, None))
+    held = 0.0 if along is None else None
+    motion = fc.Motion(force=(along, force), displacement=(held, None))
     tool = fc.HalfSpace((0.0, 1.0 + gap), (0, -1), displacement=motion)
-    contacts = [scene.contact("arm", TOP, tool, fc.Frictionless(), name="tool")]
+    contacts = [scene.contact("arm", TOP, tool, fc.Coulomb(3.0), name="tool")]
     if parked:
         wall = fc.HalfSpace((1.0 + parked[0], 0.0), (-1, 0))
         contacts.append(scene.contact("arm", RIGHT, wall, fc.Frictionless(), name="parked"))
@@ -83,7 +85,7 @@ def step_of(gap, force, parked=()):
     equations.solvers[True].setOperators(matrix)
     equations.solvers[True].solve(-equations.function, change)
     here = equations.system.unknowns.motions(change.array_r * equations.length)
-    return float(here[0])
+    return float(here[-1])
 
 
 @pytest.mark.parametrize("gap", [1e-2, 1e-6])
@@ -98,10 +100,16 @@ def test_a_step_goes_through_twice_the_gap(gap, parked):
     assert moved == pytest.approx(-2 * gap, rel=1e-3 + gap)
 
 
-def test_a_step_away_from_what_is_near():
-    """A tool driven away from an arm meets nothing, and goes no further than twice the mesh."""
-    moved = step_of(1e-6, 1e-7)
-    assert 0 < moved <= 2 * np.sqrt(2) * (1 + 1e-6)
+def test_a_step_by_the_smaller_of_two_forces():
+    """A tool that a larger force pushes along the surface closes its gap all the same."""
+    moved = step_of(1e-6, -1e-7, along=2e-7)
+    assert moved == pytest.approx(-2e-6, rel=1e-3)
+
+
+@pytest.mark.parametrize("parked", [(), (1e-7,)], ids=["alone", "beside a nearer one"])
+def test_a_step_away_from_what_is_near(parked):
+    """A tool driven away from an arm meets nothing, and goes twice the size of the mesh, √2."""
+    assert step_of(1e-6, 1e-7, parked) == pytest.approx(2 * np.sqrt(2), rel=1e-3)
 
 
 def test_a_force_beyond_what_the_arm_bears():

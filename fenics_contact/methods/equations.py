@@ -16,6 +16,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.methods.active_set_monitor import ActiveSetMonitor
 from fenics_contact.methods.limit_analysis import Overload, find_overload
+from fenics_contact.methods.regularisation import LooseModes
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.systems.balance import Norms
 from fenics_contact.systems.ejected_bodies import find_ejected_bodies
@@ -272,38 +273,41 @@ class Equations:
         Slipping points of the bodies concerned get the secant stiffness of friction under the
         present pressure, with which a step along the mode goes as far as they have slipped, by the
         share of the forces on the mode that is not in balance. Open points get the stiffness with
-        which it closes the nearest gap (`RigidBodyModes.imbalance`), where slipping points would
+        which it closes the nearest gap (`LooseModes.closing`), where slipping points would
         not hold the body if they stuck. With what is not in balance the regularisation vanishes,
         and convergence stays superlinear (Levenberg-Marquardt).
         """
-        share, is_open, closing = self._imbalance()
-        free = ~np.isnan(share)
-        self.free_parts = free[self.full.scales.group]
-        if not free.any():
+        full, modes = self.full, self._loose_modes()
+        free = np.zeros(0, np.bool_) if modes is None else ~np.isnan(modes.share)
+        if modes is None or not free.any():
+            self.free_parts = np.zeros(len(full.scales.group), np.bool_)
             yield from self.tangents()
             return
-        share = np.where(free, np.maximum(share, _LEAST_SHARE), 0.0)
-        for number, operator in enumerate(self.system.operators):
-            contact, group = operator.contact, self.full.scales.group_of_points(number)
+        self.free_parts = free[full.scales.group]
+        share = np.where(free, np.maximum(modes.share, _LEAST_SHARE), 0.0)
+        operators = self.system.operators
+        within = [operator.within for operator in operators]
+        closing = modes.closing(self.motions, full.scales, full.operators, within)
+        for number, (operator, close) in enumerate(zip(operators, closing, strict=True)):
+            contact, group = operator.contact, full.scales.group_of_points(number)
             slips = np.where(contact.status == Status.SLIP, share[group], 0.0)
-            opens = np.where((contact.status == Status.OPEN) & is_open[group], share[group], 0.0)
-            opens = np.where((opens > 0) & (closing[number] < 1.0), closing[number], opens)
+            opens = np.where(close < 1.0, close, share[group])
+            opens[(contact.status != Status.OPEN) | ~modes.is_open[group]] = 0.0
             tangent = contact.acting.tangent().scaled(1.0 - slips)
             yield operator.tangent(tangent)
             secant = slips * _secant(contact)
             yield operator.springs(contact.springs(opens + slips, opens + secant))
 
-    def _imbalance(self) -> tuple[Array, Mask, list[Array]]:
-        """`RigidBodyModes.imbalance` at the evaluated state. Collective."""
-        full = self.full
-        if not len(self.motions.free):
-            free = np.full(full.scales.n_groups, np.nan)
-            return free, np.zeros_like(free, np.bool_), []
+    def _loose_modes(self) -> LooseModes | None:
+        """Rigid-body modes that contact leaves free at the evaluated state. Collective."""
+        full, motions = self.full, self.motions
+        if not len(motions.free):
+            return None
         # Of a body that was positioned round-off closes some of many points.
-        load = self.motions.generalised_load(full.load)
+        load = motions.generalised_load(full.load)
         idle = full.contact_force_sizes() < _OPEN_SHARE * load
         first = self.watch.tractions or [c.values.total_traction for c in self.contacts]
-        return self.motions.imbalance(full.operators, full.load, first, idle)
+        return LooseModes.find(motions, full.scales, full.operators, full.load, first, idle)
 
     def tangents(self) -> Iterator[PETSc.Mat]:
         """Consistent tangents of the contacts, which are evaluated. Collective."""

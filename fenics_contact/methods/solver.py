@@ -296,7 +296,8 @@ class Solver:
         to a million unknowns, takes 1.2 to 1.7 linear solves by multigrid so, and 2.8 to 3.4 by the
         primal-dual method, the quicker one where contact is stiffer than by default: dragged
         aside, five increments, in 0.9 to 1.1 times the time of L-BFGS at k_n = 10 E/h, 0.5 at 100.
-        Bodies that contact alone holds L-BFGS leaves where its H₀ lets them drift.
+        Without multigrid Newton's method is for bodies that contact alone holds: L-BFGS leaves them
+        where its H₀ lets them drift.
         """
         full = self._full
         if self.condensed or not full.bulk.linear:

@@ -29,10 +29,6 @@ __all__ = ["RigidBodyModes", "tangential_gram"]
 _FREE = 1e-12
 _FELT = 1e-10
 _BALANCED = 1e-8
-# Gaps that a step goes through along a mode that is open: half of it touches, as well.
-_BEYOND = 2.0
-# Gaps by the size of the mesh that are taken for no smaller: their cubes do not overflow.
-_LEAST_GAP = 1e-64
 
 
 class RigidBodyModes:
@@ -300,106 +296,6 @@ class RigidBodyModes:
             self._holding, self._holders = bearing, weakref.WeakSet(operators)
         return held
 
-    def imbalance(
-        self,
-        operators: Sequence[ContactOperator],
-        load: Array,
-        tractions: Sequence[Array],
-        idle: Mask,
-    ) -> tuple[Array, Mask, list[Array]]:
-        """Forces on modes that contact leaves free that are not in balance. Collective.
-
-        The tangent of friction is none along the friction of a slipping point.
-
-        Args:
-            operators: Of evaluated contacts, over all unknowns.
-            load: External forces at this rank's unknowns (force).
-            tractions: Of every contact where the iteration began, (n_points, gdim) (stress): what
-                is let go bears less and less, and is compared with what it bore.
-            idle: Groups of coupled parts of which all modes count as free, (n_groups,).
-
-        Returns:
-            The largest share of the forces on a free mode of every group, 0 to 1, or NaN where it
-            has none, (n_groups,); which groups have modes that would be free if no point slipped;
-            and by contact what `_closing` returns for the mode with the largest of these forces.
-        """
-        share, rows = np.full(self._scales.n_groups, np.nan), np.arange(len(self.free))
-        groups = self.groups()
-        loose = self.unconstrained(operators, rows, closed_only=True, slips=True)
-        if not len(loose) and not idle.any():
-            return share, idle, [np.ones(o.contact.quadrature.n_points) for o in operators]
-        stuck = self.unconstrained(operators, rows, closed_only=True)
-        open_groups = idle.copy()
-        open_groups[groups[np.argmax(np.abs(stuck), axis=1)]] = True
-        loose = np.concatenate([loose, np.eye(len(rows))[idle[groups]]])
-        loose /= np.abs(loose).max(axis=1)[:, None]
-        resultant = loose @ global_sum(self.comm, self._free_fields @ load)
-        borne = np.zeros((3, len(loose)))
-        for operator, first in zip(operators, tractions, strict=True):
-            contact = operator.contact
-            modes = np.einsum("lm,mqd->lqd", loose, self.at_points(operator))
-            work, then = (
-                np.einsum("lqd,qd->lq", modes, t) for t in (contact.values.total_traction, first)
-            )
-            borne += np.stack([work, np.abs(work), np.abs(then)]) @ contact.measure
-        work, *sizes = global_sum(self.comm, borne)
-        size = np.max([np.abs(resultant), *sizes], axis=0)
-        left = np.where(size > 0.0, resultant + work, 0.0)
-        of_modes = groups[np.argmax(np.abs(loose), axis=1)]
-        shares = np.minimum(np.abs(left) / np.where(size > 0.0, size, 1.0), 1.0)
-        np.fmax.at(share, of_modes, shares)
-        force = np.zeros(len(share))
-        ways = np.zeros((len(share), len(rows)))
-        for group in np.unique(of_modes):
-            mine = np.flatnonzero(of_modes == group)
-            most = mine[np.argmax(np.abs(left[mine]))]
-            force[group], ways[group] = abs(left[most]), np.sign(left[most]) * loose[most]
-        return share, open_groups, self._closing(operators, force, ways)
-
-    def _closing(
-        self, operators: Sequence[ContactOperator], force: Array, ways: Array
-    ) -> list[Array]:
-        """Secant stiffness of open points, with which a force closes the nearest gap. Collective.
-
-        Springs k = F near³/(2 w² Σ near²) bear the force F on a mode that approaches the points by
-        w if it goes twice as far as each is open, the nearest ones most of it; near = w/gap. Half
-        of the step, which a line search takes next, touches, too. All points get as much as ends
-        any step within twice the size of the mesh, and all are in series with the stiffness of
-        closed points, which then bear the force.
-
-        Args:
-            operators: Of evaluated contacts, over all unknowns.
-            force: On a free mode of every group, (n_groups,) (force).
-            ways: The mode, in free motions, along the force, (n_groups, n_free).
-
-        Returns:
-            By contact, by the stiffness of a closed point, 0 to 1, (n_points,); 1 where there is no
-            gap, or no force that is more than round-off.
-        """
-        scales, points = self._scales, []
-        sums: Array = np.zeros((2, len(force)))
-        force = np.where(force > scales.round_off_of_groups, force, 0.0)
-        for number, operator in enumerate(operators):
-            contact, values = operator.contact, operator.contact.values
-            group, gap = scales.group_of_points(number), contact.gap / scales.mesh_size
-            closed = contact.area * values.normal_stiffness
-            apart = (contact.status == Status.OPEN) & (gap > 0.0) & (closed * force[group] > 0.0)
-            gap = np.where(apart, np.maximum(gap, _LEAST_GAP), 1.0)
-            along = np.einsum("mqd,qd->qm", self.at_points(operator), values.normal)
-            approach = np.maximum(np.sum(ways[group] * along, axis=1), 0.0)
-            near = np.where(apart, approach, 0.0) / gap
-            sums[0] += np.bincount(group, near**2, minlength=len(force))
-            sums[1] += np.bincount(group, apart, minlength=len(force))
-            points.append((apart, near / gap**2, group, np.where(apart, closed, 1.0)))
-        squares, counts = scales.global_sum(sums)
-        by_near = force / (_BEYOND * scales.mesh_size * np.where(squares > 0, squares, 1.0))
-        by_all = force / (_BEYOND * scales.mesh_size * np.maximum(counts, 1.0))
-        found = []
-        for apart, near, group, closed in points:
-            stiffness = by_near[group] * near + by_all[group]
-            found.append(np.where(apart, stiffness / (stiffness + closed), 1.0))
-        return found
-
     def unconstrained(
         self,
         operators: Sequence[ContactOperator],
@@ -458,12 +354,16 @@ class RigidBodyModes:
         """Whether some are rotations of obstacles, whose arms change with the state."""
         return bool(self._turning.any())
 
+    def work_of(self, forces: Array) -> Array:
+        """Work of forces at this rank's unknowns on the free motions, (n_free,). Collective."""
+        return global_sum(self.comm, self._free_fields @ forces)
+
     def resultants(self, forces: Array) -> Array:
-        """Work of forces at this rank's unknowns on the free motions. Collective.
+        """`work_of` forces at this rank's unknowns. Collective.
 
         But for those by which obstacles turn: what presses may have no moment.
         """
-        return global_sum(self.comm, (self._free_fields @ forces)[self.straight()])
+        return self.work_of(forces)[self.straight()]
 
     def load_resultant(
         self, load: Array, operators: Sequence[ContactOperator]
