@@ -172,11 +172,11 @@ class Parts:
                 np.minimum.at(row, one, round_off[other])
         acts = pushes > np.maximum(exact, _UNLOADED_FORCE_RATIO * force)
         # A displacement that nothing holds may grow without bounds, and would excuse anything.
-        held = self._scales.held
+        fixed = self._scales.held
         # What a sine leaves of a load at its zeros, and moves no digit where conditions hold all.
         none = np.append(_ROUND_OFF * self._scales.least_force, np.zeros(len(self._motions)))
-        loaded = loads > np.where(held, none, 0.0)
-        limited = loaded | (acts.any(axis=0) & ~held)
+        loaded = loads > np.where(fixed, none, 0.0)
+        limited = loaded | (acts.any(axis=0) & ~fixed)
         floor = np.where(limited, np.minimum(round_off, MOST_EXCUSED * force), round_off)
         floor = np.maximum(floor, _LEAST)
         floors = np.where(acts, np.minimum(round_off, MOST_EXCUSED * pushes), round_off)
