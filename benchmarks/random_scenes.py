@@ -8,10 +8,9 @@ The scenes are those of ``verification/``: small displacements without cuts, som
 cells and with stiffer contact, and with finite kinematics, on rigid obstacles and between two
 bodies, with one cut. Nothing is said of the method, the condensation or the linear solver. An
 increment counts if the verification accepts it; a scene is complete if all its increments are. The
-table has the complete scenes of every method, the
-iterations of those, and processor time; the CSV has a row for every scene and method. Requirement:
-the default completes at least as many scenes as the best single method, in at most 1.1 of its
-iterations on the scenes that both complete.
+table has the complete scenes of every method, the iterations of those, and processor time; the CSV
+has a row for every scene and method. Requirement: the default completes at least as many scenes as
+the best single method, in at most 1.1 of its iterations on the scenes that both complete.
 """
 
 from __future__ import annotations

@@ -15,11 +15,7 @@ from dolfinx import fem
 from fenics_contact.arguments import check_instance
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.acting import ActingLaw
-from fenics_contact.contact.choices import (
-    enforcement_of,
-    is_finite,
-    opposite_of,
-)
+from fenics_contact.contact.choices import enforcement_of, is_finite, opposite_of
 from fenics_contact.contact.inputs import FreeMotion, Inputs, varies
 from fenics_contact.contact.multipliers import Multipliers, TraceProjection
 from fenics_contact.contact.opposite import OppositeState, Parts

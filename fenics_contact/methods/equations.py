@@ -273,16 +273,16 @@ class Equations:
         Slipping points of the bodies concerned get the secant stiffness of friction under the
         present pressure, with which a step along the mode goes as far as they have slipped, by the
         share of the forces on the mode that is not in balance. Open points get the stiffness with
-        which it closes the nearest gap (`LooseModes.closing`), where slipping points would
-        not hold the body if they stuck. With what is not in balance the regularisation vanishes,
-        and convergence stays superlinear (Levenberg-Marquardt).
+        which it closes the nearest gap (`LooseModes.closing`), where slipping points would not hold
+        the body if they stuck. With what is not in balance the regularisation vanishes, and
+        convergence stays superlinear (Levenberg-Marquardt).
         """
         full, modes = self.full, self._loose_modes()
-        free = np.zeros(0, np.bool_) if modes is None else ~np.isnan(modes.share)
-        if modes is None or not free.any():
+        if modes is None or np.isnan(modes.share).all():
             self.free_parts = np.zeros(len(full.scales.group), np.bool_)
             yield from self.tangents()
             return
+        free = ~np.isnan(modes.share)
         self.free_parts = free[full.scales.group]
         share = np.where(free, np.maximum(modes.share, _LEAST_SHARE), 0.0)
         operators = self.system.operators

@@ -135,9 +135,8 @@ class QuasiNewton(SnesMethod):
             return False
         self._refreshed = True
         tangent = not equations.has_potential and equations.is_constrained()
-        parts = equations.stiffnesses(everywhere=False)
-        if tangent:
-            parts = equations.regularised_tangents()
+        springs = equations.stiffnesses(everywhere=False)
+        parts = equations.regularised_tangents() if tangent else springs
         consistent = tangent and not equations.by_cycle
         self._clear_pairs(consistent=consistent)
         equations.assemble(equations.matrix(consistent), parts)

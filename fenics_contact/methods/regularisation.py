@@ -16,7 +16,7 @@ from fenics_contact.contact.values import Status
 from fenics_contact.parallel import agreed
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.reference_scales import ReferenceScales
-from fenics_contact.systems.rigid_body_modes import RigidBodyModes
+from fenics_contact.systems.rigid_body_modes import FELT, RigidBodyModes
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["LooseModes"]
@@ -25,8 +25,6 @@ __all__ = ["LooseModes"]
 _BEYOND = 2.0
 # Gaps by the size of the mesh that are taken for no smaller: their cubes do not overflow.
 _LEAST_GAP = 1e-64
-# An approach by less than this share of a mode is none.
-_FELT = 1e-10
 
 
 @dataclass(frozen=True)
@@ -73,16 +71,15 @@ class LooseModes:
         """
         n = len(motions.free)
         share, groups = np.full(scales.n_groups, np.nan), motions.groups()
-        none = cls(share, idle, np.zeros((0, n)), np.zeros(0), np.zeros(0, dtype=np.intp))
         loose = motions.unconstrained(operators, np.arange(n), closed_only=True, slips=True)
         if not len(loose) and not idle.any():
-            return none
+            return cls(share, idle, np.zeros((0, n)), np.zeros(0), np.zeros(0, dtype=np.intp))
         stuck = motions.unconstrained(operators, np.arange(n), closed_only=True)
         is_open = idle.copy()
         is_open[groups[np.argmax(np.abs(stuck), axis=1)]] = True
         loose = np.concatenate([loose, np.eye(n)[idle[groups]]])
         loose /= np.abs(loose).max(axis=1)[:, None]
-        resultant = loose @ motions.work_of(load)
+        resultant = loose @ motions.generalised_forces(load)
         borne = np.zeros((3, len(loose)))
         for operator, first in zip(operators, tractions, strict=True):
             contact = operator.contact
@@ -97,9 +94,8 @@ class LooseModes:
         group = groups[np.argmax(np.abs(loose), axis=1)]
         part = np.abs(left) / np.where(size > 0.0, size, 1.0)
         np.fmax.at(share, group, np.minimum(part, 1.0))
-        return cls(
-            share, is_open, np.where(left < 0.0, -1.0, 1.0)[:, None] * loose, np.abs(left), group
-        )
+        ways = np.where(left < 0.0, -1.0, 1.0)[:, None] * loose
+        return cls(share, is_open, ways, np.abs(left), group)
 
     def closing(
         self,
@@ -142,19 +138,17 @@ class LooseModes:
             modes = np.einsum("lm,mqd->lqd", self.ways, motions.at_points(operator))
             modes *= apart[:, None]
             approach = np.einsum("lqd,qd->lq", modes, values.normal)
-            near = np.where(approach > _FELT, approach, 0.0) / gap
+            near = np.where(approach > FELT, approach, 0.0) / gap
             travel = np.sum(modes**2, axis=2)
             sums += np.stack([np.sum(near**2, axis=1), np.sum(travel, axis=1)])
-            points.append((apart, near / gap**2, travel > _FELT, np.where(apart, closed, 1.0)))
-        squares, travels = np.where((sums := scales.global_sum(sums)) > 0.0, sums, 1.0)
+            points.append((apart, near / gap**2, travel > FELT, np.where(apart, closed, 1.0)))
+        sums = scales.global_sum(sums)
+        squares, travels = np.where(sums > 0.0, sums, 1.0)
         size = _BEYOND * scales.mesh_size
-        of_modes = self.force / (size * squares), largest[self.group] / (size * travels)
+        by_gap, by_size = self.force / (size * squares), largest[self.group] / (size * travels)
         found = []
         for apart, near, moved, closed in points:
-            nearest, any_ = (
-                np.max(force[:, None] * part, axis=0, initial=0.0)
-                for force, part in zip(of_modes, (near, moved), strict=True)
-            )
-            stiffness = nearest + any_
+            stiffness = np.max(by_gap[:, None] * near, axis=0, initial=0.0)
+            stiffness += np.max(by_size[:, None] * moved, axis=0, initial=0.0)
             found.append(np.where(apart, stiffness / (stiffness + closed), 1.0))
         return found

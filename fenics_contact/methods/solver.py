@@ -302,8 +302,9 @@ class Solver:
         full = self._full
         if self.condensed or not full.bulk.linear:
             return "newton"
-        held = full.scales.held.all() and not full.follows
-        costly = full.linear_kind == "multigrid" or (full.gdim == 3 and held)
+        if full.linear_kind == "multigrid":
+            return "lbfgs"
+        costly = full.gdim == 3 and full.scales.held.all() and not full.follows
         return "lbfgs" if costly else "newton"
 
     def _choose_linear_solver(self) -> str:

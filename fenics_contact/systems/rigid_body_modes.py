@@ -21,13 +21,13 @@ from fenics_contact.systems.reference_scales import ReferenceScales, body_of_poi
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["RigidBodyModes", "tangential_gram"]
+__all__ = ["FELT", "RigidBodyModes", "tangential_gram"]
 
 
 # Relative sizes below which an energy, a work or a share of a mode counts as zero. One clamped dof
 # among N gives 1/N, so that the first must lie below any 1/N; the others are far above round-off.
 _FREE = 1e-12
-_FELT = 1e-10
+FELT = 1e-10
 _BALANCED = 1e-8
 
 
@@ -325,7 +325,7 @@ class RigidBodyModes:
             weights = contact.quadrature.weights
             if closed_only:
                 weights = weights * (contact.status != Status.OPEN)
-            felt = np.abs(modes).max(axis=2, initial=0.0) > _FELT
+            felt = np.abs(modes).max(axis=2, initial=0.0) > FELT
             area += ((together @ felt) > 0) @ contact.quadrature.weights
             if contact.law.has_normal_stiffness:
                 gram += (along * weights) @ along.T
@@ -340,8 +340,8 @@ class RigidBodyModes:
         for group in np.unique(groups):  # no vector is of several
             mine = np.flatnonzero(groups == group)
             sizes, vectors = np.linalg.eigh(gram[np.ix_(mine, mine)])
-            found = np.zeros((np.count_nonzero(sizes < _FELT), n_free))
-            found[:, mine] = (vectors * scale[mine, None])[:, sizes < _FELT].T
+            found = np.zeros((np.count_nonzero(sizes < FELT), n_free))
+            found[:, mine] = (vectors * scale[mine, None])[:, sizes < FELT].T
             loose.append(found)
         return agreed(self.comm, np.concatenate(loose))
 
@@ -354,16 +354,16 @@ class RigidBodyModes:
         """Whether some are rotations of obstacles, whose arms change with the state."""
         return bool(self._turning.any())
 
-    def work_of(self, forces: Array) -> Array:
+    def generalised_forces(self, forces: Array) -> Array:
         """Work of forces at this rank's unknowns on the free motions, (n_free,). Collective."""
         return global_sum(self.comm, self._free_fields @ forces)
 
     def resultants(self, forces: Array) -> Array:
-        """`work_of` forces at this rank's unknowns. Collective.
+        """`generalised_forces` of forces at this rank's unknowns. Collective.
 
         But for those by which obstacles turn: what presses may have no moment.
         """
-        return self.work_of(forces)[self.straight()]
+        return self.generalised_forces(forces)[self.straight()]
 
     def load_resultant(
         self, load: Array, operators: Sequence[ContactOperator]
@@ -417,7 +417,7 @@ def _plain(rows: Array) -> Array:
             if other != pivot:
                 rows[other] -= rows[other, j] * rows[pivot]
         done.append(pivot)
-    rows[np.abs(rows) < _FELT] = 0.0
+    rows[np.abs(rows) < FELT] = 0.0
     return rows / np.abs(rows).max(axis=1, initial=1.0)[:, None] if rows.size else rows
 
 
