@@ -251,17 +251,20 @@ class Equations:
     def assemble_tangent(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
         """The consistent tangent of bulk and contact at ``x``. Collective."""
         self.evaluate(x)
+        self.note()
         self.assemble(matrix, self.regularised_tangents())
 
     def evaluate(self, x: PETSc.Vec) -> None:
-        """Evaluate bulk and contacts at ``x``, where the residual was computed last. Collective."""
-        residual = self.norms.total
+        """Evaluate bulk and contacts at ``x``. Collective."""
         self.set_state(x)
         if not self._bulk.linear:  # else nothing changes it during a solution
             self.full.update_stiffness()
         for contact in self.contacts:
             contact.evaluate()
-        self.watch.note(residual)
+
+    def note(self) -> None:
+        """Let `watch` see the status of the points, evaluated where the residual was last."""
+        self.watch.note(self.norms.total)
 
     def is_constrained(self) -> bool:
         """Whether the closed points hold all free motions. Collective."""

@@ -24,6 +24,8 @@ __all__ = ["OVERLOADED", "InnerSnes", "Method", "Newton", "OwnMethod", "SnesMeth
 # states whose levels were 0.93 and 0.96 of each other's; with a quarter (Deuflhard's restricted
 # monotonicity) it does not begin where one point is closed, from which levels fall to 0.83.
 _DECREASE = 0.1
+# Share of a step from which on it is the whole one: but for round-off.
+_WHOLE = 1.0 - 1e-9
 # Iterations without a lower residual after which another method takes over.
 _PATIENCE = 14
 
@@ -247,6 +249,8 @@ class Newton(SnesMethod):
         super().__init__(equations, snes, gives_up)
         self._sizes: Array | None = None  # of the correction and the residual at the iterate
         self._iterate: Array = np.zeros(0)
+        self._trial: Array | None = None  # whose tangent the matrix holds, if not the iterate's
+        self._looks_ahead = False  # whether to ask for the correction after a whole step
 
     @classmethod
     def main_options(cls) -> Mapping[str, Any]:
@@ -263,7 +267,7 @@ class Newton(SnesMethod):
     def attach(self, *, consistent: bool) -> None:
         """See `SnesMethod.attach`; a line search gets its level function."""
         super().attach(consistent=consistent)
-        self._sizes = None
+        self._sizes = self._trial = None
         if self.snes.getType() != PETSc.SNES.Type.NEWTONLS:
             return
         this: Newton = weakref.proxy(self)
@@ -275,8 +279,12 @@ class Newton(SnesMethod):
         )
 
     def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
-        super()._compute_jacobian(x, J)
-        self._sizes = None
+        trial, self._sizes, self._trial = self._trial, None, None
+        different = trial is None or not np.array_equal(x.array_r, trial)
+        if self._equations.full.unknowns.comm.allreduce(int(different)):
+            super()._compute_jacobian(x, J)
+        else:
+            self._equations.note()
 
     def _level(self, x: PETSc.Vec, f: PETSc.Vec) -> float:
         """min(|J⁻¹f| / |J⁻¹f₀|, |f| / |f₀|)² of a residual f at a trial x. Collective.
@@ -289,13 +297,14 @@ class Newton(SnesMethod):
         takes forces orders of magnitude larger than to bend it, and where stiff contact closes a
         little too deep forces are large, too; the next correction is small. Where points change
         their status neither need fall along a step: it is taken if one does.
+
+        Nor need any of both fall where points close along a step, whose stiffness J does not have.
+        On a linear bulk nothing else changes J: a whole step is taken, too, if the correction that
+        follows, by the tangent at its end, is smaller. Where it is not, as between stick and slip,
+        that is not tried again: it costs two factorisations.
         """
-        ksp, correction = self.snes.getKSP(), f.duplicate()
-        ksp.solve(f, correction)
-        found = ksp.getConvergedReason() > 0
-        linear.forget_failure(ksp.getPC())
-        sizes = np.array([correction.norm() if found else np.inf, f.norm()])
-        correction.destroy()
+        correction = self._correction(f)
+        sizes = np.array([correction, f.norm()])
         if self._sizes is None:
             self._sizes, self._iterate = sizes, x.array_r.copy()
             return 1.0
@@ -304,10 +313,38 @@ class Newton(SnesMethod):
         share = np.sqrt(global_sum(self._equations.full.unknowns.comm, moved)) / self._sizes[0]
         enough = 1.0 - _DECREASE * min(1.0, float(share))
         level = float(np.min(sizes / self._sizes)) / enough
+        if level > 1.0 and share > _WHOLE and self._looks_ahead:
+            self._assemble_tangent(x)
+            if self._correction(f) <= enough * self._sizes[0]:
+                self._trial = x.array_r.copy()
+                return 0.0
+            self._looks_ahead = False
+            iterate = x.duplicate()
+            iterate.array[:] = self._iterate
+            self._assemble_tangent(iterate)
+            iterate.destroy()
         return level * level  # infinite where it overflows
+
+    def _assemble_tangent(self, x: PETSc.Vec) -> None:
+        """The consistent tangent at x, no iterate of SNES. Collective."""
+        self._equations.evaluate(x)
+        self._equations.assemble(
+            self._equations.matrix(True), self._equations.regularised_tangents()
+        )
+
+    def _correction(self, f: PETSc.Vec) -> float:
+        """Norm of the Newton correction of a residual by the present tangent. Collective."""
+        ksp, correction = self.snes.getKSP(), f.duplicate()
+        ksp.solve(f, correction)
+        found = ksp.getConvergedReason() > 0
+        linear.forget_failure(ksp.getPC())
+        size = correction.norm() if found else np.inf
+        correction.destroy()
+        return float(size)
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`."""
+        self._looks_ahead = self._equations.full.bulk.linear
         iterations, reason = self._callbacks.solve(self.snes, self._equations.solution)
         # The line search `cp`, by option, takes a step across the residual, F·y = 0, for the end.
         if reason == _REASONS.CONVERGED_FNORM_ABS:
