@@ -334,12 +334,12 @@ class RigidObstacleProbe:
         # The distance changes by no more than the way: farther obstacles do not reach the facet.
         going: Mask = distance < size[facet]
         scale: Array = np.ones(len(facet))
+        inverse = np.linalg.pinv(self._tangents(points))
         for _ in range(_DESCENT_STEPS):
             facet, at, scale = facet[going], at[going], scale[going]
             distance, normal = distance[going], normal[going]
             step = (scale * np.maximum(distance, 0.1 * size[facet]))[:, None] * normal
-            tangents = self._tangents(facet, points)
-            moved = at + np.einsum("nij,nj->ni", np.linalg.pinv(tangents), step)
+            moved = at + np.einsum("nij,nj->ni", inverse[facet], step)
             moved = places.facets.clipped(moved)
             going = np.abs(moved - at).max(axis=1, initial=0.0) > 1e-3
             if not self._comm.allreduce(int(going.any())):
@@ -355,18 +355,19 @@ class RigidObstacleProbe:
         facets, references, distances, normals = map(np.concatenate, zip(*found, strict=True))
         return facets, references, distances, normals
 
-    def _tangents(self, facet: Index, points: Array) -> Array:
-        """Edges of facets, in the frame of the obstacle, (n, gdim, gdim - 1) (length)."""
-        d = points.shape[1]
+    def _tangents(self, points: Array) -> Array:
+        """Edges of all facets, in the frame of the obstacle, (n_facets, gdim, gdim - 1) (length)."""
+        n, d = len(self._places.size), points.shape[1]
         origin, *ends = (
-            self._places.values(points, facet, np.broadcast_to(unit, (len(facet), d - 1)))
+            self._places.values(points, np.arange(n), np.broadcast_to(unit, (n, d - 1)))
             for unit in np.vstack([np.zeros(d - 1), np.eye(d - 1)])
         )
         return np.stack([end - origin for end in ends], axis=2)
 
-    def _outward(self, facet: Index, points: Array) -> Array:
-        """Outward unit normals at the first corners of facets, (n, gdim)."""
-        return self._places.facets.outward_normals(facet, self._tangents(facet, points))
+    def _outward(self, points: Array) -> Array:
+        """Outward unit normals at the first corners of all facets, (n_facets, gdim)."""
+        every = np.arange(len(self._places.size))
+        return self._places.facets.outward_normals(every, self._tangents(points))
 
     def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
         """See `Probe`: by where the points are in the frame of the obstacle."""
@@ -381,7 +382,7 @@ class RigidObstacleProbe:
         size = self._places.size[self._facet]
         clear = _DEPTH_RESOLUTION * size + self._distance
         # What has entered the body may go deeper.
-        inside = _dot(np.nan_to_num(self._toward), self._outward(self._facet, self.points)) < 0
+        inside = _dot(np.nan_to_num(self._toward), self._outward(self.points)[self._facet]) < 0
         clear -= np.where(inside, _ALLOWED_BEFORE * size, 0.0)
         known = known and bool(np.all(np.linalg.norm(moved, axis=1) <= clear))
         # A point may have come to the opposite side of what is thinner.
@@ -418,7 +419,7 @@ class RigidObstacleProbe:
         facet, place, toward = self._facet[some], self._z[some], self._toward[some]
         # Half way through an obstacle there is no normal.
         depth[some[~(np.linalg.norm(toward, axis=1) > 0.5)]] = np.inf
-        inward = -self._outward(facet, self.points)
+        inward = -self._outward(self.points)[facet]
         aside = np.nan_to_num(toward - _dot(toward, inward)[:, None] * inward)
         length = np.linalg.norm(aside, axis=1, keepdims=True)
         aside *= size[some, None] / np.where(length > 0, length, 1.0)
@@ -484,7 +485,8 @@ class RigidObstacleProbe:
         # A distance changes by no more than the path: what is farther away was not touched, and
         # what is inside of the body was outside, or inside by what was allowed.
         changed = not np.array_equal(self._sampler.committed_shape, self._shape)
-        inside = _dot(toward, self._outward(self._facet, field_end)) < 0
+        outward_end = self._outward(field_end)
+        inside = _dot(toward, outward_end[self._facet]) < 0
         before = np.where(inside, _ALLOWED_BEFORE * size, 0.0)
         near = changed | ~(distance_end > way + angle * radius + before)
         # A diverged state is not finite, and is refused for its residual.
@@ -500,7 +502,7 @@ class RigidObstacleProbe:
             points = np.concatenate([feet[0], self._nearest(feet[1], since)])
             points_end = np.concatenate([self._nearest(feet[0], until), feet[1]])
         facet, size = self._facet[near], size[near]
-        inward, inward_end = (-self._outward(facet, p) for p in (field, field_end))
+        inward, inward_end = -self._outward(field)[facet], -outward_end[facet]
         inside = _dot(normal, inward) * distance > 0
         entered = np.append(inside & (distance < 0), np.zeros(len(near), dtype=np.bool_))
         through = np.full(len(points), -1)

@@ -247,8 +247,8 @@ class Newton(SnesMethod):
     ) -> None:
         """See `SnesMethod`."""
         super().__init__(equations, snes, gives_up)
-        self._sizes: Array | None = None  # of the correction and the residual at the iterate
-        self._iterate: Array = np.zeros(0)
+        self._iterate: tuple[PETSc.Vec, PETSc.Vec] | None = None  # and the residual there
+        self._step: float | None = None  # norm of the correction there, once it is asked for
         self._trial: Array | None = None  # whose tangent the matrix holds, if not the iterate's
         self._looks_ahead = False  # whether to ask for the correction after a whole step
 
@@ -267,7 +267,7 @@ class Newton(SnesMethod):
     def attach(self, *, consistent: bool) -> None:
         """See `SnesMethod.attach`; a line search gets its level function."""
         super().attach(consistent=consistent)
-        self._sizes = self._trial = None
+        self._iterate = self._trial = None
         if self.snes.getType() != PETSc.SNES.Type.NEWTONLS:
             return
         this: Newton = weakref.proxy(self)
@@ -279,7 +279,7 @@ class Newton(SnesMethod):
         )
 
     def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
-        trial, self._sizes, self._trial = self._trial, None, None
+        trial, self._iterate, self._trial = self._trial, None, None
         different = trial is None or not np.array_equal(x.array_r, trial)
         if self._equations.full.unknowns.comm.allreduce(int(different)):
             super()._compute_jacobian(x, J)
@@ -303,27 +303,27 @@ class Newton(SnesMethod):
         follows, by the tangent at its end, is smaller. Where it is not, as between stick and slip,
         that is not tried again: it costs two factorisations.
         """
-        correction = self._correction(f)
-        sizes = np.array([correction, f.norm()])
-        if self._sizes is None:
-            self._sizes, self._iterate = sizes, x.array_r.copy()
+        if self._iterate is None:
+            self._iterate, self._step = (x.copy(), f.copy()), None
             return 1.0
+        iterate, residual = self._iterate
+        fall = f.norm() / residual.norm()
+        if fall <= 1.0 - _DECREASE:
+            return float(fall * fall)
+        if self._step is None:
+            self._step = self._correction(residual)
         # Nor is the first step that is tried the whole one where that is too long.
-        moved = np.sum((x.array_r - self._iterate) ** 2)
-        share = np.sqrt(global_sum(self._equations.full.unknowns.comm, moved)) / self._sizes[0]
+        share = (x - iterate).norm() / self._step
         enough = 1.0 - _DECREASE * min(1.0, float(share))
-        level = float(np.min(sizes / self._sizes)) / enough
+        level = min(fall, self._correction(f) / self._step) / enough
         if level > 1.0 and share > _WHOLE and self._looks_ahead:
             self._assemble_tangent(x)
-            if self._correction(f) <= enough * self._sizes[0]:
+            if self._correction(f) <= enough * self._step:
                 self._trial = x.array_r.copy()
                 return 0.0
             self._looks_ahead = False
-            iterate = x.duplicate()
-            iterate.array[:] = self._iterate
             self._assemble_tangent(iterate)
-            iterate.destroy()
-        return level * level  # infinite where it overflows
+        return float(level * level)  # infinite where it overflows
 
     def _assemble_tangent(self, x: PETSc.Vec) -> None:
         """The consistent tangent at x, no iterate of SNES. Collective."""

@@ -104,12 +104,13 @@ def _crossings(start: Array, end: Array, vertices: Index, facets: MovingFacets) 
     centre, radius = _ball(np.stack([start, end], axis=1))
     corners = np.concatenate([facets.start, facets.end], axis=1)
     middle, reach = _ball(corners)
-    tree = scipy.spatial.cKDTree(middle)
-    # Most paths are far from all facets: only those that come near are compared one by one.
+    # Most paths are far from all facets: only those that come near are compared one by one. Facets
+    # of a graded mesh differ more in size than paths in length.
     place: Any
     facet: Any
     known = np.flatnonzero(np.isfinite(radius))  # not where an obstacle has no normal
-    place, facet = near_pairs(tree, centre[known], radius[known] + reach.max())
+    tree = scipy.spatial.cKDTree(centre[known])
+    facet, place = near_pairs(tree, middle, reach + radius[known].max(initial=0.0))
     place = known[place]
     near = np.linalg.norm(centre[place] - middle[facet], axis=1) <= radius[place] + reach[facet]
     near &= ~(vertices[place][:, :, None] == facets.vertices[facet][:, None, :]).any(axis=(1, 2))
