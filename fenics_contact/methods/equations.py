@@ -61,6 +61,7 @@ class Equations:
         by_cycle: Whether H₀ is a V-cycle, which serves for its matrix as for the tangent.
         hierarchy: Its levels.
         factorisations: Of sparse matrices, counted.
+        loads: The largest generalised force of the load on rigid-body modes, (n_groups,) (force).
         free_parts: Bodies and free obstacles of groups with a rigid-body mode along which the
             consistent tangent assembled last is regularised, (n_parts,).
         overload: By what the load outdid friction where `friction_needed` looked last, if it did.
@@ -89,6 +90,7 @@ class Equations:
         self.solvers: dict[bool, PETSc.KSP] = {}
         self.by_cycle, self.hierarchy = False, Hierarchy()
         self.factorisations = 0
+        self.loads: Array = np.zeros(full.scales.n_groups)
         self.free_parts: Mask = np.zeros(len(full.scales.group), np.bool_)
         self.overload: Overload | None = None
         self._matrices: dict[bool, PETSc.Mat] = {}
@@ -307,8 +309,7 @@ class Equations:
         if not len(motions.free):
             return None
         # Of a body that was positioned round-off closes some of many points.
-        load = motions.generalised_load(full.load)
-        idle = full.contact_force_sizes() < _OPEN_SHARE * load
+        idle = full.contact_force_sizes() < _OPEN_SHARE * self.loads
         first = self.watch.tractions or [c.values.total_traction for c in self.contacts]
         return LooseModes.find(motions, full.scales, full.operators, full.load, first, idle)
 

@@ -466,13 +466,15 @@ class Solver:
         Returns:
             Reason of the last solution, what was tried, and how many solutions there were.
         """
-        self.equations.start = np.zeros_like(self.equations.start)
-        self.equations.has_round_off = False
+        equations = self.equations
+        equations.start = np.zeros_like(equations.start)
+        equations.has_round_off = False
+        equations.loads = equations.motions.generalised_load(self._full.load)
 
         def iterate(ahead: float, stiffness_changed: bool) -> tuple[int, list[Attempt]]:
             return self._iterate(ahead, rate, cold, stiffness_changed)
 
-        return solve_in_rounds(self.equations, iterate, ahead, stiffness_changed, load_before)
+        return solve_in_rounds(equations, iterate, ahead, stiffness_changed, load_before)
 
     def _iterate(
         self,
