@@ -356,7 +356,7 @@ class RigidObstacleProbe:
         return facets, references, distances, normals
 
     def _tangents(self, points: Array) -> Array:
-        """Edges of all facets, in the frame of the obstacle, (n_facets, gdim, gdim - 1) (length)."""
+        """Edges of all facets in the obstacle's frame, (n_facets, gdim, gdim - 1) (length)."""
         n, d = len(self._places.size), points.shape[1]
         origin, *ends = (
             self._places.values(points, np.arange(n), np.broadcast_to(unit, (n, d - 1)))
