@@ -14,7 +14,6 @@ from petsc4py import PETSc
 from fenics_contact.methods.callbacks import Callbacks
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.options import Defaults
-from fenics_contact.parallel import global_sum
 from fenics_contact.systems import linear
 from fenics_contact.types import Array
 
