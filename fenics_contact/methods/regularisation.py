@@ -90,8 +90,10 @@ class LooseModes:
             borne += np.stack([work, np.abs(work), np.abs(then)]) @ contact.measure
         work, *sizes = scales.global_sum(borne)
         size = np.max([np.abs(resultant), *sizes], axis=0)
-        left = agreed(motions.comm, np.where(size > 0.0, resultant + work, 0.0))
         group = groups[np.argmax(np.abs(loose), axis=1)]
+        # What is left of round-off is not in balance either, and would never be.
+        size = np.where(size > scales.round_off_of_groups[group], size, 0.0)
+        left = agreed(motions.comm, np.where(size > 0.0, resultant + work, 0.0))
         part = np.abs(left) / np.where(size > 0.0, size, 1.0)
         np.fmax.at(share, group, np.minimum(part, 1.0))
         ways = np.where(left < 0.0, -1.0, 1.0)[:, None] * loose
@@ -124,7 +126,6 @@ class LooseModes:
         """
         largest: Array = np.zeros(scales.n_groups)
         np.maximum.at(largest, self.group, self.force)
-        largest[largest <= scales.round_off_of_groups] = 0.0
         sums: Array = np.zeros((2, len(self.force)))
         points = []
         for number, (operator, mask) in enumerate(zip(operators, within, strict=True)):
