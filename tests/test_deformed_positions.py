@@ -8,10 +8,16 @@ Held against it are scenes of the same kind in which nothing overlaps.
 import numpy as np
 import pytest
 import ufl
+from dolfinx import fem
 
 import fenics_contact as fc
+from fenics_contact.elasticity import LinearElastic
+from scenes.blocks import BOTTOM as BLOCK_BOTTOM
+from scenes.blocks import TOP as BLOCK_TOP
+from scenes.blocks import block_mesh, dimension
 from scenes.bodies import Bodies, boxes
 from scenes.comparing import raised_everywhere
+from scenes.elasticity import displacement_space, hold
 from scenes.tags import between, either, near
 
 pytestmark = pytest.mark.two_ranks
@@ -770,3 +776,41 @@ def test_a_roller_goes_past_the_end_of_a_block_and_back(n):
         forces.append(contact.resultants().force)
     forces = np.array(forces)
     assert np.abs(forces[:7] - forces[::-1][:7]).max() <= 1e-6 * np.abs(forces).max()
+
+
+@pytest.mark.parametrize(
+    ("kinematics", "turned"), [("small", 0.0), ("finite", 0.0), ("finite", 2.5)]
+)
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
+def test_nodes_without_points_do_not_pass_through_the_floor(cell, kinematics, turned, caplog):
+    """Vertex quadrature on quadratic elements: their other nodes pass through what is opposite.
+
+    The points carry no more than linear displacements of a facet: by these nothing is deep, while
+    the middles of edges are below the floor by a tenth of the facet. The floor may have turned.
+    """
+    d = dimension(cell)
+    mesh, tags = block_mesh(cell, n=1)
+    u = fem.Function(displacement_space(mesh, 2))
+    body = LinearElastic(u, E, 0.45, {2: "plane strain", 3: "3D"}[d])
+    F = body.residual(ufl.TestFunction(u.function_space), ufl.dx(mesh))
+    down = fem.Constant(mesh, 0.0)
+    bcs = [hold(u, tags, BLOCK_TOP, i) for i in range(d - 1)]
+    bcs.append(hold(u, tags, BLOCK_TOP, d - 1, down))
+    centre, up = np.full(d, 0.5), np.eye(d)[-1]
+    centre[-1] = -100.0
+    angle = fem.Constant(mesh, 0.0)
+    floor = fc.HalfSpace(np.zeros(d), up)
+    if turned:
+        axis = None if d == 2 else (0, 1, 0)
+        floor = fc.Cylinder(centre, 100.0, axis, rotation=fc.Rotation(angle, centre, axis))
+
+    def contact(scheme):
+        surface = fc.ContactSurface(mesh, tags, BLOCK_BOTTOM, quadrature_scheme=scheme)
+        return fc.Contact(u, surface, floor, fc.Frictionless(), kinematics=kinematics)
+
+    problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact("vertex")])
+    assert ("too soft" in caplog.text) == (mesh.comm.rank == 0)
+    down.value, angle.value = -0.1, turned
+    fails(problem, "penetrates between the quadrature points")
+    u.x.array[:] = 0.0
+    assert fc.ContactProblem(F, u, bcs=bcs, contacts=[contact(None)]).solve().verdict.failures == []

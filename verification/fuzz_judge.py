@@ -237,11 +237,10 @@ class Judge:
             u = self._nodal_values(reported["u"])
             if reported["rigid"]:
                 then, now = (problem.evaluate(v, self._motion, load, old) for v in (before, u))
+                # Groups of coupled bodies are positioned one after the other.
+                mine = [(n, c) for n, c in enumerate(problem.contacts) if groups[n] == groups[i]]
                 depth, deeper = (
-                    max(
-                        f["overclosure"][c.paired].max(initial=-np.inf)
-                        for c, f in zip(problem.contacts, at, strict=True)
-                    )
+                    max(at[n]["overclosure"][c.paired].max(initial=-np.inf) for n, c in mine)
                     for at in (then, now)
                 )
                 found = now[i]

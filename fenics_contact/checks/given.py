@@ -281,6 +281,15 @@ def _warn_of_few_points(contact: Contact) -> None:
             "that the finer one is Γc, or use "
             f"ContactSurface(quadrature_degree={sparse.degree})",
         )
+    degree = contact.displacement.degree
+    if contact.quadrature.at_vertices and degree > 1:
+        warn(
+            contact.surface.mesh.comm,
+            f"{contact.name}: vertex quadrature has no points at the other nodes of elements of "
+            f"degree {degree}, which penetrate freely: contact is too soft (a block with one and "
+            "with two facets by 48 and by 24 %). Use elements of degree 1, or the default "
+            "quadrature_scheme",
+        )
 
 
 def _warn_of_doubles(contacts: Sequence[Contact]) -> None:

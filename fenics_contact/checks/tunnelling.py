@@ -185,7 +185,7 @@ class TunnellingCheck:
                 probes[name] = known
                 continue
             probe: Probe = (
-                RigidObstacleProbe(contact, known)
+                RigidObstacleProbe(contact, before, known)
                 if contact.rigid
                 else OpposingBodyProbe(contact, before, known)
             )
@@ -273,13 +273,20 @@ class RigidObstacleProbe:
         x: Where the places are on the undeformed Γc, (n, gdim) (length).
         resisted: See `Probe`.
         points: The points in the frame of the obstacle, (n_points, gdim) (length).
+        field: The nodes of Γc in that frame, (n_nodes, gdim) (length); see `FacetPlaces`.
     """
 
-    def __init__(self, contact: Contact, known: RigidObstacleProbe | None = None) -> None:
+    def __init__(
+        self,
+        contact: Contact,
+        before: fem.Function | None,
+        known: RigidObstacleProbe | None = None,
+    ) -> None:
         """Sample the obstacle at the places and, on each facet, where it is deepest. Collective.
 
         Args:
             contact: With a rigid obstacle.
+            before: The displacement at the last commit; None: it is not known.
             known: An earlier probe, from which on paths were not followed yet.
         """
         opposite, values = contact.opposite, contact.values
@@ -292,49 +299,56 @@ class RigidObstacleProbe:
         self._law_normal = values.normal.copy()
         self._gap, self._normal = self._sampler.sample(self.points)
         self._shape = self._sampler.shape
-        self._start = values.x + opposite.committed_jump
-        if known is not None and not opposite.turns:
-            self._start = known.points
         self._rotation = opposite.rotation_in_increment(values)
-        self._facet, self._reference, self._distance, self._toward = self._deepest(self.points)
+        self.field = self._in_frame(contact)
+        self._start = places.at_nodes(
+            values.x + opposite.committed_jump,
+            before or contact.u,
+            lambda rest: opposite.in_frame(rest, opposite.committed_angle),
+        )
+        if known is not None and not opposite.turns:
+            self._start = known.field
+        self._facet, self._reference, self._distance, self._toward = self._deepest()
         self.x, _ = places.facets.positions(self._facet, self._reference)
-        self._z = self._at(self.points)
+        self._z = self._at(self.field)
         closed = contact.status != Status.OPEN
         # A penetration that the law knows of is its own matter, with no stiffness as well.
         deep = np.maximum(values.penetration, np.where(closed, -self._gap, 0.0))[places.rows]
         self.resisted = [(places.facets.corner_vertices(), deep.max(axis=1, initial=0.0))]
 
+    def _in_frame(self, contact: Contact) -> Array:
+        """The nodes in the frame of the obstacle as they are now. Collective."""
+        opposite, values = contact.opposite, contact.values
+        angle = opposite.angle(values)
+        return self._places.at_nodes(
+            values.x + values.jump, contact.u, lambda rest: opposite.in_frame(rest, angle)
+        )
+
     def _at(self, field: Array) -> Array:
-        """A point field at the places."""
+        """A field of the nodes at the places."""
         return self._places.values(field, self._facet, self._reference)
 
-    def _deepest(self, points: Array) -> tuple[Index, Array, Array, Array]:
+    def _deepest(self) -> tuple[Index, Array, Array, Array]:
         """The places of Γc, then those that the obstacle comes closest to between them. Collective.
 
         From every place the tangential part of the way to the obstacle is followed along the facet:
         alternating projections, which end at the closest places of facet and obstacle.
-
-        Args:
-            points: The points of Γc in the frame of the obstacle, (n_points, gdim) (length).
 
         Returns:
             Facet, reference coordinates, distance (length), and unit normal towards the obstacle,
             (n, ...).
         """
         places, size = self._places, self._places.size
-        facet, at = places.facet, places.reference
-        if points is self.points:  # sampled already; the points come first
-            rows = places.rows.ravel()
-            between = places.values(points, facet[rows.size :], at[rows.size :])
-            known, more = (self._gap[rows], self._normal[rows]), self._sampler.sample(between)
-            distance, normal = (np.concatenate(both) for both in zip(known, more, strict=True))
-        else:
-            distance, normal = self._sampler.sample(places.values(points, facet, at))
+        facet, at, rows = places.facet, places.reference, places.rows.ravel()
+        between = places.values(self.field, facet[rows.size :], at[rows.size :])
+        # The points, which come first, are sampled already.
+        known, more = (self._gap[rows], self._normal[rows]), self._sampler.sample(between)
+        distance, normal = (np.concatenate(both) for both in zip(known, more, strict=True))
         found = [(facet, at, distance, normal)]
         # The distance changes by no more than the way: farther obstacles do not reach the facet.
         going: Mask = distance < size[facet]
         scale: Array = np.ones(len(facet))
-        inverse = np.linalg.pinv(self._tangents(points))
+        inverse = np.linalg.pinv(self._tangents(self.field))
         for _ in range(_DESCENT_STEPS):
             facet, at, scale = facet[going], at[going], scale[going]
             distance, normal = distance[going], normal[going]
@@ -344,7 +358,7 @@ class RigidObstacleProbe:
             going = np.abs(moved - at).max(axis=1, initial=0.0) > 1e-3
             if not self._comm.allreduce(int(going.any())):
                 break
-            there, toward = self._sampler.sample(places.values(points, facet, moved))
+            there, toward = self._sampler.sample(places.values(self.field, facet, moved))
             deeper = going & (there < distance - 1e-3 * size[facet])
             # The step has passed over what is narrower than it.
             scale = np.where(deeper, scale, scale / 2)
@@ -355,19 +369,19 @@ class RigidObstacleProbe:
         facets, references, distances, normals = map(np.concatenate, zip(*found, strict=True))
         return facets, references, distances, normals
 
-    def _tangents(self, points: Array) -> Array:
+    def _tangents(self, field: Array) -> Array:
         """Edges of all facets in the obstacle's frame, (n_facets, gdim, gdim - 1) (length)."""
-        n, d = len(self._places.size), points.shape[1]
+        n, d = len(self._places.size), field.shape[1]
         origin, *ends = (
-            self._places.values(points, np.arange(n), np.broadcast_to(unit, (n, d - 1)))
+            self._places.values(field, np.arange(n), np.broadcast_to(unit, (n, d - 1)))
             for unit in np.vstack([np.zeros(d - 1), np.eye(d - 1)])
         )
         return np.stack([end - origin for end in ends], axis=2)
 
-    def _outward(self, points: Array) -> Array:
+    def _outward(self, field: Array) -> Array:
         """Outward unit normals at the first corners of all facets, (n_facets, gdim)."""
         every = np.arange(len(self._places.size))
-        return self._places.facets.outward_normals(every, self._tangents(points))
+        return self._places.facets.outward_normals(every, self._tangents(field))
 
     def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
         """See `Probe`: by where the points are in the frame of the obstacle."""
@@ -378,11 +392,11 @@ class RigidObstacleProbe:
     def is_valid_for(self, contact: Contact) -> bool:
         """See `Probe`: of an obstacle that neither turns nor changes its shape."""
         known = np.array_equal(self._shape, self._sampler.shape) and not contact.opposite.turns
-        moved = self._at(contact.values.x + contact.values.jump) - self._z
+        moved = self._at(self._in_frame(contact)) - self._z
         size = self._places.size[self._facet]
         clear = _DEPTH_RESOLUTION * size + self._distance
         # What has entered the body may go deeper.
-        inside = _dot(np.nan_to_num(self._toward), self._outward(self.points)[self._facet]) < 0
+        inside = _dot(np.nan_to_num(self._toward), self._outward(self.field)[self._facet]) < 0
         clear -= np.where(inside, _ALLOWED_BEFORE * size, 0.0)
         known = known and bool(np.all(np.linalg.norm(moved, axis=1) <= clear))
         # A point may have come to the opposite side of what is thinner.
@@ -395,8 +409,9 @@ class RigidObstacleProbe:
         places = self._places
         deep = resisted.at(places.facets.corner_vertices())[self._facet]
         rows = places.rows[self._facet]
+        # What the points do not carry of the displacement they do not explain either.
         planes = _below(
-            self._z,
+            places.by_points(self.points, self._facet, self._reference),
             self.points[rows] + self._gap[rows][..., None] * self._normal[rows],
             -self._normal[rows],
         )
@@ -419,7 +434,7 @@ class RigidObstacleProbe:
         facet, place, toward = self._facet[some], self._z[some], self._toward[some]
         # Half way through an obstacle there is no normal.
         depth[some[~(np.linalg.norm(toward, axis=1) > 0.5)]] = np.inf
-        inward = -self._outward(self.points)[facet]
+        inward = -self._outward(self.field)[facet]
         aside = np.nan_to_num(toward - _dot(toward, inward)[:, None] * inward)
         length = np.linalg.norm(aside, axis=1, keepdims=True)
         aside *= size[some, None] / np.where(length > 0, length, 1.0)
@@ -427,7 +442,7 @@ class RigidObstacleProbe:
         for way in (aside, -aside):
             narrow &= self._sampler.sample(place + way)[0] >= 0
         some, place, inward = some[narrow], place[narrow], inward[narrow]
-        surface = self._surface(self.points, allowed) if self._comm.allreduce(len(some)) else None
+        surface = self._surface(self.field, allowed) if self._comm.allreduce(len(some)) else None
         reach = allowed[some]
         while self._comm.allreduce(len(some)):
             assert surface is not None
@@ -453,10 +468,10 @@ class RigidObstacleProbe:
         return np.concatenate(parts)
 
     def _points_at(self, time: float) -> Array:
-        """The points of Γc at a time from 0 to 1 in the increment, in the frame of the obstacle."""
+        """The nodes of Γc at a time from 0 to 1 in the increment, in the frame of the obstacle."""
         if time in (0.0, 1.0):
-            return self.points if time else self._start
-        end = self._rotation.turned(self.points, 1.0)
+            return self.field if time else self._start
+        end = self._rotation.turned(self.field, 1.0)
         return self._rotation.turned(self._start + time * (end - self._start), -time)
 
     def _crossed_between(self, since: float, until: float, allowed: Array) -> Array:
@@ -538,7 +553,7 @@ class RigidObstacleProbe:
             facet: Facet of this rank that each is nearest to, (n,).
             outward: Its outward unit normal, (n, gdim).
             some: Which of the points are looked at, (n,).
-            field: The points of Γc in that frame, (n_points, gdim) (length).
+            field: The nodes of Γc in that frame, (n_nodes, gdim) (length).
 
         Returns:
             Their numbers among those of all ranks, (n,); -1 for points that are outside, or below
@@ -610,7 +625,7 @@ class RigidObstacleProbe:
 
         Args:
             points: Of the obstacle, in its frame, (n, gdim) (length).
-            field: The points of Γc in that frame, (n_points, gdim) (length).
+            field: The nodes of Γc in that frame, (n_nodes, gdim) (length).
             through: See `_enter`.
             allowed: Allowed depth at the places of this rank, (n_places,) (length).
 
@@ -632,7 +647,7 @@ class RigidObstacleProbe:
         """Collect the flat pieces of Γc on all ranks. Collective.
 
         Args:
-            field: The points of Γc in the frame of the obstacle, (n_points, gdim) (length).
+            field: The nodes of Γc in the frame of the obstacle, (n_nodes, gdim) (length).
             allowed: Allowed depth at the places of this rank, (n_places,) (length).
         """
         most: Array = np.zeros(len(self._places.size))

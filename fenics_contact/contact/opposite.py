@@ -474,6 +474,10 @@ class Opposite(ABC):
             'kinematics="finite" only'
         )
 
+    def in_frame(self, vectors: Array, angle: float) -> Array:
+        """Vectors in the frame of the obstacle turned by an angle since it began, (n, gdim)."""
+        return vectors
+
     def rotation_in_increment(self, values: PointValues) -> IncrementalRotation:
         """Rotation of the obstacle since the last commit. Collective.
 

@@ -175,6 +175,11 @@ class MovingOpposite(Opposite):
         largest[known] = np.linalg.eigvalsh(curvature[known]).max(axis=1, initial=0.0)
         return largest
 
+    def in_frame(self, vectors: Array, angle: float) -> Array:
+        """See `Opposite`."""
+        rotation = self._parts.obstacle.rotation
+        return vectors if rotation is None else rotation.turned(vectors, -angle)
+
     def rotation_in_increment(self, values: PointValues) -> IncrementalRotation:
         """See `Opposite`."""
         rotation, angle = self._parts.obstacle.rotation, self.turned_by(values)

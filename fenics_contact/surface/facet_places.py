@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from dolfinx import fem
 
@@ -15,11 +19,49 @@ from fenics_contact.types import Array, Index
 __all__ = ["FacetPlaces"]
 
 
+@dataclass(frozen=True)
+class _Interpolation:
+    """Polynomials on facets through values at nodes.
+
+    Attributes:
+        rows: Nodes of every facet of this rank, (n_facets, n).
+        basis: Of the polynomials.
+        coefficients: From the values at the nodes, (n_facets, n_basis, n).
+    """
+
+    rows: Index
+    basis: Any
+    coefficients: Array
+
+    @classmethod
+    def of(cls, facets: FacetSet, rows: Index, at: Array, n_basis: int) -> _Interpolation:
+        """The largest complete ones, of ``n_basis`` functions at most, that the nodes can carry.
+
+        Args:
+            facets: The facets.
+            rows: See the attribute.
+            at: Reference coordinates of the nodes, in the order of ``rows``, (rows.size, gdim - 1).
+            n_basis: See above.
+        """
+        n_facets, n = rows.shape
+        basis = polynomials(at.shape[1] + 1, facets.simplex, min(n, n_basis))
+        table = tabulate(basis, 0, at)[0, :, :, 0].reshape(n_facets, n, basis.dim)
+        coefficients = np.linalg.pinv(table) if n_facets else table.swapaxes(1, 2)
+        return cls(rows, basis, np.asarray(coefficients, dtype=np.float64))
+
+    def __call__(self, field: Array, facet: Index, reference: Array) -> Array:
+        """A field at the nodes, (n_nodes, ...), at places on facets: (n, ...)."""
+        table = tabulate(self.basis, 0, reference)[0, :, :, 0]
+        weights = np.einsum("nb,nbq->nq", table, self.coefficients[facet])
+        return np.asarray(np.einsum("nq,nq...->n...", weights, field[self.rows[facet]]))
+
+
 class FacetPlaces:
     """The points of Γc, and corners, middles of edges and middles of its facets.
 
-    A field that is known at the quadrature points is evaluated elsewhere on a facet by the
-    polynomial that its points carry: exactly, where it is of the degree of the displacement.
+    A field is evaluated on a facet by the polynomial that its nodes carry, which is of the degree
+    of displacement and geometry. The nodes are the quadrature points where there are enough of
+    them, else a lattice (`at_nodes`).
 
     Attributes:
         facets: Γc as a set of facets.
@@ -53,33 +95,66 @@ class FacetPlaces:
         n_basis = (degree + 1) ** (d - 1)
         if d == 3 and self.facets.simplex:
             n_basis = (degree + 1) * (degree + 2) // 2
-        self._basis = polynomials(d, self.facets.simplex, min(n_points, n_basis))
-        table = tabulate(self._basis, 0, at)[0, :, :, 0]
-        table = table.reshape(n_facets, n_points, self._basis.dim)
+        self._at_points = _Interpolation.of(self.facets, self.rows, at, n_basis)
+        self._nodes, self._at_nodes = self.reference[:0], self._at_points
+        if n_points < n_basis:
+            lattice = self.facets.interpolation_nodes(degree)
+            rows = np.arange(n_facets * len(lattice)).reshape(n_facets, len(lattice))
+            self._nodes = np.tile(lattice, (n_facets, 1))
+            self._at_nodes = _Interpolation.of(self.facets, rows, self._nodes, n_basis)
         self._pieces = self.facets.flat_pieces(degree)
-        self._coefficients = np.linalg.pinv(table) if n_facets else table.swapaxes(1, 2)
 
-    def values(self, field: Array, facet: Index, reference: Array) -> Array:
-        """A point field at places on facets.
+    def at_nodes(
+        self, field: Array, u: fem.Function, turned: Callable[[Array], Array] | None = None
+    ) -> Array:
+        """Places that are known at the points, at the nodes.
+
+        What fewer points than nodes do not carry of the displacement is added.
 
         Args:
-            field: At this rank's points, (n_points, ...).
+            field: Places of this rank's points, displaced by ``u`` and moved rigidly, (n_points,
+                gdim) (length).
+            u: The displacement.
+            turned: The rotation in that, of (n, gdim); None: there is none.
+
+        Returns:
+            (n_nodes, gdim) (length); the field itself where the points are the nodes.
+        """
+        if self._at_nodes is self._at_points:
+            return field
+        facet = np.repeat(np.arange(len(self.rows)), self._at_nodes.rows.shape[1])
+        mine = slice(self.rows.size)
+        places = np.empty_like(field)
+        places[self.rows.ravel()], _ = self.facets.positions(
+            self.facet[mine], self.reference[mine], u
+        )
+        rest, _ = self.facets.positions(facet, self._nodes, u)
+        rest -= self._at_points(places, facet, self._nodes)
+        return self._at_points(field, facet, self._nodes) + (turned(rest) if turned else rest)
+
+    def by_points(self, field: Array, facet: Index, reference: Array) -> Array:
+        """As `values`, of a field at this rank's points, (n_points, ...), by what these carry."""
+        return self._at_points(field, facet, reference)
+
+    def values(self, field: Array, facet: Index, reference: Array) -> Array:
+        """A field at places on facets.
+
+        Args:
+            field: At this rank's nodes, (n_nodes, ...); see `at_nodes`.
             facet: Facet of this rank of every place, (n,).
             reference: Reference coordinates on it, (n, gdim - 1).
 
         Returns:
             (n, ...), in the unit of the field.
         """
-        table = tabulate(self._basis, 0, reference)[0, :, :, 0]
-        weights = np.einsum("nb,nbq->nq", table, self._coefficients[facet])
-        return np.asarray(np.einsum("nq,nq...->n...", weights, field[self.rows[facet]]))
+        return self._at_nodes(field, facet, reference)
 
     def moving_facets(self, start: Array, end: Array) -> MovingFacets:
-        """The facets of this rank, in flat pieces, whose points move from a start to an end.
+        """The facets of this rank, in flat pieces, whose nodes move from a start to an end.
 
         Args:
-            start: Of this rank's points, (n_points, gdim) (length).
-            end: Of this rank's points, (n_points, gdim) (length).
+            start: Of this rank's nodes, (n_nodes, gdim) (length).
+            end: Of this rank's nodes, (n_nodes, gdim) (length).
         """
         n, (n_pieces, n_corners, _) = len(self.rows), self._pieces.shape[:3]
         facet = np.repeat(np.arange(n), n_pieces * n_corners)

@@ -188,6 +188,18 @@ class FacetSet:
         facets = np.arange(len(self.cells)) if facets is None else facets
         return np.repeat(facets, len(places)), np.tile(places, (len(facets), 1))
 
+    def interpolation_nodes(self, degree: int) -> Array:
+        """Reference coordinates on a facet of the nodes of polynomials, (n, d - 1).
+
+        Args:
+            degree: Of the polynomials.
+        """
+        along = np.linspace(0.0, 1.0, degree + 1)
+        grid = np.meshgrid(*[along] * (self._d - 1), indexing="ij")
+        nodes = np.column_stack([g.ravel() for g in grid])
+        inside = nodes.sum(axis=1) < 1.0 + 0.5 / degree
+        return nodes[inside] if self.simplex and self._d == 3 else nodes
+
     def flat_pieces(self, degree: int) -> Array:
         """Reference corners of the pieces, in order, that are taken as flat: (n, n_corners, d - 1).
 
