@@ -580,8 +580,9 @@ class Problem:
             now = trial if share == tried else evaluate(now.z + share * step)
         norm, now = best
         # Forces that carry a body along excuse none of its loads, nor does round-off.
-        excused = max(1e3 * rtol * now.size, 1e-12 * condensed.roundoff(now.z, now.forces))
-        if norm > min(excused, 1e-3 * _norm(load.force) or np.inf):
+        limits = rtol * now.size, 1e-14 * condensed.roundoff(now.z, now.forces)
+        excused = max(1e3 * limits[0], 1e2 * limits[1])
+        if norm > max(min(excused, 1e-3 * _norm(load.force) or np.inf), *limits):
             raise Failed(f"residual {norm / max(now.size, 1e-300):.1e} of the forces")
         u = u.copy()
         u[load.fixed] = load.values

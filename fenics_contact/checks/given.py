@@ -287,8 +287,8 @@ def _warn_of_few_points(contact: Contact) -> None:
             contact.surface.mesh.comm,
             f"{contact.name}: vertex quadrature has no points at the other nodes of elements of "
             f"degree {degree}, which penetrate freely: contact is too soft (a block with one and "
-            "with two facets by 48 and by 24 %). Use elements of degree 1, or the default "
-            "quadrature_scheme",
+            "with two facets by 48 and by 24 %). Use elements of degree 1 or, without "
+            "NodalSprings, the default quadrature_scheme",
         )
 
 

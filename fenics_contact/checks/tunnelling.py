@@ -279,7 +279,7 @@ class RigidObstacleProbe:
     def __init__(
         self,
         contact: Contact,
-        before: fem.Function | None,
+        before: fem.Function | None = None,
         known: RigidObstacleProbe | None = None,
     ) -> None:
         """Sample the obstacle at the places and, on each facet, where it is deepest. Collective.
@@ -300,28 +300,36 @@ class RigidObstacleProbe:
         self._gap, self._normal = self._sampler.sample(self.points)
         self._shape = self._sampler.shape
         self._rotation = opposite.rotation_in_increment(values)
-        self.field = self._in_frame(contact)
-        self._start = places.at_nodes(
-            values.x + opposite.committed_jump,
-            before or contact.u,
-            lambda rest: opposite.in_frame(rest, opposite.committed_angle),
-        )
+        self.field = self._in_frame(contact, contact.u)
         if known is not None and not opposite.turns:
             self._start = known.field
+        else:
+            self._start = places.at_nodes(
+                values.x + opposite.committed_jump,
+                contact.u if before is None else before,
+                lambda rest: opposite.in_frame(rest, opposite.committed_angle),
+            )
         self._facet, self._reference, self._distance, self._toward = self._deepest()
         self.x, _ = places.facets.positions(self._facet, self._reference)
         self._z = self._at(self.field)
+        # What the points do not carry of the displacement they do not explain either.
+        self._explained = self._at(self._in_frame(contact, None))
         closed = contact.status != Status.OPEN
         # A penetration that the law knows of is its own matter, with no stiffness as well.
         deep = np.maximum(values.penetration, np.where(closed, -self._gap, 0.0))[places.rows]
         self.resisted = [(places.facets.corner_vertices(), deep.max(axis=1, initial=0.0))]
 
-    def _in_frame(self, contact: Contact) -> Array:
-        """The nodes in the frame of the obstacle as they are now. Collective."""
+    def _in_frame(self, contact: Contact, u: fem.Function | None) -> Array:
+        """The nodes in the present frame of the obstacle; see `FacetPlaces.at_nodes`. Collective.
+
+        Args:
+            contact: The contact, evaluated.
+            u: The displacement; None: of it no more than the points carry.
+        """
         opposite, values = contact.opposite, contact.values
         angle = opposite.angle(values)
         return self._places.at_nodes(
-            values.x + values.jump, contact.u, lambda rest: opposite.in_frame(rest, angle)
+            values.x + values.jump, u, lambda rest: opposite.in_frame(rest, angle)
         )
 
     def _at(self, field: Array) -> Array:
@@ -348,7 +356,8 @@ class RigidObstacleProbe:
         # The distance changes by no more than the way: farther obstacles do not reach the facet.
         going: Mask = distance < size[facet]
         scale: Array = np.ones(len(facet))
-        inverse = np.linalg.pinv(self._tangents(self.field))
+        inverse, near = np.swapaxes(self._tangents(self.field), 1, 2), np.unique(facet[going])
+        inverse[near] = np.linalg.pinv(np.swapaxes(inverse[near], 1, 2))
         for _ in range(_DESCENT_STEPS):
             facet, at, scale = facet[going], at[going], scale[going]
             distance, normal = distance[going], normal[going]
@@ -392,7 +401,7 @@ class RigidObstacleProbe:
     def is_valid_for(self, contact: Contact) -> bool:
         """See `Probe`: of an obstacle that neither turns nor changes its shape."""
         known = np.array_equal(self._shape, self._sampler.shape) and not contact.opposite.turns
-        moved = self._at(self._in_frame(contact)) - self._z
+        moved = self._at(self._in_frame(contact, contact.u)) - self._z
         size = self._places.size[self._facet]
         clear = _DEPTH_RESOLUTION * size + self._distance
         # What has entered the body may go deeper.
@@ -409,9 +418,8 @@ class RigidObstacleProbe:
         places = self._places
         deep = resisted.at(places.facets.corner_vertices())[self._facet]
         rows = places.rows[self._facet]
-        # What the points do not carry of the displacement they do not explain either.
         planes = _below(
-            places.by_points(self.points, self._facet, self._reference),
+            self._explained,
             self.points[rows] + self._gap[rows][..., None] * self._normal[rows],
             -self._normal[rows],
         )

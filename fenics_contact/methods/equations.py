@@ -265,7 +265,7 @@ class Equations:
             contact.evaluate()
 
     def note(self) -> None:
-        """Let `watch` see the status of the points, evaluated where the residual was last."""
+        """Let `watch` see the status of the points, evaluated where `norms` are from."""
         self.watch.note(self.norms.total)
 
     def is_constrained(self) -> bool:

@@ -23,8 +23,8 @@ __all__ = ["OVERLOADED", "InnerSnes", "Method", "Newton", "OwnMethod", "SnesMeth
 # states whose levels were 0.93 and 0.96 of each other's; with a quarter (Deuflhard's restricted
 # monotonicity) it does not begin where one point is closed, from which levels fall to 0.83.
 _DECREASE = 0.1
-# Share of a step from which on it is the whole one: but for round-off.
-_WHOLE = 1.0 - 1e-9
+# Share of a step from which on it is the whole one, and no half: multigrid has it to a hundredth.
+_WHOLE = 0.9
 # Iterations without a lower residual after which another method takes over.
 _PATIENCE = 14
 
@@ -297,10 +297,10 @@ class Newton(SnesMethod):
         little too deep forces are large, too; the next correction is small. Where points change
         their status neither need fall along a step: it is taken if one does.
 
-        Nor need any of both fall where points close along a step, whose stiffness J does not have.
-        On a linear bulk nothing else changes J: a whole step is taken, too, if the correction that
+        Neither need fall where points close along a step, whose stiffness J does not have. On a
+        linear bulk little else changes J: a whole step is taken, too, if the correction that
         follows, by the tangent at its end, is smaller. Where it is not, as between stick and slip,
-        that is not tried again: it costs two factorisations.
+        that is not tried again in this solution: it costs two factorisations.
         """
         if self._iterate is None:
             self._iterate, self._step = (x.copy(), f.copy()), None
@@ -320,7 +320,7 @@ class Newton(SnesMethod):
             if self._correction(f) <= enough * self._step:
                 self._trial = x.array_r.copy()
                 return 0.0
-            self._looks_ahead = False
+            self._looks_ahead, self._trial = False, None
             self._assemble_tangent(iterate)
         return float(level * level)  # infinite where it overflows
 
@@ -343,6 +343,7 @@ class Newton(SnesMethod):
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`."""
+        self._iterate = self._trial = None
         self._looks_ahead = self._equations.full.bulk.linear
         iterations, reason = self._callbacks.solve(self.snes, self._equations.solution)
         # The line search `cp`, by option, takes a step across the residual, F·y = 0, for the end.

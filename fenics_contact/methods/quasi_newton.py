@@ -120,6 +120,7 @@ class QuasiNewton(SnesMethod):
         equations = self._equations
         self._clear_pairs(consistent=False)
         equations.evaluate(equations.solution)
+        equations.note()
         self._refreshed = not idle and equations.is_constrained()
         equations.make_h0(everywhere=not self._refreshed)
 
@@ -131,6 +132,7 @@ class QuasiNewton(SnesMethod):
         """
         equations = self._equations
         equations.evaluate(equations.solution)
+        equations.note()
         if not np.isfinite(equations.full.bulk.scale):
             return False
         self._refreshed = True

@@ -91,7 +91,7 @@ class LooseModes:
         work, *sizes = scales.global_sum(borne)
         size = np.max([np.abs(resultant), *sizes], axis=0)
         group = groups[np.argmax(np.abs(loose), axis=1)]
-        # What is left of round-off is not in balance either, and would never be.
+        # Sums of round-off count as no force: no share of them would ever be in balance.
         size = np.where(size > scales.round_off_of_groups[group], size, 0.0)
         left = agreed(motions.comm, np.where(size > 0.0, resultant + work, 0.0))
         part = np.abs(left) / np.where(size > 0.0, size, 1.0)
@@ -126,6 +126,7 @@ class LooseModes:
         """
         largest: Array = np.zeros(scales.n_groups)
         np.maximum.at(largest, self.group, self.force)
+        largest[largest <= scales.round_off_of_groups] = 0.0
         sums: Array = np.zeros((2, len(self.force)))
         points = []
         for number, (operator, mask) in enumerate(zip(operators, within, strict=True)):

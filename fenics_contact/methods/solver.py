@@ -86,8 +86,8 @@ METHODS: dict[str, type[Method]] = {
     "primal_dual": PrimalDual,
     "continuation": Continuation,
 }
-# What takes over where a method fails, and what tells whether friction can bear the load. Last it
-# solved none of 420 random scenes that the others do not, but it finds overloads that no start
+# What takes over where a method fails, and what tells whether friction can bear the load. Behind
+# the others the latter solved none of 420 random scenes, but it finds overloads that no start
 # shows: of a tight fit in the first round of multipliers, whose springs are soft.
 _FALLBACKS, _DIAGNOSIS = ("primal_dual", "continuation"), "alternating"
 

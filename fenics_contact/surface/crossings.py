@@ -88,7 +88,7 @@ def find_crossings(
     number = found[:, 0].astype(np.int64) - first
     own = (number >= 0) & (number < len(start))
     found, number = found[own], number[own]
-    order = np.lexsort((found[:, 1], number))
+    order = np.lexsort((found[:, -1], found[:, 1], number))
     found = found[order]
     time, inward, depth, normal = found[:, 1], found[:, 2] > 0, found[:, 3], found[:, 4 : 4 + d]
     return Crossings(number[order], time, inward, normal, depth, found[:, -1].astype(np.int64))
@@ -104,13 +104,20 @@ def _crossings(start: Array, end: Array, vertices: Index, facets: MovingFacets) 
     centre, radius = _ball(np.stack([start, end], axis=1))
     corners = np.concatenate([facets.start, facets.end], axis=1)
     middle, reach = _ball(corners)
-    # Most paths are far from all facets: only those that come near are compared one by one. Facets
-    # of a graded mesh differ more in size than paths in length.
+    # Most paths are far from all facets: only those that come near are compared one by one. Each
+    # searches as far as the largest of the others reach: those that differ most in size search.
     place: Any
     facet: Any
     known = np.flatnonzero(np.isfinite(radius))  # not where an obstacle has no normal
-    tree = scipy.spatial.cKDTree(centre[known])
-    facet, place = near_pairs(tree, middle, reach + radius[known].max(initial=0.0))
+    if not len(known):
+        return nothing
+    longest, widest = radius[known].max(), reach.max()
+    if np.mean((reach + longest) ** (d - 1)) < np.mean((radius[known] + widest) ** (d - 1)):
+        tree = scipy.spatial.cKDTree(centre[known])
+        facet, place = near_pairs(tree, middle, reach + longest)
+    else:
+        tree = scipy.spatial.cKDTree(middle)
+        place, facet = near_pairs(tree, centre[known], radius[known] + widest)
     place = known[place]
     near = np.linalg.norm(centre[place] - middle[facet], axis=1) <= radius[place] + reach[facet]
     near &= ~(vertices[place][:, :, None] == facets.vertices[facet][:, None, :]).any(axis=(1, 2))

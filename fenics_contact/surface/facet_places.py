@@ -105,22 +105,22 @@ class FacetPlaces:
         self._pieces = self.facets.flat_pieces(degree)
 
     def at_nodes(
-        self, field: Array, u: fem.Function, turned: Callable[[Array], Array] | None = None
+        self, field: Array, u: fem.Function | None, turned: Callable[[Array], Array]
     ) -> Array:
         """Places that are known at the points, at the nodes.
 
-        What fewer points than nodes do not carry of the displacement is added.
+        What fewer points than nodes do not carry of geometry and displacement is added.
 
         Args:
-            field: Places of this rank's points, displaced by ``u`` and moved rigidly, (n_points,
-                gdim) (length).
-            u: The displacement.
-            turned: The rotation in that, of (n, gdim); None: there is none.
+            field: Places of this rank's points, displaced and moved rigidly, (n_points, gdim)
+                (length).
+            u: The displacement; None: what the points do not carry of it is left out.
+            turned: The rotation in that motion, of (n, gdim).
 
         Returns:
             (n_nodes, gdim) (length); the field itself where the points are the nodes.
         """
-        if self._at_nodes is self._at_points:
+        if self.points_are_nodes:
             return field
         facet = np.repeat(np.arange(len(self.rows)), self._at_nodes.rows.shape[1])
         mine = slice(self.rows.size)
@@ -130,11 +130,12 @@ class FacetPlaces:
         )
         rest, _ = self.facets.positions(facet, self._nodes, u)
         rest -= self._at_points(places, facet, self._nodes)
-        return self._at_points(field, facet, self._nodes) + (turned(rest) if turned else rest)
+        return self._at_points(field, facet, self._nodes) + turned(rest)
 
-    def by_points(self, field: Array, facet: Index, reference: Array) -> Array:
-        """As `values`, of a field at this rank's points, (n_points, ...), by what these carry."""
-        return self._at_points(field, facet, reference)
+    @property
+    def points_are_nodes(self) -> bool:
+        """Whether the quadrature points carry displacement and geometry."""
+        return self._at_nodes is self._at_points
 
     def values(self, field: Array, facet: Index, reference: Array) -> Array:
         """A field at places on facets.
