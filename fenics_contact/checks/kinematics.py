@@ -26,7 +26,8 @@ _NEGLIGIBLE = 1e-3
 # Slide, as a share of the smallest facet, and difference of the displacements on Γc, as a share of
 # its size, below which pairs in the deformed bodies are those of before.
 _SLID, _TURNED = 1e-2, 1e-3
-# Round-off of a gap, relative to the coordinates that it is the difference of.
+# Round-off of a gap, relative to the coordinates that it is the difference of, and of tractions
+# that cancel.
 _ROUND_OFF = 1e-12
 # Share by which small displacements may change forces or pressures before it is said.
 _NOTABLE = 0.01
@@ -261,21 +262,25 @@ def linearisation(
     added = [d.added(c, s) for (d, c), s in zip(pairs, springs, strict=True)]
     jumps = respond([s.stiffness for s in springs], added)
     return {
-        c.name: _relative(c, traction + s.change(jump))
+        c.name: _relative(c, traction, s.change(jump))
         for c, s, traction, jump in zip(contacts, springs, added, jumps, strict=True)
     }
 
 
-def _relative(contact: Contact, change: Array) -> Linearisation:
-    comm, measure = contact.surface.mesh.comm, contact.measure
+def _relative(contact: Contact, added: Array, answered: Array) -> Linearisation:
+    """The error by the change of the tractions at fixed displacements, and that by their change."""
+    comm, measure, change = contact.surface.mesh.comm, contact.measure, added + answered
     force_change = global_sum(comm, measure @ change)
     size = float(global_sum(comm, measure @ np.linalg.norm(contact.traction, axis=1)))
     largest = longest(comm, contact.pressure) or 1.0  # squares must not overflow
     along = np.sum(change * contact.values.normal, axis=1) / largest
     squares = [measure @ along**2, measure @ (contact.pressure / largest) ** 2]
     changed, whole = np.sqrt(global_sum(comm, squares))
-    # Where the contact bears nothing all of what it ought to bear is missing.
-    size = size or float(global_sum(comm, measure @ np.linalg.norm(change, axis=1)))
+    if not size:
+        # All of what it ought to bear is missing, but where a free body moves out of the way.
+        parts = [np.linalg.norm(part, axis=1) for part in (change, added)]
+        size, at_rest = global_sum(comm, [measure @ part for part in parts])
+        size = size if size > _ROUND_OFF * at_rest else 0.0
     force = float(np.linalg.norm(force_change)) / size if size else 0.0
     pressure = float(changed / whole) if whole else 0.0
     return Linearisation(force, pressure, not contact.rigid)
