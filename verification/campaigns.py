@@ -66,7 +66,7 @@ def page(found: dict[str, list[Row]]) -> str:
     increments = sum(int(row["increments"] or 0) for rows in found.values() for row in rows)
     lines = ["# Random scenes", ""]
     lines += report.text(
-        f"**{wrong} of {total} random scenes had a wrong result when they were run**, of which 2 "
+        f"**{wrong} of {total} random scenes had a wrong result when they were run**, of which 4 "
         "are not explained ([below](#wrong-results)). Every scene is solved by the package and by "
         f"an independent solver, {increments:,} increments in all."
     )
@@ -111,6 +111,9 @@ def page(found: dict[str, list[Row]]) -> str:
         "of up to 20 times the width.",
     )
     lines += ["## Wrong results", ""]
+    later = found["the same, later"]
+    solved = sum(row["kind"] == "NotConverged: not converged (solved apart)" for row in later)
+    required = sum("rightly" in row["kind"] for row in later)
     lines += report.text(
         "- Seed 900161 (three bodies, augmented Lagrangian, unloading, restart): a multiplier has "
         "an error of 1.4e-8, the independent solver allows 2.9e-9. Which of the two is wrong is "
@@ -131,9 +134,15 @@ def page(found: dict[str, list[Row]]) -> str:
         "pressed by a force, 25 were faults of the independent solver. All crashes were a NumPy "
         "warning. The causes are corrected; 26 of 30 that were solved again are correct or "
         "refused.",
-        "- Of the later 3351 mixed scenes 160 did not converge and were solved by the independent "
-        "solver, and 128 refusals are required by the geometry. In one a pin sank slowly into a "
-        "flat cell (813024); it is refused now.",
+        f"- Of the later {len(later)} mixed scenes {solved} did not converge and were solved by "
+        f"the independent solver, and {required} refusals are required by the geometry. In one a "
+        "pin sank slowly into a flat cell (813024), and in one the middles of quadratic facets "
+        "passed through the obstacle between the points of vertex quadrature (814618): both are "
+        "refused now. In one a point is 1e-9 of the length away from the vertex of a polygon, "
+        "whose normal there has a round-off of 5e-8 (815370).",
+        "- Not explained are a penetration with multipliers 10 % above what is allowed, on a "
+        "single facet (815746), and a slip reference taken 1e-4 of the body's size inside of the "
+        "obstacle, a plate that passes by (815922).",
         "- Faults found earlier by scenes of two bodies are corrected and among the tests: a "
         "resumed history refused for the round-off of a prescribed zero, a NumPy error for a "
         "flattened surface, a residual of 5e-7 of a soft body's forces taken for the round-off of "
@@ -172,7 +181,8 @@ def page(found: dict[str, list[Row]]) -> str:
         "- Faults of the independent solver were: integrals between curved facets; round-off if Γc "
         "is a single point; the non-uniqueness of friction multipliers at constrained nodes; "
         "penalty forces at points that lost their pairs; the nearest point of a friction polygon; "
-        "multipliers that no displacement can change.",
+        "multipliers that no displacement can change; the depth of bodies that were not "
+        "positioned; residuals relative to the forces that carry a body along.",
         "- In 8 correct scenes with finite kinematics and rigid obstacles, and in 18 with "
         "dissimilar bodies, the independent solver did not reach the end of the history.",
         "- Seeds from 600000 on are families of 12 (`--alike 12`), from 720000 on of 48, that "
