@@ -628,6 +628,9 @@ def page(rows: list[Row]) -> str:
         "Where one slave facet spans 20 master facets, 2 quadrature points per facet are too few; "
         "with 40 the error is 3.9e-2, with 80 it is 1.5e-2. The gap of 1000 heights is closed if "
         "the increment may be halved 14 times (`max_cuts=14`; 6 by default).",
+        "Sliding off an end is refused where the corner of the last facet is deeper than the "
+        "points around explain, all of which are open by then: finer facets, or more points, are "
+        "needed.",
         f"{len(free)} verified runs have no reference, because the method or solver that would "
         "give it fails: " + "; ".join(dict.fromkeys(f"{r.group}: {r.case}" for r in free)) + ".",
     )
