@@ -50,8 +50,14 @@ class NotConverged(RuntimeError):
         what = "; ".join(failures) or "the last state passes the verification"
         tried = ". ".join(str(attempt) for attempt in attempts)
         super().__init__(
-            f"increment {increment} did not converge: SNES reason {reason} after {self.iterations} "
-            f"iterations; {what}; the forces have magnitude {verdict.force:.3e}. Tried: {tried}. "
+            (
+                f"increment {increment}: the solution after {self.iterations} iterations does not "
+                "pass the verification: "
+                if reason > 0
+                else f"increment {increment} did not converge: SNES reason {reason} after "
+                f"{self.iterations} iterations; "
+            )
+            + f"{what}; the forces have magnitude {verdict.force:.3e}. Tried: {tried}. "
             + _advice(reason, verdict, attempts, stiffnesses, driven=driven)
             + f"; -{prefix}snes_monitor shows the iterations"
         )

@@ -88,8 +88,8 @@ class ContactProblem:
             Newton's method with a line search on the energy. It is not for mixed functions, whose
             solutions are saddle points. By default "newton"; for a linear bulk on all unknowns
             "lbfgs" by multigrid, and in three dimensions if Dirichlet conditions constrain all
-            bodies and pairs do not change. After a failure "primal_dual", "continuation" and
-            "alternating" follow, those that apply.
+            bodies and none slide on each other with finite kinematics. After a failure
+            "primal_dual", "continuation" and "alternating" follow, those that apply.
         alpha: Factor α of the normal contact stiffness in H₀, 0 to 1 (source paper: 1).
         phi: Factor φ of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
             source paper has 0; with 1 a third of the iterations suffices once points stick.

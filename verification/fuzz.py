@@ -62,6 +62,7 @@ CATEGORIES = {
     "no contact force can balance": "load not balanced",
     "neither Dirichlet conditions nor contact constrain": "not held",
     "did not converge": "not converged",
+    "does not pass the verification": "not converged",
     "penetrat": "penetration",
     "no potential": "no potential",
     "too large": "too large",

@@ -59,7 +59,7 @@ class Placement:
 class Motion:
     """A rigid translation of an obstacle, of which components with a given force are unknown.
 
-    For every component either force or displacement is given, and the other is None. An obstacle
+    For every component a force, a displacement or neither (at rest) is given. An obstacle
     with ``Motion(force=(None, -5), displacement=(pull, None))`` is pressed down with force 5 and
     moved by ``pull`` in x.
 
