@@ -19,9 +19,9 @@ __all__ = ["DeformableBody"]
 class DeformableBody(Obstacle):
     """An opposing deformable body: another part of the same mesh and displacement space.
 
-    Γc is the slave side, on which the contact law is integrated, and should be on the softer or
-    more finely meshed body; the surface of this body is the master side. The contact forces on both
-    bodies are equal and opposite up to round-off.
+    Γc is the slave side, on which the contact law is integrated, and should be on the more finely
+    meshed body, with equal meshes on the softer one; the surface of this body is the master side.
+    The contact forces on both bodies are equal and opposite up to round-off.
 
     Args:
         facet_tags: Tags on the facets of the mesh.
