@@ -95,8 +95,9 @@ class _Module:
         return [HOLE]
 
     def _joined(self, parts: list[list[str]]) -> list[str]:
-        return self._some(["".join(each) for each in itertools.product(*parts)]) or [
-            "".join(part[0] if len(part) == 1 else HOLE for part in parts)
+        known = [part or [HOLE] for part in parts]  # too many texts are as good as none
+        return self._some(["".join(each) for each in itertools.product(*known)]) or [
+            "".join(part[0] if len(part) == 1 else HOLE for part in known)
         ]
 
     @staticmethod

@@ -553,6 +553,12 @@ class ContactProblem:
             return False
         if any(contact.opposite.pairs_anew for contact in self.contacts):
             return False
+        # Of nodes that the quadrature points do not carry only a complete u tells where they are.
+        carried = (
+            c.opposite.sampler is None or c.facet_places.points_are_nodes for c in self.contacts
+        )
+        if not all(carried):
+            return False
         if self.solver.system.mark in self.state.energy.forces:
             return True
         return self.increment == 0 and not self._comm.allreduce(int(self.state.unknowns.any()))

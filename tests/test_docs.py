@@ -241,6 +241,8 @@ def test_the_tables_have_every_text(tmp_path: Path) -> None:
     plain = [re.sub(r"\\(.)", r"\1", row) for row in rows]
     for message in messages.read():
         assert any(row.startswith(f"| {message.text} |") for row in plain), message
+    for why in ("did not converge: SNES reason …", "does not pass the verification: …"):
+        assert any(why in row and "the forces have magnitude" in row for row in plain), why
 
 
 @pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import compress
 
 import numpy as np
 from dolfinx import fem
@@ -59,10 +58,8 @@ class Judge:
         self._full, self._motions = full, motions
         self._cross_check = CrossCheck(full.contacts) if cross_check else None
         self._contacts, self._comm = full.contacts, full.unknowns.comm
-        # Which are known at the points, before the displacement of other unknowns is.
-        known = [c.rigid and c.facet_places.points_are_nodes for c in full.contacts]
-        self._at_points = TunnellingCheck(list(compress(full.contacts, known)))
-        self._elsewhere = TunnellingCheck(list(compress(full.contacts, np.logical_not(known))))
+        self._obstacles = TunnellingCheck([c for c in full.contacts if c.rigid])
+        self._bodies = TunnellingCheck([c for c in full.contacts if not c.rigid])
         self._warned: dict[str, float] = {}
         self._inexact: set[str] = set()
         self._few: set[tuple[str, str]] = set()
@@ -118,8 +115,9 @@ class Judge:
         unbalanced = np.max([np.linalg.norm(part, axis=1) for part in parts], axis=0)
         sums = zip(names, unbalanced, sizes[1], allowed, strict=False)
         complete = system is self._full
-        tunnelling = self._at_points.evaluate(before) if laws else {}
-        tunnelling |= self._elsewhere.evaluate(before) if complete else {}
+        # Of the opposite only what Γc meets is known before u is complete; of rigid obstacles all.
+        tunnelling = self._obstacles.evaluate(before) if laws else {}
+        tunnelling |= self._bodies.evaluate(before) if complete else {}
         verdict = Verdict(
             equations={name: ForceBalance(*map(float, row)) for name, *row in equations},
             sums={name: ForceBalance(*map(float, row)) for name, *row in sums},

@@ -280,7 +280,7 @@ def _relative(contact: Contact, added: Array, answered: Array) -> Linearisation:
         # All of what it ought to bear is missing, but where a free body moves out of the way.
         parts = [np.linalg.norm(part, axis=1) for part in (change, added)]
         size, at_rest = global_sum(comm, [measure @ part for part in parts])
-        size = size if size > _ROUND_OFF * at_rest else 0.0
+        size = 0.0 if size <= _ROUND_OFF * at_rest < np.inf else size  # NaN: nothing is known
     force = float(np.linalg.norm(force_change)) / size if size else 0.0
     pressure = float(changed / whole) if whole else 0.0
     return Linearisation(force, pressure, not contact.rigid)
