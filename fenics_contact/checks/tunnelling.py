@@ -313,7 +313,8 @@ class RigidObstacleProbe:
         self.x, _ = places.facets.positions(self._facet, self._reference)
         self._z = self._at(self.field)
         # What the points do not carry of the displacement they do not explain either.
-        self._explained = self._at(self._in_frame(contact, None))
+        carried = places.points_are_nodes
+        self._explained = self._z if carried else self._at(self._in_frame(contact, None))
         closed = contact.status != Status.OPEN
         # A penetration that the law knows of is its own matter, with no stiffness as well.
         deep = np.maximum(values.penetration, np.where(closed, -self._gap, 0.0))[places.rows]
@@ -327,9 +328,10 @@ class RigidObstacleProbe:
             u: The displacement; None: of it no more than the points carry.
         """
         opposite, values = contact.opposite, contact.values
-        angle = opposite.angle(values)
         return self._places.at_nodes(
-            values.x + values.jump, u, lambda rest: opposite.in_frame(rest, angle)
+            values.x + values.jump,
+            u,
+            lambda rest: opposite.in_frame(rest, opposite.angle(values)),
         )
 
     def _at(self, field: Array) -> Array:

@@ -223,7 +223,6 @@ class Alternation(OwnMethod):
     def _assemble(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
         equations = self._equations
         equations.evaluate(x)
-        equations.note()
         if not equations.is_constrained():
             equations.assemble(matrix, equations.stiffnesses(everywhere=True))
             return

@@ -253,11 +253,19 @@ class Equations:
     def assemble_tangent(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
         """The consistent tangent of bulk and contact at ``x``. Collective."""
         self.evaluate(x)
-        self.note()
         self.assemble(matrix, self.regularised_tangents())
 
+    def assemble_trial_tangent(self, x: PETSc.Vec) -> None:
+        """That into `matrix`, at a trial ``x`` that is no iterate: `watch` does not see it."""
+        self._evaluate(x)
+        self.assemble(self.matrix(True), self.regularised_tangents())
+
     def evaluate(self, x: PETSc.Vec) -> None:
-        """Evaluate bulk and contacts at ``x``. Collective."""
+        """Evaluate bulk and contacts at ``x``, where the residual was computed last. Collective."""
+        self._evaluate(x)
+        self.note()
+
+    def _evaluate(self, x: PETSc.Vec) -> None:
         self.set_state(x)
         if not self._bulk.linear:  # else nothing changes it during a solution
             self.full.update_stiffness()

@@ -316,20 +316,13 @@ class Newton(SnesMethod):
         enough = 1.0 - _DECREASE * min(1.0, float(share))
         level = min(fall, self._correction(f) / self._step) / enough
         if level > 1.0 and share > _WHOLE and self._looks_ahead:
-            self._assemble_tangent(x)
+            self._equations.assemble_trial_tangent(x)
             if self._correction(f) <= enough * self._step:
                 self._trial = x.array_r.copy()
                 return 0.0
             self._looks_ahead, self._trial = False, None
-            self._assemble_tangent(iterate)
+            self._equations.assemble_trial_tangent(iterate)
         return float(level * level)  # infinite where it overflows
-
-    def _assemble_tangent(self, x: PETSc.Vec) -> None:
-        """The consistent tangent at x, no iterate of SNES. Collective."""
-        self._equations.evaluate(x)
-        self._equations.assemble(
-            self._equations.matrix(True), self._equations.regularised_tangents()
-        )
 
     def _correction(self, f: PETSc.Vec) -> float:
         """Norm of the Newton correction of a residual by the present tangent. Collective."""

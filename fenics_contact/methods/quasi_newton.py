@@ -120,7 +120,6 @@ class QuasiNewton(SnesMethod):
         equations = self._equations
         self._clear_pairs(consistent=False)
         equations.evaluate(equations.solution)
-        equations.note()
         self._refreshed = not idle and equations.is_constrained()
         equations.make_h0(everywhere=not self._refreshed)
 
@@ -132,7 +131,6 @@ class QuasiNewton(SnesMethod):
         """
         equations = self._equations
         equations.evaluate(equations.solution)
-        equations.note()
         if not np.isfinite(equations.full.bulk.scale):
             return False
         self._refreshed = True
