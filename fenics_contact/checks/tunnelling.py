@@ -31,10 +31,9 @@ from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["OpposingBodyProbe", "RigidObstacleProbe", "Tunnelling", "TunnellingCheck"]
 
-# Penetration, as a share of the facet, up to which tangent planes at its points explain more
+# Penetration, as a share of the facet, up to which tangent planes at the points around explain more
 # than these points resist: of a tilted facet the corner is 0.2 of it away from the nearest point.
-# Less of it where no point resists anything.
-_PREDICTED_DEPTH, _PREDICTED_UNRESISTED = 0.15, 0.05
+_PREDICTED_DEPTH = 0.15
 # Penetration, as a share of the facet, that two quadrature rules may differ by.
 _DEPTH_RESOLUTION = 0.02
 # The largest penetration, as a share of the facet, that places without resistance may have been
@@ -318,7 +317,11 @@ class RigidObstacleProbe:
         closed = contact.status != Status.OPEN
         # A penetration that the law knows of is its own matter, with no stiffness as well.
         deep = np.maximum(values.penetration, np.where(closed, -self._gap, 0.0))[places.rows]
-        self.resisted = [(places.facets.corner_vertices(), deep.max(axis=1, initial=0.0))]
+        corners = places.facets.corner_vertices()
+        self.resisted = [(corners, deep.max(axis=1, initial=0.0))]
+        through = self.points + self._gap[:, None] * self._normal
+        planes = through[places.rows], -self._normal[places.rows]
+        self._planes = _with_those_around(self._comm, corners, deep, *planes)
 
     def _in_frame(self, contact: Contact, u: fem.Function | None) -> Array:
         """The nodes in the present frame of the obstacle; see `FacetPlaces.at_nodes`. Collective.
@@ -419,12 +422,7 @@ class RigidObstacleProbe:
         """See `Probe`."""
         places = self._places
         deep = resisted.at(places.facets.corner_vertices())[self._facet]
-        rows = places.rows[self._facet]
-        planes = _below(
-            self._explained,
-            self.points[rows] + self._gap[rows][..., None] * self._normal[rows],
-            -self._normal[rows],
-        )
+        planes = _below(self._explained, *(p[self._facet] for p in self._planes))
         size = places.size[self._facet]
         allowed = _allowed(deep, planes, size, size)
         # Deeper in a flat cell it may be nearer to another surface, and `_entered_before` would not
@@ -574,7 +572,7 @@ class RigidObstacleProbe:
             size, height = self._places.size[facet[some]], self._places.facets.heights()
             reach = np.minimum(_ALLOWED_BEFORE * size, height[facet[some]] / 2)
             facets = self._places.moving_facets(field, field)
-            _, found[some] = self._below(points[some], outward[some], reach, facets)
+            _, found[some] = _below_facets(self._comm, points[some], outward[some], reach, facets)
         return found
 
     def _enter(self, start: Array, end: Array, entered: Mask, through: Index, times: Array) -> None:
@@ -648,7 +646,7 @@ class RigidObstacleProbe:
         depth = -_dot(points - surface.corner[through], surface.normal[through])
         rows = np.flatnonzero((through >= 0) & (depth > surface.allowed[through]))
         normal = surface.normal[through[rows]]
-        depth, facet = self._below(points[rows], normal, 2 * depth[rows], surface.facets)
+        depth, facet = _below_facets(self._comm, points[rows], normal, 2 * depth[rows], surface.facets)
         deep = (facet >= 0) & (depth > surface.allowed[facet])
         deep &= ~self._is_shallow(points[rows], normal, surface)
         return np.asarray(surface.middle[np.unique(facet[deep])])
@@ -684,34 +682,10 @@ class RigidObstacleProbe:
         cosine = normal @ surface.normal.T
         row, facet = np.nonzero(near & (cosine > _OPPOSITE_SIDES) & (cosine < _EDGE))
         reach = 2 * depth[row, facet] + _DEPTH_RESOLUTION * surface.allowed[facet]
-        _, met = self._below(points[row], surface.normal[facet], reach, surface.facets)
+        _, met = _below_facets(self._comm, points[row], surface.normal[facet], reach, surface.facets)
         found = np.zeros(len(points), dtype=np.bool_)
         found[row[met == facet]] = True
         return found
-
-    def _below(
-        self, points: Array, outward: Array, reach: Array, facets: MovingFacets
-    ) -> tuple[Array, Index]:
-        """How deep points are below Γc, along outward directions. Collective.
-
-        Beside Γc a point is below none of its facets.
-
-        Args:
-            points: (n, gdim) (length).
-            outward: Unit vectors, (n, gdim).
-            reach: How far Γc is looked for, (n,) (length).
-            facets: Γc, at rest.
-
-        Returns:
-            The depth, (n,) (length), and the number of the facet among those of all ranks, (n,), -1
-            for points that are not below Γc.
-        """
-        vertices, end = np.full((len(points), 1), -1), points + reach[:, None] * outward
-        met = find_crossings(self._comm, points, end, vertices, facets)
-        first = np.append(True, np.diff(met.place) > 0)[: len(met.place)] & ~met.inward
-        place, depth, facet = met.place[first], np.zeros(len(points)), np.full(len(points), -1)
-        depth[place], facet[place] = met.time[first] * reach[place], met.facet[first]
-        return depth, facet
 
 
 class OpposingBodyProbe:
@@ -755,7 +729,9 @@ class OpposingBodyProbe:
         n = contact.quadrature.n_points
         gap, partner = self._hits.distance[:n], self._hits.facet[:n]
         closed = contact.status != Status.OPEN
-        deep = np.maximum(values.penetration, np.where(closed, -np.nan_to_num(gap), 0.0))
+        self._deep = deep = np.maximum(
+            values.penetration, np.where(closed, -np.nan_to_num(gap), 0.0)
+        )
         met = (deep > 0) & (partner >= 0)
         self.resisted = [
             (
@@ -833,14 +809,16 @@ class OpposingBodyProbe:
         """The tangent planes that the points of every facet of all ranks see. Collective.
 
         Returns:
-            Places of the partners, (n_facets, n_points, gdim) (length), NaN where there is none,
-            and outward unit normals there.
+            See `_with_those_around`.
         """
         n, here = self._rows.size, self._here
         ray, normal = here.normal[:n], _normals(self._hits)[:n]
         through = here.place[:n] + self._hits.distance[:n, None] * ray
         normal = normal * -np.sign(_dot(normal, ray))[:, None]
-        through, normal = (gather_rows(self._comm, v[self._rows]) for v in (through, normal))
+        corners = here.side.corners[here.side.own]
+        planes = through[self._rows], normal[self._rows]
+        planes = _with_those_around(self._comm, corners, self._deep[self._rows], *planes)
+        through, normal = (gather_rows(self._comm, v) for v in planes)
         return through, normal
 
     def crossed(self, allowed: Array) -> Array:
@@ -913,7 +891,7 @@ class _Side:
             before=u,  # for the tangents
         )
 
-    def moving(self, before: fem.Function, shift: Array) -> MovingFacets:
+    def moving(self, before: fem.Function, shift: Array | float = 0.0) -> MovingFacets:
         """The facets of this rank in the increment, its start moved by a shift."""
         side, facets = self.side, self.side.facets
         start, end = facets.moved_corners(before) + shift, facets.moved_corners(self._u)
@@ -926,15 +904,20 @@ class _Side:
         facets = other.moving(before, shift)
         met = find_crossings(self._comm, start, self.place, vertices, facets)
         found = np.zeros(len(self.facet), dtype=np.bool_)
-        if not len(met.place):
-            return found
-        first = np.append(True, np.diff(met.place) > 0)
-        last = np.append(np.diff(met.place) > 0, True)
+        first = np.append(True, np.diff(met.place) > 0)[: len(met.place)]
+        last = np.append(np.diff(met.place) > 0, True)[: len(met.place)]
         place, leaves = met.place[last], ~met.inward[last]
         # Of a place that was inside from the start, through the side that its own normal met.
         entry = np.where(met.inward[first][:, None], met.normal[first], -self.normal[place])
         through = leaves & (_dot(entry, met.normal[last]) < _OPPOSITE_SIDES)
-        found[place] = through | (~leaves & (met.depth[last] > allowed[place]))
+        deep = ~leaves & (met.depth[last] > allowed[place])
+        if self._comm.allreduce(int(deep.any())):
+            # Beside the surface it has left through what is not part of the surface.
+            end, normal, reach = self.place[place], met.normal[last], 2 * met.depth[last]
+            at_rest = other.moving(self._u)
+            _, facet = _below_facets(self._comm, end, normal, np.where(deep, reach, 0.0), at_rest)
+            deep &= facet >= 0
+        found[place] = through | deep
         return found
 
 
@@ -943,6 +926,66 @@ def _normals(hits: Hits) -> Array:
     normal = across(hits.partner.tangents)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     return np.asarray(normal / np.where(length > 0, length, 1.0))
+
+
+def _below_facets(
+    comm: MPI.Comm, points: Array, outward: Array, reach: Array, facets: MovingFacets
+) -> tuple[Array, Index]:
+    """How deep points are below a surface, along outward directions. Collective.
+
+    Beside the surface a point is below none of its facets.
+
+    Args:
+        comm: The ranks.
+        points: (n, gdim) (length).
+        outward: Unit vectors, (n, gdim).
+        reach: How far the surface is looked for, (n,) (length).
+        facets: Those of this rank, at rest.
+
+    Returns:
+        The depth, (n,) (length), and the number of the facet among those of all ranks, (n,), -1
+        for points that are not below the surface.
+    """
+    vertices, end = np.full((len(points), 1), -1), points + reach[:, None] * outward
+    met = find_crossings(comm, points, end, vertices, facets)
+    first = np.append(True, np.diff(met.place) > 0)[: len(met.place)] & ~met.inward
+    place, depth, facet = met.place[first], np.zeros(len(points)), np.full(len(points), -1)
+    depth[place], facet[place] = met.time[first] * reach[place], met.facet[first]
+    return depth, facet
+
+
+def _with_those_around(
+    comm: MPI.Comm, corners: Index, resisted: Array, through: Array, normal: Array
+) -> tuple[Array, Array]:
+    """Tangent planes that the points of facets see, and one from around each corner. Collective.
+
+    The one is seen by the point that is deepest of those that the law resists on the facets there.
+    Where what is opposite ends below a facet, no point of the facet itself may see it.
+
+    Args:
+        comm: The ranks.
+        corners: Global numbers of the vertices of this rank's facets, (n, n_corners).
+        resisted: Penetration at their points that the law resists, (n, n_points) (length).
+        through: A place of the plane that each sees, (n, n_points, gdim) (length).
+        normal: Outward unit normal of that, (n, n_points, gdim).
+
+    Returns:
+        Places and normals, (n, n_points + n_corners, gdim) each, NaN where there is none.
+    """
+    n, n_corners = corners.shape
+    deepest = (np.arange(n), resisted.argmax(axis=1)) if n else (np.arange(0), np.arange(0))
+    rows = np.column_stack([-resisted[deepest], through[deepest], normal[deepest]])
+    seen = rows[:, 0] < 0
+    table = np.repeat(rows[seen], n_corners, axis=0)
+    table = gather_rows(comm, np.column_stack([corners[seen].ravel(), table]))
+    table = table[np.lexsort(table.T[::-1])]
+    vertices, first = np.unique(table[:, 0], return_index=True)
+    table = np.concatenate([table[first, 2:], np.full((1, table.shape[1] - 2), np.nan)])
+    place = np.searchsorted(vertices, corners)
+    place[np.append(vertices, np.nan)[place] != corners] = len(vertices)
+    around = np.split(table[place], 2, axis=2)
+    through, normal = (np.append(*both, axis=1) for both in zip((through, normal), around))
+    return through, normal
 
 
 def _below(place: Array, through: Array, normal: Array) -> Array:
@@ -966,8 +1009,7 @@ def _allowed(resisted: Array, planes: Array, facet: Array, smaller: Array) -> Ar
         facet: Size of the facet of Γc, (n,).
         smaller: Size of the smaller facet that meets there, (n,).
     """
-    share = np.where(resisted > 0, _PREDICTED_DEPTH, _PREDICTED_UNRESISTED)
-    predicted = np.minimum(planes, resisted + share * facet)
+    predicted = np.minimum(planes, resisted + _PREDICTED_DEPTH * facet)
     return np.maximum(resisted, predicted) + _DEPTH_RESOLUTION * smaller
 
 
