@@ -355,7 +355,7 @@ def test_multipliers_of_a_light_body_beside_a_heavy_one():
     assert close(_on_multipliers(["heavy", "light"]), _on_multipliers(["light"]), 1e-6)
 
 
-@pytest.mark.parametrize("method", ["newton", "primal_dual"])
+@pytest.mark.parametrize("method", ["newton", "continuation"])
 def test_a_body_that_is_led_aside_after_a_restart_of_the_solver(method):
     """Its forces are the round-off of its displacement alone, which is allowed for as before."""
     scene = Beside({"block": Box()}, [BUSY["led aside"]], E=1e3)

@@ -646,9 +646,11 @@ class RigidObstacleProbe:
         depth = -_dot(points - surface.corner[through], surface.normal[through])
         rows = np.flatnonzero((through >= 0) & (depth > surface.allowed[through]))
         normal = surface.normal[through[rows]]
-        depth, facet = _below_facets(self._comm, points[rows], normal, 2 * depth[rows], surface.facets)
+        depth, facet = _below_facets(
+            self._comm, points[rows], normal, 2 * depth[rows], surface.facets
+        )
         deep = (facet >= 0) & (depth > surface.allowed[facet])
-        deep &= ~self._is_shallow(points[rows], normal, surface)
+        deep &= ~self._is_shallow(points, normal, surface)
         return np.asarray(surface.middle[np.unique(facet[deep])])
 
     def _surface(self, field: Array, allowed: Array) -> _Surface:
@@ -682,8 +684,10 @@ class RigidObstacleProbe:
         cosine = normal @ surface.normal.T
         row, facet = np.nonzero(near & (cosine > _OPPOSITE_SIDES) & (cosine < _EDGE))
         reach = 2 * depth[row, facet] + _DEPTH_RESOLUTION * surface.allowed[facet]
-        _, met = _below_facets(self._comm, points[row], surface.normal[facet], reach, surface.facets)
-        found = np.zeros(len(points), dtype=np.bool_)
+        _, met = _below_facets(
+            self._comm, points[row], surface.normal[facet], reach, surface.facets
+        )
+        found = np.zeros(len(depth), dtype=np.bool_)
         found[row[met == facet]] = True
         return found
 
@@ -984,8 +988,7 @@ def _with_those_around(
     place = np.searchsorted(vertices, corners)
     place[np.append(vertices, np.nan)[place] != corners] = len(vertices)
     around = np.split(table[place], 2, axis=2)
-    through, normal = (np.append(*both, axis=1) for both in zip((through, normal), around))
-    return through, normal
+    return np.append(through, around[0], axis=1), np.append(normal, around[1], axis=1)
 
 
 def _below(place: Array, through: Array, normal: Array) -> Array:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import logging
 import weakref
+from collections.abc import Callable, Mapping
 from itertools import chain
 from typing import Any
 
@@ -22,8 +23,9 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
+from fenics_contact.methods.callbacks import Callbacks
 from fenics_contact.methods.limit_analysis import CLEARLY
-from fenics_contact.methods.method import OVERLOADED, InnerSnes, OwnMethod, Tools
+from fenics_contact.methods.method import OVERLOADED, OwnMethod, Tools
 from fenics_contact.types import Array
 
 __all__ = ["Alternation"]
@@ -72,16 +74,9 @@ class Alternation(OwnMethod):
 
     def __init__(self, tools: Tools) -> None:
         """Set up SNES; the matrices are those of H₀. Collective."""
-        equations = self._equations = tools.equations
-        # That of H₀, if it will do.
-        solver = tools.linear_solver(equations.symmetric(False))
-
-        def made(prefix: str, options: dict[str, Any]) -> InnerSnes:
-            both = tools.prefix, prefix
-            return InnerSnes(equations, tools.defaults, both, options, solver, consistent=False)
-
-        self._search = made("alternating_", _OPTIONS)
-        self._finish = made("finishing_", _FINISH)
+        self._equations = tools.equations
+        self._search = _InnerSnes(tools, "alternating_", _OPTIONS)
+        self._finish = _InnerSnes(tools, "finishing_", _FINISH)
         self.snes = self._search.snes
         self._goal = 0.0
         # Potential at the state asked for last, and where it was last found to have fallen.
@@ -229,3 +224,65 @@ class Alternation(OwnMethod):
         # Where all slips, what nothing but friction holds would be loose.
         still = (o.springs(o.contact.springs(0.0, _STILL)) for o in equations.system.operators)
         equations.assemble(matrix, chain(equations.tangents(), still))
+
+
+class _InnerSnes:
+    """A SNES for the problems that are solved one after another, whose matrices are those of H₀.
+
+    Attributes:
+        snes: The solver.
+    """
+
+    def __init__(self, tools: Tools, part: str, options: Mapping[str, Any]) -> None:
+        """Make it. Collective.
+
+        Args:
+            tools: What it is made of.
+            part: What follows the prefix of the problem's options in that of this one.
+            options: Those of SNES.
+        """
+        self._equations = equations = tools.equations
+        comm = equations.full.unknowns.comm
+        solver = tools.linear_solver(equations.symmetric(False))
+        self._shares_solver = not solver  # that of the matrix will do
+        self._function: PETSc.Vec | None = None
+        self.snes = tools.defaults.make_snes(comm, tools.prefix, part, {**options, **solver})
+        self._callbacks = Callbacks(comm)
+
+    def attach(
+        self,
+        assemble: Callable[[PETSc.Vec, PETSc.Mat], None],
+        converged: Callable[[], int],
+        energy: Callable[[PETSc.Vec], float] | None = None,
+    ) -> None:
+        """Take vectors, matrix and solver of the present system. Collective.
+
+        Args:
+            assemble: Fills the matrix at x. It must not keep this object, which keeps it.
+            converged: Whether to end, and why; likewise.
+            energy: What the line search is to lower; none: it looks at the residual.
+        """
+        equations = self._equations
+        if self._function is not equations.function:
+            self.snes.reset()
+        self._function = equations.function
+        if self._shares_solver:
+            self.snes.setKSP(equations.solvers[False])
+        this: _InnerSnes = weakref.proxy(self)
+        self._callbacks.attach(
+            self.snes,
+            lambda x, f: this._compute_residual(x, f),
+            self._function,
+            assemble,
+            equations.matrix(False),
+            converged,
+        )
+        if energy is not None:
+            self._callbacks.set_objective(self.snes, energy)
+
+    def solve(self) -> tuple[int, int]:
+        """Iterations and reason, from ``solution`` of the equations on. Collective."""
+        return self._callbacks.solve(self.snes, self._equations.solution)
+
+    def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        self._equations.residual(x, f)

@@ -2,8 +2,7 @@
 
 Newton's method finds the solution of soft contact from far away, and that of stiff contact from the
 solution of one that is a little softer: the points that are closed, stick and slip are nearly those
-of the next one, and for a given status the equations are linear, or nearly so. Where it fails the
-primal-dual method is tried from the same start, if the equations are for it; where a step of the
+of the next one, and for a given status the equations are linear, or nearly so. Where a step of the
 stiffness does not succeed, a smaller one may. Soft contact that has no solution says nothing of
 stiffer contact, which given displacements squeeze more: it is passed over. A start that is as near
 to the solution as that of a softer problem would be is not softened.
@@ -12,29 +11,19 @@ to the solution as that of a softer problem would be is not softened.
 from __future__ import annotations
 
 import logging
-import weakref
 
 import numpy as np
 from petsc4py import PETSc
 
-from fenics_contact import compat
-from fenics_contact.methods.method import InnerSnes, OwnMethod, Tools
+from fenics_contact.methods.method import Newton, OwnMethod, Tools
 
 __all__ = ["Continuation"]
 
 logger = logging.getLogger("fenics_contact")
 
-_OPTIONS = {
-    "snes_type": "newtonls",
-    "snes_rtol": 0.0,
-    "snes_stol": 0.0,
-    "snes_atol": 0.0,
-    "snes_max_it": 25,
-    # One secant step towards the least residual: with none Newton's method cycles earlier, and cp
-    # or bt, which go on until the residual falls, take steps too short for a change of status.
-    "snes_linesearch_type": compat.LEAST_RESIDUAL,
-    "snes_linesearch_max_it": 1,
-}
+# Iterations for one stiffness: with 60 in place of 25 none of 142 random scenes on which Newton's
+# method fails was solved in addition, in 1.06 times the iterations.
+_PATIENCE = 25
 # Factor of the stiffness from one problem to the next, and the least that is tried.
 _FACTOR = 10.0
 _LEAST_FACTOR = 1.2
@@ -56,21 +45,21 @@ class Continuation(OwnMethod):
         """Set up SNES; the matrix is that of the consistent tangent. Collective."""
         equations = self._equations = tools.equations
         solver = tools.linear_solver(equations.symmetric(True))
-        both = tools.prefix, "continuation_"
-        self._newton = InnerSnes(equations, tools.defaults, both, _OPTIONS, solver, consistent=True)
-        self.snes = self._newton.snes
-        self._otherwise = tools.others["primal_dual"]
+        options = {**Newton.main_options(), "snes_max_it": _PATIENCE, **solver}
+        comm = equations.full.unknowns.comm
+        self.snes = tools.defaults.make_snes(comm, tools.prefix, "continuation_", options)
+        self._newton = Newton(equations, self.snes, lambda: True, own_solver=bool(solver))
+        self._function: PETSc.Vec | None = None
         self.by_newton = False
-        self._coarse = 0.0
         self._whole: list[float] = []  # of each contact
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`. Iterations are those of all stiffnesses."""
         equations = self._equations
-        this: Continuation = weakref.proxy(self)
-        self._newton.attach(
-            lambda x, J: this._equations.assemble_tangent(x, J), lambda: this._test()
-        )
+        if self._function is not equations.function:
+            self.snes.reset()
+        self._function = equations.function
+        self._newton.attach(consistent=True)
         self._whole = [float(c.inputs.stiffness_factor.value) for c in equations.contacts]
         soft = min(1.0, 1.0 / max(equations.hardness(), 1.0))
         # From a start as near as they are solved to, softer problems only lead away.
@@ -81,7 +70,8 @@ class Continuation(OwnMethod):
         try:
             while iterations <= _MAX_ITERATIONS:
                 self._soften(share)
-                made, reason = self._solve_one(softer=solved > 0.0 or share < 1.0)
+                equations.watch.start()
+                made, reason = self._newton.solve()
                 iterations += made
                 self.by_newton = reason > 0
                 if share == 1.0 and (reason > 0 or not (near or solved)):
@@ -109,26 +99,4 @@ class Continuation(OwnMethod):
         """Let the contacts have a share of the stiffness they came with."""
         for contact, whole in zip(self._equations.contacts, self._whole, strict=True):
             contact.inputs.stiffness_factor.value = share * whole
-        self._coarse = _COARSE if share < 1.0 else 0.0
-
-    def _solve_one(self, *, softer: bool) -> tuple[int, int]:
-        """Iterations and reason for the present stiffness. Collective.
-
-        Args:
-            softer: Whether the start is, or the problem: else the primal-dual method had its turn.
-        """
-        equations = self._equations
-        equations.watch.start()
-        start = equations.solution.copy()
-        made, reason = self._newton.solve()
-        if reason <= 0 and softer and self._otherwise.suits:
-            start.copy(equations.solution)
-            more, reason = self._otherwise.solve()
-            made += more
-        start.destroy()
-        return made, reason
-
-    def _test(self) -> int:
-        reasons = PETSc.SNES.ConvergedReason
-        converged = self._equations.solved(self._coarse)
-        return int(reasons.CONVERGED_FNORM_RELATIVE if converged else reasons.ITERATING)
+        self._newton.coarse = _COARSE if share < 1.0 else 0.0

@@ -17,7 +17,7 @@ from fenics_contact.methods.options import Defaults
 from fenics_contact.systems import linear
 from fenics_contact.types import Array
 
-__all__ = ["OVERLOADED", "InnerSnes", "Method", "Newton", "OwnMethod", "SnesMethod", "Tools"]
+__all__ = ["OVERLOADED", "Method", "Newton", "OwnMethod", "SnesMethod", "Tools"]
 
 # Least decrease of the level function along a step. Without any, Newton's method cycled between two
 # states whose levels were 0.93 and 0.96 of each other's; with a quarter (Deuflhard's restricted
@@ -61,14 +61,12 @@ class Tools:
         prefix: Of the problem's options.
         linear_solver: Options of a linear solver of one's own, for symmetric matrices or any; none:
             the one of the matrix will do.
-        others: The methods made before, by name.
     """
 
     equations: Equations
     defaults: Defaults
     prefix: str
     linear_solver: Callable[[bool], dict[str, Any]]
-    others: Mapping[str, OwnMethod]
 
 
 class OwnMethod(Method):
@@ -99,91 +97,22 @@ class OwnMethod(Method):
         return
 
 
-class InnerSnes:
-    """A SNES of a method's own, for the problems that it solves one after another.
+class SnesMethod(Method):
+    """A method on a SNES: the main one, whose options are the user's, or one of another method.
 
     Attributes:
         snes: The solver.
+        gives_up: Whether to stop where the residual does not fall any more.
+        coarse: Residual, as a share of the forces, that ends it before the tolerance does.
     """
 
     def __init__(
         self,
         equations: Equations,
-        defaults: Defaults,
-        prefix: tuple[str, str],
-        options: Mapping[str, Any],
-        solver: Mapping[str, Any],
+        snes: PETSc.SNES,
+        gives_up: Callable[[], bool],
         *,
-        consistent: bool,
-    ) -> None:
-        """Make it. Collective.
-
-        Args:
-            equations: What to solve.
-            defaults: What takes the options.
-            prefix: Of the problem's options, and what follows it in that of this one.
-            options: Those of SNES.
-            solver: Those of a linear solver of its own; none: it is that of the matrix.
-            consistent: Whether the matrix is that of the consistent tangent, or else of H₀.
-        """
-        self._equations, self._consistent = equations, consistent
-        self._shares_solver = not solver
-        self._function: PETSc.Vec | None = None
-        comm = equations.full.unknowns.comm
-        self.snes = defaults.make_snes(comm, *prefix, {**options, **solver})
-        self._callbacks = Callbacks(comm)
-
-    def attach(
-        self,
-        assemble: Callable[[PETSc.Vec, PETSc.Mat], None],
-        converged: Callable[[], int],
-        energy: Callable[[PETSc.Vec], float] | None = None,
-        residual: Callable[[PETSc.Vec, PETSc.Vec], None] | None = None,
-    ) -> None:
-        """Take vectors, matrix and solver of the present system. Collective.
-
-        Args:
-            assemble: Fills the matrix at x. It must not keep this object, which keeps it.
-            converged: Whether to end, and why; likewise.
-            energy: What the line search is to lower; none: it looks at the residual.
-            residual: What steps are to take away, likewise; none: that of the equations.
-        """
-        equations = self._equations
-        if self._function is not equations.function:
-            self.snes.reset()
-        self._function = equations.function
-        if self._shares_solver:
-            self.snes.setKSP(equations.solvers[self._consistent])
-        this: InnerSnes = weakref.proxy(self)
-        self._callbacks.attach(
-            self.snes,
-            residual or (lambda x, f: this._compute_residual(x, f)),
-            self._function,
-            assemble,
-            equations.matrix(self._consistent),
-            converged,
-        )
-        if energy is not None:
-            self._callbacks.set_objective(self.snes, energy)
-
-    def solve(self) -> tuple[int, int]:
-        """Iterations and reason, from ``solution`` of the equations on. Collective."""
-        return self._callbacks.solve(self.snes, self._equations.solution)
-
-    def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        self._equations.residual(x, f)
-
-
-class SnesMethod(Method):
-    """A method on the main SNES, whose options are the user's.
-
-    Attributes:
-        snes: The solver.
-        gives_up: Whether to stop where the residual does not fall any more.
-    """
-
-    def __init__(
-        self, equations: Equations, snes: PETSc.SNES, gives_up: Callable[[], bool]
+        own_solver: bool = False,
     ) -> None:
         """Take the solver; `attach` gives it the equations.
 
@@ -191,8 +120,10 @@ class SnesMethod(Method):
             equations: What to solve.
             snes: By what.
             gives_up: See the attribute.
+            own_solver: Whether SNES keeps its own linear solver, not that of the matrix.
         """
-        self.snes, self.gives_up = snes, gives_up
+        self.snes, self.gives_up, self.coarse = snes, gives_up, 0.0
+        self._own_solver = own_solver
         self._equations = equations
         self._callbacks = Callbacks(equations.full.unknowns.comm)
         self.consistent = False
@@ -213,7 +144,8 @@ class SnesMethod(Method):
         # cycle, at another time on every rank, and to free a factorisation is collective.
         this: SnesMethod = weakref.proxy(self)
         equations = self._equations
-        self.snes.setKSP(equations.solvers[consistent])
+        if not self._own_solver:
+            self.snes.setKSP(equations.solvers[consistent])
         self._callbacks.attach(
             self.snes,
             lambda x, f: this._compute_residual(x, f),
@@ -231,7 +163,7 @@ class SnesMethod(Method):
 
     def converged(self) -> int:
         """Why SNES ends here, or that it goes on, as SNES has it."""
-        if self._equations.solved():
+        if self._equations.solved(self.coarse):
             return int(_REASONS.CONVERGED_FNORM_RELATIVE)
         if self._equations.watch.idle > _PATIENCE and self.gives_up():
             return int(_REASONS.DIVERGED_LINE_SEARCH)
@@ -242,10 +174,15 @@ class Newton(SnesMethod):
     """Newton's method with the consistent tangent."""
 
     def __init__(
-        self, equations: Equations, snes: PETSc.SNES, gives_up: Callable[[], bool]
+        self,
+        equations: Equations,
+        snes: PETSc.SNES,
+        gives_up: Callable[[], bool],
+        *,
+        own_solver: bool = False,
     ) -> None:
         """See `SnesMethod`."""
-        super().__init__(equations, snes, gives_up)
+        super().__init__(equations, snes, gives_up, own_solver=own_solver)
         self._iterate: tuple[PETSc.Vec, PETSc.Vec] | None = None  # and the residual there
         self._step: float | None = None  # norm of the correction there, once it is asked for
         self._trial: Array | None = None  # whose tangent the matrix holds, if not the iterate's

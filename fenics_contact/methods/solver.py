@@ -26,7 +26,6 @@ from fenics_contact.methods.load_balance import LoadBalance
 from fenics_contact.methods.method import OVERLOADED, Method, Newton, OwnMethod, SnesMethod, Tools
 from fenics_contact.methods.neighbourhood import linearised, respond
 from fenics_contact.methods.options import Defaults, take_command_line
-from fenics_contact.methods.primal_dual import PrimalDual
 from fenics_contact.methods.quasi_newton import QuasiNewton
 from fenics_contact.methods.rounds import INNER, solve_in_rounds
 from fenics_contact.methods.starts import Starts
@@ -78,18 +77,17 @@ _COMMON: dict[str, Any] = {
 _VECTORS: dict[str, Any] = {"vec_mdot_use_gemv": False}
 # Options that only make sense for the sparse matrices over all unknowns.
 _NAMES_A_SOLVER = ("ksp_type", "pc_type", "pc_factor_mat_solver_type")
-# By name. Of those with solvers of their own each sees the ones made before it.
+# By name.
 METHODS: dict[str, type[Method]] = {
     "lbfgs": QuasiNewton,
     "newton": Newton,
     "alternating": Alternation,
-    "primal_dual": PrimalDual,
     "continuation": Continuation,
 }
 # What takes over where a method fails, and what tells whether friction can bear the load. Behind
-# the others the latter solved none of 420 random scenes, but it finds overloads that no start
+# the other the latter solved none of 420 random scenes, but it finds overloads that no start
 # shows: of a tight fit in the first round of multipliers, whose springs are soft.
-_FALLBACKS, _DIAGNOSIS = ("primal_dual", "continuation"), "alternating"
+_FALLBACK, _DIAGNOSIS = "continuation", "alternating"
 
 
 @dataclass(frozen=True)
@@ -249,7 +247,7 @@ class Solver:
             return self.system.linear_solver(symmetric=symmetric, accurate=True) | newton
 
         self.methods = {}
-        tools = Tools(equations, options, prefix, newton_solver, self.methods)
+        tools = Tools(equations, options, prefix, newton_solver)
         for name, kind in METHODS.items():
             if issubclass(kind, OwnMethod):
                 self.methods[name] = kind(tools)
@@ -545,7 +543,7 @@ class Solver:
         if not goes_on:
             return []
         overloaded = equations.friction_needed() > 1.0
-        order = (_DIAGNOSIS, *_FALLBACKS) if overloaded else (*_FALLBACKS, _DIAGNOSIS)
+        order = (_DIAGNOSIS, _FALLBACK) if overloaded else (_FALLBACK, _DIAGNOSIS)
         return [name for name in order if name != self.method and self.methods[name].suits]
 
     def _outcome(self, reason: int) -> str:
