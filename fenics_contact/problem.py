@@ -80,16 +80,14 @@ class ContactProblem:
         bcs: Dirichlet conditions on ``u`` or its components, or on parts of w.
         contacts: Contacts of ``u``.
         method: "newton": Newton's method with the consistent tangent. "lbfgs": quasi-Newton with
-            H₀ = (K + αK_n + φK_t)⁻¹. "primal_dual": primal-dual active set method with the
-            tractions as additional unknowns, for frictional contact of a linear bulk with small
-            displacements. "continuation": Newton's method with contact stiffness increased step by
-            step, and "primal_dual" where that fails. "alternating": fixed-point iteration on the
-            friction bound; each step is a problem with Tresca friction, solved as a minimisation by
+            H₀ = (K + αK_n + φK_t)⁻¹. "continuation": Newton's method with contact stiffness
+            increased step by step. "alternating": fixed-point iteration on the friction bound;
+            each step is a problem with Tresca friction, solved as a minimisation by
             Newton's method with a line search on the energy. It is not for mixed functions, whose
             solutions are saddle points. By default "newton"; for a linear bulk on all unknowns
             "lbfgs" by multigrid, and in three dimensions if Dirichlet conditions constrain all
             bodies and none slide on each other with finite kinematics. After a failure
-            "primal_dual", "continuation" and "alternating" follow, those that apply.
+            "continuation" follows, and then "alternating" where it applies.
         alpha: Factor α of the normal contact stiffness in H₀, 0 to 1 (source paper: 1).
         phi: Factor φ of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
             source paper has 0; with 1 a third of the iterations suffices once points stick.

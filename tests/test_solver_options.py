@@ -8,7 +8,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from fenics_contact.methods.method import InnerSnes, OwnMethod, Tools
+from fenics_contact.methods.method import OwnMethod, Tools
 from fenics_contact.methods.solver import METHODS
 from scenes.blocks import TOP
 from scenes.comparing import at_points, close, gathered, nodal, raised_everywhere
@@ -209,22 +209,12 @@ class Plain(OwnMethod):
 
     def __init__(self, tools: Tools) -> None:
         """One SNES."""
-        self._equations = tools.equations
-        solver = tools.linear_solver(tools.equations.symmetric(True))
-        options = {"snes_type": "newtonls", "snes_linesearch_type": "basic", "snes_max_it": 50}
-        self._newton = InnerSnes(
-            tools.equations,
-            tools.defaults,
-            (tools.prefix, "plain_"),
-            options,
-            solver,
-            consistent=True,
-        )
+        options = {"snes_linesearch_type": "basic", "snes_max_it": 50}
+        self._newton = tools.newton("plain_", options)
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`."""
-        equations = self._equations
-        self._newton.attach(equations.assemble_tangent, lambda: 2 if equations.solved() else 0)
+        self._newton.attach(consistent=True)
         return self._newton.solve()
 
 

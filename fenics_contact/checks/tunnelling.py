@@ -645,10 +645,8 @@ class RigidObstacleProbe:
         surface = self._surface(field, allowed)
         depth = -_dot(points - surface.corner[through], surface.normal[through])
         rows = np.flatnonzero((through >= 0) & (depth > surface.allowed[through]))
-        normal = surface.normal[through[rows]]
-        depth, facet = _below_facets(
-            self._comm, points[rows], normal, 2 * depth[rows], surface.facets
-        )
+        points, normal = points[rows], surface.normal[through[rows]]
+        depth, facet = _below_facets(self._comm, points, normal, 2 * depth[rows], surface.facets)
         deep = (facet >= 0) & (depth > surface.allowed[facet])
         deep &= ~self._is_shallow(points, normal, surface)
         return np.asarray(surface.middle[np.unique(facet[deep])])

@@ -15,7 +15,7 @@ import logging
 import numpy as np
 from petsc4py import PETSc
 
-from fenics_contact.methods.method import Newton, OwnMethod, Tools
+from fenics_contact.methods.method import OwnMethod, Tools
 
 __all__ = ["Continuation"]
 
@@ -43,22 +43,15 @@ class Continuation(OwnMethod):
 
     def __init__(self, tools: Tools) -> None:
         """Set up SNES; the matrix is that of the consistent tangent. Collective."""
-        equations = self._equations = tools.equations
-        solver = tools.linear_solver(equations.symmetric(True))
-        options = {**Newton.main_options(), "snes_max_it": _PATIENCE, **solver}
-        comm = equations.full.unknowns.comm
-        self.snes = tools.defaults.make_snes(comm, tools.prefix, "continuation_", options)
-        self._newton = Newton(equations, self.snes, lambda: True, own_solver=bool(solver))
-        self._function: PETSc.Vec | None = None
+        self._equations = tools.equations
+        self._newton = tools.newton("continuation_", {"snes_max_it": _PATIENCE})
+        self.snes = self._newton.snes
         self.by_newton = False
         self._whole: list[float] = []  # of each contact
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`. Iterations are those of all stiffnesses."""
         equations = self._equations
-        if self._function is not equations.function:
-            self.snes.reset()
-        self._function = equations.function
         self._newton.attach(consistent=True)
         self._whole = [float(c.inputs.stiffness_factor.value) for c in equations.contacts]
         soft = min(1.0, 1.0 / max(equations.hardness(), 1.0))

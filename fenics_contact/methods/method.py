@@ -68,6 +68,20 @@ class Tools:
     prefix: str
     linear_solver: Callable[[bool], dict[str, Any]]
 
+    def newton(self, part: str, options: Mapping[str, Any]) -> Newton:
+        """Newton's method on a SNES of its own; `Newton.attach` before every solution. Collective.
+
+        Args:
+            part: What follows the prefix of the problem's options in that of this SNES.
+            options: Those that differ from `Newton.main_options`.
+        """
+        equations = self.equations
+        solver = self.linear_solver(equations.symmetric(True))
+        comm = equations.full.unknowns.comm
+        all_options = {**Newton.main_options(), **options, **solver}
+        snes = self.defaults.make_snes(comm, self.prefix, part, all_options)
+        return Newton(equations, snes, lambda: True, own_solver=bool(solver))
+
 
 class OwnMethod(Method):
     """A method with solvers of its own; a new one is such a class, and a line in `METHODS`.
@@ -124,6 +138,7 @@ class SnesMethod(Method):
         """
         self.snes, self.gives_up, self.coarse = snes, gives_up, 0.0
         self._own_solver = own_solver
+        self._function: PETSc.Vec | None = None  # of the system it is attached to
         self._equations = equations
         self._callbacks = Callbacks(equations.full.unknowns.comm)
         self.consistent = False
@@ -144,6 +159,9 @@ class SnesMethod(Method):
         # cycle, at another time on every rank, and to free a factorisation is collective.
         this: SnesMethod = weakref.proxy(self)
         equations = self._equations
+        if self._function not in (None, equations.function):
+            self.snes.reset()
+        self._function = equations.function
         if not self._own_solver:
             self.snes.setKSP(equations.solvers[consistent])
         self._callbacks.attach(

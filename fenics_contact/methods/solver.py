@@ -292,10 +292,8 @@ class Solver:
         """Newton's method, or L-BFGS.
 
         L-BFGS is for linear bodies by multigrid, and for those in space on all unknowns, where a
-        tangent costs dozens of iterations with an older one. A ball pressed on a block, of 32,000
-        to a million unknowns, takes 1.2 to 1.7 linear solves by multigrid so, and 2.8 to 3.4 by the
-        primal-dual method, the quicker one where contact is stiffer than by default: dragged
-        aside, five increments, in 0.9 to 1.1 times the time of L-BFGS at k_n = 10 E/h, 0.5 at 100.
+        tangent costs dozens of iterations with an older one: a ball pressed on a block, of 32,000
+        to a million unknowns, takes 1.2 to 1.7 linear solves by multigrid so.
         Without multigrid Newton's method is for bodies that contact alone holds: L-BFGS leaves them
         where its H₀ lets them drift.
         """
