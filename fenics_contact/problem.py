@@ -350,13 +350,12 @@ class ContactProblem:
     # ---- solving ---------------------------------------------------------------------------------
 
     @interrupts_held()
-    def solve(self, *, ahead: float = 1.0, recover_interior: bool = True) -> Step:
+    def solve(self, *, recover_interior: bool = True) -> Step:
         """Solve the next increment with the present loads and conditions. Collective.
 
         The history does not change until `commit`.
 
         Args:
-            ahead: Size of this increment relative to the last one, for the predictor.
             recover_interior: Whether to recover the interior displacement after static
                 condensation. If False, u away from the contact may remain that of an earlier
                 increment; the results of all contacts are those of this one, and the verification
@@ -397,7 +396,7 @@ class ContactProblem:
                 step = None
                 while step is None:
                     with self.solver.options.present():
-                        step = self._solve(start, ahead, recover_interior, tried)
+                        step = self._solve(start, recover_interior, tried)
                     # Outside, lest a SNES that is made anew takes its options for the caller's.
                     if step is None:
                         self._go_back(start_unknowns)
@@ -447,13 +446,12 @@ class ContactProblem:
         for contact, trial in zip(self.contacts, trials, strict=True):
             contact.restore(trial)
 
-    def _solve(self, start: float, ahead: float, field: bool, tried: list[Attempt]) -> Step | None:
+    def _solve(self, start: float, field: bool, tried: list[Attempt]) -> Step | None:
         """`solve`; None if it takes other unknowns than are kept. Collective.
 
         Args:
             start: When it began.
-            ahead: See `solve`.
-            field: Likewise.
+            field: Whether to recover the interior, see `solve`.
             tried: What was tried before; what is tried here is added.
         """
         solver = self.solver
@@ -480,8 +478,6 @@ class ContactProblem:
             solver.starts.carried = self._first_touch.end
         with solver.system.acting():
             reason, attempts, rounds = solver.solve(
-                ahead=ahead,
-                rate=self.state.change,
                 cold=cold,
                 stiffness_changed=stiffness_changed,
                 load_before=self.state.load,
@@ -696,14 +692,12 @@ class ContactProblem:
                 contact.set_state(state)
             self.restore()
             raise
-        unknowns = self.full.state()
         self.state = State(
-            unknowns=unknowns,
+            unknowns=self.full.state(),
             contacts=tuple(contact.state for contact in self.contacts),
             load=trial.load,
             energy=trial.energy.between([c.opposite.committed_jump for c in self.contacts]),
             interior=trial.interior,
-            change=unknowns - start.unknowns,
             increment=start.increment + 1,
         )
         self._trial = None
@@ -743,7 +737,6 @@ class ContactProblem:
             kept[self.solver.system.unknowns.kept] = True
         return CommittedState(
             state=state.unknowns,
-            rate=np.zeros(kept.size) if state.change is None else state.change,
             internal=forces.internal,
             external=forces.external,
             kept=kept,
@@ -827,7 +820,6 @@ class ContactProblem:
             contacts=tuple(contact.state for contact in self.contacts),
             load=load,
             energy=energy.between([c.opposite.committed_jump for c in self.contacts]),
-            change=taken.rate.copy() if taken.increment else None,
             increment=taken.increment,
         )
         self.restart_solver()

@@ -22,7 +22,6 @@ class State:
         energy: Forces and energies.
         interior: What recovers the interior displacement after static condensation; None if the
             unknowns are up to date.
-        change: Change of the unknowns in the last increment; None before the first.
         increment: Number of increments so far.
     """
 
@@ -31,7 +30,6 @@ class State:
     load: Array
     energy: EnergyState
     interior: Array | None = None
-    change: Array | None = None
     increment: int = 0
 
 

@@ -143,11 +143,10 @@ def picture(made: History) -> dict[str, Array]:
     found = {"u": _nodal(problem, problem.u), "increment": np.array([problem.increment])}
     field = fem.Function(problem.u.function_space)
     committed = problem.committed_state()
-    for name in ("state", "rate", "internal", "external"):
+    for name in ("state", "internal", "external"):
         owned(field)[:] = getattr(committed, name)[: problem.unknowns.n_dofs]
         found[f"committed {name}"] = _nodal(problem, field)
-    for name in ("state", "rate"):
-        found[f"{name} of obstacles"] = problem.unknowns.motions(getattr(committed, name))
+    found["state of obstacles"] = problem.unknowns.motions(committed.state)
     energy = problem.committed_energy
     found["springs"] = np.array([COMM.allreduce(sum(map(np.sum, energy.springs)))])
     if problem.solver.condensed:

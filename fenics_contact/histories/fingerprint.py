@@ -21,7 +21,7 @@ from fenics_contact.obstacles.base import SampledObstacle
 from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.problem import ContactProblem
-from fenics_contact.systems.committed import CommittedState
+from fenics_contact.systems.committed import N_ROWS, CommittedState
 from fenics_contact.types import Array
 
 __all__ = ["changed_data", "data_words", "fixed_words", "probe", "why_another_scene"]
@@ -187,12 +187,12 @@ def _compare_shapes(
     wanted: dict[str, tuple[int | None, ...]] = {
         "numbers": (None,),
         "state": (2 + len(problem.contacts),),
-        "motions": (6, n_motions),
+        "motions": (N_ROWS, n_motions),
         "stiffness": (2, 9),
         "loads": (2, 3 + n_motions),
     }
     for part in parts_of(problem):
-        wanted[part.name] = (None, 2 * gdim + 6 * part.space.dofmap.bs)
+        wanted[part.name] = (None, 2 * gdim + N_ROWS * part.space.dofmap.bs)
     for c in problem.contacts:
         sizes = [sum(max(width, 1) for _, width in t) for t in stored.scene["contacts"][c.name]]
         n_history = c.history.rows().shape[1]

@@ -326,13 +326,15 @@ def _history(
             goal = target if within else at.load + direction * at.largest
             try:
                 if estimate and not halves:
-                    _solve_to(goal, problem, apply, at)
+                    apply(goal)
+                    problem.solve()
                     whole = quantities(problem)
                     problem.restore()
                     halves = [0.5 * (at.load + goal), goal]
                 goal = halves[0] if halves else goal
                 wanted = goal == end or field == "every" or estimate or behind + 1 == field
-                step = _solve_to(goal, problem, apply, at, recover_interior=wanted)
+                apply(goal)
+                step = problem.solve(recover_interior=wanted)
             except BaseException as failure:
                 apply(at.load)
                 halves = []
@@ -354,8 +356,9 @@ def _history(
                         at.largest,
                     )
                 continue
+            began = problem.state.unknowns
             problem.commit()
-            at.advance(goal, problem if step.complete and not behind else None)
+            at.advance(goal, problem, began if step.complete and not behind else None)
             halves = halves[1:]
             found = None
             if estimate and not halves:
@@ -387,21 +390,6 @@ def _history(
             if due and fields:
                 apply(goal)  # what the loop may have set otherwise
                 write()
-
-
-def _solve_to(
-    goal: float,
-    problem: ContactProblem,
-    apply: Callable[[float], None],
-    at: _Progress,
-    *,
-    recover_interior: bool = True,
-) -> Step:
-    """Solve for a load parameter from the last committed one. Collective."""
-    apply(goal)
-    return problem.solve(
-        ahead=(goal - at.load) / at.last if at.last else 1.0, recover_interior=recover_interior
-    )
 
 
 @dataclasses.dataclass
@@ -584,16 +572,18 @@ class _Progress:
     def cut(self, tried: float) -> None:
         self.largest, self.cuts, self.successes = tried / 2, self.cuts + 1, 0
 
-    def advance(self, goal: float, problem: ContactProblem | None) -> None:
+    def advance(self, goal: float, problem: ContactProblem, began: Array | None) -> None:
         """Take note of the increment that was committed. Collective.
 
         Args:
             goal: Load parameter at its end.
-            problem: Whose; None if the interior displacement was not up to date at both ends.
+            problem: Whose.
+            began: The unknowns where it began; None if the interior displacement was not up to date
+                at both ends.
         """
         self.last, self.load, self.change = goal - self.load, goal, 0.0
-        if problem is not None and problem.state.change is not None:
-            change = problem.state.change
+        if began is not None:
+            change = problem.state.unknowns - began
             squares = global_sum(problem.u.function_space.mesh.comm, float(change @ change))
             self.change = float(np.sqrt(squares))
             self.way += self.change

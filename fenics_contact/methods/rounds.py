@@ -34,9 +34,7 @@ _FELL, _NOTHING = 0.2, 1e-10
 
 def solve_in_rounds(
     equations: Equations,
-    iterate: Callable[[float, bool], tuple[int, list[Attempt]]],
-    ahead: float,
-    stiffness_changed: bool,
+    iterate: Callable[[bool], tuple[int, list[Attempt]]],
     load_before: Array,
 ) -> tuple[int, list[Attempt], int]:
     """Solve, let multipliers take over what the springs bear, and again. Collective.
@@ -45,10 +43,8 @@ def solve_in_rounds(
 
     Args:
         equations: What is solved.
-        iterate: A solution, from a start by how much of an increment is ahead, and by whether the
-            bulk's tangent has changed: its reason as SNES has it, and what was tried.
-        ahead: Size of the increment in units of the last one.
-        stiffness_changed: Whether the bulk's tangent is another one than in the last increment.
+        iterate: A solution, by whether it is the first: its reason as SNES has it, and what was
+            tried.
         load_before: External forces at this rank's unknowns in the committed state (force).
 
     Returns:
@@ -56,7 +52,7 @@ def solve_in_rounds(
     """
     augmented = [c for c in equations.contacts if c.multipliers is not None]
     if not augmented:
-        return *iterate(ahead, stiffness_changed), 1
+        return *iterate(True), 1
     _shrink(equations, load_before)
     attempts: list[Attempt] = []
     exact = False
@@ -65,7 +61,7 @@ def solve_in_rounds(
     try:
         for number in range(1, _MAX_ROUNDS + 1):
             start = equations.system.state()
-            reason, tried = iterate(ahead, stiffness_changed)
+            reason, tried = iterate(number == 1)
             _append(attempts, tried)
             overloaded = reason == OVERLOADED
             if reason <= 0 and not overloaded:
@@ -89,7 +85,6 @@ def solve_in_rounds(
                     break
             if worst <= share and (exact or overloaded):
                 break
-            ahead, stiffness_changed = 0.0, False
             exact = worst <= _NEARLY
             left = min((e for e in errors if e > 0), default=0.0)
             equations.round_rtol = 0.0 if exact else min(_FIRST_ROUND, INNER * left)

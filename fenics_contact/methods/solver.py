@@ -446,8 +446,6 @@ class Solver:
     def solve(
         self,
         *,
-        ahead: float,
-        rate: Array | None,
         cold: bool,
         stiffness_changed: bool,
         load_before: Array,
@@ -455,8 +453,6 @@ class Solver:
         """Solve, let multipliers take over what the springs bear, and again. Collective.
 
         Args:
-            ahead: Size of the increment in units of the last one.
-            rate: By how much that moved all unknowns; None: there was none.
             cold: Whether nothing was borne before.
             stiffness_changed: Whether the bulk's tangent is another one than in the last increment.
             load_before: External forces at this rank's unknowns in the committed state (force).
@@ -469,17 +465,13 @@ class Solver:
         equations.has_round_off = False
         equations.loads = equations.motions.generalised_load(self._full.load)
 
-        def iterate(ahead: float, stiffness_changed: bool) -> tuple[int, list[Attempt]]:
-            return self._iterate(ahead, rate, cold, stiffness_changed)
+        def iterate(first_round: bool) -> tuple[int, list[Attempt]]:
+            return self._iterate(first_round, cold, first_round and stiffness_changed)
 
-        return solve_in_rounds(equations, iterate, ahead, stiffness_changed, load_before)
+        return solve_in_rounds(equations, iterate, load_before)
 
     def _iterate(
-        self,
-        ahead: float,
-        rate: Array | None,
-        cold: bool,
-        stiffness_changed: bool,
+        self, first_round: bool, cold: bool, stiffness_changed: bool
     ) -> tuple[int, list[Attempt]]:
         """Iterate by one method after another from the same start. Collective.
 
@@ -489,7 +481,8 @@ class Solver:
         equations = self.equations
         factored = self.starts.factored
         equations.watch.start()
-        start: Array = np.divide(self.starts.choose(ahead, rate, cold), equations.length)
+        chosen = self.starts.choose(first_round=first_round, cold=cold)
+        start: Array = np.divide(chosen, equations.length)
         attempts: list[Attempt] = []
         chain = [self.method]
         for method in chain:

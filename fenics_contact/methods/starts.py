@@ -17,14 +17,8 @@ from fenics_contact.types import Array
 
 __all__ = ["Starts"]
 
-
 # A start with up to this many times the residual of the best is taken if its points slip.
 _FAR = 100.0
-# By how much a step makes the residual larger where the load has turned round: 4 measured in
-# fretting. Where contact grows it does so too, and the step goes on in the direction of the last.
-_TURNED = 2.0
-
-
 # Γc is where a solution was found if its points are there to this share of the size of the mesh.
 _THERE = 1e-10
 
@@ -97,28 +91,24 @@ class Starts:
             displacement = contact.opposite.present_jump()
             self._borne.append(_Borne(contact.values, contact.acting.tangent(), displacement))
 
-    def choose(self, ahead: float, rate: Array | None, cold: bool) -> Array:
+    def choose(self, *, first_round: bool, cold: bool) -> Array:
         """Choose the unknowns of the system to start from: what is nearest to equilibrium of these.
 
-        Collective. The present state; that state moved on by as much as the last increment moved
-        it: in proportional loading that is the solution; that state with one step of Newton's
-        method on the tangent of the last solution; with a nonlinear bulk what `_followed` finds;
-        `_carried` where obstacles have moved and no values prescribed have; bodies that have gone
-        with such obstacles as rigid ones; and the state moved, or the present one, with obstacles
-        that turn freely rolled to where they are now: where all points would slip no tangent tells
-        by how much.
+        Collective. The present state; that state with one step of Newton's method on the tangent of
+        the last solution (`_stepped`, with a nonlinear bulk and other prescribed values
+        `_followed`); bodies that have gone with obstacles that have moved as rigid ones; and bodies
+        with obstacles that turn freely rolled to where they are now: where all points would slip no
+        tangent tells by how much.
 
         At the present state itself no point has slipped yet, and all closed ones stick: from there
         Newton's method takes ten steps to let them slip again, one after another from the edge of
         the contact inwards; and a body that others slide over is dragged along by all of the way,
         in a state that is near equilibrium and far from the solution. The start by a step on the
         tangent of the last solution has the right ones slipping, and is chosen unless it is far
-        off; or unless the load has turned round, so that slipping points stick: then the step goes
-        back, and to go on is worse than to stay, by a step as by the last increment.
+        off, or goes where friction pulls: then the load has turned round, and they stick.
 
         Args:
-            ahead: Size of the increment in units of the last one.
-            rate: By how much that moved all unknowns; None: there was none.
+            first_round: Whether loads and obstacles, and not multipliers, are what changed.
             cold: Whether nothing was borne before.
         """
         equations, system = self._equations, self._equations.system
@@ -143,48 +133,38 @@ class Starts:
         # Where nothing was borne yet the last increment tells nothing of this one.
         predicts, factored = self.predict and not cold, self.factored and not cold
         self.forget()
-        first = None
-        if predicts and (self._moved is not None or equations.full.bulk.linear):
-            step = self._predicted if self._moved is None else self._followed
-            first = add(step(present))
-        last = None
-        if rate is not None and ahead and not cold:
-            last = add(present + ahead * system.part(rate))
-        moved = present
+        step = None  # which of the starts is one on the tangent of the last solution
+        moved, turned = present, False
         if self._moved is not None:
-            if first is None or not residuals[first] < residuals[0] or self._turns(rate):
-                first = None
+            if predicts:
+                step = add(self._followed(present))
+            if step is None or not residuals[step] < residuals[0]:
+                step = None
                 moved = starts[add(self._followed(present, anew=True))]
             else:
-                moved = starts[first]
-        elif factored and ahead:
-            carried = self._carried(present)
-            if carried is not None:
-                first = add(carried)
+                moved = starts[step]
+        else:
+            tractions = self._tractions() if factored and first_round else None
+            if tractions is not None or (predicts and equations.full.bulk.linear):
+                step = add(self._stepped(present, tractions))
+                turned = self._friction_works()
         self._moved = None
-        if self.carried is not None and ahead:
+        if self.carried is not None and first_round:
             add(system.part(self.carried))
-        if ahead and any(c.free_angle is not None for c in equations.contacts):
+        if first_round and any(c.free_angle is not None for c in equations.contacts):
             add(system.rolled(moved))
-        if first is not None and residuals[first] <= _FAR * min(residuals):
-            worse = last is not None and residuals[0] < residuals[last]
-            worse = worse and residuals[0] < residuals[first] / _TURNED
-            if not (worse and self._goes_back(starts[first] - present, rate)):
-                residuals[first] = 0.0
+        if step is not None and not turned and residuals[step] <= _FAR * min(residuals):
+            return starts[step]
         return starts[int(np.argmin(residuals))]
 
-    def _goes_back(self, step: Array, rate: Array | None) -> bool:
-        """Whether a step of the system is against the last increment. Collective."""
-        assert rate is not None
-        along = float(step @ self._equations.system.part(rate))
-        return bool(self._equations.full.unknowns.comm.allreduce(along) < 0.0)
-
-    def _turns(self, rate: Array | None) -> bool:
-        """Whether the values prescribed go back to where they came from. Collective."""
-        if self._moved is None or rate is None:
-            return False
-        comm = self._equations.full.unknowns.comm
-        return bool(comm.allreduce(float(self._moved @ rate)) < 0.0)
+    def _friction_works(self) -> bool:
+        """Whether committed friction does work on the way to the present state. Collective."""
+        work = 0.0
+        for contact in self._equations.contacts:
+            values = contact.values
+            power = np.einsum("qi,qi->q", values.old_traction, values.increment)
+            work += float(contact.measure @ power)
+        return bool(self._equations.full.unknowns.comm.allreduce(work) > 0.0)
 
     def _followed(self, present: Array, *, anew: bool = False) -> Array:
         """Where the body goes with the values prescribed now, by one step from before. Collective.
@@ -231,33 +211,36 @@ class Starts:
         full.update_stiffness()
         return present + step.array_r if found else present
 
-    def _carried(self, present: Array) -> Array | None:
-        """Where obstacles that have moved take the body, by one step from before. Collective.
+    def _stepped(self, present: Array, tractions: list[Array] | None) -> Array:
+        """One Newton step on the tangent factored last. Collective.
 
-        On the tangent factored last, with the tractions that points would have if those that stuck
-        still did, and all others bore what they bore: in the residual at the present state a
-        obstacle is deep in points that were open, and nothing sticks to it any more.
+        Args:
+            present: The state, at which the residual was computed last.
+            tractions: What points would bear if those that stuck still did, and all others bore
+                what they bore, see `_tractions`: in the residual an obstacle that has moved is deep
+                in points that were open, and nothing sticks to it any more; None: the residual is
+                what the step is to take away.
 
         Returns:
-            The state; None where no obstacle has moved, or no step is found.
+            The state; the present one where no step is found.
         """
-        equations = self._equations
-        equations.system.set_state(present)
-        tractions = self._tractions()
-        if tractions is None:
-            return None
-        forces, step = equations.system.vector(), equations.system.vector()
-        forces.array[:] = equations.system.bulk_force()
-        for operator, traction in zip(equations.system.operators, tractions, strict=True):
-            operator.add_force(forces, traction)
-        forces.array[equations.system.constrained] = 0.0
-        forces.scale(-1.0 / equations.full.bulk.scale)
+        equations, system = self._equations, self._equations.system
+        forces, step = equations.function.copy(), system.vector()
+        forces.scale(equations.length)
+        if tractions is not None:
+            system.set_state(present)
+            forces.array[:] = system.bulk_force()
+            for operator, traction in zip(system.operators, tractions, strict=True):
+                operator.add_force(forces, traction)
+            forces.array[system.constrained] = 0.0
+            forces.scale(1.0 / equations.full.bulk.scale)
         ksp = equations.solvers[True]
         ksp.solve(forces, step)
+        dense.raise_kept(ksp)
         found = ksp.getConvergedReason() > 0
         linear.forget_failure(ksp.getPC())
-        self._stay_where_free(equations.system, step)
-        moved = np.asarray(present + step.array_r) if found else None
+        self._stay_where_free(system, step)
+        moved: Array = present - step.array_r if found else present
         for vector in (forces, step):
             vector.destroy()
         return moved
@@ -286,17 +269,6 @@ class Starts:
                 traction = turned - np.einsum("qij,qj->qi", borne.tangent.by_jump, way)
             tractions.append(traction)
         return tractions if moved else None
-
-    def _predicted(self, present: Array) -> Array:
-        """One Newton step on the tangent factored last; the residual is there. Collective."""
-        equations, ksp = self._equations, self._equations.solvers[True]
-        step = equations.solution.duplicate()
-        ksp.solve(equations.function, step)
-        dense.raise_kept(ksp)
-        self._stay_where_free(equations.system, step)
-        moved = present - equations.length * step.array_r
-        step.destroy()
-        return np.asarray(moved, dtype=np.float64)
 
     def _stay_where_free(self, system: System, step: PETSc.Vec) -> None:
         """Take bodies out of a step of which contact left a mode free where the last one ended.

@@ -12,10 +12,11 @@ from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array, Mask
 
-__all__ = ["CommittedState"]
+__all__ = ["N_ROWS", "CommittedState"]
 
-# How many of the rows are displacements, and how many are displacements or forces.
-_STATES, _PHYSICAL = 2, 4
+# How many arrays a state has over the unknowns: displacements, then forces, then masks; and how
+# many of them have a unit.
+N_ROWS, _PHYSICAL = 5, 3
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,6 @@ class CommittedState:
 
     Attributes:
         state: Values of the unknowns.
-        rate: By how much the last increment moved them.
         internal: Internal forces at them (force).
         external: External ones.
         kept: Mask of those kept when condensed.
@@ -35,7 +35,6 @@ class CommittedState:
     """
 
     state: Array
-    rate: Array
     internal: Array
     external: Array
     kept: Mask
@@ -50,8 +49,8 @@ class CommittedState:
         return np.array([self.increment, self.expected, *self.pairs_anew], dtype=np.float64)
 
     def rows(self, unknowns: Unknowns, bulk: Bulk) -> Array:
-        """The arrays in the user's units, (6, n_local)."""
-        found = (self.state, self.rate, self.internal, self.external, self.kept, self.constrained)
+        """The arrays in the user's units, (N_ROWS, n_local)."""
+        found = (self.state, self.internal, self.external, self.kept, self.constrained)
         return _converted(np.stack(found).astype(np.float64), unknowns, bulk, back=False)
 
     @classmethod
@@ -61,10 +60,10 @@ class CommittedState:
         """What gave these `rows` and `numbers`."""
         increment, expected, *anew = (int(number) for number in numbers)
         arrays = _converted(rows, unknowns, bulk, back=True)
-        state, rate, internal, external, kept, constrained = arrays
+        state, internal, external, kept, constrained = arrays
         masks = kept > 0, constrained > 0
         pairs = tuple(bool(found) for found in anew)
-        return cls(state, rate, internal, external, *masks, increment, expected, pairs)
+        return cls(state, internal, external, *masks, increment, expected, pairs)
 
 
 def _converted(rows: Array, unknowns: Unknowns, bulk: Bulk, *, back: bool) -> Array:
@@ -72,5 +71,5 @@ def _converted(rows: Array, unknowns: Unknowns, bulk: Bulk, *, back: bool) -> Ar
     n, found = unknowns.n_dofs, rows.copy()
     convert = (bulk.in_units, bulk.from_units)
     for i in range(_PHYSICAL):
-        found[i, :n] = convert[(i < _STATES) != back](rows[i, :n])
+        found[i, :n] = convert[(i == 0) != back](rows[i, :n])
     return found
