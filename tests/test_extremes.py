@@ -75,7 +75,10 @@ FINITE = {
         "360° in 12, μ = 1",
     ),
     "sliding over facets": ("plane of 1000 facets, 10 increments",),
-    "sliding off the end of a plate": ("μ = 0, 10 increments",),
+    "sliding off the end of a plate": (
+        "μ = 0, 10 increments",
+        "μ = 0, 40 increments",
+    ),
     "rubber column compressed to 60 %": (
         "k_n h/E = 1e-03",
         "k_n h/E = 1e+06",
@@ -96,7 +99,10 @@ FINITE = {
 BODIES = {
     "both rotated by 360°, increments": ("36, μ = 1, Γc 20 times finer",),
     "sliding over facets": ("110 in 10, 1.2 slave per master facet, μ = 0",),
-    "sliding off the end, increments": ("10, μ = 0.3",),
+    "sliding off the end, increments": (
+        "10, μ = 0.3",
+        "10, μ = 0.3, lower body 1e3 times stiffer",
+    ),
     "lift-off after sliding, μ": ("0.3, upper body 1e6 times stiffer",),
     "rubber columns compressed to 60 %": (
         "k_n h/E = 1e-03",
