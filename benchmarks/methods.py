@@ -182,7 +182,7 @@ def main() -> None:
     for row in measure(1 if arguments.short else arguments.repeat):
         rows.append(row)
         print(*row.values(), sep="  ", flush=True)
-    title = "Five methods on five scenes with friction"
+    title = "Four methods on five scenes with friction"
     timing.write(arguments.output, "methods", title, rows)
 
 

@@ -15,7 +15,6 @@ from petsc4py import PETSc
 from fenics_contact.types import Array
 
 __all__ = [
-    "LEAST_RESIDUAL",
     "LONGEST_STEP",
     "NOT_FINITE",
     "adjacency",
@@ -37,10 +36,9 @@ if tuple(map(int, dolfinx.__version__.split(".")[:2])) < (0, 9):
         "later one, or use the container (docker/run)"
     )
 
-# PETSc's line search for the least residual, renamed in 3.24; bound to Python since 3.23.
+# The longest step of a line search, renamed in PETSc 3.24, like the line search SECANT; both are
+# bound to Python since 3.23.
 _line_searches = getattr(getattr(PETSc, "SNESLineSearch", None), "Type", None)
-LEAST_RESIDUAL = getattr(_line_searches, "SECANT", "l2")
-# The longest step of a line search, renamed in the same release.
 _RENAMED = hasattr(_line_searches, "SECANT")
 LONGEST_STEP = "snes_linesearch_maxlambda" if _RENAMED else "snes_linesearch_maxstep"
 # The reason of SNES where the residual is not finite, renamed in 3.25 (the number is the same).

@@ -33,7 +33,8 @@ __all__ = ["OpposingBodyProbe", "RigidObstacleProbe", "Tunnelling", "TunnellingC
 
 # Penetration, as a share of the facet, up to which tangent planes at the points around explain more
 # than these points resist: of a tilted facet the corner is 0.2 of it away from the nearest point.
-_PREDICTED_DEPTH = 0.15
+# Less of it where no point resists anything.
+_PREDICTED_DEPTH, _PREDICTED_UNRESISTED = 0.15, 0.05
 # Penetration, as a share of the facet, that two quadrature rules may differ by.
 _DEPTH_RESOLUTION = 0.02
 # The largest penetration, as a share of the facet, that places without resistance may have been
@@ -572,7 +573,7 @@ class RigidObstacleProbe:
             size, height = self._places.size[facet[some]], self._places.facets.heights()
             reach = np.minimum(_ALLOWED_BEFORE * size, height[facet[some]] / 2)
             facets = self._places.moving_facets(field, field)
-            _, found[some] = _below_facets(self._comm, points[some], outward[some], reach, facets)
+            _, found[some] = self._below(points[some], outward[some], reach, facets)
         return found
 
     def _enter(self, start: Array, end: Array, entered: Mask, through: Index, times: Array) -> None:
@@ -645,10 +646,10 @@ class RigidObstacleProbe:
         surface = self._surface(field, allowed)
         depth = -_dot(points - surface.corner[through], surface.normal[through])
         rows = np.flatnonzero((through >= 0) & (depth > surface.allowed[through]))
-        points, normal = points[rows], surface.normal[through[rows]]
-        depth, facet = _below_facets(self._comm, points, normal, 2 * depth[rows], surface.facets)
+        normal = surface.normal[through[rows]]
+        depth, facet = self._below(points[rows], normal, 2 * depth[rows], surface.facets)
         deep = (facet >= 0) & (depth > surface.allowed[facet])
-        deep &= ~self._is_shallow(points, normal, surface)
+        deep &= ~self._is_shallow(points[rows], normal, surface)
         return np.asarray(surface.middle[np.unique(facet[deep])])
 
     def _surface(self, field: Array, allowed: Array) -> _Surface:
@@ -682,12 +683,34 @@ class RigidObstacleProbe:
         cosine = normal @ surface.normal.T
         row, facet = np.nonzero(near & (cosine > _OPPOSITE_SIDES) & (cosine < _EDGE))
         reach = 2 * depth[row, facet] + _DEPTH_RESOLUTION * surface.allowed[facet]
-        _, met = _below_facets(
-            self._comm, points[row], surface.normal[facet], reach, surface.facets
-        )
-        found = np.zeros(len(depth), dtype=np.bool_)
+        _, met = self._below(points[row], surface.normal[facet], reach, surface.facets)
+        found = np.zeros(len(points), dtype=np.bool_)
         found[row[met == facet]] = True
         return found
+
+    def _below(
+        self, points: Array, outward: Array, reach: Array, facets: MovingFacets
+    ) -> tuple[Array, Index]:
+        """How deep points are below Γc, along outward directions. Collective.
+
+        Beside Γc a point is below none of its facets.
+
+        Args:
+            points: (n, gdim) (length).
+            outward: Unit vectors, (n, gdim).
+            reach: How far Γc is looked for, (n,) (length).
+            facets: Γc, at rest.
+
+        Returns:
+            The depth, (n,) (length), and the number of the facet among those of all ranks, (n,), -1
+            for points that are not below Γc.
+        """
+        vertices, end = np.full((len(points), 1), -1), points + reach[:, None] * outward
+        met = find_crossings(self._comm, points, end, vertices, facets)
+        first = np.append(True, np.diff(met.place) > 0)[: len(met.place)] & ~met.inward
+        place, depth, facet = met.place[first], np.zeros(len(points)), np.full(len(points), -1)
+        depth[place], facet[place] = met.time[first] * reach[place], met.facet[first]
+        return depth, facet
 
 
 class OpposingBodyProbe:
@@ -893,7 +916,7 @@ class _Side:
             before=u,  # for the tangents
         )
 
-    def moving(self, before: fem.Function, shift: Array | float = 0.0) -> MovingFacets:
+    def moving(self, before: fem.Function, shift: Array) -> MovingFacets:
         """The facets of this rank in the increment, its start moved by a shift."""
         side, facets = self.side, self.side.facets
         start, end = facets.moved_corners(before) + shift, facets.moved_corners(self._u)
@@ -906,20 +929,15 @@ class _Side:
         facets = other.moving(before, shift)
         met = find_crossings(self._comm, start, self.place, vertices, facets)
         found = np.zeros(len(self.facet), dtype=np.bool_)
-        first = np.append(True, np.diff(met.place) > 0)[: len(met.place)]
-        last = np.append(np.diff(met.place) > 0, True)[: len(met.place)]
+        if not len(met.place):
+            return found
+        first = np.append(True, np.diff(met.place) > 0)
+        last = np.append(np.diff(met.place) > 0, True)
         place, leaves = met.place[last], ~met.inward[last]
         # Of a place that was inside from the start, through the side that its own normal met.
         entry = np.where(met.inward[first][:, None], met.normal[first], -self.normal[place])
         through = leaves & (_dot(entry, met.normal[last]) < _OPPOSITE_SIDES)
-        deep = ~leaves & (met.depth[last] > allowed[place])
-        if self._comm.allreduce(int(deep.any())):
-            # Beside the surface it has left through what is not part of the surface.
-            end, normal, reach = self.place[place], met.normal[last], 2 * met.depth[last]
-            at_rest = other.moving(self._u)
-            _, facet = _below_facets(self._comm, end, normal, np.where(deep, reach, 0.0), at_rest)
-            deep &= facet >= 0
-        found[place] = through | deep
+        found[place] = through | (~leaves & (met.depth[last] > allowed[place]))
         return found
 
 
@@ -928,32 +946,6 @@ def _normals(hits: Hits) -> Array:
     normal = across(hits.partner.tangents)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     return np.asarray(normal / np.where(length > 0, length, 1.0))
-
-
-def _below_facets(
-    comm: MPI.Comm, points: Array, outward: Array, reach: Array, facets: MovingFacets
-) -> tuple[Array, Index]:
-    """How deep points are below a surface, along outward directions. Collective.
-
-    Beside the surface a point is below none of its facets.
-
-    Args:
-        comm: The ranks.
-        points: (n, gdim) (length).
-        outward: Unit vectors, (n, gdim).
-        reach: How far the surface is looked for, (n,) (length).
-        facets: Those of this rank, at rest.
-
-    Returns:
-        The depth, (n,) (length), and the number of the facet among those of all ranks, (n,), -1
-        for points that are not below the surface.
-    """
-    vertices, end = np.full((len(points), 1), -1), points + reach[:, None] * outward
-    met = find_crossings(comm, points, end, vertices, facets)
-    first = np.append(True, np.diff(met.place) > 0)[: len(met.place)] & ~met.inward
-    place, depth, facet = met.place[first], np.zeros(len(points)), np.full(len(points), -1)
-    depth[place], facet[place] = met.time[first] * reach[place], met.facet[first]
-    return depth, facet
 
 
 def _with_those_around(
@@ -977,7 +969,7 @@ def _with_those_around(
     n, n_corners = corners.shape
     deepest = (np.arange(n), resisted.argmax(axis=1)) if n else (np.arange(0), np.arange(0))
     rows = np.column_stack([-resisted[deepest], through[deepest], normal[deepest]])
-    seen = rows[:, 0] < 0
+    seen = (rows[:, 0] < 0) & ~np.isnan(rows).any(axis=1)
     table = np.repeat(rows[seen], n_corners, axis=0)
     table = gather_rows(comm, np.column_stack([corners[seen].ravel(), table]))
     table = table[np.lexsort(table.T[::-1])]
@@ -1010,7 +1002,8 @@ def _allowed(resisted: Array, planes: Array, facet: Array, smaller: Array) -> Ar
         facet: Size of the facet of Γc, (n,).
         smaller: Size of the smaller facet that meets there, (n,).
     """
-    predicted = np.minimum(planes, resisted + _PREDICTED_DEPTH * facet)
+    share = np.where(resisted > 0, _PREDICTED_DEPTH, _PREDICTED_UNRESISTED)
+    predicted = np.minimum(planes, resisted + share * facet)
     return np.maximum(resisted, predicted) + _DEPTH_RESOLUTION * smaller
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
+from fenics_contact import compat
 from fenics_contact.methods.callbacks import Callbacks
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.options import Defaults
@@ -211,7 +212,9 @@ class Newton(SnesMethod):
         """See `Method.main_options`: steps are halved until `_level` falls."""
         return {
             "snes_type": "newtonls",
+            "snes_stol": 0.0,
             "snes_max_it": 100,
+            compat.LONGEST_STEP: 100.0,
             "snes_linesearch_type": "bt",
             "snes_linesearch_order": 1,
             "snes_linesearch_alpha": 0.0,

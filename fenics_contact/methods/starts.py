@@ -138,7 +138,8 @@ class Starts:
         if self._moved is not None:
             if predicts:
                 step = add(self._followed(present))
-            if step is None or not residuals[step] < residuals[0]:
+                turned = self._friction_works()
+            if step is None or turned or not residuals[step] < residuals[0]:
                 step = None
                 moved = starts[add(self._followed(present, anew=True))]
             else:
@@ -146,8 +147,10 @@ class Starts:
         else:
             tractions = self._tractions() if factored and first_round else None
             if tractions is not None or (predicts and equations.full.bulk.linear):
-                step = add(self._stepped(present, tractions))
-                turned = self._friction_works()
+                stepped = self._stepped(present, tractions)
+                if stepped is not None:
+                    step = add(stepped)
+                    turned = self._friction_works()
         self._moved = None
         if self.carried is not None and first_round:
             add(system.part(self.carried))
@@ -158,9 +161,10 @@ class Starts:
         return starts[int(np.argmin(residuals))]
 
     def _friction_works(self) -> bool:
-        """Whether committed friction does work on the way to the present state. Collective."""
+        """Whether committed friction does work on the way to the start added last. Collective."""
         work = 0.0
         for contact in self._equations.contacts:
+            contact.evaluate()
             values = contact.values
             power = np.einsum("qi,qi->q", values.old_traction, values.increment)
             work += float(contact.measure @ power)
@@ -211,7 +215,7 @@ class Starts:
         full.update_stiffness()
         return present + step.array_r if found else present
 
-    def _stepped(self, present: Array, tractions: list[Array] | None) -> Array:
+    def _stepped(self, present: Array, tractions: list[Array] | None) -> Array | None:
         """One Newton step on the tangent factored last. Collective.
 
         Args:
@@ -222,12 +226,14 @@ class Starts:
                 what the step is to take away.
 
         Returns:
-            The state; the present one where no step is found.
+            The state; None where no step is found.
         """
         equations, system = self._equations, self._equations.system
-        forces, step = equations.function.copy(), system.vector()
-        forces.scale(equations.length)
-        if tractions is not None:
+        forces, step = system.vector(), system.vector()
+        if tractions is None:
+            equations.function.copy(forces)
+            forces.scale(equations.length)
+        else:
             system.set_state(present)
             forces.array[:] = system.bulk_force()
             for operator, traction in zip(system.operators, tractions, strict=True):
@@ -240,7 +246,7 @@ class Starts:
         found = ksp.getConvergedReason() > 0
         linear.forget_failure(ksp.getPC())
         self._stay_where_free(system, step)
-        moved: Array = present - step.array_r if found else present
+        moved: Array | None = present - step.array_r if found else None
         for vector in (forces, step):
             vector.destroy()
         return moved
