@@ -26,8 +26,6 @@ __all__ = ["OVERLOADED", "Method", "Newton", "OwnMethod", "SnesMethod", "Tools"]
 _DECREASE = 0.1
 # Share of a step from which on it is the whole one, and no half: multigrid has it to a hundredth.
 _WHOLE = 0.9
-# Halvings of a step before the line search fails.
-_HALVINGS = 40
 # Iterations without a lower residual after which another method takes over.
 _PATIENCE = 14
 
@@ -196,8 +194,8 @@ class Newton(SnesMethod):
 
     Attributes:
         most_halvings: Of a step that `_level` refuses, before what is left of it is taken: where a
-            point is about to change its status no share of a step need lower anything. As many as
-            the line search makes: it fails, sooner than by going on so.
+            point is about to change its status no share of a step need lower anything. Infinite:
+            the line search fails.
     """
 
     def __init__(
@@ -213,7 +211,7 @@ class Newton(SnesMethod):
         self._iterate: tuple[PETSc.Vec, PETSc.Vec] | None = None  # and the residual there
         self._step: float | None = None  # norm of the correction there, once it is asked for
         self._trial: Array | None = None  # whose tangent the matrix holds, if not the iterate's
-        self.most_halvings = _HALVINGS
+        self.most_halvings = np.inf
         self._trials = 0  # of the present step
         self._looks_ahead = False  # whether to ask for the correction after a whole step
 
@@ -228,7 +226,7 @@ class Newton(SnesMethod):
             "snes_linesearch_type": "bt",
             "snes_linesearch_order": 1,
             "snes_linesearch_alpha": 0.0,
-            "snes_linesearch_max_it": _HALVINGS,
+            "snes_linesearch_max_it": 40,
         }
 
     def attach(self, *, consistent: bool) -> None:
