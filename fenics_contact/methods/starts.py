@@ -105,8 +105,7 @@ class Starts:
         the contact inwards; and a body that others slide over is dragged along by all of the way,
         in a state that is near equilibrium and far from the solution. The start by a step on the
         tangent of the last solution has the right ones slipping, and is chosen unless it is far
-        off, or (with a linear bulk) goes where friction pulls: then the load has turned round, and
-        they stick.
+        off, or goes where friction pulls: then the load has turned round, and they stick.
 
         Args:
             first_round: Whether loads and obstacles, and not multipliers, are what changed.
@@ -139,7 +138,8 @@ class Starts:
         if self._moved is not None:
             if predicts:
                 step = add(self._followed(present))
-            if step is None or not residuals[step] < residuals[0]:
+                turned = self._friction_works()
+            if step is None or turned or not residuals[step] < residuals[0]:
                 step = None
                 moved = starts[add(self._followed(present, anew=True))]
             else:
