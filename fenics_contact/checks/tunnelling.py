@@ -754,9 +754,7 @@ class OpposingBodyProbe:
         n = contact.quadrature.n_points
         gap, partner = self._hits.distance[:n], self._hits.facet[:n]
         closed = contact.status != Status.OPEN
-        self._deep = deep = np.maximum(
-            values.penetration, np.where(closed, -np.nan_to_num(gap), 0.0)
-        )
+        deep = np.maximum(values.penetration, np.where(closed, -np.nan_to_num(gap), 0.0))
         met = (deep > 0) & (partner >= 0)
         self.resisted = [
             (
@@ -765,6 +763,7 @@ class OpposingBodyProbe:
             ),
             (there.corners[partner[met]], deep[met]),
         ]
+        self._planes = self._tangent_planes(deep)
         # What lies aside of the normals may be nearer than what they meet.
         depth, allowed = self.depth(ResistedDepth.of(self._comm, [], []))
         # So may facets beyond the `nearby` ones, which are a height away at least.
@@ -821,7 +820,7 @@ class OpposingBodyProbe:
         met = ~np.isnan(distance)
         # A place opposite stands for the one of Γc that its normal meets.
         foot = there.place + np.nan_to_num(back.distance)[:, None] * there.normal
-        planes = _below(np.concatenate([here.place, foot]), *(p[on] for p in self._planes()))
+        planes = _below(np.concatenate([here.place, foot]), *(p[on] for p in self._planes))
         planes[on < 0] = -np.inf
         smaller = np.where(met, np.minimum(size, other), np.where(on >= 0, size, other))
         allowed = _allowed(deep, planes, size, smaller) + np.where(met, slack, 0.0)
@@ -830,8 +829,11 @@ class OpposingBodyProbe:
         steepness = np.concatenate([abs(_dot(_normals(h), s.normal)) for h, s in pairs])
         return np.where(met, -distance * steepness, 0.0), allowed
 
-    def _planes(self) -> tuple[Array, Array]:
-        """The tangent planes that the points of every facet of all ranks see. Collective.
+    def _tangent_planes(self, resisted: Array) -> tuple[Array, Array]:
+        """Those of the opposite surface, of the facets of all ranks. Collective.
+
+        Args:
+            resisted: Penetration at the points that the law resists, (n_points,) (length).
 
         Returns:
             See `_with_those_around`.
@@ -842,7 +844,7 @@ class OpposingBodyProbe:
         normal = normal * -np.sign(_dot(normal, ray))[:, None]
         corners = here.side.corners[here.side.own]
         planes = through[self._rows], normal[self._rows]
-        planes = _with_those_around(self._comm, corners, self._deep[self._rows], *planes)
+        planes = _with_those_around(self._comm, corners, resisted[self._rows], *planes)
         through, normal = (gather_rows(self._comm, v) for v in planes)
         return through, normal
 
