@@ -478,6 +478,32 @@ def test_ranks_without_cells(method):
     assert np.all(gathered(COMM, contact.pressure) > 0)
 
 
+@pytest.mark.parametrize("condensation", [False, None])
+@pytest.mark.parametrize("method", ["lbfgs", "continuation", "alternating"])
+def test_methods_without_a_tangent_continue_the_last_increment(method, condensation):
+    """A block that sticks is pressed and relieved by uneven increments: u follows the load.
+
+    Reference: the equations are linear, so that after the first increment the start is the
+    solution, whatever the sizes of the increments, and 0 iterations follow; at the end u is 0.4 of
+    that of the first increment, to 1e-8 (the solver's own tolerance is 1e-9 of the forces).
+    """
+    scene = block("quadrilateral", n=4)
+    led = fem.Constant(scene.mesh, 0.0)
+    bcs = [*scene.rollers(), scene.hold(TOP, 1, led)]
+    law = fc.Coulomb(10.0, 1e4, 1e4)
+    problem, _ = scene.problem(law, bcs, method=method, condensation=condensation)
+    found = []
+    for step in fc.increments(problem, led, 0.0, -0.03, steps=[-0.01, -0.015, -0.03]):
+        found.append((step.iterations, step.method))
+        if len(found) == 1:
+            first = nodal(scene.u)
+    for step in fc.increments(problem, led, -0.03, -0.004, steps=[-0.02, -0.004]):
+        found.append((step.iterations, step.method))
+    assert [n for n, _ in found[1:]] == [0, 0, 0, 0]
+    assert {by for _, by in found} == {method}
+    assert close(nodal(scene.u), 0.4 * first, 1e-8)
+
+
 # ---- what is said, kept and freed ----------------------------------------------------------------
 
 

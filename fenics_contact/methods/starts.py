@@ -53,15 +53,22 @@ class Starts:
         self.carried: Array | None = None
         self._equations = equations
         self._moved: Array | None = None  # of the values prescribed, since the last increment
+        self._ended: Array | None = None  # the state in which that did
+        self._change: Array | None = None  # of the state, in the last increment that changed it
         self._borne: list[_Borne] = []  # by contact, in the solution found last
 
     def moved_from(self, before: Array) -> None:
-        """Take note of how far the values prescribed now have moved. Collective.
+        """Take note of what the last increment and the values prescribed now changed. Collective.
 
         Args:
             before: The state of the full system in which the last increment ended.
         """
         full = self._equations.full
+        if self._ended is not None:
+            change = before - self._ended
+            if global_max(full.unknowns.comm, np.abs(change)) > 0.0:  # it is not tried once more
+                self._change = change
+        self._ended = before
         self._moved = None
         if not full.bulk.linear:
             change = full.vector()
@@ -96,7 +103,8 @@ class Starts:
 
         Collective. The present state; that state with one step of Newton's method on the tangent of
         the last solution (`_stepped`, with a nonlinear bulk and other prescribed values
-        `_followed`); bodies that have gone with obstacles that have moved as rigid ones; and bodies
+        `_followed`), or where there is none continued as in the last increment (`_continued`);
+        bodies that have gone with obstacles that have moved as rigid ones; and bodies
         with obstacles that turn freely rolled to where they are now: where all points would slip no
         tangent tells by how much.
 
@@ -152,6 +160,8 @@ class Starts:
                     step = add(stepped)
                     turned = self._friction_works()
         self._moved = None
+        if first_round and not predicts and not cold and self._change is not None:
+            add(self._continued(present, self._change))
         if self.carried is not None and first_round:
             add(system.part(self.carried))
         if first_round and any(c.free_angle is not None for c in equations.contacts):
@@ -159,6 +169,22 @@ class Starts:
         if step is not None and not turned and residuals[step] <= _FAR * min(residuals):
             return starts[step]
         return starts[int(np.argmin(residuals))]
+
+    def _continued(self, present: Array, change: Array) -> Array:
+        """Where a change like that of the last increment leaves no force along it. Collective.
+
+        By the secant between none and all of it, so that the sizes of the increments do not matter.
+        """
+        equations, system = self._equations, self._equations.system
+        way = system.part(change).copy()
+        way[system.constrained] = 0.0
+        along = np.zeros(2)
+        for share in (0, 1):
+            equations.residual_at(present + share * way)
+            along[share] = equations.function.array_r @ way
+        first, last = equations.full.unknowns.comm.allreduce(along)
+        found = np.isfinite(last) and first != last
+        return present + first / (first - last) * way if found else present
 
     def _friction_works(self) -> bool:
         """Whether committed friction does work on the way to the start added last. Collective."""
