@@ -573,7 +573,7 @@ def test_newton_starts_where_the_right_points_slip(condensation):
         for i in range(1, 13):
             made.move(0.004 * i, 0.05)
             if not helped:
-                made.problem.solver.starts.predict = False
+                made.problem.restart_solver()
             taken[-1] += made.problem.solve().iterations
             made.problem.commit()
         assert made.contact.resultants().slip > 0

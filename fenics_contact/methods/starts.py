@@ -65,9 +65,9 @@ class Starts:
         """
         full = self._equations.full
         if self._ended is not None:
-            change = before - self._ended
-            if global_max(full.unknowns.comm, np.abs(change)) > 0.0:  # it is not tried once more
-                self._change = change
+            last = before - self._ended
+            if global_max(full.unknowns.comm, np.abs(last)) > 0.0:  # it is not tried once more
+                self._change = last
         self._ended = before
         self._moved = None
         if not full.bulk.linear:
@@ -78,6 +78,11 @@ class Starts:
     def forget(self) -> None:
         """Another tangent is factored than that of the solution found last."""
         self.factored = self.predict = False
+
+    def restart(self) -> None:
+        """Know no more than a run that is taken up here."""
+        self.forget()
+        self._ended = self._change = None
 
     def keep(self, *, predict: bool) -> None:
         """Take note of what contacts bear in the solution that was just found. Collective.
@@ -183,7 +188,7 @@ class Starts:
             equations.residual_at(present + share * way)
             along[share] = equations.function.array_r @ way
         first, last = equations.full.unknowns.comm.allreduce(along)
-        found = np.isfinite(last) and first != last
+        found = np.isfinite(first) and np.isfinite(last) and first != last
         return present + first / (first - last) * way if found else present
 
     def _friction_works(self) -> bool:
