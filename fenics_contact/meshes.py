@@ -16,6 +16,7 @@ from mpi4py import MPI
 from fenics_contact import compat
 from fenics_contact.joining import exchange_rows, tag_facets
 from fenics_contact.parallel import collective_errors
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index
 
 __all__ = ["mesh_from_arrays", "model_to_mesh"]
@@ -28,8 +29,6 @@ _DEGREES = {
     "hexahedron": {8: 1, 27: 2},
 }
 _NODE_ORDERS = ("vtk", "gmsh", "dolfinx")
-# Smallest Jacobian determinant of a valid cell, relative to its diameter to the power of gdim.
-_DEGENERATE_JACOBIAN_RATIO = 1e-12
 _LARGEST_TAG = np.iinfo(np.int32).max
 # Number of rows of a bad array that an error message shows.
 _SHOWN_ROWS = 3
@@ -313,7 +312,7 @@ def _check_jacobians(x: Array, nodes: Index, kind: str, node_order: str) -> None
     det = np.linalg.det(jacobians)
     diameter = np.linalg.norm(np.ptp(corners, axis=1), axis=1)
     det = det / np.maximum(diameter, np.finfo(float).tiny)[:, None] ** gdim
-    small = np.flatnonzero(np.abs(det).max(axis=1) <= _DEGENERATE_JACOBIAN_RATIO)
+    small = np.flatnonzero(np.abs(det).max(axis=1) <= ROUND_OFF)
     if len(small):
         raise ValueError(
             f"{len(small)} cells have no volume, the first is cells[{small[0]}] with the points "

@@ -11,13 +11,10 @@ from fenics_contact.checks.verdict import Verdict
 from fenics_contact.contact.values import Resultants
 from fenics_contact.markup import shown
 from fenics_contact.methods.attempt import Attempt
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
 __all__ = ["Step"]
-
-
-# Of a vector's length, what of a component is the solver's tolerance.
-_NOTHING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -141,4 +138,4 @@ class Step:
 def _components(vector: Array) -> str:
     """In words; what is next to nothing beside the length is 0."""
     size = np.linalg.norm(vector)
-    return "(" + ", ".join(f"{v if abs(v) > _NOTHING * size else 0:.6g}" for v in vector) + ")"
+    return "(" + ", ".join(f"{v if abs(v) > NEGLIGIBLE * size else 0:.6g}" for v in vector) + ")"

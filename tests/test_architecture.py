@@ -36,7 +36,7 @@ APART = {"methods": {"checks"}}
 # Modules that stand in no room and know none of them.
 GROUND = {
     *("compat", "parallel", "types", "meshes", "joining", "arguments", "elasticity", "markup"),
-    *("_version", "compiling", "installation"),
+    *("_version", "compiling", "installation", "tolerances"),
 }
 # DOLFINx names its C++ objects so, and there is no other way to them.
 OF_DOLFINX = {"_cpp_object"}

@@ -19,6 +19,7 @@ from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_nodes
 from fenics_contact.systems.unknowns import Unknowns
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Mask
 
 __all__ = [
@@ -32,9 +33,6 @@ __all__ = [
 
 logger = logging.getLogger("fenics_contact")
 
-# Gaps relative to the coordinates that they are differences of, and differences of unit normals,
-# that are round-off.
-_SAME_PLACE = 1e-12
 # Largest round-off of coordinates, relative to the facets of Γc.
 _COORDINATE_ROUND_OFF = 2e-7
 # How parts of a mixed function are prescribed.
@@ -209,7 +207,7 @@ def check_start(contacts: Sequence[Contact]) -> float:
         _refuse_enclosed(contact)
         contact.inputs.check_side(contact.values, gap_prescribed=contact.gap_prescribed)
         gap = global_min(comm, contact.opposite.undeformed_gap(contact.values))
-        if gap < -_SAME_PLACE * extent and not contact.gap_prescribed:
+        if gap < -ROUND_OFF * extent and not contact.gap_prescribed:
             worst = max(worst, -gap)
             if comm.rank == 0:
                 logger.warning(
@@ -326,5 +324,5 @@ def _n_doubled(one: Contact, other: Contact) -> int:
         facing &= np.all(values.paired[points], axis=1)
     gaps, normals = (np.abs(a - b) for a, b in zip(*places, strict=True))
     extent = np.abs(one.points).max(initial=0.0)
-    same = (gaps <= _SAME_PLACE * extent) & np.all(normals <= _SAME_PLACE, axis=1)
+    same = (gaps <= ROUND_OFF * extent) & np.all(normals <= ROUND_OFF, axis=1)
     return int(np.count_nonzero(same & facing))

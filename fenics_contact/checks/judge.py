@@ -20,6 +20,7 @@ from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.system import System
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array
 
 __all__ = ["Judge", "Respond"]
@@ -106,7 +107,7 @@ class Judge:
         names, tolerance = system.parts.names, norms.tolerance(rtol)
         reaction = np.where(system.constrained, total, 0.0)
         imbalance, sizes = self._force_sums(system, bulk - reaction, [bulk, *contacts])
-        allowed = np.sqrt(sizes[0]) * 2 * tolerance[: len(imbalance)] + 1e-12 * sizes[1]
+        allowed = np.sqrt(sizes[0]) * 2 * tolerance[: len(imbalance)] + ROUND_OFF * sizes[1]
         augmented = [c for c in self._contacts if c.multipliers is not None and laws]
         rows = norms.residual, norms.force, tolerance, norms.round_off
         equations = zip(names, *rows, strict=True)

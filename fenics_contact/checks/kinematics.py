@@ -16,6 +16,7 @@ from fenics_contact.contact.choices import is_regularised
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_min, global_sum, longest
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Mask
 
 __all__ = ["Deviation", "LinearSprings", "Linearisation", "linearisation"]
@@ -26,9 +27,6 @@ _NEGLIGIBLE = 1e-3
 # Slide, as a share of the smallest facet, and difference of the displacements on Γc, as a share of
 # its size, below which pairs in the deformed bodies are those of before.
 _SLID, _TURNED = 1e-2, 1e-3
-# Round-off of a gap, relative to the coordinates that it is the difference of, and of tractions
-# that cancel.
-_ROUND_OFF = 1e-12
 # Share by which small displacements may change forces or pressures before it is said.
 _NOTABLE = 0.01
 
@@ -161,7 +159,7 @@ class Deviation:
             return cls(zero, turn, values.normal, nothing, nothing)
         true = np.where(contact.paired, values.gap, 0.0) + change
         size = np.linalg.norm(values.x, axis=1) + contact.quadrature.facet_sizes
-        apart = _ROUND_OFF * size
+        apart = ROUND_OFF * size
         if not contact.rigid:  # facets that meet at angles make as much of a gap where points close
             apart += longest(contact.surface.mesh.comm, np.nan_to_num(change[closed]))
         closing = told & ~closed & (true < -apart)
@@ -280,7 +278,7 @@ def _relative(contact: Contact, added: Array, answered: Array) -> Linearisation:
         # All of what it ought to bear is missing, but where a free body moves out of the way.
         parts = [np.linalg.norm(part, axis=1) for part in (change, added)]
         size, at_rest = global_sum(comm, [measure @ part for part in parts])
-        size = 0.0 if size <= _ROUND_OFF * at_rest < np.inf else size  # NaN: nothing is known
+        size = 0.0 if size <= ROUND_OFF * at_rest < np.inf else size  # NaN: nothing is known
     force = float(np.linalg.norm(force_change)) / size if size else 0.0
     pressure = float(changed / whole) if whole else 0.0
     return Linearisation(force, pressure, not contact.rigid)

@@ -7,6 +7,8 @@ from math import ceil
 
 import numpy as np
 
+from fenics_contact.tolerances import ROUND_OFF
+
 __all__ = ["DEFAULT_FACTOR", "PRESETS", "Accuracy"]
 
 # k_n and k_t in units of E/h where nothing else is said.
@@ -62,7 +64,7 @@ class Accuracy:
                 "force and pressure, between 1e-8 and 0.5"
             )
         needed = _PENALTY_ERROR / error
-        soft = needed <= _STIFFEST * (1 + 1e-12)
+        soft = needed <= _STIFFEST * (1 + ROUND_OFF)
         left = _LEFT * error / (_PENALTY_ERROR / _STIFFEST)
         return cls(
             error=float(error),
@@ -70,7 +72,7 @@ class Accuracy:
             enforcement="penalty" if soft else "augmented",
             tolerance=float(np.clip(left, 1e-8, 0.1)),
             rtol=float(np.clip(_SHARE * error, 1e-10, 1e-4)),
-            increments=ceil(_INCREMENT_ERROR / error * (1 - 1e-12)),
+            increments=ceil(_INCREMENT_ERROR / error * (1 - ROUND_OFF)),
         )
 
     def __str__(self) -> str:

@@ -9,6 +9,7 @@ from dolfinx import fem
 from fenics_contact.obstacles.base import Placement
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
+from fenics_contact.tolerances import FLAT
 from fenics_contact.types import Array
 
 __all__ = ["DeformedPlaces", "VaryingMotion"]
@@ -16,8 +17,6 @@ __all__ = ["DeformedPlaces", "VaryingMotion"]
 
 # Deviation of a gap's slope along the normal from -1 with which it is no distance.
 _NO_DISTANCE = 0.5
-# Extent of a facet along one direction, by its largest, that is round-off.
-_FLAT = 1e-6
 
 
 class DeformedPlaces:
@@ -88,7 +87,7 @@ class VaryingMotion:
         away, change = (v[self._rows] - v[self._rows].mean(axis=1)[:, None] for v in (x, shift))
         mean = normal[self._rows].mean(axis=1)
         away -= np.einsum("fqi,fi,fj->fqj", away, mean, mean)
-        by_facet = (np.linalg.pinv(away, rcond=_FLAT) @ change).swapaxes(1, 2)
+        by_facet = (np.linalg.pinv(away, rcond=FLAT) @ change).swapaxes(1, 2)
         self._slope[self._rows] = by_facet[:, None]
         moved = shift + np.einsum("qij,qj->qi", self._slope, displacement)
         self._fields.assign({"moved": moved})

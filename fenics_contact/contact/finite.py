@@ -26,6 +26,7 @@ from fenics_contact.laws.base import ContactTraction, Law, PointKinematics
 from fenics_contact.obstacles.base import Placement
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array
 
 __all__ = [
@@ -38,10 +39,6 @@ __all__ = [
     "check_rigid",
     "is_known_everywhere",
 ]
-
-
-# Of 1 + n·n₀ where a normal has turned round.
-_OPPOSITE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -306,7 +303,7 @@ def _turned(vector: Any, before: Any, normal: Any) -> Any:
         sine = before[0] * normal[1] - before[1] * normal[0]
         return tangential(cosine * vector + sine * ufl.perp(vector), normal)
     axis = ufl.cross(before, normal)
-    share = ufl.dot(axis, vector) / ufl.max_value(1 + cosine, _OPPOSITE)
+    share = ufl.dot(axis, vector) / ufl.max_value(1 + cosine, ROUND_OFF)
     return tangential(cosine * vector + ufl.cross(axis, vector) + share * axis, normal)
 
 

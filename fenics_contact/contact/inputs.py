@@ -24,6 +24,7 @@ from fenics_contact.parallel import global_max, global_min
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.modulus import modulus_over_height
 from fenics_contact.surface.surface import SurfaceQuadrature, VertexAreas
+from fenics_contact.tolerances import FLAT, ROUND_OFF
 from fenics_contact.types import Array, Indices
 
 __all__ = ["FreeMotion", "Inputs", "check_given", "varies"]
@@ -33,14 +34,8 @@ logger = logging.getLogger("fenics_contact")
 
 # What a contact itself is given by these names, among which a law's parameters stand.
 _OWN = ("angle", "displacement", "gap", "moment", "obstacle", "weight")
-# Normal times outward normal of the body above minus which Γc faces its obstacle.
-_FACING = 1e-6
 # The size of the mesh times this is a penetration that no mesh has.
 _DEEP = 0.1
-# A direction with no more than this share across the normal counts as parallel to it.
-_PARALLEL = 1e-6
-# A weight with no more than this share of the largest counts as none.
-_NOTHING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -388,7 +383,7 @@ class Inputs:
                 f"{self._name}: weight is zero at every point of Γc, so that there is no contact "
                 "force; it must be the thickness, or 2πr"
             )
-        if self._quadrature.at_vertices and least <= _NOTHING * global_max(comm, weight):
+        if self._quadrature.at_vertices and least <= ROUND_OFF * global_max(comm, weight):
             raise ValueError(
                 f"{self._name}: weight is {least:g} at a vertex of Γc, as 2πr is on the axis, so "
                 'that with quadrature_scheme="vertex" it has no contact force; use the default '
@@ -408,7 +403,7 @@ class Inputs:
             ValueError: The body is deep inside of it, too.
         """
         comm = self._surface.mesh.comm
-        if global_max(comm, values.facing) > -_FACING:  # NaN has its own errors
+        if global_max(comm, values.facing) > -FLAT:  # NaN has its own errors
             return
         x, depth = self._surface.mesh.geometry.x, -global_min(comm, values.initial_gap)
         text = (
@@ -427,7 +422,7 @@ class Inputs:
         across = np.linalg.norm(given - np.sum(given * normal, axis=1)[:, None] * normal, axis=1)
         share = across / np.where(length > 0, length, 1.0)
         least = global_min(self._surface.mesh.comm, share, empty=1.0)
-        if not least > _PARALLEL:
+        if not least > FLAT:
             raise ValueError(
                 f"{self._name}: direction of friction is zero or parallel to the normal at a "
                 f"point of Γc (tangential part: {least:.1g} of its length); it must have a "

@@ -32,13 +32,12 @@ from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.mass import mass_solver
 from fenics_contact.surface.surface import SurfaceQuadrature
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index
 
 __all__ = ["Multipliers", "TraceProjection"]
 
 
-# Of the projection of tractions, relative.
-_ROUND_OFF = 1e-12
 # Round-off of a displacement, by its size.
 _BLUR = 100 * np.finfo(float).eps
 # How many rounds before the last are combined with it, and how well their rests are to be told
@@ -237,7 +236,7 @@ class Multipliers:
         left = np.maximum(change, _LOST * scale)
         first = np.where(np.isnan(self._first), [left, scale], self._first)
         grown = bears & (scale > _GROWN * first[1]) & (left > _FALLEN * first[0])
-        nothing = change <= np.maximum(_ROUND_OFF * np.maximum(scale, before), noise)
+        nothing = change <= np.maximum(ROUND_OFF * np.maximum(scale, before), noise)
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = np.where(nothing, 0.0, change / scale)
             error = np.where(grown, left / first[1], relative)

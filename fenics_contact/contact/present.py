@@ -37,15 +37,10 @@ from fenics_contact.parallel import global_max
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.rays import Hits, interpolation_matrix
 from fenics_contact.surface.surface import SurfaceQuadrature
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Mask
 
 __all__ = ["PresentKinematics", "PresentPairs"]
-
-
-# A weight below this is the round-off of one that is zero.
-_NO_WEIGHT = 1e-14
-# Determinant of the metric of unit vectors below which they span nothing.
-_FLAT = 1e-20
 
 
 @dataclass(frozen=True)
@@ -289,7 +284,7 @@ class PresentPairs(Pairs):
         bs = space.dofmap.bs
         values = np.repeat(values[:, :, None], d, axis=2)
         columns = at[:, :, None] * bs + np.arange(d)[None, None, :, None]
-        kept = np.abs(values) > _NO_WEIGHT
+        kept = np.abs(values) > ROUND_OFF
         pointers = np.concatenate([[0], np.cumsum(kept.sum(axis=3).ravel())])
         return PETSc.Mat().createAIJ(
             ((n * 2 * d * d, None), (space.dofmap.index_map.size_local * bs, None)),
@@ -426,7 +421,7 @@ def _metric(vectors: Array) -> tuple[Array, Mask]:
     with np.errstate(all="ignore"):
         unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
         metric = np.einsum("qia,qib->qab", unit, unit)
-        return metric, np.atleast_1d(np.linalg.det(metric) > _FLAT)
+        return metric, np.atleast_1d(np.linalg.det(metric) > ROUND_OFF)
 
 
 def _reciprocal(tangents: Array) -> tuple[Array, Mask]:

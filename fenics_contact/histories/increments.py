@@ -24,6 +24,7 @@ from fenics_contact.methods.attempt import Attempt
 from fenics_contact.parallel import collective_errors, global_sum, warn
 from fenics_contact.problem import ContactProblem
 from fenics_contact.step import Step
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
 __all__ = ["increments"]
@@ -35,8 +36,6 @@ _PATIENCE = 2
 # Towards a maximum of the load the displacement per load grows as 1/√(distance): from this factor
 # on, by the mean of the history, a maximum is named where increments fail.
 _LIMIT_POINT = 2.0
-# Load parameters that differ by no more than this, relative to the way, are the same.
-_SAME = 1e-9
 
 
 def increments(
@@ -210,7 +209,7 @@ def _check_constant(problem: ContactProblem, load: fem.Constant, start: float, e
             "load is a constant on which neither F, nor a Dirichlet condition, nor a contact "
             "depends, so that it has no effect; use the fem.Constant itself there, not its value",
         )
-    if problem.increment and abs(now - start) > _SAME * max(abs(now), abs(end - start)):
+    if problem.increment and abs(now - start) > NEGLIGIBLE * max(abs(now), abs(end - start)):
         warn(
             comm,
             f"start is {start:g}, but the load is {now:g} after {problem.increment} increments: "
@@ -417,7 +416,7 @@ class _Leg:
         return difference if self.ends[-1] >= self.start else -difference
 
     def _round_off(self) -> float:
-        return _SAME * abs(self.ends[-1] - self.start)
+        return NEGLIGIBLE * abs(self.ends[-1] - self.start)
 
     def is_done(self) -> bool:
         return self.passed() == len(self.ends)

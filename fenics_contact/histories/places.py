@@ -21,6 +21,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.histories.archive import Stored, refuse
 from fenics_contact.problem import ContactProblem
 from fenics_contact.surface.facets import facet_cells
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Indices
 
 __all__ = [
@@ -37,10 +38,6 @@ __all__ = [
     "set_rows",
     "unpack",
 ]
-
-# Distance, relative to the mesh, within which a place is found again: computed on other ranks its
-# coordinates differ by round-off.
-_SAME = 1e-9
 
 
 def layout_of(data: dict[str, Array]) -> list[tuple[str, int]]:
@@ -91,7 +88,7 @@ def find(comm: MPI.Comm, stored: Stored, name: str, places: Array, size: float) 
     missing, row = len(places), np.zeros(0, dtype=np.int64)
     if len(table):
         distance, row = scipy.spatial.cKDTree(table[:, :width]).query(places)
-        missing = int(np.count_nonzero(distance > _SAME * size))
+        missing = int(np.count_nonzero(distance > NEGLIGIBLE * size))
     missing = comm.allreduce(missing)
     if missing or len(table) != sum(counts):
         refuse(
@@ -117,7 +114,9 @@ def n_shared(comm: MPI.Comm, places: Array, size: float) -> int:
     """
     every, found = gather(comm, places), 0
     if len(every):
-        found = len(scipy.spatial.cKDTree(every).query_pairs(_SAME * size, output_type="ndarray"))
+        found = len(
+            scipy.spatial.cKDTree(every).query_pairs(NEGLIGIBLE * size, output_type="ndarray")
+        )
     return int(comm.bcast(found))
 
 

@@ -15,6 +15,7 @@ from fenics_contact.contact.values import Status
 from fenics_contact.parallel import agreed, gather_rows, global_max, global_min, global_sum
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes, tangential_gram
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Approach"]
@@ -25,18 +26,11 @@ _IDLE = 1e-3
 _MOST = 0.5
 # The share of a motion at Γc that may go along a Γc that grips: of a body tilted by up to 0.2.
 _ALONG = 0.05
-# How far bodies are set down into their obstacles, by the largest gap: round-off is to leave none
-# of the points that bear open, ten times the tolerance of the linear programme.
-_INTO = 1e-9
-# Gap, by the size of the mesh, up to which points touch what a body rests on.
-_TOUCHING = 1e-6
 # Part of a free motion, squared, that points must feel to take a body along: less is round-off.
 _SHARED = 1e-6
-# Relative sizes of motions at points, and of forces, that are none.
-_FELT = 1e-10
 # Where gaps are not linear in rigid motions a body is set down step by step, in the first of which
 # it turns by this angle at most (radians), in each other one by half of that before; and the last
-# step, by the largest gap, whose square is to be far below `_INTO`.
+# step, by the largest gap, whose square is to be far below `NEGLIGIBLE`.
 _TURN, _STEPS, _LAST = 0.2, 30, 1e-6
 
 
@@ -59,7 +53,7 @@ class _Free:
 
 def _feeling(jumps: Array) -> Mask:
     """Which points feel any motions, by their jumps there, (n_free, n_points, gdim)."""
-    return np.asarray(np.abs(jumps).max(axis=(0, 2), initial=0.0) > _FELT)
+    return np.asarray(np.abs(jumps).max(axis=(0, 2), initial=0.0) > NEGLIGIBLE)
 
 
 class Approach:
@@ -167,7 +161,7 @@ class Approach:
         gram, work = global_sum(comm, gram), global_sum(comm, work)
         if not np.abs(work).max() > 0:
             return None
-        return agreed(comm, np.linalg.lstsq(gram, work, rcond=_FELT)[0])
+        return agreed(comm, np.linalg.lstsq(gram, work, rcond=NEGLIGIBLE)[0])
 
     def _untouched(self) -> Index:
         """Free motions of what no closed point touches, by their numbers. Collective."""
@@ -177,7 +171,7 @@ class Approach:
             contacts, self._felt(np.arange(len(motions.free)))[1], strict=True
         ):
             closed = contact.status != Status.OPEN
-            touched += (np.abs(jumps[:, closed]) > _FELT).any(axis=(1, 2))
+            touched += (np.abs(jumps[:, closed]) > NEGLIGIBLE).any(axis=(1, 2))
         touched = global_sum(self._full.unknowns.comm, touched)
         # What turns about a point does not move there.
         return np.flatnonzero(~(motions.of_same_body() @ (touched > 0)))
@@ -236,7 +230,7 @@ class Approach:
         for contact, jumps, motion in zip(
             self._full.contacts, self._felt(which)[1], obstacles, strict=True
         ):
-            touches = contact.values.opening <= _TOUCHING * self._full.scales.mesh_size
+            touches = contact.values.opening <= NEGLIGIBLE * self._full.scales.mesh_size
             weights = np.where(contact.paired & touches, contact.measure, 0.0)
             way = motion.of_points(contact.own_displacement())
             gram += np.einsum("mqd,q,nqd->mn", jumps, weights, jumps)
@@ -332,7 +326,7 @@ class Approach:
             values = contact.values
             jump = np.tensordot(coefficients, jumps, axes=1)
             closing = np.einsum("qd,qd->q", jump, values.normal)
-            nearing = closing > _FELT
+            nearing = closing > NEGLIGIBLE
             ways = values.opening[nearing] / closing[nearing]
             way = min(way, global_min(comm, ways, empty=np.inf))
         return None if way == np.inf else way * coefficients
@@ -403,20 +397,22 @@ class Approach:
         felt = rubs + presses
         if not np.trace(felt) > 0:
             return None
-        felt += _FELT * np.trace(felt) * np.eye(len(felt))  # there are motions that nothing feels
+        # There are motions that nothing feels.
+        felt += NEGLIGIBLE * np.trace(felt) * np.eye(len(felt))
         shares, vectors = scipy.linalg.eigh(rubs, felt)
         ways = agreed(comm, vectors[:, shares < along])
         limits = gather_rows(comm, np.concatenate(rows))
         # What closes no gap, as to go along a corner, round-off of the load would take to no end.
         _, closes, kept = np.linalg.svd(limits[:, :-1] @ ways, full_matrices=False)
-        ways = agreed(comm, ways @ kept[closes > _FELT * closes.max(initial=0.0)].T)
+        ways = agreed(comm, ways @ kept[closes > NEGLIGIBLE * closes.max(initial=0.0)].T)
         work = drive @ ways
         if not len(work):
             return None
         led = work @ np.linalg.solve(ways.T @ free.mass @ ways, work)
         if not led > _MOST * (drive @ np.linalg.solve(free.mass, drive)):
             return None
-        gaps = limits[:, -1] / far + _INTO
+        # By ten times the tolerance of the linear programme no point that bears is left open.
+        gaps = limits[:, -1] / far + NEGLIGIBLE
         bounds, most = [limits[:, :-1] @ ways], []
         turning = motions.turns > 0
         if turn < np.inf and turning.any():
@@ -426,7 +422,7 @@ class Approach:
             most += [np.full(2 * len(angles), turn / far)]
         matrix, ends = np.concatenate(bounds), np.concatenate(most) if most else np.zeros(0)
         # What was let go, obstacles may have moved into: it goes out, or no deeper where it cannot.
-        for deep in (gaps, np.maximum(gaps, _INTO)):
+        for deep in (gaps, np.maximum(gaps, NEGLIGIBLE)):
             limit = np.concatenate([deep, ends])
             found = _linear_programme(-work, matrix, limit)
             if found is not None or gaps.min() >= 0:
@@ -467,7 +463,7 @@ def _least_motion(work: Array, matrix: Array, limit: Array, found: Array) -> Arr
         np.hstack([-unit, -unit]),
         np.concatenate([-work, np.zeros(n)])[None],
     ]
-    ends = np.concatenate([limit, np.zeros(2 * n), [-most + _FELT * abs(most)]])
+    ends = np.concatenate([limit, np.zeros(2 * n), [-most + NEGLIGIBLE * abs(most)]])
     cost = np.concatenate([np.zeros(n), np.ones(n)])
     least = _linear_programme(cost, np.concatenate(rows), ends)
     return found if least is None else least[:n]

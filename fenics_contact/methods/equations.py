@@ -24,6 +24,7 @@ from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.hierarchy import Hierarchy
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.system import System
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Mask
 
 __all__ = ["Equations"]
@@ -34,8 +35,6 @@ __all__ = ["Equations"]
 _OPEN_SHARE = 1e-3
 # The least share with which a tangent is regularised: on a mode without any force nothing is left.
 _LEAST_SHARE = 1e-6
-# An unknown with less than this share of the stiffness of its body has none.
-_FELT = 1e-12
 
 
 class Equations:
@@ -359,7 +358,7 @@ class Equations:
             diagonal.destroy()
         # The motion of an obstacle has no stiffness.
         stiffness = np.append(self.full.scales.stiffness, np.full(self.system.n_bodies, np.inf))
-        felt = (bulk > _FELT * stiffness[self.system.label]) & ~self.system.constrained
+        felt = (bulk > ROUND_OFF * stiffness[self.system.label]) & ~self.system.constrained
         found = global_max(self._comm, added[felt] / bulk[felt])
         self._hardness = given, found
         return found

@@ -10,6 +10,7 @@ from fenics_contact.systems.candidates import acting, distances, nearest, touche
 from fenics_contact.systems.condensed import all_kept, inexpensive, worthwhile
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Indices
 
 __all__ = ["Kept"]
@@ -17,8 +18,6 @@ __all__ = ["Kept"]
 
 # What is kept grows by this factor, lest it grows often.
 _GROWTH = 2
-# Distances of points that differ by less than this share of the size of the mesh are the same.
-_ROUND_OFF = 1e-9
 
 
 class Kept:
@@ -86,7 +85,7 @@ class Kept:
             self._full.unknowns,
             away,
             max(at_least, for_nothing),
-            _ROUND_OFF * self._size,
+            NEGLIGIBLE * self._size,
         )
 
     def _grown(self, away: Sequence[Array] | None, *, anew: bool) -> Indices:

@@ -19,6 +19,7 @@ from mpi4py import MPI
 from fenics_contact.parallel import agreed, global_max, global_sum
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Index
 
 __all__ = ["CLEARLY", "Overload", "find_overload"]
@@ -31,8 +32,6 @@ _STEPS, _NEAR = 200, 1e-3
 _FAR = 1e4
 # Share of the largest motion below which one is not named.
 _SLIGHT = 0.02
-# Approach at a point, by the largest motion, that is round-off.
-_TOUCHES = 1e-9
 
 
 @dataclass(frozen=True)
@@ -161,7 +160,7 @@ def _worst_motion(
         pressed = motion @ closing
         largest = np.abs(motion).max()
         deepest = global_max(comm, pressed, empty=0.0)
-        if deepest > _TOUCHES * largest:
+        if deepest > NEGLIGIBLE * largest:
             first = comm.allgather(pressed.size > 0 and pressed.max() == deepest).index(True)
             row = closing[:, np.argmax(pressed)] if comm.rank == first else None
             planes.append(comm.bcast(row, root=first))

@@ -16,6 +16,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import agreed, gather_rows
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index
 
 __all__ = ["LoadBalance", "unbalanced"]
@@ -183,7 +184,7 @@ def _admissible_forces(operator: ContactOperator, modes: Array) -> Array:
 
 
 def _alike(one: Array, other: Array) -> bool:
-    return one.shape == other.shape and np.allclose(one, other, rtol=0.0, atol=1e-12)
+    return one.shape == other.shape and np.allclose(one, other, rtol=0.0, atol=ROUND_OFF)
 
 
 def unbalanced(rays: Array, resultant: Array) -> float:

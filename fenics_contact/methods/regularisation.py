@@ -16,7 +16,8 @@ from fenics_contact.contact.values import Status
 from fenics_contact.parallel import agreed
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.reference_scales import ReferenceScales
-from fenics_contact.systems.rigid_body_modes import FELT, RigidBodyModes
+from fenics_contact.systems.rigid_body_modes import RigidBodyModes
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["LooseModes"]
@@ -140,10 +141,10 @@ class LooseModes:
             modes = np.einsum("lm,mqd->lqd", self.ways, motions.at_points(operator))
             modes *= apart[:, None]
             approach = np.einsum("lqd,qd->lq", modes, values.normal)
-            near = np.where(approach > FELT, approach, 0.0) / gap
+            near = np.where(approach > NEGLIGIBLE, approach, 0.0) / gap
             travel = np.sum(modes**2, axis=2)
             sums += np.stack([np.sum(near**2, axis=1), np.sum(travel, axis=1)])
-            points.append((apart, near / gap**2, travel > FELT, np.where(apart, closed, 1.0)))
+            points.append((apart, near / gap**2, travel > NEGLIGIBLE, np.where(apart, closed, 1.0)))
         sums = scales.global_sum(sums)
         squares, travels = np.where(sums > 0.0, sums, 1.0)
         size = _BEYOND * scales.mesh_size

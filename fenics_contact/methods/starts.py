@@ -13,14 +13,13 @@ from fenics_contact.methods.equations import Equations
 from fenics_contact.parallel import global_max
 from fenics_contact.systems import dense, linear
 from fenics_contact.systems.system import System
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
 __all__ = ["Starts"]
 
 # A start with up to this many times the residual of the best is taken if its points slip.
 _FAR = 100.0
-# Γc is where a solution was found if its points are there to this share of the size of the mesh.
-_THERE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -298,7 +297,7 @@ class Starts:
         for contact, borne in zip(equations.contacts, self._borne, strict=True):
             opposite, traction = contact.opposite, borne.values.total_traction
             change = np.abs(opposite.present_jump() - borne.displacement)
-            if global_max(comm, change) > _THERE * equations.length:
+            if global_max(comm, change) > NEGLIGIBLE * equations.length:
                 return None
             if opposite.carries:
                 way, turned = opposite.carried(borne.values, traction)

@@ -18,6 +18,7 @@ from mpi4py import MPI
 from fenics_contact.compiling import compile_expression
 from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_min
 from fenics_contact.results import files
+from fenics_contact.tolerances import FLAT
 from fenics_contact.types import Array
 
 __all__ = [
@@ -49,7 +50,7 @@ def at_node(u: fem.Function, point: Sequence[float]) -> Array:
     rows = gather_rows(space.mesh.comm, np.column_stack([distance[nearest], values[nearest]]))
     row = rows[np.argmin(rows[:, 0])]
     comm, x = space.mesh.comm, space.mesh.geometry.x
-    if row[0] > 1e-6 * (global_max(comm, x) - global_min(comm, x)):
+    if row[0] > FLAT * (global_max(comm, x) - global_min(comm, x)):
         raise ValueError(
             f"no node at {list(point)}; the nearest is {row[0]:g} away: give coordinates of a node"
         )

@@ -9,10 +9,9 @@ import scipy.sparse.csgraph
 from dolfinx import fem
 from mpi4py import MPI
 
-__all__ = ["connected_bodies"]
+from fenics_contact.tolerances import NEGLIGIBLE
 
-# Of a coordinate, by the largest one.
-_SAME_PLACE = 1e-9
+__all__ = ["connected_bodies"]
 
 
 def connected_bodies(space: fem.FunctionSpace) -> tuple[int, npt.NDArray[np.intp]]:
@@ -78,7 +77,7 @@ def _ordered(space: fem.FunctionSpace, n: int, body: npt.NDArray[np.intp]) -> np
     space.mesh.comm.Allreduce(MPI.IN_PLACE, corners, op=MPI.MIN)
     keys = np.concatenate([corners[0], -corners[1]], axis=1)
     # Places differ by round-off from one distribution to the other.
-    keys = np.round(keys / (_SAME_PLACE * (np.abs(keys).max() or 1.0)))
+    keys = np.round(keys / (NEGLIGIBLE * (np.abs(keys).max() or 1.0)))
     order = np.lexsort(keys.T[::-1])
     number = np.empty(n, dtype=np.intp)
     number[order] = np.arange(n)

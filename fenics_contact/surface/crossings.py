@@ -12,14 +12,13 @@ from numpy.polynomial.polynomial import polyval
 from fenics_contact.parallel import gather_rows
 from fenics_contact.surface.facets import across
 from fenics_contact.surface.projection import near_pairs
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Crossings", "MovingFacets", "find_crossings"]
 
 # Of the time at which the plane of a facet is crossed.
 _BISECTIONS = 40
-# How far outside of a facet, in its own coordinates, a path may cross it: neighbours overlap.
-_OVERLAP = 1e-9
 
 
 @dataclass(frozen=True)
@@ -214,7 +213,7 @@ class _Pairs:
         gram[~regular] = np.eye(gram.shape[1])
         right = np.einsum("nid,nd->ni", tangents, arm)
         at = np.linalg.solve(gram, right[:, :, None])[:, :, 0]
-        inside = np.all(at >= -_OVERLAP, axis=1) & (at.sum(axis=1) <= 1 + _OVERLAP)
+        inside = np.all(at >= -NEGLIGIBLE, axis=1) & (at.sum(axis=1) <= 1 + NEGLIGIBLE)
         return np.asarray(regular & inside)
 
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from fenics_contact.tolerances import FLAT
 from fenics_contact.types import Array, Mask
 
 __all__ = ["facet_values"]
-
-# Directions in which the points of a facet reach less far than this, by the farthest, are none.
-_FLAT = 1e-6
 
 
 def facet_values(points: Array, measure: Array, values: Array, nodes: Array) -> Array:
@@ -44,7 +42,7 @@ def facet_values(points: Array, measure: Array, values: Array, nodes: Array) -> 
     # Along the facet alone: its points, and those of a curved one nearly, are in a plane.
     _, size, ways = np.linalg.svd(root * (points - middle), full_matrices=False)
     size, ways = size[:, : points.shape[2] - 1], ways[:, : points.shape[2] - 1]
-    used = (size > _FLAT * size[:, :1].clip(min=1e-300)) & whole[:, None]
+    used = (size > FLAT * size[:, :1].clip(min=1e-300)) & whole[:, None]
     inverse = np.divide(1.0, size**2, out=np.zeros_like(size), where=used)
     along = np.einsum("fpd,fwd->fpw", points - middle, ways)
     slope = np.einsum("fw,fpw,fp,fpk->fwk", inverse, along, share, filled)

@@ -12,6 +12,7 @@ import scipy.spatial
 from dolfinx import fem
 
 from fenics_contact import compat
+from fenics_contact.tolerances import FLAT, ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["FacetSet", "across", "facet_cells", "facet_nodes", "local_facets", "tabulate"]
@@ -21,9 +22,6 @@ Rule: TypeAlias = Callable[[Index, Index, Array, Array], Mask]
 
 # Facets tried first for every point, nearest first; more only where these need not be enough.
 _NEAREST = 12
-# How far outside its facet, in its reference coordinates, a point may be met: neighbours overlap by
-# this much, so that no ray slips through between them.
-_OVERLAP = 1e-6
 _NEWTON_STEPS = 25
 # Pairs of points and facets looked at in one go, to bound the memory.
 _CHUNK = 2_000_000
@@ -336,7 +334,7 @@ class FacetSet:
             system = np.concatenate([tangents, -ray[rows, :, None]], axis=2)
             # A facet along the ray is never met; its singular system must not stop the others.
             size = np.prod(np.linalg.norm(system, axis=1), axis=1)
-            singular[rows] = np.abs(np.linalg.det(system)) < 1e-12 * size
+            singular[rows] = np.abs(np.linalg.det(system)) < ROUND_OFF * size
             system[singular[rows]] = np.eye(d)
             rest[singular[rows]] = 0.0
             step = np.linalg.solve(system, -rest[..., None])[..., 0]
@@ -351,11 +349,12 @@ class FacetSet:
         position, tangents = self.positions(facet, place, u)
         rest = np.linalg.norm(position - x - distance[:, None] * ray, axis=1)
         size = np.linalg.norm(tangents, axis=1).max(axis=1, initial=0.0)
-        met = ~singular & (rest <= 1e-10 * size) & np.all(place >= -_OVERLAP, axis=1)
+        # Neighbours overlap, so that no ray slips through between them.
+        met = ~singular & (rest <= 1e-10 * size) & np.all(place >= -FLAT, axis=1)
         if self.simplex:
-            met &= place.sum(axis=1) <= 1 + _OVERLAP
+            met &= place.sum(axis=1) <= 1 + FLAT
         else:
-            met &= np.all(place <= 1 + _OVERLAP, axis=1)
+            met &= np.all(place <= 1 + FLAT, axis=1)
         return place, distance, met, tangents
 
 

@@ -27,7 +27,6 @@ from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_mean
 from fenics_contact.surface.facets import tabulate
 from fenics_contact.surface.projection import (
-    COVERED,
     cut_lines,
     cut_polygons,
     facing_pairs,
@@ -36,6 +35,7 @@ from fenics_contact.surface.projection import (
 )
 from fenics_contact.surface.rays import BEHIND, Hits, Rays, Side
 from fenics_contact.surface.surface import SurfaceQuadrature
+from fenics_contact.tolerances import FLAT
 from fenics_contact.types import Array, Index
 
 __all__ = ["Pairing", "PresentHits"]
@@ -380,13 +380,13 @@ class Pairing:
         """
         here, there = self._sides
         n = len(self._here.cells)
-        doubtful = np.abs(np.bincount(facet, share, n) - 1) > COVERED
+        doubtful = np.abs(np.bincount(facet, share, n) - 1) > FLAT
         doubtful[facet[here.body[here.first + facet] == there.body[other]]] = True
         if not doubtful.any():
             return facet
         ends = there.vertices[other][:, :, None] == there.vertices[hit][:, None, :]
         kept = ~doubtful[facet] | ((hit >= 0) & ends.any(axis=(1, 2)))
-        full = np.abs(np.bincount(facet, share * kept, n) - 1) <= COVERED
+        full = np.abs(np.bincount(facet, share * kept, n) - 1) <= FLAT
         return np.where(kept & full[facet], facet, -1)
 
     def _projection(

@@ -11,15 +11,10 @@ import numpy.typing as npt
 import scipy.sparse
 import scipy.spatial
 
+from fenics_contact.tolerances import FLAT, NEGLIGIBLE
 from fenics_contact.types import Array
 
-__all__ = ["COVERED", "cut_lines", "cut_polygons", "facing_pairs", "near_pairs", "polynomials"]
-
-
-# Pieces of a facet smaller than this, relative to it, are left out; a facet is covered if what is
-# left out is no more.
-_SLIVER = 1e-9
-COVERED = 1e-6
+__all__ = ["cut_lines", "cut_polygons", "facing_pairs", "near_pairs", "polynomials"]
 
 
 def polynomials(d: int, simplex: bool, n_points: int) -> Any:
@@ -83,9 +78,9 @@ def cut_lines(
         other = second[first == f]
         ends = (there[other] - origin) @ edge / (edge @ edge)
         low, high = ends.min(axis=1).clip(0, 1), ends.max(axis=1).clip(0, 1)
-        kept = high - low > _SLIVER
+        kept = high - low > NEGLIGIBLE
         low, high, other = low[kept], high[kept], other[kept]
-        if (high - low).sum() < 1 - COVERED:
+        if (high - low).sum() < 1 - FLAT:
             continue
         along = (low[:, None] + (high - low)[:, None] * rule[None, :, 0]).ravel()
         facets.append(np.full(along.size, f))
@@ -126,8 +121,8 @@ def cut_polygons(
     edge = corner[:, :, 1:] - corner[:, :, :1]
     twice = np.where(spread < count[:, None] - 1, np.linalg.det(edge), 0.0)
     size = 2 * _area(own)
-    covered = np.bincount(first, twice.sum(axis=1), len(here)) / size >= 1 - COVERED
-    kept = (twice > _SLIVER * size[first][:, None]) & covered[first][:, None]
+    covered = np.bincount(first, twice.sum(axis=1), len(here)) / size >= 1 - FLAT
+    kept = (twice > NEGLIGIBLE * size[first][:, None]) & covered[first][:, None]
     pair, fan = np.nonzero(kept)
     inside = corner[pair, fan, None, 0] + np.einsum("qk,tke->tqe", rule, edge[pair, fan])
     facet, other = np.repeat(first[pair], len(rule)), np.repeat(second[pair], len(rule))

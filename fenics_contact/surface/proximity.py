@@ -17,6 +17,7 @@ from fenics_contact.parallel import gather_rows
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.surface.projection import near_pairs
+from fenics_contact.tolerances import FLAT, NEGLIGIBLE
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Neighbours", "find_neighbours"]
@@ -24,12 +25,6 @@ __all__ = ["Neighbours", "find_neighbours"]
 # Of the height of the higher cell: how deep facets of two bodies may lie in each other. Half of it,
 # so that no facet is behind one of a body that it lies in front of.
 _DEEP = 0.5
-# Of normals: facets at a right angle do not face each other, whatever round-off says.
-_FACING = 1e-6
-# Of the size of a facet: how far in front another one of the same body must be.
-_FRONT = -1e-9
-# Of the largest coordinate: places that are one.
-_SAME_PLACE = 1e-9
 # Facets that are searched from, and pairs that are measured, in one go, to bound the memory.
 _AT_ONCE, _TOGETHER = 2000, 200_000
 
@@ -200,7 +195,7 @@ def _pairs(
             reach = 1.01 * (distance + radius[some] + radius.max())
             one, other = near_pairs(tree, middle[some], reach)
             one = some[one]
-            kept = np.einsum("pd,pd->p", every.looks[one], every.looks[other]) < -_FACING
+            kept = np.einsum("pd,pd->p", every.looks[one], every.looks[other]) < -FLAT
             kept &= (every.label[one] != every.label[other]) | self_contact
             one, other = one[kept], other[kept]
             for k in range(0, len(one), _TOGETHER):
@@ -217,7 +212,7 @@ def _in_front(every: _Facets, f: Index, g: Index) -> Mask:
     same = every.part[f] == every.part[g]
     shared = every.vertices[f][:, :, None] == every.vertices[g][:, None, :]
     deep = -_DEEP * np.maximum(every.height[f], every.height[g])
-    deep = np.where(same, _FRONT * every.diameter[f], deep)
+    deep = np.where(same, -NEGLIGIBLE * every.diameter[f], deep)
     front = ~(same & shared.any(axis=(1, 2)))
     for one, other in ((f, g), (g, f)):
         arm = every.corners[other] - every.middle[one][:, None]
@@ -241,7 +236,7 @@ def _sides(pairs: Index, middle: Array, *, same: bool) -> tuple[Index, Index]:
     graph = scipy.sparse.coo_matrix((ones, number.T), (len(touched), len(touched))).tocsr()
     side = np.full(len(touched), -1)
     _, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    places = middle[touched] / (_SAME_PLACE * (np.abs(middle[touched]).max() or 1.0))
+    places = middle[touched] / (NEGLIGIBLE * (np.abs(middle[touched]).max() or 1.0))
     by_place = np.lexsort(np.round(places).T[::-1])
     _, first = np.unique(group[by_place], return_index=True)
     for start in by_place[first]:

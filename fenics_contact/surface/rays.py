@@ -20,6 +20,7 @@ from fenics_contact.parallel import gather_rows
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.surface.surface import SurfaceQuadrature, tagged_facets
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Index
 
 __all__ = ["BEHIND", "REASONS", "Hits", "Partner", "Rays", "Side", "interpolation_matrix"]
@@ -29,8 +30,6 @@ __all__ = ["BEHIND", "REASONS", "Hits", "Partner", "Rays", "Side", "interpolatio
 # interference of a body with itself), and one whose cell shares a node with it (the lips of a
 # slit, meshed differently).
 _OWN, _JOINED = 0.5, 0.05
-# Of the height of a cell: places that are one.
-_TOUCHING = 1e-9
 # Why a point has no opposite, the likeliest last.
 _NOTHING, _FAR, BEHIND, _ITSELF = range(4)
 REASONS = {
@@ -122,7 +121,7 @@ class _Admission:
         near = np.abs(distance) <= self._obstacle.search_distance
         depth = np.maximum(height, other.height[there]) if release is None else release
         # What touches lies behind by round-off as often as in front.
-        depth = np.maximum(depth, 2 * self._deep[here]) + _TOUCHING * height
+        depth = np.maximum(depth, 2 * self._deep[here]) + NEGLIGIBLE * height
         ahead = distance >= -depth
         foreign = one.body[here] != other.body[there]
         same = np.flatnonzero(~foreign)

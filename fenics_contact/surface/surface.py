@@ -21,6 +21,7 @@ from fenics_contact.arguments import check_cells, check_instance, is_number
 from fenics_contact.compiling import compile_form, printed_as_ever
 from fenics_contact.parallel import gather_rows, global_max, global_min
 from fenics_contact.surface.mass import assembled
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Indices
 
 __all__ = [
@@ -67,8 +68,6 @@ _GRADED = 1.5
 #     h = 2 R: 1: 0.82 and 37 %, 2/3: 0.96 and 27 %, 1/2: 0.99 and 17 %, 1/3: 1.000 and 16 %;
 # by multipliers at the nodes 0.68 at h = R, 0.91 at R / 2.
 POINTS_PER_RADIUS = 4
-# Round-off of a number of points.
-_SAME_LENGTH = 1e-9
 # Of the squared cosine of the angle between normals: from here on facets are compared.
 _FACING = 0.5
 
@@ -185,7 +184,7 @@ class ContactSurface:
         See `POINTS_PER_RADIUS`.
         """
         lengths = gather_rows(self.mesh.comm, self._spreads(self.facets)[:, 3:4])
-        return int(np.ceil(POINTS_PER_RADIUS * np.median(lengths) / radius - _SAME_LENGTH))
+        return int(np.ceil(POINTS_PER_RADIUS * np.median(lengths) / radius - NEGLIGIBLE))
 
     def _times_as_coarse(self, opposite: Indices, *, across: bool) -> int:
         """How many facets of the opposite surface are as long as one of Γc, at least 1. Collective.

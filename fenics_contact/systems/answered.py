@@ -21,12 +21,10 @@ import numpy as np
 from fenics_contact.parallel import global_max
 from fenics_contact.surface.mass import mass_solver
 from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Mask
 
 __all__ = ["leave_out_unanswered"]
-
-# Of the closest displacement, relative.
-_PRECISION = 1e-12
 
 
 def leave_out_unanswered(operator: ContactOperator, state: Array, constrained: Mask) -> None:
@@ -58,7 +56,7 @@ def leave_out_unanswered(operator: ContactOperator, state: Array, constrained: M
     force.pointwiseMult(free, force)
     # The rows of what is held are empty then, and nothing acts there.
     stiffness.diagonalScale(free, free)
-    solver = mass_solver(stiffness, rtol=_PRECISION, atol=1e-300, max_it=500)
+    solver = mass_solver(stiffness, rtol=ROUND_OFF, atol=1e-300, max_it=500)
     solver.solve(force, closest)
     multipliers.leave_out(change - values.tangential(operator.jump(closest.array_r)))
     for item in (force, stiffness, free, closest, solver):

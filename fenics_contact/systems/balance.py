@@ -15,6 +15,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from fenics_contact.systems.reference_scales import ReferenceScales
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["MOST_EXCUSED", "Labels", "Norms", "Parts", "by_body"]
@@ -29,9 +30,6 @@ _ROUND_OFF = 40 * np.finfo(float).eps
 # The largest share of forces that round-off excuses: of loads, of contact forces on a body that no
 # condition holds, and on one of both sides of every contact.
 MOST_EXCUSED = 1e-5
-# Contact forces that are a smaller share of the forces on a body are none: of one led to its first
-# touch by other forces they are the round-off of where it lies.
-_UNLOADED_FORCE_RATIO = 1e-12
 # Forces below which numbers have lost digits: what is left of a load that has been taken away.
 _LEAST = np.finfo(float).tiny / np.finfo(float).eps
 
@@ -170,7 +168,7 @@ class Parts:
         for row, pairs in zip(exact, self._pairs, strict=True):
             for one, other in (pairs.T, pairs.T[::-1]):
                 np.minimum.at(row, one, round_off[other])
-        acts = pushes > np.maximum(exact, _UNLOADED_FORCE_RATIO * force)
+        acts = pushes > np.maximum(exact, ROUND_OFF * force)
         # A displacement that nothing holds may grow without bounds, and would excuse anything.
         fixed = self._scales.held
         # What a sine leaves of a load at its zeros, and moves no digit where conditions hold all.

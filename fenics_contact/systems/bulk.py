@@ -24,12 +24,11 @@ from fenics_contact.parallel import all_finite, collective_errors, global_max, g
 from fenics_contact.surface.dependence import Dependence
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.systems.measures import check_measures, share_subdomain_data
+from fenics_contact.tolerances import NEGLIGIBLE, ROUND_OFF
 from fenics_contact.types import Array, Indices
 
 __all__ = ["Bulk"]
 
-# By the root of the stiffness of both, a coupling that is more than round-off.
-_COUPLED = 1e-8
 _OF_ONE = (
     "; several fields must be one function w of a mixed element, whose residual has the "
     "test functions v, q = ufl.TestFunctions(W)"
@@ -324,7 +323,7 @@ class Bulk:
         displacements = self.displacement.within(np.ones(self.displacement.n_owned))
         coupling = self._block_size(mask, displacements)
         own = self._block_size(mask, mask)
-        if coupling > _COUPLED * np.sqrt(self.scale * own):
+        if coupling > NEGLIGIBLE * np.sqrt(self.scale * own):
             unit = self.scale / coupling
         else:
             unit = np.sqrt(self.scale / own) if own > 0 else 1.0
@@ -359,7 +358,7 @@ class Bulk:
         self.stiffness.multTranspose(probe, mirrored)
         size = image.norm()
         image.axpy(-1.0, mirrored)
-        symmetric = image.norm() <= 1e-10 * size
+        symmetric = image.norm() <= ROUND_OFF * size
         image.destroy()
         mirrored.destroy()
         return bool(symmetric)

@@ -22,15 +22,14 @@ from fenics_contact.systems.balance import Labels, by_body
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.dissection import Dissection, Eliminated
 from fenics_contact.systems.unknowns import Selection
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index, Indices, Mask
 
 __all__ = ["Condensation", "ParticularSolution"]
 
 
-# Directions of loads whose particular solutions are kept, and the remainder, relative to the load
-# on each body, below which a load is a combination of them.
+# Directions of loads whose particular solutions are kept.
 _DIRECTIONS = 4
-_SAME = 1e-14
 
 
 class Condensation:
@@ -135,7 +134,7 @@ class Condensation:
             rest -= shares[-1][self._label] * direction
         responses = [response for _, response in self.directions]
         remainders = self._norms(rest)
-        new = remainders > _SAME * sizes
+        new = remainders > ROUND_OFF * sizes
         if new.any():
             known = bool(np.isfinite(remainders).all())
             shares.append(np.where(new, remainders, 0.0) if known else np.ones(len(new)))

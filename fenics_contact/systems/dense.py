@@ -13,6 +13,7 @@ import scipy.spatial
 from petsc4py import PETSc
 
 from fenics_contact.parallel import agreed, collective_errors
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["PartlyFactored", "Sum", "raise_kept"]
@@ -27,8 +28,6 @@ _MOST = 0.9
 _CORRECTED = 0.25
 # Residual, relative, that a corrected solution may have before all is factored.
 _ACCURATE = 1e-11
-# Smallest pivot, relative to the largest, of the part that is factored once.
-_SINGULAR = 1e-9
 
 
 class Sum:
@@ -235,7 +234,7 @@ class PartlyFactored:
         outside = np.setdiff1d(others, more)
         factor = _factors(self._fixed[np.ix_(outside, outside)])
         pivots = np.abs(np.diag(factor[0]))
-        if not pivots.min() > _SINGULAR * pivots.max():
+        if not pivots.min() > ROUND_OFF * pivots.max():
             return
         self._in, self.outside, self._factor_out = inside, outside, factor
         self._coupling = self._fixed[np.ix_(inside, outside)]

@@ -9,6 +9,7 @@ import numpy as np
 from fenics_contact.parallel import global_sum
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
 __all__ = ["find_ejected_bodies"]
@@ -16,8 +17,6 @@ __all__ = ["find_ejected_bodies"]
 # How many times as far as all else a body may go. Blocks thrown out from between two others went
 # ten times as far; one that is let go springs back by as much as it changes its shape.
 _FAR = 3.0
-# Of the size of the body: what is no way at all.
-_STILL = 1e-6
 
 
 def find_ejected_bodies(
@@ -64,6 +63,6 @@ def find_ejected_bodies(
     for b in np.flatnonzero(gone):
         way = float(np.linalg.norm(ways[b]))
         rest = float(most[~gone & scales.coupled_with(int(b))].max(initial=most[b]))
-        if way > max(_FAR * rest, _STILL * scales.size[b]):
+        if way > max(_FAR * rest, NEGLIGIBLE * scales.size[b]):
             found[full.parts.names[b]] = way, rest
     return found

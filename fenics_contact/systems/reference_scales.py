@@ -23,12 +23,10 @@ from fenics_contact.parallel import global_sum
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_cells
 from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["ReferenceScales", "body_of_points"]
-
-# Forces, by stiffness times size of a body, that are round-off.
-_NO_FORCE = 1e-12
 
 
 class ReferenceScales:
@@ -189,13 +187,13 @@ class ReferenceScales:
 
     def is_unloaded(self, force: Array) -> Mask:
         """Which bodies bear no force but round-off, by the sum of sizes of the forces on each."""
-        return np.asarray(force <= _NO_FORCE * self.force)
+        return np.asarray(force <= ROUND_OFF * self.force)
 
     @property
     def round_off_of_groups(self) -> Array:
         """Force on a group of coupled parts that is round-off, of its softest body, (n_groups,)."""
         found = np.full(self.n_groups, np.inf)
-        np.minimum.at(found, self.group[: self.n_bodies], _NO_FORCE * self.force)
+        np.minimum.at(found, self.group[: self.n_bodies], ROUND_OFF * self.force)
         return np.where(np.isfinite(found), found, 0.0)
 
     @property

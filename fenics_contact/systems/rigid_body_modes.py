@@ -19,16 +19,10 @@ from fenics_contact.systems.modes import rigid_motions
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.reference_scales import ReferenceScales, body_of_points
 from fenics_contact.systems.unknowns import Unknowns
+from fenics_contact.tolerances import FLAT, NEGLIGIBLE, ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["FELT", "RigidBodyModes", "tangential_gram"]
-
-
-# Relative sizes below which an energy, a work or a share of a mode counts as zero. One clamped dof
-# among N gives 1/N, so that the first must lie below any 1/N; the others are far above round-off.
-_FREE = 1e-12
-FELT = 1e-10
-_BALANCED = 1e-8
+__all__ = ["RigidBodyModes", "tangential_gram"]
 
 
 class RigidBodyModes:
@@ -138,7 +132,8 @@ class RigidBodyModes:
         energy, mass = global_sum(self.comm, gram)
         scale = 1 / np.sqrt(np.diag(mass))
         values, vectors = np.linalg.eigh((energy + energy.T) / 2 * np.outer(scale, scale))
-        free = agreed(self.comm, (vectors * scale[:, None])[:, values < _FREE])
+        # One clamped dof among N gives 1/N, and round-off is below any.
+        free = agreed(self.comm, (vectors * scale[:, None])[:, values < ROUND_OFF])
         self._jumps.clear()
         self.free = _plain(free.T)
         self._scales.held = np.all(~np.hstack(self._moved()), axis=0)
@@ -263,9 +258,9 @@ class RigidBodyModes:
         """Name a motion by its share of each of all motions, (n_motions,)."""
         share = np.abs(coefficients) / np.abs(coefficients).max()
         terms = [
-            name if s > 1 - 1e-6 else f"{s:.2g} of {name}"
+            name if s > 1 - FLAT else f"{s:.2g} of {name}"
             for name, s in zip(self.names, share, strict=True)
-            if s > 1e-6
+            if s > FLAT
         ]
         return " with ".join(terms)
 
@@ -325,7 +320,7 @@ class RigidBodyModes:
             weights = contact.quadrature.weights
             if closed_only:
                 weights = weights * (contact.status != Status.OPEN)
-            felt = np.abs(modes).max(axis=2, initial=0.0) > FELT
+            felt = np.abs(modes).max(axis=2, initial=0.0) > NEGLIGIBLE
             area += ((together @ felt) > 0) @ contact.quadrature.weights
             if contact.law.has_normal_stiffness:
                 gram += (along * weights) @ along.T
@@ -340,8 +335,8 @@ class RigidBodyModes:
         for group in np.unique(groups):  # no vector is of several
             mine = np.flatnonzero(groups == group)
             sizes, vectors = np.linalg.eigh(gram[np.ix_(mine, mine)])
-            found = np.zeros((np.count_nonzero(sizes < FELT), n_free))
-            found[:, mine] = (vectors * scale[mine, None])[:, sizes < FELT].T
+            found = np.zeros((np.count_nonzero(sizes < NEGLIGIBLE), n_free))
+            found[:, mine] = (vectors * scale[mine, None])[:, sizes < NEGLIGIBLE].T
             loose.append(found)
         return agreed(self.comm, np.concatenate(loose))
 
@@ -389,7 +384,7 @@ class RigidBodyModes:
                 )
                 sums += np.stack([-along @ force, np.abs(along) @ force])
         resultant, size = global_sum(self.comm, sums)
-        return np.where(np.abs(resultant) <= _BALANCED * size, 0.0, resultant), size
+        return np.where(np.abs(resultant) <= NEGLIGIBLE * size, 0.0, resultant), size
 
     def groups(self) -> Index:
         """Group of coupled parts that each free motion moves, (n_free,)."""
@@ -417,7 +412,7 @@ def _plain(rows: Array) -> Array:
             if other != pivot:
                 rows[other] -= rows[other, j] * rows[pivot]
         done.append(pivot)
-    rows[np.abs(rows) < FELT] = 0.0
+    rows[np.abs(rows) < NEGLIGIBLE] = 0.0
     return rows / np.abs(rows).max(axis=1, initial=1.0)[:, None] if rows.size else rows
 
 

@@ -1,0 +1,16 @@
+"""What is round-off, the same everywhere: below it two quantities are one, or one is none.
+
+Each is relative: the caller says to what. Other numbers in the package that small are a tolerance
+of a solver, or a multiple of the machine's precision for one operation.
+"""
+
+__all__ = ["FLAT", "NEGLIGIBLE", "ROUND_OFF"]
+
+# Of numbers that are sums and differences of such numbers: forces, stiffness, work, weights.
+ROUND_OFF = 1e-12
+# Of the size of the mesh or a facet: places, which come from files and are computed on other ranks;
+# of motions, what points feel, and of loads.
+NEGLIGIBLE = 1e-9
+# Of unit vectors and of the extent of facets, which some files have in single precision: a right
+# angle, what is parallel or flat, the rim of a facet.
+FLAT = 1e-6
