@@ -1,4 +1,4 @@
-"""The four methods on five scenes with friction: iterations, factorisations and time.
+"""The five methods on five scenes with friction: iterations, factorisations and time.
 
     python benchmarks/methods.py
 
@@ -32,7 +32,7 @@ from scenes import bodies, problems
 from scenes.elasticity import displacement_space, hold
 from scenes.tags import between, near, plane, sides
 
-METHODS = ("lbfgs", "newton", "continuation", "alternating")
+METHODS = ("lbfgs", "newton", "continuation", "alternating", "primal_dual")
 STIFFNESSES = (10.0, 1000.0)
 FAR_METHODS, FAR_STIFFNESSES = ("lbfgs", "newton", "continuation"), (1.0, 10.0)
 # Runs that take longer are not repeated (s).

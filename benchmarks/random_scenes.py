@@ -92,7 +92,7 @@ def draw_bodies(seed: int, family: int) -> Scene:
 
 
 FINITE = ("newton", "continuation")
-SMALL = (*FINITE, "lbfgs")
+SMALL = (*FINITE, "lbfgs", "primal_dual")
 KINDS = {
     "small": Kind(draw_small, fuzz_setup.SceneSetup, SMALL, 400, 940000, 0),
     "fine": Kind(draw_fine, fuzz_setup.SceneSetup, SMALL, 50, 945000, 0),

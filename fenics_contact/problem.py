@@ -81,13 +81,16 @@ class ContactProblem:
         contacts: Contacts of ``u``.
         method: "newton": Newton's method with the consistent tangent. "lbfgs": quasi-Newton with
             H₀ = (K + αK_n + φK_t)⁻¹. "continuation": Newton's method with contact stiffness
-            increased step by step. "alternating": fixed-point iteration on the friction bound;
-            each step is a problem with Tresca friction, solved as a minimisation by
-            Newton's method with a line search on the energy. It is not for mixed functions, whose
-            solutions are saddle points. By default "newton"; for a linear bulk on all unknowns
+            increased step by step. "primal_dual": primal-dual active set method for friction, with
+            tractions and displacements as unknowns; for small displacements of a linear bulk and
+            obstacles without unknown motions. "alternating": fixed-point iteration on the friction
+            bound; each step is a problem with Tresca friction, solved as a minimisation by Newton's
+            method with a line search on the energy. It is not for mixed functions, whose solutions
+            are saddle points. By default "newton"; for a linear bulk on all unknowns
             "lbfgs" by multigrid, and in three dimensions if Dirichlet conditions constrain all
             bodies and none slide on each other with finite kinematics. After a failure
-            "continuation" follows, and then "alternating" where it applies.
+            "primal_dual" follows where it applies, "continuation", and "alternating" where that
+            applies.
         alpha: Factor α of the normal contact stiffness in H₀, 0 to 1 (source paper: 1).
         phi: Factor φ of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
             source paper has 0; with 1 a third of the iterations suffices once points stick.

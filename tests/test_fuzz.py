@@ -107,8 +107,8 @@ def test_methods_are_tried_on_a_refused_scene(monkeypatch):
         return fuzz.Outcome(outcome, "", 1, 0.0, [], {})
 
     monkeypatch.setattr(fuzz, "run_scene", run_scene)
-    assert fuzz.find_solving_method({"seed": 1}) == "lbfgs"
-    assert asked == ["newton", "continuation", "lbfgs"]
+    assert fuzz.find_solving_method({"seed": 1}) == "primal_dual"
+    assert asked == ["newton", "continuation", "primal_dual"]
 
 
 @serial

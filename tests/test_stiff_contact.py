@@ -1,4 +1,4 @@
-"""Stiff contact with friction: Newton's method, followed by continuation where it fails.
+"""Stiff contact with friction: Newton's method, and the primal-dual method where it fails.
 
 What is found is compared with solutions by minimum problems (the alternation), whose matrices, line
 search and limits of friction are others, and with continuation alone. All satisfy the law to 1e-9
@@ -13,8 +13,9 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes import problems, two_blocks
+from scenes.blocks import TOP, block, kirchhoff
 from scenes.comparing import close, nodal, same_effort
-from scenes.rubbing import Rub, pressed
+from scenes.rubbing import Rub, cushion, pressed
 
 pytestmark = pytest.mark.two_ranks
 
@@ -151,3 +152,41 @@ def test_in_other_units():
         rub.move(0.01 * length, 0.03 * length)
         made.append(rub.problem.solve().attempts)
     assert same_effort(*([attempt.iterations for attempt in attempts] for attempts in made))
+
+
+@pytest.mark.parametrize(
+    ("cell", "k"), [("triangle", 1e3), ("triangle", 1e5), ("triangle", 1e9), ("tetrahedron", 1e3)]
+)
+def test_tractions_as_unknowns_from_a_cold_start(cell, k):
+    """The primal-dual method alone; in the plane it takes no more the stiffer contact is.
+
+    Reference: the same at 1e3 E/h by minimum problems, whose penetration, a thousandth of a cell,
+    moves the force by as much, and by 2e-2 where points that slipped may stick.
+    """
+    forces = []
+    for stiffness, method in ((1e3, "alternating"), (k, "primal_dual")):
+        _, problem, _ = pressed(cell, coulomb(stiffness), method, n=3, side=0.06, fallback=False)
+        step = problem.solve()
+        assert [attempt.method for attempt in step.attempts] == [method]
+        forces.append(step.contacts["contact"].normal_force)
+    assert close(forces[1], forces[0], 2e-2)
+    assert step.iterations <= 30
+
+
+@pytest.mark.parametrize(
+    "case", ["no friction", "an obstacle that is moved by a force", "a nonlinear bulk"]
+)
+def test_what_tractions_as_unknowns_are_not_for_is_refused(case):
+    """By the method's name, before any work."""
+    scene = block("triangle", n=2)
+    law, obstacle, form = coulomb(10.0), cushion(2), scene.F
+    if case == "no friction":
+        law = fc.Frictionless()
+    elif case == "a nonlinear bulk":
+        form = kirchhoff(scene)
+    else:
+        obstacle = fc.HalfSpace((0, 0), (0, 1), displacement=fc.Motion(force=(None, 1.0)))
+    contact = scene.contact(law, obstacle=obstacle)
+    bcs = [scene.hold(TOP, i) for i in range(2)]
+    with pytest.raises(ValueError, match="method is 'primal_dual', which needs friction with"):
+        fc.ContactProblem(form, scene.u, bcs=bcs, contacts=[contact], method="primal_dual")

@@ -52,7 +52,7 @@ Scene = dict[str, Any]
 OUTCOMES = ("right", "another", "refused", "wrong", "crashed", "slow", "unjudged")
 FIELDS = ("seed", "ranks", "outcome", "kind", "increments", "seconds", "features", "detail", "by")
 # Methods that are tried alone on refused scenes, and their largest number of iterations.
-METHODS = {"newton": 100, "continuation": 100, "lbfgs": 1000}
+METHODS = {"newton": 100, "continuation": 100, "primal_dual": 100, "lbfgs": 1000}
 # Categories of refusals by words of their texts.
 CATEGORIES = {
     "half of the radius": "too deep",
