@@ -276,6 +276,8 @@ class Newton(SnesMethod):
         if self._trials > self.most_halvings:
             return 0.0
         iterate, residual = self._iterate
+        if residual.norm() == 0.0:  # what is left is round-off that no step takes away
+            return 1.0
         fall = f.norm() / residual.norm()
         if fall <= 1.0 - _DECREASE:
             return float(fall * fall)
