@@ -12,6 +12,7 @@ import numpy as np
 from fenics_contact.contact.contact import Contact
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.reference_scales import ReferenceScales
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index
 
 __all__ = ["Energy", "EnergyState"]
@@ -159,7 +160,9 @@ class EnergyState:
             float, sums.sum(axis=1)
         )
         exchanged = np.maximum(np.abs(sums[:3]).sum(axis=0), sums[6])
-        gives = (sums[5] > 0) & (exchanged > 0)
+        # Where no load is left forces and displacements are round-off.
+        nothing = ROUND_OFF * scales.mesh_size * scales.round_off_of_groups
+        gives = (sums[5] > 0) & (exchanged > nothing)
         return Energy(
             work=work,
             elastic=elastic,

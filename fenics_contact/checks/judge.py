@@ -176,7 +176,8 @@ class Judge:
         if not self._contacts:
             return {}
         moduli = [self._full.scales.modulus(i) for i in range(len(self._contacts))]
-        return linearisation(self._contacts, moduli, respond)
+        groups = [self._full.scales.group_of_points(i) for i in range(len(self._contacts))]
+        return linearisation(self._contacts, groups, moduli, respond)
 
     def _deformation(self) -> dict[str, float]:
         """Largest displacement of every body but for its rigid motion, by its size. Collective.

@@ -17,7 +17,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_min, global_sum, longest
 from fenics_contact.tolerances import ROUND_OFF
-from fenics_contact.types import Array, Mask
+from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Deviation", "LinearSprings", "Linearisation", "linearisation"]
 
@@ -155,17 +155,17 @@ class Deviation:
             change = np.where(paired, smooth, change)
         told = np.isfinite(normal).all(axis=1)
         turn = np.where((told & closed)[:, None], normal - values.normal, 0.0)
-        if contact.gap_prescribed:
-            return cls(zero, turn, values.normal, nothing, nothing)
+        # At the very end of the opposite surface points keep their pairs while they do not slide.
+        slid = np.linalg.norm(values.slide, axis=1) > _SLID * contact.quadrature.facet_sizes
+        lost = told & closed & slid & np.isnan(change)
+        if contact.gap_prescribed:  # pairs keep theirs, and of others none is known
+            return cls(zero, turn, normal, lost, nothing)
         true = np.where(contact.paired, values.gap, 0.0) + change
         size = np.linalg.norm(values.x, axis=1) + contact.quadrature.facet_sizes
         apart = ROUND_OFF * size
         if not contact.rigid:  # facets that meet at angles make as much of a gap where points close
             apart += longest(contact.surface.mesh.comm, np.nan_to_num(change[closed]))
         closing = told & ~closed & (true < -apart)
-        # At the very end of the opposite surface points keep their pairs while they do not slide.
-        slid = np.linalg.norm(values.slide, axis=1) > _SLID * contact.quadrature.facet_sizes
-        lost = told & closed & slid & np.isnan(change)
         gap = np.where(told & closed & ~lost, np.nan_to_num(change), np.where(closing, true, 0.0))
         return cls(gap, turn, normal, lost, closing)
 
@@ -226,59 +226,85 @@ def _moves(contact: Contact) -> bool:
 
 def linearisation(
     contacts: Sequence[Contact],
+    groups: Sequence[Index],
     moduli: Sequence[float],
     respond: Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]],
 ) -> dict[str, Linearisation]:
     """Estimate the error of the small-displacement assumption, by contact. Collective.
 
+    Where a contact is of several bodies, or groups of them that it couples, it is that of the worst
+    one, relative to what that bears.
+
     Args:
         contacts: Evaluated contacts, at a solution.
+        groups: Group of coupled bodies of every point, (n_points,) for every contact.
         moduli: Approximate modulus of the bodies of every contact (stress), to decide whether the
             linear solve is needed.
         respond: Returns the change of the relative displacements at the points of every contact
             due to tractions added on the bodies, with given contact stiffness.
     """
     deviations = [Deviation.of(c) for c in contacts]
-    matters = False
-    for contact, deviation, modulus in zip(contacts, deviations, moduli, strict=True):
-        comm, measure = contact.surface.mesh.comm, contact.measure
-        d = contact.points.shape[1]
-        sums = global_sum(comm, [measure @ (contact.pressure > 0), measure.sum()])
-        size = float(sums[0] or sums[1]) ** (1 / (d - 1)) or 1.0
-        largest = longest(comm, contact.traction)
-        gap, lost = deviation.gap, deviation.lost
-        if largest <= np.finfo(float).eps * modulus:  # what an increment to no load leaves
-            largest, gap, lost = 0.0, gap[deviation.closing], lost[:0]
-        turn = largest * longest(comm, deviation.turn)
-        push = modulus / size * longest(comm, gap)
-        gone = longest(comm, contact.traction[: len(lost)][lost])
-        matters |= not max(turn, push, gone) <= _NEGLIGIBLE * largest
-    if not matters:
+    parts = [_parts(c, group) for c, group in zip(contacts, groups, strict=True)]
+    given = zip(contacts, deviations, parts, moduli, strict=True)
+    if not any([_matters(c, d, own, e) for c, d, masks, e in given for own in masks]):
         return {c.name: Linearisation() for c in contacts}
     pairs = list(zip(deviations, contacts, strict=True))
     springs = [d.springs(c) for d, c in pairs]
     added = [d.added(c, s) for (d, c), s in zip(pairs, springs, strict=True)]
     jumps = respond([s.stiffness for s in springs], added)
     return {
-        c.name: _relative(c, traction, s.change(jump))
-        for c, s, traction, jump in zip(contacts, springs, added, jumps, strict=True)
+        c.name: _worst([_relative(c, own, traction, s.change(jump)) for own in masks])
+        for c, masks, s, traction, jump in zip(contacts, parts, springs, added, jumps, strict=True)
     }
 
 
-def _relative(contact: Contact, added: Array, answered: Array) -> Linearisation:
-    """The error by the change of the tractions at fixed displacements, and that by their change."""
-    comm, measure, change = contact.surface.mesh.comm, contact.measure, added + answered
+def _parts(contact: Contact, group: Index) -> list[Mask]:
+    """Masks of this rank's points of every group of bodies of a contact. Collective."""
+    every = contact.surface.mesh.comm.allgather(np.unique(group).tolist())
+    return [group == number for number in sorted({n for each in every for n in each})]
+
+
+def _matters(contact: Contact, deviation: Deviation, own: Mask, modulus: float) -> bool:
+    """Whether what is left out could change forces or pressures at some points. Collective."""
+    comm, measure = contact.surface.mesh.comm, contact.measure[own]
+    traction, d = contact.traction[own], contact.points.shape[1]
+    sums = global_sum(comm, [measure @ (contact.pressure[own] > 0), measure.sum()])
+    size = float(sums[0] or sums[1]) ** (1 / (d - 1)) or 1.0
+    largest = longest(comm, traction)
+    gap, lost = deviation.gap[own], deviation.lost[own]
+    if largest <= np.finfo(float).eps * modulus:  # what an increment to no load leaves
+        largest, gap, lost = 0.0, gap[deviation.closing[own]], np.zeros_like(lost)
+    turn = largest * longest(comm, deviation.turn[own])
+    push = modulus / size * longest(comm, gap)
+    gone = longest(comm, traction[lost])
+    return not max(turn, push, gone) <= _NEGLIGIBLE * largest
+
+
+def _relative(contact: Contact, own: Mask, added: Array, answered: Array) -> Linearisation:
+    """The error by the change of tractions at fixed displacements, and that by their change.
+
+    Collective.
+    """
+    comm, measure = contact.surface.mesh.comm, contact.measure[own]
+    added, change = added[own], (added + answered)[own]
+    pressure = contact.pressure[own]
     force_change = global_sum(comm, measure @ change)
-    size = float(global_sum(comm, measure @ np.linalg.norm(contact.traction, axis=1)))
-    largest = longest(comm, contact.pressure) or 1.0  # squares must not overflow
-    along = np.sum(change * contact.values.normal, axis=1) / largest
-    squares = [measure @ along**2, measure @ (contact.pressure / largest) ** 2]
+    size = float(global_sum(comm, measure @ np.linalg.norm(contact.traction[own], axis=1)))
+    largest = longest(comm, pressure) or 1.0  # squares must not overflow
+    along = np.sum(change * contact.values.normal[own], axis=1) / largest
+    squares = [measure @ along**2, measure @ (pressure / largest) ** 2]
     changed, whole = np.sqrt(global_sum(comm, squares))
     if not size:
         # All of what it ought to bear is missing, but where a free body moves out of the way.
-        parts = [np.linalg.norm(part, axis=1) for part in (change, added)]
-        size, at_rest = global_sum(comm, [measure @ part for part in parts])
+        both = [np.linalg.norm(part, axis=1) for part in (change, added)]
+        size, at_rest = global_sum(comm, [measure @ part for part in both])
         size = 0.0 if size <= ROUND_OFF * at_rest < np.inf else size  # NaN: nothing is known
     force = float(np.linalg.norm(force_change)) / size if size else 0.0
-    pressure = float(changed / whole) if whole else 0.0
-    return Linearisation(force, pressure, not contact.rigid)
+    return Linearisation(force, float(changed / whole) if whole else 0.0, not contact.rigid)
+
+
+def _worst(found: Sequence[Linearisation]) -> Linearisation:
+    """The largest errors of all; one that is not a number wins."""
+    force = np.max([each.force for each in found], initial=0.0)
+    pressure = np.max([each.pressure for each in found], initial=0.0)
+    return Linearisation(float(force), float(pressure), any(each.rough for each in found))

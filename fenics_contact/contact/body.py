@@ -95,7 +95,13 @@ class BodyOpposite(Opposite):
         counted = self.pairs.paired & (values.normal_traction < 0)
         if not comm.allreduce(int(np.any(counted))):
             counted = self.pairs.paired
-        return global_max(comm, ways[counted]) > _SLIDES
+        if global_max(comm, ways[counted]) > _SLIDES:
+            return True
+        alone = ~self.pairs.paired
+        if not comm.allreduce(int(np.any(alone))):
+            return False
+        gap, _ = self.true_placement(values)  # a number where they have come to an opposite
+        return bool(comm.allreduce(int(np.any(np.isfinite(gap[alone])))))
 
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
         """See `Opposite`."""
@@ -119,7 +125,7 @@ class BodyOpposite(Opposite):
         if not self.pairs_anew and self._mesh.comm.rank == 0:
             logger.info(
                 "%s: pairs are updated at every increment from now on, because points have slid by "
-                "more than a facet",
+                "more than a facet, or to an opposite surface",
                 self._parts.name,
             )
         # The traction stays with the points of Γc; what they slip over has moved on.
