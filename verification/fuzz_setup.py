@@ -552,10 +552,9 @@ def _record_slip_resets(setup: SceneSetup, contact: fc.Contact) -> None:
             if rigid and not any(setup.comm.allgather(bool(given[0].any()))):
                 method(*given, **options)  # other bodies are positioned
                 return
-            unloaded = (
-                given[0] & (contact.history.values("normal_traction") == 0.0) if rigid else True
-            )
-            unloaded = np.broadcast_to(unloaded, len(contact.points))
+            unloaded = given[0]
+            if rigid:
+                unloaded = unloaded & (contact.history.values("normal_traction") == 0.0)
             columns = [contact.points, contact.values.jump, unloaded]
             rows = gather_rows(setup.comm, np.column_stack(columns))
             setup.slip_resets[contact.name] = {

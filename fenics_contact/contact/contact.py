@@ -634,12 +634,15 @@ class Contact(PointResults):
         """
         self._count_from_here(moved & (self.history.values("normal_traction") == 0.0))
 
-    def count_slip_from_here(self) -> None:
+    def count_slip_from_here(self, points: Mask) -> None:
         """Measure slip from the state evaluated last, at which surfaces first touch. Collective.
 
         `restore` undoes it.
+
+        Args:
+            points: Mask of the points of these surfaces, (n_points,).
         """
-        self._count_from_here(np.ones(self.quadrature.n_points, dtype=np.bool_))
+        self._count_from_here(points)
 
     def _count_from_here(self, points: Mask) -> None:
         """Measure slip at some points from the state evaluated last. Collective."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse.csgraph
 
 from fenics_contact.contact.contact import Contact
-from fenics_contact.parallel import global_max, global_min, global_sum
+from fenics_contact.parallel import global_max, global_min
 from fenics_contact.systems.full import FullSystem
-from fenics_contact.types import Array, Index
+from fenics_contact.types import Array, Mask
 
 __all__ = ["FirstTouch"]
 
@@ -41,121 +41,142 @@ class FirstTouch:
         self.end: Array | None = None
 
     def count_slip(
-        self, start: Array, end_without: Callable[[Sequence[Contact], Array], Array | None]
+        self,
+        start: Array,
+        end_without: Callable[[Sequence[tuple[Contact, Mask]], Array], Array | None],
     ) -> None:
         """Let slip at contacts that are apart be counted from first touch. Collective.
 
         Args:
             start: The state in which the increment starts, prescribed values as they were.
-            end_without: Finds the state in which it would end if some contacts did not act, from
-                them and ``start``; None where nothing else holds the bodies.
+            end_without: Finds the state in which it would end if contacts acted at some of their
+                points alone, from these and ``start``; None where nothing else holds the bodies.
         """
         full, self.end = self._full, None
-        idle = [n for n, contact in enumerate(full.contacts) if self._is_idle(contact)]
-        if not idle:
+        parts = [part for part in self._parts() if self._is_idle(part)]
+        if not parts:
             return
         present = full.state()
-        contacts = [full.contacts[n] for n in idle]
         full.set_state(start)
-        for contact in contacts:
+        for contact in {id(part.contact): part.contact for part in parts}.values():
             contact.evaluate()
-        ways = [contact.opposite.committed_offset(contact.values) for contact in contacts]
-        apart = [
-            n for n, given in enumerate(zip(contacts, ways, strict=True)) if self._is_apart(*given)
+        ways = [part.contact.opposite.committed_offset(part.contact.values) for part in parts]
+        paths = [
+            _Path(full, part, way)
+            for part, way in zip(parts, ways, strict=True)
+            if self._is_apart(part, way)
         ]
-        contacts, ways = [contacts[n] for n in apart], [ways[n] for n in apart]
         full.set_state(present)
-        end = end_without(contacts, start) if apart else None
+        end = end_without(_without([path.part for path in paths]), start) if paths else None
         if end is not None:
-            paths = [_Path(full, *given, start, end) for given in zip(contacts, ways, strict=True)]
-            shares = np.array([path.first_touch() for path in paths])
-            groups = self._groups()[np.array(idle)[apart]]
+            shares = np.array([path.first_touch(start, end) for path in paths])
+            groups = np.array([path.part.group for path in paths])
             for path, group in zip(paths, groups, strict=True):
                 share = shares[groups == group].min()
                 if share < 1.0:
                     path.gap(share)
-                    path.contact.count_slip_from_here()
+                    path.part.contact.count_slip_from_here(path.part.points)
             self.end = end if shares.min() == 1.0 else None
         full.set_state(present)
         for contact in full.contacts:
             contact.evaluate()
 
-    def _is_idle(self, contact: Contact) -> bool:
-        """Whether a contact with friction bore nothing at the last commit. Collective."""
-        if not contact.law.has_friction:
-            return False
-        borne = np.abs(contact.history.values("normal_traction"))
+    def _parts(self) -> list[_Part]:
+        """The contacts with friction, each divided by groups of coupled bodies. Collective."""
+        scales, comm, found = self._full.scales, self._full.unknowns.comm, []
+        for number, contact in enumerate(self._full.contacts):
+            if contact.law.has_friction:
+                group = scales.group_of_points(number)
+                every = {n for each in comm.allgather(np.unique(group).tolist()) for n in each}
+                found += [_Part(contact, group == n, n) for n in sorted(every)]
+        return found
+
+    def _is_idle(self, part: _Part) -> bool:
+        """Whether it bore nothing at the last commit. Collective."""
+        borne = np.abs(part.contact.history.values("normal_traction")[part.points])
         return not global_max(self._full.unknowns.comm, borne) > 0.0
 
-    def _is_apart(self, contact: Contact, way: Array) -> bool:
-        """Whether a contact neither acts nor touches, displaced by a way. Collective.
+    def _is_apart(self, part: _Part, way: Array) -> bool:
+        """Whether it neither acts nor touches, displaced by a way. Collective.
 
         A facet along which the gap varies by more than its least at the points may touch between
         them, as a ball does that stands on a node.
         """
-        comm, rows = self._full.unknowns.comm, contact.quadrature.point_rows()
-        gap = _gap(contact, way)
+        contact, comm = part.contact, self._full.unknowns.comm
+        rows = contact.quadrature.point_rows()
+        gap = _gap(part, way)
         acting = np.abs(contact.values.friction_bound) + np.abs(contact.values.normal_traction)
         least, most = gap[rows].min(axis=1), np.where(gap < np.inf, gap, -np.inf)[rows].max(axis=1)
         apart = global_min(comm, (2.0 * least - most)[least < np.inf], empty=0.0) > 0.0
-        return apart and not global_max(comm, acting) > 0.0
-
-    def _groups(self) -> Index:
-        """Number of the group of each contact, (n_contacts,): of bodies that contacts link.
-
-        Collective.
-        """
-        full = self._full
-        touches = np.array(
-            [
-                np.bincount(full.label[operator.touched], minlength=full.n_bodies) > 0
-                for operator in full.operators
-            ]
-        )
-        touches = global_sum(full.unknowns.comm, touches.astype(np.float64))
-        _, group = scipy.sparse.csgraph.connected_components(touches @ touches.T)
-        return np.asarray(group)
+        return apart and not global_max(comm, acting[part.points]) > 0.0
 
 
-def _gap(contact: Contact, way: Array) -> Array:
-    """Gaps of points displaced by a way, (n_points,) (length). Collective.
-
-    Those of points without an opposite are infinite.
-    """
-    with contact.opposite.displaced(way):
-        contact.evaluate()
-    return np.where(contact.paired, contact.values.gap, np.inf)
-
-
-class _Path:
-    """How the surfaces of a contact approach each other as long as nothing touches.
+@dataclass(frozen=True)
+class _Part:
+    """The points of a contact on one group of coupled bodies.
 
     Attributes:
         contact: The contact.
+        points: Mask of this rank's points, (n_points,).
+        group: Number of the group.
     """
 
-    def __init__(
-        self, full: FullSystem, contact: Contact, way: Array, start: Array, end: Array
-    ) -> None:
-        """Take both ends.
+    contact: Contact
+    points: Mask
+    group: int
+
+
+def _without(parts: Sequence[_Part]) -> list[tuple[Contact, Mask]]:
+    """The contacts, and which of their points still act if the parts do not."""
+    acting: dict[int, tuple[Contact, Mask]] = {}
+    for part in parts:
+        _, points = acting.get(id(part.contact), (part.contact, np.ones_like(part.points)))
+        acting[id(part.contact)] = part.contact, points & ~part.points
+    return list(acting.values())
+
+
+def _gap(part: _Part, way: Array) -> Array:
+    """Gaps of points displaced by a way, (n_points,) (length). Collective.
+
+    Those of points without an opposite, and of other parts, are infinite.
+    """
+    contact = part.contact
+    with contact.opposite.displaced(way):
+        contact.evaluate()
+    return np.where(contact.paired & part.points, contact.values.gap, np.inf)
+
+
+class _Path:
+    """How the surfaces of a part approach each other as long as nothing touches.
+
+    Attributes:
+        part: The part.
+    """
+
+    def __init__(self, full: FullSystem, part: _Part, way: Array) -> None:
+        """Take what moves.
 
         Args:
             full: The system on all unknowns.
-            contact: The contact.
+            part: The part.
             way: Displacement of its obstacle in the increment, (n_points, gdim) (length).
-            start: The state in which the increment starts.
-            end: The state in which it would end.
         """
-        self._full, self.contact, self._way = full, contact, way
-        self._start, self._end = start, end
+        self._full, self.part, self._way = full, part, way
+        self._start = self._end = full.state()
 
     def gap(self, share: float) -> Array:
         """Gaps at a share of the increment, evaluated there, (n_points,) (length). Collective."""
         self._full.set_state(self._start + share * (self._end - self._start))
-        return _gap(self.contact, (1.0 - share) * self._way)
+        return _gap(self.part, (1.0 - share) * self._way)
 
-    def first_touch(self) -> float:
-        """Share of the increment at which the least gap closes, 1 where none does. Collective."""
+    def first_touch(self, start: Array, end: Array) -> float:
+        """Share of the increment at which the least gap closes, 1 where none does. Collective.
+
+        Args:
+            start: The state in which the increment starts.
+            end: The state in which it would end.
+        """
+        self._start, self._end = start, end
         comm = self._full.unknowns.comm
         low, high = 0.0, 1.0
         at_low, at_high = self.gap(low), self.gap(high)

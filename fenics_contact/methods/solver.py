@@ -38,7 +38,7 @@ from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Selection
-from fenics_contact.types import Array, Indices
+from fenics_contact.types import Array, Indices, Mask
 
 __all__ = ["METHODS", "Settings", "Solver"]
 
@@ -575,13 +575,13 @@ class Solver:
         self.system.begin(load)
         return linearised(self.equations, springs)
 
-    def end_without(self, contacts: Sequence[Contact], start: Array) -> Array | None:
-        """Where the increment would end, to first order, if contacts did not act. Collective.
+    def end_without(self, acting: Sequence[tuple[Contact, Mask]], start: Array) -> Array | None:
+        """Where the increment would end, to first order, if some points did not act. Collective.
 
         All other points that are closed in ``start`` stick.
 
         Args:
-            contacts: These.
+            acting: Contacts, and which of their points do, (n_points,).
             start: The state in which it starts, prescribed values as they were.
 
         Returns:
@@ -592,8 +592,8 @@ class Solver:
         moved = None
         with self.system.acting():
             try:
-                for contact in contacts:
-                    contact.confine(np.zeros(contact.quadrature.n_points, dtype=np.bool_))
+                for contact, points in acting:
+                    contact.confine(points)
                 if not full.bulk.linear:  # a bulk that conditions have moved into may be inverted
                     moved = present - start
                     full.set_state(start)
@@ -610,7 +610,7 @@ class Solver:
                     return present + solve(None)
             finally:
                 self.equations.forget_tangent()
-                for contact in contacts:
+                for contact, _ in acting:
                     contact.confine()
                 full.set_state(present)
                 if not full.bulk.linear:
