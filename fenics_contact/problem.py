@@ -548,8 +548,13 @@ class ContactProblem:
         """Whether u can stay behind: energies and pairs must be found without it. Collective."""
         if not (self.solver.condensed and self.bulk.symmetric):
             return False
-        if any(contact.opposite.pairs_anew for contact in self.contacts):
-            return False
+        for contact in self.contacts:
+            # A body that has come to no pairs yet is looked for where it is.
+            alone = contact.opposite.may_pair_anew and not self._comm.allreduce(
+                int(contact.paired.any())
+            )
+            if alone or contact.opposite.pairs_anew:
+                return False
         # Of nodes that the quadrature points do not carry only a complete u tells where they are.
         carried = (
             c.opposite.sampler is None or c.facet_places.points_are_nodes for c in self.contacts

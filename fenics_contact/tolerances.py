@@ -1,7 +1,7 @@
 """What is round-off, the same everywhere: below it two quantities are one, or one is none.
 
-Each is relative: the caller says to what. Other numbers in the package that small are a tolerance
-of a solver, or a multiple of the machine's precision for one operation.
+Each is relative: the caller says to what. Other small numbers in the package are of one operation:
+a tolerance of a solver, a multiple of the machine's precision, a step of a difference.
 """
 
 __all__ = ["FLAT", "NEGLIGIBLE", "ROUND_OFF"]

@@ -48,4 +48,4 @@ for step in fc.increments(problem, push, 0, 1e-4, steps=2):
     if msh.comm.rank == 0:
         print(step.summary())
 written = "" if msh.comm.rank else open("run.log", encoding="utf-8").read()
-assert msh.comm.bcast("INFO lbfgs: no progress" in written and "DEBUG" in written)
+assert msh.comm.bcast("INFO lbfgs: no progress" in written)

@@ -161,7 +161,7 @@ class EnergyState:
         )
         exchanged = np.maximum(np.abs(sums[:3]).sum(axis=0), sums[6])
         # Where no load is left forces and displacements are round-off.
-        nothing = ROUND_OFF * scales.mesh_size * scales.round_off_of_groups
+        nothing = ROUND_OFF * scales.size_of_groups * scales.round_off_of_groups
         gives = (sums[5] > 0) & (exchanged > nothing)
         return Energy(
             work=work,

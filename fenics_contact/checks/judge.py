@@ -177,7 +177,9 @@ class Judge:
             return {}
         moduli = [self._full.scales.modulus(i) for i in range(len(self._contacts))]
         groups = [self._full.scales.group_of_points(i) for i in range(len(self._contacts))]
-        return linearisation(self._contacts, groups, moduli, respond)
+        return linearisation(
+            self._contacts, groups, self._full.scales.round_off_of_groups, moduli, respond
+        )
 
     def _deformation(self) -> dict[str, float]:
         """Largest displacement of every body but for its rigid motion, by its size. Collective.

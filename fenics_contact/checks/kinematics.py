@@ -85,6 +85,8 @@ class LinearSprings:
 class Linearisation:
     """Relative error of a contact due to the small-displacement assumption, on every rank.
 
+    Of several groups of bodies that it presses on each other or on obstacles the largest errors.
+
     Attributes:
         force: Error of the contact force, the magnitude of its change.
         pressure: Error of the pressure, in the L² norm over Γc.
@@ -227,6 +229,7 @@ def _moves(contact: Contact) -> bool:
 def linearisation(
     contacts: Sequence[Contact],
     groups: Sequence[Index],
+    round_off: Array,
     moduli: Sequence[float],
     respond: Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]],
 ) -> dict[str, Linearisation]:
@@ -238,54 +241,75 @@ def linearisation(
     Args:
         contacts: Evaluated contacts, at a solution.
         groups: Group of coupled bodies of every point, (n_points,) for every contact.
+        round_off: Force on each group that is round-off, (n_groups,) (force).
         moduli: Approximate modulus of the bodies of every contact (stress), to decide whether the
             linear solve is needed.
         respond: Returns the change of the relative displacements at the points of every contact
             due to tractions added on the bodies, with given contact stiffness.
     """
     deviations = [Deviation.of(c) for c in contacts]
-    parts = [_parts(c, group) for c, group in zip(contacts, groups, strict=True)]
-    given = zip(contacts, deviations, parts, moduli, strict=True)
-    if not any([_matters(c, d, own, e) for c, d, masks, e in given for own in masks]):
+    parts = [
+        [own for own in _parts(c, group, round_off) if _matters(c, deviation, own, modulus)]
+        for c, deviation, group, modulus in zip(contacts, deviations, groups, moduli, strict=True)
+    ]
+    if not any(parts):
         return {c.name: Linearisation() for c in contacts}
     pairs = list(zip(deviations, contacts, strict=True))
     springs = [d.springs(c) for d, c in pairs]
     added = [d.added(c, s) for (d, c), s in zip(pairs, springs, strict=True)]
     jumps = respond([s.stiffness for s in springs], added)
     return {
-        c.name: _worst([_relative(c, own, traction, s.change(jump)) for own in masks])
-        for c, masks, s, traction, jump in zip(contacts, parts, springs, added, jumps, strict=True)
+        c.name: _worst([_relative(c, part, traction, s.change(jump)) for part in mine])
+        for c, mine, s, traction, jump in zip(contacts, parts, springs, added, jumps, strict=True)
     }
 
 
-def _parts(contact: Contact, group: Index) -> list[Mask]:
-    """Masks of this rank's points of every group of bodies of a contact. Collective."""
-    every = contact.surface.mesh.comm.allgather(np.unique(group).tolist())
-    return [group == number for number in sorted({n for each in every for n in each})]
+@dataclass(frozen=True)
+class _Part:
+    """The points of a contact on one group of coupled bodies.
+
+    Attributes:
+        points: Mask of this rank's points, (n_points,).
+        idle: Whether they bear nothing but round-off, as after an increment to no load.
+    """
+
+    points: Mask
+    idle: bool
 
 
-def _matters(contact: Contact, deviation: Deviation, own: Mask, modulus: float) -> bool:
-    """Whether what is left out could change forces or pressures at some points. Collective."""
-    comm, measure = contact.surface.mesh.comm, contact.measure[own]
-    traction, d = contact.traction[own], contact.points.shape[1]
+def _parts(contact: Contact, group: Index, round_off: Array) -> list[_Part]:
+    """The parts of a contact, the same on all ranks. Collective."""
+    comm, n = contact.surface.mesh.comm, len(round_off)
+    force = contact.measure * np.linalg.norm(contact.traction, axis=1)
+    count, borne = global_sum(
+        comm, [np.bincount(group, minlength=n), np.bincount(group, force, minlength=n)]
+    )
+    return [_Part(group == g, bool(borne[g] <= round_off[g])) for g in np.flatnonzero(count)]
+
+
+def _matters(contact: Contact, deviation: Deviation, part: _Part, modulus: float) -> bool:
+    """Whether what is left out could change forces or pressures of a part. Collective."""
+    comm, own = contact.surface.mesh.comm, part.points
+    measure, traction = contact.measure[own], contact.traction[own]
     sums = global_sum(comm, [measure @ (contact.pressure[own] > 0), measure.sum()])
-    size = float(sums[0] or sums[1]) ** (1 / (d - 1)) or 1.0
+    size = float(sums[0] or sums[1]) ** (1 / (contact.points.shape[1] - 1)) or 1.0
+    if part.idle:
+        gap = longest(comm, deviation.gap[own & deviation.closing])
+        return not modulus / size * gap <= 0.0
     largest = longest(comm, traction)
-    gap, lost = deviation.gap[own], deviation.lost[own]
-    if largest <= np.finfo(float).eps * modulus:  # what an increment to no load leaves
-        largest, gap, lost = 0.0, gap[deviation.closing[own]], np.zeros_like(lost)
     turn = largest * longest(comm, deviation.turn[own])
-    push = modulus / size * longest(comm, gap)
-    gone = longest(comm, traction[lost])
+    push = modulus / size * longest(comm, deviation.gap[own])
+    gone = longest(comm, traction[deviation.lost[own]])
     return not max(turn, push, gone) <= _NEGLIGIBLE * largest
 
 
-def _relative(contact: Contact, own: Mask, added: Array, answered: Array) -> Linearisation:
+def _relative(contact: Contact, part: _Part, added: Array, answered: Array) -> Linearisation:
     """The error by the change of tractions at fixed displacements, and that by their change.
 
     Collective.
     """
-    comm, measure = contact.surface.mesh.comm, contact.measure[own]
+    comm, own = contact.surface.mesh.comm, part.points
+    measure = contact.measure[own]
     added, change = added[own], (added + answered)[own]
     pressure = contact.pressure[own]
     force_change = global_sum(comm, measure @ change)
@@ -294,7 +318,7 @@ def _relative(contact: Contact, own: Mask, added: Array, answered: Array) -> Lin
     along = np.sum(change * contact.values.normal[own], axis=1) / largest
     squares = [measure @ along**2, measure @ (pressure / largest) ** 2]
     changed, whole = np.sqrt(global_sum(comm, squares))
-    if not size:
+    if part.idle:
         # All of what it ought to bear is missing, but where a free body moves out of the way.
         both = [np.linalg.norm(part, axis=1) for part in (change, added)]
         size, at_rest = global_sum(comm, [measure @ part for part in both])

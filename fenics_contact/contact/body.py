@@ -89,19 +89,17 @@ class BodyOpposite(Opposite):
         """See `Opposite`."""
         if self.pairs_anew or self._update != "auto":
             return self.pairs_anew
-        comm = self._mesh.comm
-        ways = np.linalg.norm(values.arrays["slide"], axis=1) / self._parts.quadrature.facet_sizes
-        # Of open points, to whom pairs are nothing yet, only where a body was carried elsewhere.
-        counted = self.pairs.paired & (values.normal_traction < 0)
+        comm, paired = self._mesh.comm, self.pairs.paired
+        slide = values.arrays["slide"]
+        # Of open points, to whom pairs are nothing yet, only where a body was carried elsewhere;
+        # where there are no pairs at all it may come to some.
+        counted = paired & (values.normal_traction < 0)
         if not comm.allreduce(int(np.any(counted))):
-            counted = self.pairs.paired
-        if global_max(comm, ways[counted]) > _SLIDES:
-            return True
-        alone = ~self.pairs.paired
-        if not comm.allreduce(int(np.any(alone))):
-            return False
-        gap, _ = self.true_placement(values)  # a number where they have come to an opposite
-        return bool(comm.allreduce(int(np.any(np.isfinite(gap[alone])))))
+            counted = paired
+        if not comm.allreduce(int(np.any(counted))):
+            slide, counted = self.pairs.own_displacement(), ~paired
+        ways = np.linalg.norm(slide, axis=1) / self._parts.quadrature.facet_sizes
+        return global_max(comm, ways[counted]) > _SLIDES
 
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
         """See `Opposite`."""
@@ -125,7 +123,7 @@ class BodyOpposite(Opposite):
         if not self.pairs_anew and self._mesh.comm.rank == 0:
             logger.info(
                 "%s: pairs are updated at every increment from now on, because points have slid by "
-                "more than a facet, or to an opposite surface",
+                "more than a facet",
                 self._parts.name,
             )
         # The traction stays with the points of Γc; what they slip over has moved on.

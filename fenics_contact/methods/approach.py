@@ -15,7 +15,7 @@ from fenics_contact.contact.values import Status
 from fenics_contact.parallel import agreed, gather_rows, global_max, global_min, global_sum
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes, tangential_gram
-from fenics_contact.tolerances import NEGLIGIBLE
+from fenics_contact.tolerances import FLAT, NEGLIGIBLE
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Approach"]
@@ -230,7 +230,7 @@ class Approach:
         for contact, jumps, motion in zip(
             self._full.contacts, self._felt(which)[1], obstacles, strict=True
         ):
-            touches = contact.values.opening <= NEGLIGIBLE * self._full.scales.mesh_size
+            touches = contact.values.opening <= FLAT * self._full.scales.mesh_size
             weights = np.where(contact.paired & touches, contact.measure, 0.0)
             way = motion.of_points(contact.own_displacement())
             gram += np.einsum("mqd,q,nqd->mn", jumps, weights, jumps)
@@ -463,7 +463,7 @@ def _least_motion(work: Array, matrix: Array, limit: Array, found: Array) -> Arr
         np.hstack([-unit, -unit]),
         np.concatenate([-work, np.zeros(n)])[None],
     ]
-    ends = np.concatenate([limit, np.zeros(2 * n), [-most + NEGLIGIBLE * abs(most)]])
+    ends = np.concatenate([limit, np.zeros(2 * n), [-most + 0.1 * NEGLIGIBLE * abs(most)]])
     cost = np.concatenate([np.zeros(n), np.ones(n)])
     least = _linear_programme(cost, np.concatenate(rows), ends)
     return found if least is None else least[:n]

@@ -1,4 +1,7 @@
-"""Contacts that begin an increment apart: slip is counted from first touch."""
+"""Surfaces that begin an increment apart: slip is counted from first touch.
+
+A contact on several groups of coupled bodies counts for each of them by itself.
+"""
 
 from __future__ import annotations
 

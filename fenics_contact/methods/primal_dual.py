@@ -154,7 +154,8 @@ class _MixedNewton(SnesMethod):
 
 def _suits(contact: Contact) -> bool:
     law = contact.law
-    springs = law.has_normal_stiffness and not (law.has_own_normal or law.has_tension)
+    springs = law.has_normal_stiffness and "k_n" in law.positive
+    springs = springs and not (law.has_own_normal or law.has_tension)
     rubs = law.has_friction or not law.has_tangential
     return springs and rubs and not (contact.finite or contact.motions)
 

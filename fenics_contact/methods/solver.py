@@ -592,8 +592,11 @@ class Solver:
         moved = None
         with self.system.acting():
             try:
-                for contact, points in acting:
-                    contact.confine(points)
+                for operator in self.system.operators:
+                    within = operator.within
+                    for contact, points in acting:
+                        if contact is operator.contact:
+                            contact.confine(points if within is None else points & within)
                 if not full.bulk.linear:  # a bulk that conditions have moved into may be inverted
                     moved = present - start
                     full.set_state(start)

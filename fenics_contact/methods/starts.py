@@ -13,7 +13,7 @@ from fenics_contact.methods.equations import Equations
 from fenics_contact.parallel import global_max
 from fenics_contact.systems import dense, linear
 from fenics_contact.systems.system import System
-from fenics_contact.tolerances import NEGLIGIBLE
+from fenics_contact.tolerances import FLAT, NEGLIGIBLE
 from fenics_contact.types import Array
 
 __all__ = ["Starts"]
@@ -187,8 +187,11 @@ class Starts:
             equations.residual_at(present + share * way)
             along[share] = equations.function.array_r @ way
         first, last = equations.full.unknowns.comm.allreduce(along)
-        found = np.isfinite(first) and np.isfinite(last) and first != last
-        return present + first / (first - last) * way if found else present
+        if abs(first - last) > FLAT * abs(first) and np.isfinite(
+            last
+        ):  # else it feels no stiffness
+            return present + first / (first - last) * way
+        return present
 
     def _friction_works(self) -> bool:
         """Whether committed friction does work on the way to the start added last. Collective."""

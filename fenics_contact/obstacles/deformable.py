@@ -31,9 +31,9 @@ class DeformableBody(Obstacle):
         update_pairs: When the opposite points are searched again. "never": they are those of the
             undeformed bodies. "increment": at every commit, in the deformed bodies. "auto": at
             every commit, once a point in contact (any point, if none is in contact) has moved
-            along the opposing surface by more than the facet there, or a point without an
-            opposite has come to one. Normals remain those of the undeformed Γc. With `Contact(kinematics="finite")` pairs and normals are always
-            those of the deformed bodies.
+            along the opposing surface, or without one, by more than the facet there. Normals
+            remain those of the undeformed Γc. With `Contact(kinematics="finite")` pairs and
+            normals are always those of the deformed bodies.
         max_initial_penetration: Largest depth (length) at which a point of Γc behind the opposing
             surface is paired in the undeformed bodies. By default the penetration of the two
             bodies; in self-contact half the height of the point's cell. In deformed bodies the

@@ -134,7 +134,7 @@ class Condensation:
             rest -= shares[-1][self._label] * direction
         responses = [response for _, response in self.directions]
         remainders = self._norms(rest)
-        new = remainders > ROUND_OFF * sizes
+        new = remainders > 0.01 * ROUND_OFF * sizes
         if new.any():
             known = bool(np.isfinite(remainders).all())
             shares.append(np.where(new, remainders, 0.0) if known else np.ones(len(new)))

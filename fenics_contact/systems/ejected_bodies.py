@@ -9,7 +9,7 @@ import numpy as np
 from fenics_contact.parallel import global_sum
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
-from fenics_contact.tolerances import NEGLIGIBLE
+from fenics_contact.tolerances import FLAT
 from fenics_contact.types import Array
 
 __all__ = ["find_ejected_bodies"]
@@ -63,6 +63,6 @@ def find_ejected_bodies(
     for b in np.flatnonzero(gone):
         way = float(np.linalg.norm(ways[b]))
         rest = float(most[~gone & scales.coupled_with(int(b))].max(initial=most[b]))
-        if way > max(_FAR * rest, NEGLIGIBLE * scales.size[b]):
+        if way > max(_FAR * rest, FLAT * scales.size[b]):
             found[full.parts.names[b]] = way, rest
     return found

@@ -197,6 +197,13 @@ class ReferenceScales:
         return np.where(np.isfinite(found), found, 0.0)
 
     @property
+    def size_of_groups(self) -> Array:
+        """Size of the largest body of a group of coupled parts, (n_groups,) (length)."""
+        found: Array = np.zeros(self.n_groups)
+        np.maximum.at(found, self.group[: self.n_bodies], self.size)
+        return found
+
+    @property
     def n_groups(self) -> int:
         """Number of groups of coupled parts."""
         return int(self.group.max()) + 1
