@@ -158,7 +158,7 @@ def test_in_other_units():
     ("cell", "k"), [("triangle", 1e3), ("triangle", 1e5), ("triangle", 1e9), ("tetrahedron", 1e3)]
 )
 def test_tractions_as_unknowns_from_a_cold_start(cell, k):
-    """The primal-dual method alone; in the plane it takes no more the stiffer contact is.
+    """The primal-dual method alone, in the plane at any stiffness.
 
     Reference: the same at 1e3 E/h by minimum problems, whose penetration, a thousandth of a cell,
     moves the force by as much, and by 2e-2 where points that slipped may stick.
@@ -170,7 +170,7 @@ def test_tractions_as_unknowns_from_a_cold_start(cell, k):
         assert [attempt.method for attempt in step.attempts] == [method]
         forces.append(step.contacts["contact"].normal_force)
     assert close(forces[1], forces[0], 2e-2)
-    assert step.iterations <= 30
+    assert step.iterations <= 10  # measured: 3 at every stiffness in the plane, 8 in space
 
 
 @pytest.mark.parametrize(

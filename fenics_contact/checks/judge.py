@@ -176,10 +176,9 @@ class Judge:
         if not self._contacts:
             return {}
         moduli = [self._full.scales.modulus(i) for i in range(len(self._contacts))]
-        groups = [self._full.scales.group_of_points(i) for i in range(len(self._contacts))]
-        return linearisation(
-            self._contacts, groups, self._full.scales.round_off_of_groups, moduli, respond
-        )
+        scales = self._full.scales
+        parts = [scales.parts_of(i) for i in range(len(self._contacts))]
+        return linearisation(self._contacts, parts, scales.round_off_of_groups, moduli, respond)
 
     def _deformation(self) -> dict[str, float]:
         """Largest displacement of every body but for its rigid motion, by its size. Collective.

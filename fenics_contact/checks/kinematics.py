@@ -7,7 +7,7 @@ solve with the present tangent.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_min, global_sum, longest
 from fenics_contact.tolerances import ROUND_OFF
-from fenics_contact.types import Array, Index, Mask
+from fenics_contact.types import Array, Mask
 
 __all__ = ["Deviation", "LinearSprings", "Linearisation", "linearisation"]
 
@@ -228,7 +228,7 @@ def _moves(contact: Contact) -> bool:
 
 def linearisation(
     contacts: Sequence[Contact],
-    groups: Sequence[Index],
+    parts: Sequence[Mapping[int, Mask]],
     round_off: Array,
     moduli: Sequence[float],
     respond: Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]],
@@ -240,7 +240,8 @@ def linearisation(
 
     Args:
         contacts: Evaluated contacts, at a solution.
-        groups: Group of coupled bodies of every point, (n_points,) for every contact.
+        parts: For every contact masks of the points on each group of coupled bodies,
+            `ReferenceScales.parts_of`.
         round_off: Force on each group that is round-off, (n_groups,) (force).
         moduli: Approximate modulus of the bodies of every contact (stress), to decide whether the
             linear solve is needed.
@@ -248,11 +249,11 @@ def linearisation(
             due to tractions added on the bodies, with given contact stiffness.
     """
     deviations = [Deviation.of(c) for c in contacts]
-    parts = [
-        [own for own in _parts(c, group, round_off) if _matters(c, deviation, own, modulus)]
-        for c, deviation, group, modulus in zip(contacts, deviations, groups, moduli, strict=True)
+    looked_at = [
+        [part for part in _parts(c, masks, round_off) if _matters(c, deviation, part, modulus)]
+        for c, deviation, masks, modulus in zip(contacts, deviations, parts, moduli, strict=True)
     ]
-    if not any(parts):
+    if not any(looked_at):
         return {c.name: Linearisation() for c in contacts}
     pairs = list(zip(deviations, contacts, strict=True))
     springs = [d.springs(c) for d, c in pairs]
@@ -260,7 +261,9 @@ def linearisation(
     jumps = respond([s.stiffness for s in springs], added)
     return {
         c.name: _worst([_relative(c, part, traction, s.change(jump)) for part in mine])
-        for c, mine, s, traction, jump in zip(contacts, parts, springs, added, jumps, strict=True)
+        for c, mine, s, traction, jump in zip(
+            contacts, looked_at, springs, added, jumps, strict=True
+        )
     }
 
 
@@ -277,14 +280,13 @@ class _Part:
     idle: bool
 
 
-def _parts(contact: Contact, group: Index, round_off: Array) -> list[_Part]:
+def _parts(contact: Contact, masks: Mapping[int, Mask], round_off: Array) -> list[_Part]:
     """The parts of a contact, the same on all ranks. Collective."""
-    comm, n = contact.surface.mesh.comm, len(round_off)
     force = contact.measure * np.linalg.norm(contact.traction, axis=1)
-    count, borne = global_sum(
-        comm, [np.bincount(group, minlength=n), np.bincount(group, force, minlength=n)]
-    )
-    return [_Part(group == g, bool(borne[g] <= round_off[g])) for g in np.flatnonzero(count)]
+    own = np.array([force @ points for points in masks.values()])
+    borne = global_sum(contact.surface.mesh.comm, own)
+    idle = borne <= round_off[list(masks)]
+    return [_Part(points, bool(none)) for points, none in zip(masks.values(), idle, strict=True)]
 
 
 def _matters(contact: Contact, deviation: Deviation, part: _Part, modulus: float) -> bool:

@@ -64,15 +64,12 @@ class FirstTouch:
         for contact in {id(part.contact): part.contact for part in parts}.values():
             contact.evaluate()
         ways = [part.contact.opposite.committed_offset(part.contact.values) for part in parts]
-        paths = [
-            _Path(full, part, way)
-            for part, way in zip(parts, ways, strict=True)
-            if self._is_apart(part, way)
-        ]
+        apart = [given for given in zip(parts, ways, strict=True) if self._is_apart(*given)]
         full.set_state(present)
-        end = end_without(_without([path.part for path in paths]), start) if paths else None
+        end = end_without(_without([part for part, _ in apart]), start) if apart else None
         if end is not None:
-            shares = np.array([path.first_touch(start, end) for path in paths])
+            paths = [_Path(full, *given, start, end) for given in apart]
+            shares = np.array([path.first_touch() for path in paths])
             groups = np.array([path.part.group for path in paths])
             for path, group in zip(paths, groups, strict=True):
                 share = shares[groups == group].min()
@@ -86,13 +83,12 @@ class FirstTouch:
 
     def _parts(self) -> list[_Part]:
         """The contacts with friction, each divided by groups of coupled bodies. Collective."""
-        scales, comm, found = self._full.scales, self._full.unknowns.comm, []
-        for number, contact in enumerate(self._full.contacts):
-            if contact.law.has_friction:
-                group = scales.group_of_points(number)
-                every = {n for each in comm.allgather(np.unique(group).tolist()) for n in each}
-                found += [_Part(contact, group == n, n) for n in sorted(every)]
-        return found
+        return [
+            _Part(contact, points, group)
+            for number, contact in enumerate(self._full.contacts)
+            if contact.law.has_friction
+            for group, points in self._full.scales.parts_of(number).items()
+        ]
 
     def _is_idle(self, part: _Part) -> bool:
         """Whether it bore nothing at the last commit. Collective."""
@@ -156,30 +152,26 @@ class _Path:
         part: The part.
     """
 
-    def __init__(self, full: FullSystem, part: _Part, way: Array) -> None:
-        """Take what moves.
+    def __init__(self, full: FullSystem, part: _Part, way: Array, start: Array, end: Array) -> None:
+        """Take both ends.
 
         Args:
             full: The system on all unknowns.
             part: The part.
             way: Displacement of its obstacle in the increment, (n_points, gdim) (length).
+            start: The state in which the increment starts.
+            end: The state in which it would end.
         """
         self._full, self.part, self._way = full, part, way
-        self._start = self._end = full.state()
+        self._start, self._end = start, end
 
     def gap(self, share: float) -> Array:
         """Gaps at a share of the increment, evaluated there, (n_points,) (length). Collective."""
         self._full.set_state(self._start + share * (self._end - self._start))
         return _gap(self.part, (1.0 - share) * self._way)
 
-    def first_touch(self, start: Array, end: Array) -> float:
-        """Share of the increment at which the least gap closes, 1 where none does. Collective.
-
-        Args:
-            start: The state in which the increment starts.
-            end: The state in which it would end.
-        """
-        self._start, self._end = start, end
+    def first_touch(self) -> float:
+        """Share of the increment at which the least gap closes, 1 where none does. Collective."""
         comm = self._full.unknowns.comm
         low, high = 0.0, 1.0
         at_low, at_high = self.gap(low), self.gap(high)

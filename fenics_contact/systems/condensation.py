@@ -134,6 +134,7 @@ class Condensation:
             rest -= shares[-1][self._label] * direction
         responses = [response for _, response in self.directions]
         remainders = self._norms(rest)
+        # Well below the round-off of K u that is excused: what is left out is found nowhere else.
         new = remainders > 0.01 * ROUND_OFF * sizes
         if new.any():
             known = bool(np.isfinite(remainders).all())

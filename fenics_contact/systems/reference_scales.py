@@ -222,6 +222,15 @@ class ReferenceScales:
         """Groups of the bodies with this rank's points of a contact, by its number, (n_points,)."""
         return np.asarray(self.group[self._own[number]])
 
+    def parts_of(self, number: int) -> dict[int, Mask]:
+        """Masks of this rank's points of a contact, (n_points,), by the group they are on.
+
+        Collective; all ranks have the same groups, in the same order.
+        """
+        group = self.group_of_points(number)
+        every = {n for each in self._comm.allgather(np.unique(group).tolist()) for n in each}
+        return {n: group == n for n in sorted(every)}
+
     def modulus(self, number: int) -> float:
         """Stiffness of the bodies that a contact touches, by the size of their cells (stress)."""
         d, mine = self.centre.shape[1], self.touching[number]
