@@ -54,6 +54,8 @@ logger = logging.getLogger("fenics_contact")
 
 # Outcome of an attempt that retained too few unknowns.
 _SPREADS = "contact spreads beyond the retained dofs"
+# Outcome of one whose points have slid from their pairs, and how often these are found anew.
+_SLID, _PAIRINGS = "solved, then again between the pairs where it ended", 3
 
 
 class ContactProblem:
@@ -391,6 +393,9 @@ class ContactProblem:
             self._complete_all()  # what it takes is about to go
         self.solver.equations.factorisations = 0
         start_unknowns, diagonal = self.full.state(), self.full.diagonal.copy()
+        for contact in self.contacts if self._trial is not None else ():
+            if contact.opposite.committed_jump is not contact.state.opposite.jump:
+                contact.restore()  # the trial has other pairs than the committed state
         try:
             # A trial of a line search may overflow, and the convergence test and the verdict see
             # it: a warning, on the rank that has the point, must not become an error there alone.
@@ -449,13 +454,44 @@ class ContactProblem:
         for contact, trial in zip(self.contacts, trials, strict=True):
             contact.restore(trial)
 
-    def _solve(self, start: float, field: bool, tried: list[Attempt]) -> Step | None:
+    def _pair_at_end(self, behind: Sequence[Contact], start: Array) -> Array:
+        """Let the increment begin anew, between the pairs where it has ended. Collective.
+
+        Forces act on the opposing body where the points are at the end of the increment.
+
+        Args:
+            behind: Contacts whose pairs are found anew.
+            start: The unknowns that it starts from.
+
+        Returns:
+            Those with which it has ended.
+        """
+        end = self.full.state()
+        if self.state.interior is not None:  # u where other points come to is part of it
+            trial, self._trial = self._trial, None
+            self._go_back(self.state.unknowns)
+            self.complete()
+            self._trial = trial
+            self.full.set_state(end)
+        for contact in behind:
+            contact.evaluate()
+            contact.pair_at_end()
+        self.full.set_state(self.state.unknowns)
+        for contact in behind:
+            contact.count_from_start()
+        self.full.set_state(start)
+        return end
+
+    def _solve(
+        self, start: float, field: bool, tried: list[Attempt], ended: Array | None = None
+    ) -> Step | None:
         """`solve`; None if it takes other unknowns than are kept. Collective.
 
         Args:
             start: When it began.
             field: Whether to recover the interior, see `solve`.
             tried: What was tried before; what is tried here is added.
+            ended: Where the increment ended between other pairs.
         """
         solver = self.solver
         load = self._check_before()
@@ -479,6 +515,8 @@ class ContactProblem:
         solver.starts.carried = self._approach.carried
         if self._first_touch.end is not None:
             solver.starts.carried = self._first_touch.end
+        if ended is not None:
+            solver.starts.carried = ended
         with solver.system.acting():
             reason, attempts, rounds = solver.solve(
                 cold=cold,
@@ -496,6 +534,19 @@ class ContactProblem:
             tried += [*attempts[:-1], replace(attempts[-1], outcome=_SPREADS)]
             return None
         tried += attempts
+
+        def between_new_pairs(behind: Sequence[Contact]) -> Step | None:
+            tried[-1] = replace(tried[-1], outcome=_SLID)
+            if lags:
+                solver.system.complete(interior)
+            return self._solve(start, field, tried, self._pair_at_end(behind, before))
+
+        may_pair = [contact for contact in self.contacts if contact.opposite.may_pair_anew]
+        again = sum(attempt.outcome == _SLID for attempt in tried)
+        if reason <= 0 or again == _PAIRINGS or self.small_displacement_tolerance == np.inf:
+            may_pair = []
+        if behind := [c for c in may_pair if c.opposite.pairs_left(c.values)]:
+            return between_new_pairs(behind)
         kinematics = reason > 0  # a solver that failed may have no factors for it
         if lags:
             self._begin_condensed_energy()
@@ -503,9 +554,12 @@ class ContactProblem:
         else:
             assemble = field or not solver.system.confined
             verdict, energies = self._judge_all(kinematics=kinematics, assemble=assemble)
+        if behind := [contact for contact in may_pair if contact.name in verdict.displaced]:
+            return between_new_pairs(behind)
         if reason <= 0 or verdict.failures:
             raise self._not_converged(reason, verdict, tried)
-        energy = energies.since(self.state.energy, self.contacts, self.full.scales)
+        began = self.state.energy.between([c.opposite.committed_jump for c in self.contacts])
+        energy = energies.since(began, self.contacts, self.full.scales)
         verdict = replace(verdict, friction_energy_gain=energy.friction_energy_gain)
         if verdict.failures:
             raise self._not_converged(reason, verdict, tried)

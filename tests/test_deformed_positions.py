@@ -531,12 +531,13 @@ def test_a_body_does_not_enter_another_from_aside(kinematics, way):
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 def test_what_slides_off_the_other_body_does_not_bear(enforcement):
-    """Half off its plate in one increment, small displacements: refused.
+    """Half off its plate, small displacements: the force of finite kinematics in one increment.
 
-    In steps of a tenth the force is that of finite kinematics, 10 %: each is of its own pairs.
+    As in ten, for it acts between the pairs where an increment ends: 1 % for the displacements,
+    3 % of its thickness, and for multipliers 2 % more, their tolerance.
     """
     forces = []
-    for kinematics, steps in (("small", 1), ("small", 10), ("finite", 10)):
+    for kinematics, steps in (("finite", 10), ("small", 1), ("small", 10)):
         axes = [
             [np.linspace(0.0, 2.0, 17), np.linspace(0.0, 0.5, 5)],
             [np.linspace(1.0, 2.0, 9), 0.5 + np.linspace(0.0, 0.5, 5)],
@@ -558,15 +559,12 @@ def test_what_slides_off_the_other_body_does_not_bear(enforcement):
         problem = body.problem(contact)
         problem.solve()
         problem.commit()
-        if steps == 1:
-            along.value = 0.5
-            fails(problem, "too large for the small-displacement")
-            continue
         for along.value in np.linspace(0.0, 0.5, steps + 1)[1:]:
             problem.solve()
             problem.commit()
         forces.append(contact.resultants().normal_force)
-    assert forces[0] == pytest.approx(forces[1], rel=0.1)
+    bound = 0.01 if enforcement == "penalty" else 0.03
+    assert forces[1:] == pytest.approx([forces[0]] * 2, rel=bound)
 
 
 def test_the_end_face_of_a_slab_is_not_taken_for_deep():

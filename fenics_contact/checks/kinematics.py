@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fenics_contact.contact.body import NEGLIGIBLE_SLIDE, SLIDES
 from fenics_contact.contact.choices import is_regularised
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
@@ -24,9 +25,9 @@ __all__ = ["Deviation", "LinearSprings", "Linearisation", "linearisation"]
 
 # Share of the largest pressure, or of the force, below which what is left out needs no solve.
 _NEGLIGIBLE = 1e-3
-# Slide, as a share of the smallest facet, and difference of the displacements on Γc, as a share of
-# its size, below which pairs in the deformed bodies are those of before.
-_SLID, _TURNED = 1e-2, 1e-3
+# Difference of the displacements on Γc, as a share of its size, below which pairs in the deformed
+# bodies are those of before.
+_TURNED = 1e-3
 # Share by which small displacements may change forces or pressures before it is said.
 _NOTABLE = 0.01
 
@@ -91,11 +92,14 @@ class Linearisation:
         force: Error of the contact force, the magnitude of its change.
         pressure: Error of the pressure, in the L² norm over Γc.
         rough: Whether the estimate of the pressure is inaccurate, as between two meshes.
+        slid: How far points that bear have slid on another body from where their forces act, in
+            sizes of their facets.
     """
 
     force: float = 0.0
     pressure: float = 0.0
     rough: bool = False
+    slid: float = 0.0
 
     @property
     def worst(self) -> float:
@@ -107,6 +111,10 @@ class Linearisation:
     def is_notable(self) -> bool:
         """Whether the error of force or pressure exceeds 1 %."""
         return self.worst > _NOTABLE
+
+    def exceeds(self, tolerance: float) -> bool:
+        """Whether the error does, or forces act more than a facet from where they should."""
+        return not self.judged <= tolerance or (tolerance < np.inf and not self.slid <= SLIDES)
 
     def describe(self) -> str:
         """Return the errors in words."""
@@ -158,7 +166,9 @@ class Deviation:
         told = np.isfinite(normal).all(axis=1)
         turn = np.where((told & closed)[:, None], normal - values.normal, 0.0)
         # At the very end of the opposite surface points keep their pairs while they do not slide.
-        slid = np.linalg.norm(values.slide, axis=1) > _SLID * contact.quadrature.facet_sizes
+        slid = (
+            np.linalg.norm(values.slide, axis=1) > NEGLIGIBLE_SLIDE * contact.quadrature.facet_sizes
+        )
         lost = told & closed & slid & np.isnan(change)
         if contact.gap_prescribed:  # pairs keep theirs, and of others none is known
             return cls(zero, turn, normal, lost, nothing)
@@ -223,7 +233,7 @@ def _moves(contact: Contact) -> bool:
     sums = global_sum(comm, np.stack([x.sum(axis=0), u.sum(axis=0), np.full(d, len(x))]))
     middle, mean = sums[:2] / np.maximum(sums[2], 1.0)
     turned = longest(comm, u - mean) / max(longest(comm, x - middle), 1e-300)
-    return not (slid <= _SLID * smallest and turned <= _TURNED)
+    return not (slid <= NEGLIGIBLE_SLIDE * smallest and turned <= _TURNED)
 
 
 def linearisation(
@@ -253,16 +263,17 @@ def linearisation(
         [part for part in _parts(c, masks, round_off) if _matters(c, deviation, part, modulus)]
         for c, deviation, masks, modulus in zip(contacts, deviations, parts, moduli, strict=True)
     ]
+    slid = [c.opposite.slid(c.values) for c in contacts]
     if not any(looked_at):
-        return {c.name: Linearisation() for c in contacts}
+        return {c.name: Linearisation(slid=far) for c, far in zip(contacts, slid, strict=True)}
     pairs = list(zip(deviations, contacts, strict=True))
     springs = [d.springs(c) for d, c in pairs]
     added = [d.added(c, s) for (d, c), s in zip(pairs, springs, strict=True)]
     jumps = respond([s.stiffness for s in springs], added)
     return {
-        c.name: _worst([_relative(c, part, traction, s.change(jump)) for part in mine])
-        for c, mine, s, traction, jump in zip(
-            contacts, looked_at, springs, added, jumps, strict=True
+        c.name: _worst([_relative(c, part, traction, s.change(jump)) for part in mine], far)
+        for c, mine, s, traction, jump, far in zip(
+            contacts, looked_at, springs, added, jumps, slid, strict=True
         )
     }
 
@@ -329,8 +340,8 @@ def _relative(contact: Contact, part: _Part, added: Array, answered: Array) -> L
     return Linearisation(force, float(changed / whole) if whole else 0.0, not contact.rigid)
 
 
-def _worst(found: Sequence[Linearisation]) -> Linearisation:
+def _worst(found: Sequence[Linearisation], slid: float) -> Linearisation:
     """The largest errors of all; one that is not a number wins."""
     force = np.max([each.force for each in found], initial=0.0)
     pressure = np.max([each.pressure for each in found], initial=0.0)
-    return Linearisation(float(force), float(pressure), any(each.rough for each in found))
+    return Linearisation(float(force), float(pressure), any(each.rough for each in found), slid)

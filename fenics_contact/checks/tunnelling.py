@@ -816,18 +816,15 @@ class OpposingBodyProbe:
         edges = np.sqrt(self.x.shape[1] - 1)  # lengths are those of diagonals in space
         size, other = here.side.length[on] / edges, there.side.length[opposite] / edges
         slack = self._search.faceting(here.side)[on] + self._search.faceting(there.side)[opposite]
-        distance = np.concatenate([hits.distance, back.distance])
-        met = ~np.isnan(distance)
+        met = ~np.isnan(np.concatenate([hits.distance, back.distance]))
         # A place opposite stands for the one of Γc that its normal meets.
         foot = there.place + np.nan_to_num(back.distance)[:, None] * there.normal
         planes = _below(np.concatenate([here.place, foot]), *(p[on] for p in self._planes))
         planes[on < 0] = -np.inf
         smaller = np.where(met, np.minimum(size, other), np.where(on >= 0, size, other))
         allowed = _allowed(deep, planes, size, smaller) + np.where(met, slack, 0.0)
-        # A ray that grazes what it meets is longer than the place is deep below that.
-        pairs = (hits, here), (back, there)
-        steepness = np.concatenate([abs(_dot(_normals(h), s.normal)) for h, s in pairs])
-        return np.where(met, -distance * steepness, 0.0), allowed
+        depth = np.concatenate([_depth(hits, here), _depth(back, there)])
+        return np.where(met, depth, 0.0), allowed
 
     def _tangent_planes(self, resisted: Array) -> tuple[Array, Array]:
         """Those of the opposite surface, of the facets of all ranks. Collective.
@@ -851,8 +848,8 @@ class OpposingBodyProbe:
     def crossed(self, allowed: Array) -> Array:
         """See `Probe`.
 
-        A place has crossed if it came in through a facet and is deeper below it than is allowed at
-        the end, or has left the body through its opposite side.
+        A place has crossed if it came in through a facet and is deeper than is allowed at the end,
+        or has left the body through its opposite side.
         """
         if self._before is None:
             return self.x[:0]
@@ -860,8 +857,11 @@ class OpposingBodyProbe:
         # What both surfaces have in common of their motion crosses nothing.
         shift = global_mean(self._comm, here.place - here.at(self._before))
         found = [
-            one.crossed(self._before, shift, other, allowed[part])
-            for one, other, part in ((here, there, slice(n)), (there, here, slice(n, None)))
+            one.crossed(self._before, shift, other, allowed[part], _depth(hits, one))
+            for one, other, part, hits in (
+                (here, there, slice(n), self._hits),
+                (there, here, slice(n, None), self._back),
+            )
         ]
         return self.x[np.concatenate(found)]
 
@@ -924,8 +924,20 @@ class _Side:
         start, end = facets.moved_corners(before) + shift, facets.moved_corners(self._u)
         return MovingFacets(start, end, facets.outward, side.vertices[side.own])
 
-    def crossed(self, before: fem.Function, shift: Array, other: _Side, allowed: Array) -> Mask:
-        """Which places have crossed the other surface, (n,). Collective."""
+    def crossed(
+        self, before: fem.Function, shift: Array, other: _Side, allowed: Array, depth: Array
+    ) -> Mask:
+        """Which places have crossed the other surface, (n,). Collective.
+
+        Args:
+            before: Displacement at the last commit.
+            shift: What both surfaces have in common of their motion, (gdim,) (length).
+            other: The places of the other surface.
+            allowed: Penetration that is allowed, (n,) (length).
+            depth: Below what their normals meet, (n,) (length): of those that are behind it. For
+                others it is that below the facet through which they came in, which one that slides
+                on along a curved surface leaves behind.
+        """
         vertices = self.side.vertices[self.number]
         start = self.at(before) + shift
         facets = other.moving(before, shift)
@@ -939,8 +951,17 @@ class _Side:
         # Of a place that was inside from the start, through the side that its own normal met.
         entry = np.where(met.inward[first][:, None], met.normal[first], -self.normal[place])
         through = leaves & (_dot(entry, met.normal[last]) < _OPPOSITE_SIDES)
-        found[place] = through | (~leaves & (met.depth[last] > allowed[place]))
+        deep = np.where(depth[place] >= 0, depth[place], met.depth[last])
+        found[place] = through | (~leaves & (deep > allowed[place]))
         return found
+
+
+def _depth(hits: Hits, side: _Side) -> Array:
+    """How deep places are below what their normals meet, (n,) (length); NaN where they meet none.
+
+    A ray that grazes what it meets is longer than the place is deep below that.
+    """
+    return -hits.distance * abs(_dot(_normals(hits), side.normal))
 
 
 def _normals(hits: Hits) -> Array:

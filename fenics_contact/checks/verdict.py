@@ -9,6 +9,7 @@ import numpy as np
 from fenics_contact.checks.kinematics import Linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.tunnelling import Tunnelling
+from fenics_contact.contact.body import SLIDES
 from fenics_contact.contact.contact import Contact
 from fenics_contact.markup import shown
 from fenics_contact.parallel import global_max, global_min, longest
@@ -204,6 +205,12 @@ class Verdict:
         return bool(self.failures) and not replace(self, laws={}).failures
 
     @property
+    def displaced(self) -> list[str]:
+        """Contacts whose small-displacement error is above the tolerance."""
+        tolerance = self.small_displacement_tolerance
+        return [c for c, error in self.small_displacement_error.items() if error.exceeds(tolerance)]
+
+    @property
     def failures(self) -> list[str]:
         """The conditions that are violated, in words; empty for a verified solution."""
         found = []
@@ -264,6 +271,13 @@ class Verdict:
                     "move the obstacle instead of the body, update the pairs "
                     '(update_pairs="increment"), use Contact(kinematics="finite"), or accept the '
                     "error: ContactProblem(small_displacement_tolerance=inf)"
+                )
+            if self.small_displacement_tolerance < np.inf and change.slid > SLIDES:
+                found.append(
+                    f"{contact}: points have slid by {change.slid:.2g} facets from the places of "
+                    "the opposing body that their forces act at. Use smaller increments, "
+                    'update_pairs="auto" or Contact(kinematics="finite"), or accept the error: '
+                    "ContactProblem(small_displacement_tolerance=inf)"
                 )
         for name, deformation in self.deformation.items():
             if self.small_displacement_tolerance == np.inf or not deformation > _MOST_DEFORMED:

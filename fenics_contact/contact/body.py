@@ -18,15 +18,17 @@ from fenics_contact.contact.values import PointValues
 from fenics_contact.obstacles.base import Placement
 from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import global_max
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Mask
 
-__all__ = ["BodyOpposite", "FollowedOpposite"]
+__all__ = ["NEGLIGIBLE_SLIDE", "SLIDES", "BodyOpposite", "FollowedOpposite"]
 
 logger = logging.getLogger("fenics_contact")
 
 # Way along the opposite, in sizes of the point's facet, from which on pairs are found anew. In
 # partial slip of fine meshes ways are half of a facet, and nothing is gained by other pairs.
-_SLIDES = 1.0
+SLIDES = 1.0
+# Below which pairs where the points are now are those of before.
+NEGLIGIBLE_SLIDE = 1e-2
 
 
 class BodyOpposite(Opposite):
@@ -48,7 +50,7 @@ class BodyOpposite(Opposite):
 
     def told(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """See `Opposite`."""
-        since = 0.0 if self.pairs.found_at is None else self.committed_jump
+        since = 0.0 if self.pairs.found_jump is None else self.pairs.found_jump
         slide, normal = arrays["jump"] - since, arrays["normal"]
         slide = slide - np.sum(slide * normal, axis=1)[:, None] * normal
         return self._told_of_pairs(arrays) | {"slide": slide}
@@ -90,16 +92,27 @@ class BodyOpposite(Opposite):
         if self.pairs_anew or self._update != "auto":
             return self.pairs_anew
         comm, paired = self._mesh.comm, self.pairs.paired
-        slide = values.arrays["slide"]
+        if comm.allreduce(int(np.any(paired & (values.normal_traction < 0)))):
+            return self.slid(values) > SLIDES
         # Of open points, to whom pairs are nothing yet, only where a body was carried elsewhere;
         # where there are no pairs at all it may come to some.
-        counted = paired & (values.normal_traction < 0)
-        if not comm.allreduce(int(np.any(counted))):
-            counted = paired
-        if not comm.allreduce(int(np.any(counted))):
-            slide, counted = self.pairs.own_displacement(), ~paired
-        ways = np.linalg.norm(slide, axis=1) / self._parts.quadrature.facet_sizes
-        return global_max(comm, ways[counted]) > _SLIDES
+        if comm.allreduce(int(np.any(paired))):
+            return self._farthest(values.slide, paired) > SLIDES
+        return self._farthest(self.pairs.own_displacement(), ~paired) > SLIDES
+
+    def pairs_left(self, values: PointValues) -> bool:
+        """See `Opposite`."""
+        least = NEGLIGIBLE_SLIDE if self.pairs_anew else SLIDES
+        return self.may_pair_anew and self.slid(values) > least
+
+    def slid(self, values: PointValues) -> float:
+        """See `Opposite`."""
+        return self._farthest(values.slide, self.pairs.paired & (values.normal_traction < 0))
+
+    def _farthest(self, ways: Array, points: Mask) -> float:
+        """The longest of the ways of some points, in sizes of their facets. Collective."""
+        lengths = np.linalg.norm(ways, axis=1) / self._parts.quadrature.facet_sizes
+        return global_max(self._mesh.comm, lengths[points])
 
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
         """See `Opposite`."""
@@ -128,8 +141,7 @@ class BodyOpposite(Opposite):
             )
         # The traction stays with the points of Γc; what they slip over has moved on.
         self.find_pairs(self._parts.displacement.u, values.depth)
-        self.committed_jump = self.present_jump()
-        return self.committed_jump - values.jump
+        return self.count_between_pairs()
 
 
 class FollowedOpposite(BodyOpposite):
@@ -159,6 +171,10 @@ class FollowedOpposite(BodyOpposite):
     def told(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """See `Opposite`."""
         return self._told_of_pairs(arrays)
+
+    def slid(self, values: PointValues) -> float:
+        """See `Opposite`."""
+        return 0.0
 
     def tangent(self, law: PointLaw) -> PointTangent:
         """See `Opposite`."""

@@ -60,11 +60,13 @@ class ContactTrial:
         history: The fields that become history, by name.
         reference: The history that the increment started from, with the slip reference of bodies
             that were positioned: `PointFields.rows`.
+        opposite: The committed place of the obstacle between the pairs of this state, and these.
     """
 
     points: PointValues
     history: Mapping[str, Array]
     reference: Array
+    opposite: OppositeState
 
 
 class Contact(PointResults):
@@ -474,6 +476,28 @@ class Contact(PointResults):
         self.opposite.find_pairs(u, none if u is None else self._evaluate().depth)
         self.forget()
 
+    def pair_at_end(self) -> None:
+        """Find the pairs of an increment that begins anew where the bodies are now. Collective.
+
+        `count_from_start` counts it between these, `restore` puts the committed ones back.
+        Multipliers stay as they are: they are near to those of the solution.
+        """
+        depth = self.values.depth
+        self.history.set_rows(self.state.history)
+        self.opposite.set_state(self.state.opposite)
+        self.opposite.find_pairs(self.displacement.u, depth)
+
+    def count_from_start(self) -> None:
+        """Count the increment from the present ``u``, the committed one, between pairs found anew.
+
+        Collective.
+        """
+        moved = self.opposite.count_between_pairs()
+        if self.law.has_friction:
+            kept = {name: self.history.values(name) for name in self.history.names}
+            self.history.assign(kept | {"jump": kept["jump"] + moved})
+        self.forget()
+
     def own_displacement(self) -> Array:
         """Return the displacement of the body that has Γc, (n_points, gdim) (length). Collective.
 
@@ -548,7 +572,8 @@ class Contact(PointResults):
         self.history.set_rows(self.state.history if trial is None else trial.reference)
         if self.multipliers is not None:
             self.multipliers.restore(self.history)
-        self._values = self.state.points if trial is None else trial.points
+        self.opposite.set_state((trial or self.state).opposite)
+        self._values = (trial or self.state).points
 
     def enforcement_error(self) -> float:
         """Return the traction that is left to the penalty, relative to the largest. Collective.
@@ -622,7 +647,8 @@ class Contact(PointResults):
             }
         if self.multipliers is not None:
             values |= self.multipliers.committed(points)
-        return ContactTrial(points, self.opposite.committed_fields(values), self.history.rows())
+        history = self.opposite.committed_fields(values)
+        return ContactTrial(points, history, self.history.rows(), self.opposite.state())
 
     def set_down(self, moved: Mask) -> None:
         """Measure slip from the state evaluated last at points that were unloaded. Collective.
@@ -689,7 +715,6 @@ class Contact(PointResults):
 
     def set_state(self, state: ContactState) -> None:
         """Make a state the committed one, and the present one. Collective."""
-        self.opposite.set_state(state.opposite)
         self.state = state
         self.restore()
 
@@ -707,7 +732,7 @@ class Contact(PointResults):
         self.set_state(ContactState(history, self.opposite.state()))
 
         def present() -> PointValues:
-            self.restore()
+            self.forget()
             return self.values
 
         unknown = np.zeros(self.quadrature.n_points)

@@ -506,6 +506,17 @@ class Opposite(ABC):
         """Whether pairs are, or may come to be, other ones than those of the undeformed bodies."""
         return False
 
+    def slid(self, values: PointValues) -> float:
+        """How far points that bear have slid from the places that their forces act at. Collective.
+
+        Args:
+            values: Of the last evaluation.
+
+        Returns:
+            The farthest, in sizes of its facet; 0 where forces act where the points are.
+        """
+        return 0.0
+
     def pairs_due(self, values: PointValues) -> bool:
         """Whether `commit` will find pairs anew, for which it needs all of ``u``. Collective.
 
@@ -523,6 +534,14 @@ class Opposite(ABC):
     def local_map(self) -> PETSc.Mat | None:
         """See the class."""
         return None
+
+    def pairs_left(self, values: PointValues) -> bool:
+        """Whether points that bear have left pairs that may be found where they are. Collective.
+
+        Args:
+            values: Of a solution.
+        """
+        return False
 
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
         """Find what lies opposite the points; see `Contact.pair`. Collective.
@@ -575,6 +594,17 @@ class Opposite(ABC):
         self.committed_angle = self.angle(values)
         if self.sampler is not None:
             self.sampler.committed_shape = self.sampler.shape
+
+    def count_between_pairs(self) -> Array:
+        """Let ways be counted between pairs that were found anew; ``u`` is the committed one.
+
+        Collective.
+
+        Returns:
+            By how much the jump is another, (n_points, gdim) (length).
+        """
+        before, self.committed_jump = self.committed_jump, self.present_jump()
+        return self.committed_jump - before
 
     def resume(self, depth: Array, evaluate: Callable[[], PointValues], *, anew: bool) -> None:
         """Take the present ``u`` for the committed one, of another run. Collective.

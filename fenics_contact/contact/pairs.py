@@ -29,6 +29,7 @@ class PairsState:
     n_unpaired: int
     distance: Array
     found_at: fem.Function | None
+    found_jump: Array | None
 
 
 class Pairs:
@@ -46,6 +47,7 @@ class Pairs:
         acts: 1 at points with an opposite, 0 at others, likewise.
         search: The surface opposite, to search; likewise.
         found_at: Displacement in which the present pairs were found; None: the undeformed bodies.
+        found_jump: The jump then, (n_points, gdim) (length); likewise.
     """
 
     def __init__(
@@ -63,6 +65,7 @@ class Pairs:
         self.distance: fem.Function | None = None
         self.acts: fem.Function | None = None
         self.found_at: fem.Function | None = None
+        self.found_jump: Array | None = None
         if isinstance(obstacle, DeformableBody):
             self.search = Pairing(obstacle, quadrature, u.function_space)
             self.distance = fem.Function(quadrature.space(), name="distance")
@@ -79,11 +82,13 @@ class Pairs:
         """
         assert self.search and self.distance and self.acts
         opposite, distance, why = self.search.pair(x, normal, u, depth)
-        self.found_at = None if u is None else u.copy()
         self.distance.x.array[: len(distance)] = np.nan_to_num(distance)
         self.distance.x.scatter_forward()
         self._set_pairs(opposite, ~np.isnan(distance))
-        self._warn_of_unpaired(why)
+        self.found_at = None if u is None else u.copy()
+        self.found_jump = None if u is None else self._product(self.jump_map, u)
+        if self.number == 1:  # of bodies that slide off each other more and more have none
+            self._warn_of_unpaired(why)
 
     def _set_pairs(self, opposite: PETSc.Mat, paired: Mask) -> None:
         """Take the map to what is opposite (used up), and which points have it. Collective."""
@@ -119,7 +124,9 @@ class Pairs:
     def state(self) -> PairsState:
         """The pairs as they are; what is found later does not change it."""
         distance = np.zeros(0) if self.distance is None else self.distance.x.array.copy()
-        return PairsState(self.jump_map, self.paired, self.n_unpaired, distance, self.found_at)
+        return PairsState(
+            self.jump_map, self.paired, self.n_unpaired, distance, self.found_at, self.found_jump
+        )
 
     def set_state(self, state: PairsState) -> None:
         """Put back what `state` gave. Collective."""
@@ -127,7 +134,8 @@ class Pairs:
             return
         assert self.distance and self.acts
         self.jump_map, self.paired = state.jump_map, state.paired
-        self.n_unpaired, self.found_at = state.n_unpaired, state.found_at
+        self.n_unpaired = state.n_unpaired
+        self.found_at, self.found_jump = state.found_at, state.found_jump
         self.number += 1  # what was made of the pairs in between is of others
         self.distance.x.array[:] = state.distance
         self.acts.x.array[: self._quadrature.n_points] = self.paired
@@ -149,9 +157,13 @@ class Pairs:
 
     def own_displacement(self) -> Array:
         """Of the body that has Γc, at the points, (n_points, gdim) (length). Collective."""
-        product = self.own_map.createVecLeft()
-        self.own_map.mult(self._u.x.petsc_vec, product)
-        values = product.array_r.reshape(-1, self._gdim).copy()
+        return self._product(self.own_map, self._u)
+
+    def _product(self, matrix: PETSc.Mat, u: fem.Function) -> Array:
+        """A map to the points times a displacement, (n_points, gdim) (length). Collective."""
+        product = matrix.createVecLeft()
+        matrix.mult(u.x.petsc_vec, product)
+        values: Array = product.array_r.reshape(-1, self._gdim).copy()
         product.destroy()
         return values
 

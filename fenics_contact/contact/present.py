@@ -237,7 +237,7 @@ class PresentPairs(Pairs):
     def state(self) -> PairsState:
         """See `Pairs.state`: all follows from the committed displacement."""
         return PairsState(
-            self.jump_map, self.paired, self.n_unpaired, np.zeros(0), self._before.copy()
+            self.jump_map, self.paired, self.n_unpaired, np.zeros(0), self._before.copy(), None
         )
 
     def set_state(self, state: PairsState) -> None:

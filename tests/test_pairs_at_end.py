@@ -1,0 +1,264 @@
+"""Two bodies at small displacements: forces act between the points opposite at an increment's end.
+
+A block is moved along a body, in one increment or in many. The references are statics, and the same
+block meshed where it ends.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import fenics_contact as fc
+from scenes.beside import BUSY, Beside, Box
+from scenes.blocks import BOTTOM, LEFT, TOP
+from scenes.comparing import assemble_number, close, compiled, raised_everywhere
+from scenes.elasticity import strain
+
+pytestmark = [pytest.mark.two_ranks, pytest.mark.three_ranks, pytest.mark.timeout(300)]
+COMM = MPI.COMM_WORLD
+LOAD = 0.02
+WIDTH, HEIGHT = 0.5, 1.0
+
+
+class Led:
+    """A block that is led along a body below, and what is looked at of it.
+
+    Attributes:
+        scene, along, contact, problem: As made.
+    """
+
+    def __init__(self, scene, along, contact, **options):
+        self.scene, self.along, self.contact = scene, along, contact
+        self.problem = scene.problem(contact, **options)
+
+    def press(self):
+        """The first increment."""
+        self.scene.keep_busy(0.5)
+        self.problem.solve()
+        self.problem.commit()
+        return self
+
+    def lead(self, way, steps=1):
+        """Move it on, in equal increments."""
+        self.scene.keep_busy(1.0)
+        return list(fc.increments(self.problem, self.along, 0.0, way, steps=steps))
+
+    @property
+    def force(self):
+        """Normal contact force."""
+        return self.contact.resultants().normal_force
+
+
+def on_cantilever(start, law=None, busy=(), **options):
+    """A block on a cantilever 10 long, pressed by a force."""
+    boxes = {
+        "beam": Box((0.0, 0.0), (10.0, HEIGHT), (80, 4)),
+        "block": Box((start, HEIGHT), (WIDTH, 0.5), (6, 6)),
+    }
+    scene = Beside(boxes, busy, E=1e5)
+    along = scene.bodies.constant(0.0)
+    scene.hold("beam", LEFT, 0, 1)
+    scene.hold("block", TOP, 0, value=along)
+    scene.load("block", TOP, 1, -LOAD)
+    law = fc.Frictionless() if law is None else law
+    return Led(scene, along, scene.contact("block", BOTTOM, ("beam", TOP), law, **options))
+
+
+def moment(led):
+    """Moment of the reactions at the clamp about the origin: their work on a small rotation."""
+    bodies, space = led.scene.bodies, led.scene.bodies.u.function_space
+    rotation = fem.Function(space)
+    rotation.interpolate(lambda x: np.array([-x[1], x[0]]))
+    facets = bodies.tags.find(led.scene.tag("beam", LEFT))
+    held = fem.locate_dofs_topological(space, 1, facets)
+    only = fem.Function(space)
+    dofs = (2 * held[:, None] + np.arange(2)).ravel()
+    only.x.array[dofs] = rotation.x.array[dofs]
+    only.x.scatter_forward()
+    return assemble_number(compiled(ufl.replace(bodies.F, {bodies.v: only})), COMM)
+
+
+def on_slab(start, law=None, *, width=3.0, soft=1.0, **options):
+    """A block on a slab, its top pressed down by 0.002; beyond x = 1.5 the slab may be softer."""
+    boxes = {
+        "slab": Box((0.0, 0.0), (width, 0.5), (8 * round(width), 4)),
+        "block": Box((start, 0.5), (1.0, 0.5), (8, 4)),
+    }
+    scene = Beside(boxes, E=1e5)
+    bodies, x = scene.bodies, ufl.SpatialCoordinate(scene.bodies.mesh)
+    modulus = ufl.conditional(ufl.And(ufl.gt(x[0], 1.5), ufl.lt(x[1], 0.5)), soft, 1.0)
+    bodies.F = ufl.inner(modulus * bodies.stress, strain(bodies.v)) * ufl.dx(bodies.mesh)
+    along = bodies.constant(0.0)
+    scene.hold("slab", BOTTOM, 0, 1)
+    scene.hold("block", TOP, 0, value=along)
+    scene.hold("block", TOP, 1, value=-0.002)
+    law = fc.Frictionless() if law is None else law
+    return Led(scene, along, scene.contact("block", BOTTOM, ("slab", TOP), law, **options))
+
+
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+@pytest.mark.parametrize("steps", [1, 7, 40])
+def test_a_load_moves_along_a_cantilever(steps, enforcement):
+    """The moment at the clamp is that of the load where it is, whatever the increments.
+
+    By statics, 1e-4: the pairs are those of a hundredth of a facet at most from the end, which is
+    1.6e-4 of the arm, and of points on both sides of it. It was 15 % of that in one increment.
+    """
+    led = on_cantilever(1.0, enforcement=enforcement).press()
+    assert moment(led) == pytest.approx(LOAD * WIDTH * (1.0 + WIDTH / 2), rel=1e-6)
+    led.lead(7.0, steps)
+    assert led.force == pytest.approx(LOAD * WIDTH, rel=1e-6)
+    assert moment(led) == pytest.approx(LOAD * WIDTH * (8.0 + WIDTH / 2), rel=1e-4)
+
+
+@pytest.mark.parametrize("busy", BUSY)
+def test_beside_a_busy_body(busy):
+    """As alone, to 1e-6."""
+    led = on_cantilever(1.0, fc.Coulomb(0.2)).press()
+    led.lead(7.0)
+    other = on_cantilever(1.0, fc.Coulomb(0.2), busy=[BUSY[busy]]).press()
+    other.lead(7.0)
+    assert moment(other) == pytest.approx(moment(led), rel=1e-6)
+    assert close(other.contact.resultants().force, led.contact.resultants().force, 1e-6)
+
+
+@pytest.mark.parametrize("steps", [1, 10])
+@pytest.mark.parametrize("way", [0.5, 1.125, 1.625])
+def test_from_stiff_to_soft(way, steps):
+    """The slab is a hundredth as stiff beyond x = 1.5: the force of the block meshed at its end.
+
+    Where the nodes of both surfaces meet, so that the meshes of both scenes are the same, 2 %: the
+    normals are undeformed, and the block stands on an edge of stiffness.
+    """
+    led = on_slab(0.25, soft=1e-2).press()
+    led.lead(way, steps)
+    assert led.force == pytest.approx(on_slab(0.25 + way, soft=1e-2).press().force, rel=0.02)
+
+
+@pytest.mark.parametrize("gap", [None, 0.0])
+@pytest.mark.parametrize("steps", [1, 5, 40])
+def test_onto_a_slab(steps, gap):
+    """From an overhang of nine tenths to the middle: the force of the block meshed there, 0.5 %."""
+    options = {} if gap is None else {"gap": gap}
+    led = on_slab(-0.875, **options).press()
+    led.lead(1.25, steps)
+    assert led.force == pytest.approx(on_slab(0.375).press().force, rel=5e-3)
+
+
+def test_what_is_solved_again():
+    """An increment solved twice, or after one that failed, is the one that is solved once."""
+    once = on_slab(0.25, fc.Coulomb(0.3), soft=1e-2).press()
+    once.along.value = 0.5
+    once.problem.solve()
+    once.problem.commit()
+    again = on_slab(0.25, fc.Coulomb(0.3), soft=1e-2).press()
+    again.along.value = 0.9
+    again.problem.solve()
+    again.along.value = 0.5
+    with pytest.warns(UserWarning, match="not committed"):
+        again.problem.solve()
+    state = again.contact.values.jump.copy()
+    number = again.contact.pairs.number
+    again.along.value = 1.0
+    again.problem.small_displacement_tolerance = 0.0
+    raised_everywhere(again.problem.solve, fc.NotConverged)
+    again.problem.small_displacement_tolerance = 0.2
+    assert again.contact.pairs.number > number
+    assert close(again.contact.opposite.present_jump(), state, 1e-12)
+    again.problem.commit()
+    for led in (once, again):
+        led.along.value = 0.75
+        led.problem.solve()
+    assert close(again.contact.resultants().force, once.contact.resultants().force, 1e-8)
+    again.problem.restore()
+    assert close(again.contact.resultants().force, state_of(once), 1e-8)
+
+
+def state_of(led):
+    """Contact force of the committed state."""
+    led.problem.restore()
+    return led.contact.resultants().force
+
+
+@pytest.mark.parametrize("field", ["every", "last"])
+def test_a_history_goes_on(field, tmp_path):
+    """Interrupted between increments that slide by some facets: the same digits, 1e-9."""
+    path = COMM.bcast(tmp_path / "state")
+    whole = on_slab(0.25, fc.Coulomb(0.3), soft=0.1).press()
+    options = {"recover_interior": field}
+    list(fc.increments(whole.problem, whole.along, 0.0, 1.5, steps=3, **options))
+
+    def make():
+        return on_slab(0.25, fc.Coulomb(0.3), soft=0.1)
+
+    def load(led):
+        def to(t):
+            led.along.value = 0.5 * max(t - 1.0, 0.0)
+
+        return to
+
+    first = make()
+    steps = fc.increments(first.problem, load(first), 0.0, 4.0, steps=4, checkpoint=path, **options)
+    for _ in range(3):
+        next(steps)
+    steps.close()
+    again = make()
+    list(fc.increments(again.problem, load(again), 0.0, 4.0, steps=4, checkpoint=path, **options))
+    forces = [led.contact.resultants().force for led in (again, whole)]
+    assert close(*forces, 1e-9)
+
+
+def test_pairs_that_stay_are_refused_once_points_slide_over_facets():
+    """With update_pairs="never" forces stay where they were; said, unless the error is accepted."""
+
+    def make():
+        led = on_cantilever(1.0)
+        obstacle = fc.DeformableBody(
+            led.scene.bodies.tags, led.scene.tag("beam", TOP), update_pairs="never"
+        )
+        contact = led.scene.contact("block", BOTTOM, obstacle, fc.Frictionless(), name="stays")
+        return Led(led.scene, led.along, contact).press()
+
+    led = make()
+    led.along.value = 0.05  # less than a facet
+    led.problem.solve()
+    led.along.value = 1.0
+    raised_everywhere(led.problem.solve, fc.NotConverged, "have slid by", "facets")
+    led.problem.small_displacement_tolerance = np.inf
+    led.problem.solve()
+    led.problem.commit()
+    assert moment(led) == pytest.approx(LOAD * WIDTH * (1.0 + WIDTH / 2), rel=1e-6)
+
+
+def test_one_contact_slides_and_another_stays():
+    """A second block stands still on the same beam: its pairs stay, and both loads count."""
+    boxes = {
+        "beam": Box((0.0, 0.0), (10.0, HEIGHT), (80, 4)),
+        "one": Box((1.0, HEIGHT), (WIDTH, 0.5), (6, 6)),
+        "two": Box((8.0, HEIGHT), (WIDTH, 0.5), (6, 6)),
+    }
+    scene = Beside(boxes, E=1e5)
+    along = scene.bodies.constant(0.0)
+    scene.hold("beam", LEFT, 0, 1)
+    scene.hold("one", TOP, 0, value=along)
+    scene.hold("two", TOP, 0)
+    contacts = []
+    for name in ("one", "two"):
+        scene.load(name, TOP, 1, -LOAD)
+        contact = scene.contact(name, BOTTOM, ("beam", TOP), fc.Coulomb(0.3), name=name)
+        contacts.append(contact)
+    problem = scene.problem(*contacts)
+    problem.solve()
+    problem.commit()
+    number = contacts[1].pairs.number
+    along.value = 5.0
+    step = problem.solve()
+    problem.commit()
+    assert contacts[1].pairs.number == number
+    slid = step.contacts["one"]
+    assert slid.slip > 0 and slid.stick == 0
+    assert slid.tangential_force == pytest.approx(0.3 * slid.normal_force, rel=1e-6)
