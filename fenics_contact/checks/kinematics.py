@@ -116,6 +116,11 @@ class Linearisation:
         """Whether the error does, or forces act more than a facet from where they should."""
         return not self.judged <= tolerance or (tolerance < np.inf and not self.slid <= SLIDES)
 
+    def is_of_pairs(self, tolerance: float) -> bool:
+        """Whether pairs found where the points are now may take away a notable error."""
+        notable = self.judged > _NOTABLE and self.slid > NEGLIGIBLE_SLIDE
+        return notable or self.exceeds(tolerance)
+
     def describe(self) -> str:
         """Return the errors in words."""
         return (

@@ -206,9 +206,9 @@ class Verdict:
 
     @property
     def displaced(self) -> list[str]:
-        """Contacts whose small-displacement error is above the tolerance."""
-        tolerance = self.small_displacement_tolerance
-        return [c for c, error in self.small_displacement_error.items() if error.exceeds(tolerance)]
+        """Contacts whose small-displacement error may be that of their pairs."""
+        errors, tolerance = self.small_displacement_error, self.small_displacement_tolerance
+        return [name for name, error in errors.items() if error.is_of_pairs(tolerance)]
 
     @property
     def failures(self) -> list[str]:

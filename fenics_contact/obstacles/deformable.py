@@ -34,7 +34,7 @@ class DeformableBody(Obstacle):
             more than a hundredth of their facet since pairs were found. "auto": likewise, from
             the first increment on in which a point in contact (any point, if none is in contact)
             has moved along the opposing surface, or without one, by more than its facet, or in
-            which the small-displacement error would be above the tolerance. With
+            which the small-displacement error of the contact force would be above 1 %. With
             ``ContactProblem(small_displacement_tolerance=inf)`` no increment is solved again, and
             pairs are those where it began. Normals remain those of the undeformed Γc. With `Contact(kinematics="finite")` pairs and normals are always
             those of the deformed bodies.
