@@ -30,7 +30,16 @@ from verification import finite_scenes, fuzz_scenes, fuzz_setup, sliding_scenes
 
 Scene = dict[str, Any]
 # What scenes say of the solution is left out, and what the methods alone cannot take.
-LEFT_OUT = ("multipliers", "motion", "accuracy", "method", "max_iterations", "restart", "units")
+LEFT_OUT = (
+    "far",
+    "multipliers",
+    "motion",
+    "accuracy",
+    "method",
+    "max_iterations",
+    "restart",
+    "units",
+)
 SAID = ("method", "max_iterations", "restart", "condensation")
 # Scenes of a family share compiled forms.
 FAMILY = 8

@@ -124,6 +124,7 @@ class Judge:
         name = f"stage {record['stage']} at {record['load']:.4g}"
         problem, load = self.problem, self._load(record["stage"], record["load"])
         self._change_friction(record["stage"])
+        self._pair_within(record)
         self._check_slip_resets(name, record, load)
         u = self._nodal_values(record["u"])
         motion = np.array([record["contacts"][c]["motion"][i] for c, i in problem.free_motions()])
@@ -161,7 +162,7 @@ class Judge:
         now["springs"] = sum(
             c.stored_energy(f) for c, f in zip(problem.contacts, found, strict=True)
         )
-        self._update_pairs(problem, self._state, u)
+        self._update_pairs(problem, self._state, u, record)
         self._before, self._u, self._motion = now, u, motion
 
     def try_next_load(self, stage: int, t: float) -> str:
@@ -811,7 +812,7 @@ class Judge:
         self._other_state = [
             c.next_state(f, o) for c, f, o in zip(problem.contacts, found, old, strict=True)
         ]
-        self._update_pairs(problem, self._other_state, u)
+        self._update_pairs(problem, self._other_state, u, record)
         self._other_u, self._other_motion = u, motion
 
     def _total_force(self, forces: list[Array], i: int) -> Array:
@@ -848,12 +849,28 @@ class Judge:
             reported.append(free.reshape(-1, c.d)[own].sum(axis=0))
         return reported
 
+    def _pair_within(self, record: dict[str, Any]) -> None:
+        """Find pairs where the package has found them within the increment."""
+        for i, reported in enumerate(record["contacts"]):
+            if reported["paired_at"] is not None:
+                at = self._nodal_values(reported["paired_at"])
+                self._update_pairs_of(self.problem, self._state, i, at, self._u)
+                self._update_pairs_of(self._other, self._other_state, i, at, self._other_u)
+
+    def _update_pairs(
+        self, problem: Any, states: list[Any], u: Array, record: dict[str, Any]
+    ) -> None:
+        """Update pairs at a committed state, and with them the slip reference."""
+        for i, reported in enumerate(record["contacts"]):
+            if reported["pairs_anew"]:
+                self._update_pairs_of(problem, states, i, u, u)
+
     @staticmethod
-    def _update_pairs(problem: Any, states: list[Any], u: Array) -> None:
-        """Update pairs, and with them the slip reference."""
-        for contact, state in zip(problem.contacts, states, strict=True):
-            if contact.update_pairs is None:
-                continue
-            before = contact.jump(u)
-            contact.update_pairs(u)
-            state.jump += contact.jump(u) - before
+    def _update_pairs_of(problem: Any, states: list[Any], i: int, at: Array, u: Array) -> None:
+        """Update the pairs of a contact to those at a displacement; u is the committed one."""
+        contact = problem.contacts[i]
+        if contact.update_pairs is None:
+            return
+        before = contact.jump(u)
+        contact.update_pairs(at)
+        states[i].jump += contact.jump(u) - before

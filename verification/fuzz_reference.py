@@ -280,7 +280,7 @@ def _make_contact(setup: SceneSetup, contact: Scene, slave: Surface, opposite: A
     if given is None and not model.law.tension:
         thickness = scene.get("thickness", 1.0)
         model.overlap = lambda u: reference_geometry.find_overlap(master, slave, u, thickness)
-    if contact["obstacle"]["update_pairs"] == "increment":
+    if contact["obstacle"]["update_pairs"] != "never":
         model.update_pairs = update_pairs
     if given is None:
 

@@ -369,7 +369,23 @@ def draw(
         scene["cuts"] = 4
     if chance(0.08, "max_iterations", of=rng):
         scene["max_iterations"] = int(rng.integers(3, 9))
+    if "far" not in without:
+        _slide_far(scene, np.random.default_rng([seed, 29]))
     return scene | draw_form(seed, family, without)
+
+
+def _slide_far(scene: Scene, rng: np.random.Generator) -> None:
+    """Let a block that is led on another one slide over facets, here and there past its end."""
+    pairs = [c["obstacle"] for c in scene["contacts"] if c["obstacle"]["kind"] == "body"]
+    small = scene["strain"] < 0.02 and "bend" not in scene
+    searched = scene["degree"] == 1 and scene["cell"] != "hexahedron"
+    led = scene["layout"] == "pair" and scene["drive"] == "prescribed" and len(pairs) == 1
+    if not (small and searched and led) or rng.random() > 0.4:
+        return
+    pairs[0]["update_pairs"] = "auto" if rng.random() < 0.7 else "increment"
+    for stage in scene["stages"]:
+        way = np.sign(stage["side"]) * rng.uniform(0.02, 0.6) / scene["strain"]
+        stage["side"] = float(f"{way:.3g}")
 
 
 def draw_form(seed: int, family: int | None, without: tuple[str, ...]) -> dict[str, str]:

@@ -103,6 +103,8 @@ class SceneSetup:
         slip_resets: New slip references of this increment by contact: "rigid", whether bodies were
             positioned; "u", see `_gather_displacement`; "jump" at the points, (n_points, d); and
             "unloaded", the points that it applies to, (n_points,).
+        paired_at: By contact, where its pairs were found in this increment,
+            see `_gather_displacement`.
     """
 
     LEVELS: tuple[str, ...] = ("normal", "side", "across")
@@ -113,6 +115,7 @@ class SceneSetup:
         scene = fuzz_features.with_unrelated_body(scene)
         self.scene, self.comm = scene, comm
         self.slip_resets: dict[str, dict[str, Any]] = {}
+        self.paired_at: dict[str, Array] = {}
         self.length, self.force = scene["units"]
         x, cells, boxes = _mesh_arrays(scene)
         self.d = d = x.shape[1]
@@ -545,7 +548,7 @@ def _gather_displacement(setup: SceneSetup) -> np.ndarray:
 
 
 def _record_slip_resets(setup: SceneSetup, contact: fc.Contact) -> None:
-    """Record the calls by which a contact moves its slip reference."""
+    """Record the calls by which a contact moves its slip reference, or finds other pairs."""
 
     def wrap(method: Any, *, rigid: bool) -> Any:
         def wrapped(*given: Any, **options: Any) -> None:
@@ -567,6 +570,11 @@ def _record_slip_resets(setup: SceneSetup, contact: fc.Contact) -> None:
 
         return wrapped
 
+    def pair_at_end() -> None:
+        setup.paired_at[contact.name] = _gather_displacement(setup)
+        paired()
+
+    paired, contact.pair_at_end = contact.pair_at_end, pair_at_end  # type: ignore[method-assign]
     contact.set_down = wrap(contact.set_down, rigid=True)  # type: ignore[method-assign]
     contact.count_slip_from_here = wrap(  # type: ignore[method-assign]
         contact.count_slip_from_here, rigid=False
@@ -609,6 +617,8 @@ def _make_record(
                 "unpaired": contact.n_unpaired,
                 "error": contact.accuracy.error if contact.accuracy else None,
                 "slip_reset": setup.slip_resets.get(contact.name),
+                "paired_at": setup.paired_at.get(contact.name),
+                "pairs_anew": contact.opposite.pairs_anew,
             }
         )
     return {
@@ -660,6 +670,7 @@ def run_history(
             ) -> Any:
                 def apply(t: float) -> None:
                     setup.slip_resets.clear()
+                    setup.paired_at.clear()
                     setup.apply(stage, t)
 
                 return fc.increments(

@@ -28,16 +28,17 @@ class DeformableBody(Obstacle):
         tags: Tag or tags of the opposing surface.
         search_distance: Largest distance of a point of Γc from its opposite point (length),
             infinite by default.
-        update_pairs: Which points are opposite each other. "never": those of the undeformed
-            bodies; points may slide by a facet at most. "increment": those of the deformed bodies
-            at the end of each increment, which is solved again if points in contact have slid by
-            more than a hundredth of their facet since pairs were found. "auto": likewise, from
-            the first increment on in which a point in contact (any point, if none is in contact)
-            has moved along the opposing surface, or without one, by more than its facet, or in
-            which the small-displacement error of the contact force would be above 1 %. With
+        update_pairs: Which points are opposite each other. "never": those of the undeformed bodies;
+            points may slide by a facet at most. "increment": those of the deformed bodies at the
+            end of each increment, which is solved again if points in contact have slid by more than
+            a hundredth of their facet since pairs were found. "auto": likewise, from the first
+            increment on in which a point in contact (any point, if none is in contact) has moved
+            along the opposing surface, or without one, by more than its facet, or in which the
+            small-displacement error of the contact force would be above 1 %. With
             ``ContactProblem(small_displacement_tolerance=inf)`` no increment is solved again, and
-            pairs are those where it began. Normals remain those of the undeformed Γc. With `Contact(kinematics="finite")` pairs and normals are always
-            those of the deformed bodies.
+            pairs are those where it began. Normals remain those of the undeformed Γc. With
+            `Contact(kinematics="finite")` pairs and normals are always those of the deformed
+            bodies.
         max_initial_penetration: Largest depth (length) at which a point of Γc behind the opposing
             surface is paired in the undeformed bodies. By default the penetration of the two
             bodies; in self-contact half the height of the point's cell. In deformed bodies the
