@@ -142,6 +142,7 @@ class Starts:
             return len(starts) - 1
 
         add(present)
+        forces = equations.function.array_r.copy()
         # Where nothing was borne yet the last increment tells nothing of this one.
         predicts, factored = self.predict and not cold, self.factored and not cold
         self.forget()
@@ -165,7 +166,7 @@ class Starts:
                     turned = self._friction_works()
         self._moved = None
         if first_round and not predicts and not cold and self._change is not None:
-            add(self._continued(present, self._change))
+            add(self._continued(present, forces, self._change))
         if self.carried is not None and first_round:
             add(system.part(self.carried))
         if first_round and any(c.free_angle is not None for c in equations.contacts):
@@ -174,24 +175,24 @@ class Starts:
             return starts[step]
         return starts[int(np.argmin(residuals))]
 
-    def _continued(self, present: Array, change: Array) -> Array:
+    def _continued(self, present: Array, forces: Array, change: Array) -> Array:
         """Where a change like that of the last increment leaves no force along it. Collective.
 
         By the secant between none and all of it, so that the sizes of the increments do not matter.
+
+        Args:
+            present: The state.
+            forces: The residual there.
+            change: Of the state of the full system, in that increment.
         """
         equations, system = self._equations, self._equations.system
         way = system.part(change).copy()
         way[system.constrained] = 0.0
-        along = np.zeros(2)
-        for share in (0, 1):
-            equations.residual_at(present + share * way)
-            along[share] = equations.function.array_r @ way
+        equations.residual_at(present + way)
+        along = np.array([forces @ way, equations.function.array_r @ way])
         first, last = equations.full.unknowns.comm.allreduce(along)
-        if abs(first - last) > FLAT * abs(first) and np.isfinite(
-            last
-        ):  # else it feels no stiffness
-            return present + first / (first - last) * way
-        return present
+        stiff = abs(first - last) > FLAT * abs(first)  # else the way feels no stiffness
+        return present + first / (first - last) * way if stiff and np.isfinite(last) else present
 
     def _friction_works(self) -> bool:
         """Whether committed friction does work on the way to the start added last. Collective."""
