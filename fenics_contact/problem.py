@@ -469,9 +469,11 @@ class ContactProblem:
         end = self.full.state()
         if self.state.interior is not None:  # u where other points come to is part of it
             trial, self._trial = self._trial, None
-            self._go_back(self.state.unknowns)
-            self.complete()
-            self._trial = trial
+            try:
+                self._go_back(self.state.unknowns)
+                self.complete()
+            finally:
+                self._trial = trial
             self.full.set_state(end)
         for contact in behind:
             contact.evaluate()
@@ -558,7 +560,9 @@ class ContactProblem:
             return between_new_pairs(behind)
         if reason <= 0 or verdict.failures:
             raise self._not_converged(reason, verdict, tried)
-        began = self.state.energy.between([c.opposite.committed_jump for c in self.contacts])
+        began = self.state.energy
+        if ended is not None:
+            began = began.between([c.opposite.committed_jump for c in self.contacts])
         energy = energies.since(began, self.contacts, self.full.scales)
         verdict = replace(verdict, friction_energy_gain=energy.friction_energy_gain)
         if verdict.failures:

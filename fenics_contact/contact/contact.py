@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -236,7 +236,7 @@ class Contact(PointResults):
         self.acting = ActingLaw(law, self.opposite, self.quadrature)
         self._values: PointValues | None = None
         if not self.rigid:
-            self.pair()
+            self._find_pairs(None)
         self.opposite.begins_anew()
         self.state = ContactState(self.history.rows(), self.opposite.state())
         self._start()
@@ -471,6 +471,11 @@ class Contact(PointResults):
         Args:
             u: Displacement of the bodies in which to search; None: the undeformed bodies.
         """
+        self._find_pairs(u)
+        self.state = replace(self.state, opposite=self.opposite.state())
+
+    def _find_pairs(self, u: fem.Function | None) -> None:
+        """See `pair`; the committed state keeps the pairs that it has. Collective."""
         self.opposite.update()
         none = np.zeros(self.quadrature.n_points)
         self.opposite.find_pairs(u, none if u is None else self._evaluate().depth)
