@@ -386,6 +386,8 @@ def _slide_far(scene: Scene, rng: np.random.Generator) -> None:
     for stage in scene["stages"]:
         way = np.sign(stage["side"]) * rng.uniform(0.02, 0.6) / scene["strain"]
         stage["side"] = float(f"{way:.3g}")
+        # Surfaces that come back to where they just touch bear round-off, or nothing.
+        stage["normal"] = stage["normal"] or -0.3
 
 
 def draw_form(seed: int, family: int | None, without: tuple[str, ...]) -> dict[str, str]:
