@@ -32,6 +32,7 @@ from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
 from fenics_contact.methods.first_touch import FirstTouch
 from fenics_contact.methods.load_balance import LoadBalance
+from fenics_contact.methods.opposite_points import OppositePoints
 from fenics_contact.methods.solver import Settings, Solver
 from fenics_contact.parallel import fail_together, global_max, warn
 from fenics_contact.state import State, Trial
@@ -54,8 +55,8 @@ logger = logging.getLogger("fenics_contact")
 
 # Outcome of an attempt that retained too few unknowns.
 _SPREADS = "contact spreads beyond the retained dofs"
-# Outcome of one whose points have slid from their pairs, and how often these are found anew.
-_SLID, _PAIRINGS = "solved, then again between the pairs where it ended", 3
+# Outcome of one after which points are not opposite each other any more.
+_SLID = "converged; opposite points updated, solved again"
 
 
 class ContactProblem:
@@ -393,9 +394,13 @@ class ContactProblem:
             self._complete_all()  # what it takes is about to go
         self.solver.equations.factorisations = 0
         start_unknowns, diagonal = self.full.state(), self.full.diagonal.copy()
+        at_present = self._is_present(start_unknowns)
         for contact in self.contacts if self._trial is not None else ():
-            if contact.opposite.committed_jump is not contact.state.opposite.jump:
+            pairs = contact.state.opposite.pairs
+            if not contact.opposite.follows and contact.pairs.jump_map is not pairs.jump_map:
                 contact.restore()  # the trial has other pairs than the committed state
+        follows = self.small_displacement_tolerance < np.inf
+        points = OppositePoints(self.contacts if follows else [])
         try:
             # A trial of a line search may overflow, and the convergence test and the verdict see
             # it: a warning, on the rank that has the point, must not become an error there alone.
@@ -404,16 +409,20 @@ class ContactProblem:
                 step = None
                 while step is None:
                     with self.solver.options.present():
-                        step = self._solve(start, recover_interior, tried)
+                        step = self._solve(start, recover_interior, tried, points)
+                    if step is None:  # what it starts from may have been completed meanwhile
+                        began = self._present.unknowns if at_present else start_unknowns
+                        self._go_back(began)
+                        points.begin(self.contacts)
+                        self.full.set_state(began)
                     # Outside, lest a SNES that is made anew takes its options for the caller's.
-                    if step is None:
-                        self._go_back(start_unknowns)
+                    if step is None and not (tried and tried[-1].outcome == _SLID):
                         spread = sum(attempt.outcome == _SPREADS for attempt in tried)
                         self.solver.change(anew=spread <= 1)
                 release_interrupt()
         except BaseException as error:
             fail_together(self._comm, error)
-            self._go_back(start_unknowns)
+            self._go_back(self._present.unknowns if at_present else start_unknowns)
             if not self.bulk.linear:  # that of cells near collapse would excuse any residual
                 self.full.diagonal = diagonal
             if not isinstance(error, NotConverged | ValueError):
@@ -423,6 +432,11 @@ class ContactProblem:
             if self._comm.rank == 0:
                 self.solver.options.warn_of_unread(self.prefix)
         return step
+
+    def _is_present(self, unknowns: Array) -> bool:
+        """Whether they are those of the present state. Collective."""
+        differs = not np.array_equal(unknowns, self._present.unknowns)
+        return not self._comm.allreduce(int(differs))
 
     def _check_committed(self) -> None:
         """Warn, once, where an increment with friction is solved and the last is no history."""
@@ -454,49 +468,46 @@ class ContactProblem:
         for contact, trial in zip(self.contacts, trials, strict=True):
             contact.restore(trial)
 
-    def _pair_at_end(self, behind: Sequence[Contact], start: Array) -> Array:
-        """Let the increment begin anew, between the pairs where it has ended. Collective.
-
-        Forces act on the opposing body where the points are at the end of the increment.
+    def _find_opposite_points(
+        self,
+        points: OppositePoints,
+        contacts: Sequence[Contact],
+        tried: list[Attempt],
+        interior: Array | None,
+    ) -> None:
+        """Find the opposite points of contacts where the increment has ended. Collective.
 
         Args:
-            behind: Contacts whose pairs are found anew.
-            start: The unknowns that it starts from.
-
-        Returns:
-            Those with which it has ended.
+            points: The iteration for them.
+            contacts: Contacts, evaluated there.
+            tried: What was tried; the last outcome is replaced.
+            interior: What recovers the interior displacement there; None: u is up to date.
         """
-        end = self.full.state()
-        if self.state.interior is not None:  # u where other points come to is part of it
-            trial, self._trial = self._trial, None
-            try:
-                self._go_back(self.state.unknowns)
-                self.complete()
-            finally:
-                self._trial = trial
-            self.full.set_state(end)
-        for contact in behind:
-            contact.evaluate()
-            contact.pair_at_end()
-        self.full.set_state(self.state.unknowns)
-        for contact in behind:
-            contact.count_from_start()
-        self.full.set_state(start)
-        return end
+        tried[-1] = replace(tried[-1], outcome=_SLID)
+        if interior is not None:
+            self.solver.system.complete(interior)
+        points.choose_states(contacts, self.full.state())
+        if any(state.interior is not None for state in (self._present, self.state)):
+            # Other parts of the committed u are needed, and other pairs leave nothing to recover
+            # those of a trial from.
+            self._go_back(self._present.unknowns)
+            self._complete_all()
+        points.find(self.full, self.state.unknowns)
 
     def _solve(
-        self, start: float, field: bool, tried: list[Attempt], ended: Array | None = None
+        self, start: float, field: bool, tried: list[Attempt], points: OppositePoints
     ) -> Step | None:
-        """`solve`; None if it takes other unknowns than are kept. Collective.
+        """`solve`; None if it takes other unknowns than are kept, or other pairs. Collective.
 
         Args:
             start: When it began.
             field: Whether to recover the interior, see `solve`.
             tried: What was tried before; what is tried here is added.
-            ended: Where the increment ended between other pairs.
+            points: Between which points of bodies it is solved.
         """
         solver = self.solver
-        load = self._check_before()
+        # Between points of its end a load that nothing balances is a failure of the increment.
+        load = self._check_before(balance=points.end is None)
         before = self.full.state()
         for bc in self._bcs:
             bc.set(self.u.x.array)
@@ -517,8 +528,8 @@ class ContactProblem:
         solver.starts.carried = self._approach.carried
         if self._first_touch.end is not None:
             solver.starts.carried = self._first_touch.end
-        if ended is not None:
-            solver.starts.carried = ended
+        if points.end is not None:
+            solver.starts.carried = points.end
         with solver.system.acting():
             reason, attempts, rounds = solver.solve(
                 cold=cold,
@@ -537,18 +548,9 @@ class ContactProblem:
             return None
         tried += attempts
 
-        def between_new_pairs(behind: Sequence[Contact]) -> Step | None:
-            tried[-1] = replace(tried[-1], outcome=_SLID)
-            if lags:
-                solver.system.complete(interior)
-            return self._solve(start, field, tried, self._pair_at_end(behind, before))
-
-        may_pair = [contact for contact in self.contacts if contact.opposite.may_pair_anew]
-        again = sum(attempt.outcome == _SLID for attempt in tried)
-        if reason <= 0 or again == _PAIRINGS or self.small_displacement_tolerance == np.inf:
-            may_pair = []
-        if behind := [c for c in may_pair if c.opposite.pairs_left(c.values)]:
-            return between_new_pairs(behind)
+        if reason > 0 and (contacts := points.to_update()):
+            self._find_opposite_points(points, contacts, tried, interior)
+            return None
         kinematics = reason > 0  # a solver that failed may have no factors for it
         if lags:
             self._begin_condensed_energy()
@@ -556,12 +558,13 @@ class ContactProblem:
         else:
             assemble = field or not solver.system.confined
             verdict, energies = self._judge_all(kinematics=kinematics, assemble=assemble)
-        if behind := [contact for contact in may_pair if contact.name in verdict.displaced]:
-            return between_new_pairs(behind)
+        if reason > 0 and (contacts := points.to_update_for(verdict.pairing_errors)):
+            self._find_opposite_points(points, contacts, tried, interior)
+            return None
         if reason <= 0 or verdict.failures:
             raise self._not_converged(reason, verdict, tried)
         began = self.state.energy
-        if ended is not None:
+        if points.end is not None:
             began = began.between([c.opposite.committed_jump for c in self.contacts])
         energy = energies.since(began, self.contacts, self.full.scales)
         verdict = replace(verdict, friction_energy_gain=energy.friction_energy_gain)
@@ -679,8 +682,12 @@ class ContactProblem:
             self._trial = trial
             self._go_back(unknowns)
 
-    def _check_before(self) -> Array:
-        """Look at all that was given; the external forces (force). Collective."""
+    def _check_before(self, *, balance: bool) -> Array:
+        """Look at all that was given; the external forces (force). Collective.
+
+        Args:
+            balance: Whether to raise a ValueError for a load that contact cannot balance.
+        """
         self.bulk.check_finite()
         for contact in self.contacts:
             contact.check_input()
@@ -695,7 +702,7 @@ class ContactProblem:
         check_values(self._bcs, self.u)
         if self.bulk.has_new_data():
             self._find_free_motions()
-        if self.bulk.linear:
+        if balance and self.bulk.linear:
             self._balance.check(load, self.operators)
         return load
 

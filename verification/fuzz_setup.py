@@ -540,10 +540,10 @@ def _nodes(setup: SceneSetup) -> tuple[Array, Array]:
     return box[:n], setup.V.tabulate_dof_coordinates()[:n, : setup.d]
 
 
-def _gather_displacement(setup: SceneSetup) -> np.ndarray:
+def _gather_displacement(setup: SceneSetup, u: fem.Function | None = None) -> np.ndarray:
     """Return body, coordinates and displacement of all nodes, (n_nodes, 1 + 2 d). Collective."""
     box, x = _nodes(setup)
-    u = setup.u.x.array.reshape(-1, setup.d)[: len(box)]
+    u = (u or setup.u).x.array.reshape(-1, setup.d)[: len(box)]
     return gather_rows(setup.comm, np.column_stack([box, x, u]))
 
 
@@ -570,11 +570,11 @@ def _record_slip_resets(setup: SceneSetup, contact: fc.Contact) -> None:
 
         return wrapped
 
-    def pair_at_end() -> None:
-        setup.paired_at[contact.name] = _gather_displacement(setup)
-        paired()
+    def begin_between(opposite: Any) -> None:
+        setup.paired_at[contact.name] = _gather_displacement(setup, opposite.pairs.found_at)
+        begin(opposite)
 
-    paired, contact.pair_at_end = contact.pair_at_end, pair_at_end  # type: ignore[method-assign]
+    begin, contact.begin_between = contact.begin_between, begin_between  # type: ignore[method-assign]
     contact.set_down = wrap(contact.set_down, rigid=True)  # type: ignore[method-assign]
     contact.count_slip_from_here = wrap(  # type: ignore[method-assign]
         contact.count_slip_from_here, rigid=False

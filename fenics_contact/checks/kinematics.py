@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fenics_contact.contact.body import NEGLIGIBLE_SLIDE, SLIDES
+from fenics_contact.contact.body import NEGLIGIBLE_SLIDE
 from fenics_contact.contact.choices import is_regularised
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
@@ -92,14 +92,16 @@ class Linearisation:
         force: Error of the contact force, the magnitude of its change.
         pressure: Error of the pressure, in the L² norm over Γc.
         rough: Whether the estimate of the pressure is inaccurate, as between two meshes.
-        slid: How far points that bear have slid on another body from where their forces act, in
-            sizes of their facets.
+        slid: How far points that transmit forces have slid on another body from where these act,
+            in sizes of their facets.
+        slide_limit: How far they may have.
     """
 
     force: float = 0.0
     pressure: float = 0.0
     rough: bool = False
     slid: float = 0.0
+    slide_limit: float = np.inf
 
     @property
     def worst(self) -> float:
@@ -113,10 +115,12 @@ class Linearisation:
         return self.worst > _NOTABLE
 
     def exceeds(self, tolerance: float) -> bool:
-        """Whether the error does, or forces act more than a facet from where they should."""
-        return not self.judged <= tolerance or (tolerance < np.inf and not self.slid <= SLIDES)
+        """Whether the error does, or forces act too far from where they should."""
+        if tolerance == np.inf:
+            return False
+        return not (self.judged <= tolerance and self.slid <= self.slide_limit)
 
-    def is_of_pairs(self, tolerance: float) -> bool:
+    def is_due_to_pairs(self, tolerance: float) -> bool:
         """Whether pairs found where the points are now may take away a notable error."""
         notable = self.judged > _NOTABLE and self.slid > NEGLIGIBLE_SLIDE
         return notable or self.exceeds(tolerance)
@@ -268,17 +272,18 @@ def linearisation(
         [part for part in _parts(c, masks, round_off) if _matters(c, deviation, part, modulus)]
         for c, deviation, masks, modulus in zip(contacts, deviations, parts, moduli, strict=True)
     ]
-    slid = [c.opposite.slid(c.values) for c in contacts]
+    slides = [(c.opposite.largest_slide(c.values), c.opposite.slide_limit) for c in contacts]
     if not any(looked_at):
-        return {c.name: Linearisation(slid=far) for c, far in zip(contacts, slid, strict=True)}
+        none = 0.0, 0.0, False
+        return {c.name: Linearisation(*none, *s) for c, s in zip(contacts, slides, strict=True)}
     pairs = list(zip(deviations, contacts, strict=True))
     springs = [d.springs(c) for d, c in pairs]
     added = [d.added(c, s) for (d, c), s in zip(pairs, springs, strict=True)]
     jumps = respond([s.stiffness for s in springs], added)
     return {
-        c.name: _worst([_relative(c, part, traction, s.change(jump)) for part in mine], far)
-        for c, mine, s, traction, jump, far in zip(
-            contacts, looked_at, springs, added, jumps, slid, strict=True
+        c.name: _worst([_relative(c, part, traction, s.change(jump)) for part in mine], slide)
+        for c, mine, s, traction, jump, slide in zip(
+            contacts, looked_at, springs, added, jumps, slides, strict=True
         )
     }
 
@@ -345,8 +350,9 @@ def _relative(contact: Contact, part: _Part, added: Array, answered: Array) -> L
     return Linearisation(force, float(changed / whole) if whole else 0.0, not contact.rigid)
 
 
-def _worst(found: Sequence[Linearisation], slid: float) -> Linearisation:
+def _worst(found: Sequence[Linearisation], slide: tuple[float, float]) -> Linearisation:
     """The largest errors of all; one that is not a number wins."""
     force = np.max([each.force for each in found], initial=0.0)
     pressure = np.max([each.pressure for each in found], initial=0.0)
-    return Linearisation(float(force), float(pressure), any(each.rough for each in found), slid)
+    rough = any(each.rough for each in found)
+    return Linearisation(float(force), float(pressure), rough, *slide)

@@ -24,7 +24,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.obstacle_sampler import ObstacleSampler
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import gather_rows, global_max, global_mean, global_min
-from fenics_contact.surface.crossings import MovingFacets, find_crossings
+from fenics_contact.surface.crossings import MovingFacets, find_crossings, largest_depth_on_path
 from fenics_contact.surface.facets import across
 from fenics_contact.surface.rays import Hits, Rays, Side
 from fenics_contact.types import Array, Index, Mask
@@ -934,25 +934,30 @@ class _Side:
             shift: What both surfaces have in common of their motion, (gdim,) (length).
             other: The places of the other surface.
             allowed: Penetration that is allowed, (n,) (length).
-            depth: Below what their normals meet, (n,) (length): of those that are behind it. For
-                others it is that below the facet through which they came in, which one that slides
-                on along a curved surface leaves behind.
+            depth: Below what their normals meet, (n,) (length). Of those that are behind it this
+                is all that counts: one that slides on along a curved surface leaves the facet
+                through which it came in behind.
         """
         vertices = self.side.vertices[self.number]
         start = self.at(before) + shift
         facets = other.moving(before, shift)
         met = find_crossings(self._comm, start, self.place, vertices, facets)
         found = np.zeros(len(self.facet), dtype=np.bool_)
-        if not len(met.place):
-            return found
-        first = np.append(True, np.diff(met.place) > 0)
-        last = np.append(np.diff(met.place) > 0, True)
+        n = len(met.place)
+        first = np.append(True, np.diff(met.place) > 0)[:n]
+        last = np.append(np.diff(met.place) > 0, True)[:n]
         place, leaves = met.place[last], ~met.inward[last]
         # Of a place that was inside from the start, through the side that its own normal met.
         entry = np.where(met.inward[first][:, None], met.normal[first], -self.normal[place])
         through = leaves & (_dot(entry, met.normal[last]) < _OPPOSITE_SIDES)
-        deep = np.where(depth[place] >= 0, depth[place], met.depth[last])
-        found[place] = through | (~leaves & (deep > allowed[place]))
+        found[place] = through
+        known = depth[place] >= 0  # and compared with what is allowed
+        deep = ~leaves & ~known & (met.depth[last] > allowed[place])
+        # One that slides on and leaves the body sideways is deep below a facet that it has left.
+        which, since = place[deep], met.time[last][deep]
+        ends = start[which], self.place[which]
+        path = largest_depth_on_path(self._comm, *ends, since, vertices[which], facets)
+        found[which] |= path > allowed[which]
         return found
 
 

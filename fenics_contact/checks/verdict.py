@@ -9,7 +9,6 @@ import numpy as np
 from fenics_contact.checks.kinematics import Linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.tunnelling import Tunnelling
-from fenics_contact.contact.body import SLIDES
 from fenics_contact.contact.contact import Contact
 from fenics_contact.markup import shown
 from fenics_contact.parallel import global_max, global_min, longest
@@ -205,10 +204,10 @@ class Verdict:
         return bool(self.failures) and not replace(self, laws={}).failures
 
     @property
-    def displaced(self) -> list[str]:
+    def pairing_errors(self) -> list[str]:
         """Contacts whose small-displacement error may be that of their pairs."""
         errors, tolerance = self.small_displacement_error, self.small_displacement_tolerance
-        return [name for name, error in errors.items() if error.is_of_pairs(tolerance)]
+        return [name for name, error in errors.items() if error.is_due_to_pairs(tolerance)]
 
     @property
     def failures(self) -> list[str]:
@@ -272,11 +271,12 @@ class Verdict:
                     '(update_pairs="increment"), use Contact(kinematics="finite"), or accept the '
                     "error: ContactProblem(small_displacement_tolerance=inf)"
                 )
-            if self.small_displacement_tolerance < np.inf and change.slid > SLIDES:
+            if not change.slid <= change.slide_limit:
                 found.append(
-                    f"{contact}: points have slid by {change.slid:.2g} facets from the places of "
-                    "the opposing body that their forces act at. Use smaller increments, "
-                    'update_pairs="auto" or Contact(kinematics="finite"), or accept the error: '
+                    f"{contact}: points have slid by {change.slid:.2g} facets from where their "
+                    f"forces act on the opposing body, more than {change.slide_limit:g}. "
+                    'Use smaller increments, update_pairs="auto" where it is "never", or '
+                    'Contact(kinematics="finite"), or accept the error: '
                     "ContactProblem(small_displacement_tolerance=inf)"
                 )
         for name, deformation in self.deformation.items():

@@ -20,13 +20,13 @@ from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import global_max
 from fenics_contact.types import Array, Mask
 
-__all__ = ["NEGLIGIBLE_SLIDE", "SLIDES", "BodyOpposite", "FollowedOpposite"]
+__all__ = ["MAX_SLIDE", "NEGLIGIBLE_SLIDE", "BodyOpposite", "FollowedOpposite"]
 
 logger = logging.getLogger("fenics_contact")
 
 # Way along the opposite, in sizes of the point's facet, from which on pairs are found anew. In
 # partial slip of fine meshes ways are half of a facet, and nothing is gained by other pairs.
-SLIDES = 1.0
+MAX_SLIDE = 1.0
 # Below which pairs where the points are now are those of before.
 NEGLIGIBLE_SLIDE = 1e-2
 
@@ -92,22 +92,30 @@ class BodyOpposite(Opposite):
         if self.pairs_anew or self._update != "auto":
             return self.pairs_anew
         comm, paired = self._mesh.comm, self.pairs.paired
-        if comm.allreduce(int(np.any(paired & (values.normal_traction < 0)))):
-            return self.slid(values) > SLIDES
+        if comm.allreduce(int(np.any(self.transmits(values)))):
+            return self.largest_slide(values) > MAX_SLIDE
         # Of open points, to whom pairs are nothing yet, only where a body was carried elsewhere;
         # where there are no pairs at all it may come to some.
         if comm.allreduce(int(np.any(paired))):
-            return self._farthest(values.slide, paired) > SLIDES
-        return self._farthest(self.pairs.own_displacement(), ~paired) > SLIDES
+            return self._farthest(values.slide, paired) > MAX_SLIDE
+        return self._farthest(self.pairs.own_displacement(), ~paired) > MAX_SLIDE
 
-    def pairs_left(self, values: PointValues) -> bool:
+    def needs_new_pairs(self, values: PointValues) -> bool:
         """See `Opposite`."""
-        least = NEGLIGIBLE_SLIDE if self.pairs_anew else SLIDES
-        return self.may_pair_anew and self.slid(values) > least
+        return self.may_pair_anew and self.largest_slide(values) > self.slide_limit
 
-    def slid(self, values: PointValues) -> float:
+    def transmits(self, values: PointValues) -> Mask:
         """See `Opposite`."""
-        return self._farthest(values.slide, self.pairs.paired & (values.normal_traction < 0))
+        return self.pairs.paired & (np.abs(values.total_traction).max(axis=1) > 0)
+
+    def largest_slide(self, values: PointValues) -> float:
+        """See `Opposite`."""
+        return self._farthest(values.slide, self.transmits(values))
+
+    @property
+    def slide_limit(self) -> float:
+        """See `Opposite`."""
+        return NEGLIGIBLE_SLIDE if self.pairs_anew else MAX_SLIDE
 
     def _farthest(self, ways: Array, points: Mask) -> float:
         """The longest of the ways of some points, in sizes of their facets. Collective."""
@@ -135,13 +143,13 @@ class BodyOpposite(Opposite):
             return None
         if not self.pairs_anew and self._mesh.comm.rank == 0:
             logger.info(
-                "%s: pairs are updated at every increment from now on, because points have slid by "
-                "more than a facet",
+                "%s: opposite points are those at the end of every increment from now on, because "
+                "points have slid along the opposing surface",
                 self._parts.name,
             )
         # The traction stays with the points of Γc; what they slip over has moved on.
         self.find_pairs(self._parts.displacement.u, values.depth)
-        return self.count_between_pairs()
+        return self.update_committed_jump()
 
 
 class FollowedOpposite(BodyOpposite):
@@ -172,7 +180,7 @@ class FollowedOpposite(BodyOpposite):
         """See `Opposite`."""
         return self._told_of_pairs(arrays)
 
-    def slid(self, values: PointValues) -> float:
+    def largest_slide(self, values: PointValues) -> float:
         """See `Opposite`."""
         return 0.0
 

@@ -60,7 +60,8 @@ class ContactTrial:
         history: The fields that become history, by name.
         reference: The history that the increment started from, with the slip reference of bodies
             that were positioned: `PointFields.rows`.
-        opposite: The committed place of the obstacle between the pairs of this state, and these.
+        opposite: Committed place of the obstacle, and the pairs of this state, between which it is
+            measured.
     """
 
     points: PointValues
@@ -481,23 +482,14 @@ class Contact(PointResults):
         self.opposite.find_pairs(u, none if u is None else self._evaluate().depth)
         self.forget()
 
-    def pair_at_end(self) -> None:
-        """Find the pairs of an increment that begins anew where the bodies are now. Collective.
+    def begin_between(self, opposite: OppositeState) -> None:
+        """Count an increment from its start between other pairs; `restore` undoes it. Collective.
 
-        `count_from_start` counts it between these, `restore` puts the committed ones back.
-        Multipliers stay as they are: they are near to those of the solution.
+        Args:
+            opposite: The pairs, with the jump between them in the committed state.
         """
-        depth = self.values.depth
-        self.history.set_rows(self.state.history)
-        self.opposite.set_state(self.state.opposite)
-        self.opposite.find_pairs(self.displacement.u, depth)
-
-    def count_from_start(self) -> None:
-        """Count the increment from the present ``u``, the committed one, between pairs found anew.
-
-        Collective.
-        """
-        moved = self.opposite.count_between_pairs()
+        moved = opposite.jump - self.opposite.committed_jump
+        self.opposite.set_state(opposite)
         if self.law.has_friction:
             kept = {name: self.history.values(name) for name in self.history.names}
             self.history.assign(kept | {"jump": kept["jump"] + moved})
@@ -566,7 +558,7 @@ class Contact(PointResults):
         self._values = None
 
     def restore(self, trial: ContactTrial | None = None) -> None:
-        """Restore history, multipliers and results of the last commit. Collective.
+        """Restore history, multipliers, pairs and results of the last commit. Collective.
 
         The results are restored, not evaluated again: at the committed state the law would return
         stick at points that slipped to it. Before the first commit there are no results.

@@ -36,7 +36,7 @@ from fenics_contact.parallel import global_max
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import SurfaceQuadrature
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Mask
 
 __all__ = ["IncrementalRotation", "ObstacleMotion", "Opposite", "OppositeState", "Parts"]
 
@@ -506,8 +506,21 @@ class Opposite(ABC):
         """Whether pairs are, or may come to be, other ones than those of the undeformed bodies."""
         return False
 
-    def slid(self, values: PointValues) -> float:
-        """How far points that bear have slid from the places that their forces act at. Collective.
+    def transmits(self, values: PointValues) -> Mask:
+        """Mask of the points that transmit forces to another body, (n_points,).
+
+        Args:
+            values: Of the last evaluation.
+        """
+        return np.zeros(len(values.x), dtype=np.bool_)
+
+    @property
+    def slide_limit(self) -> float:
+        """Largest `largest_slide` in a solution."""
+        return np.inf
+
+    def largest_slide(self, values: PointValues) -> float:
+        """How far they have slid from the places that their forces act at. Collective.
 
         Args:
             values: Of the last evaluation.
@@ -535,8 +548,8 @@ class Opposite(ABC):
         """See the class."""
         return None
 
-    def pairs_left(self, values: PointValues) -> bool:
-        """Whether points that bear have left pairs that may be found where they are. Collective.
+    def needs_new_pairs(self, values: PointValues) -> bool:
+        """Whether they have left pairs that may be found where the bodies are. Collective.
 
         Args:
             values: Of a solution.
@@ -595,7 +608,7 @@ class Opposite(ABC):
         if self.sampler is not None:
             self.sampler.committed_shape = self.sampler.shape
 
-    def count_between_pairs(self) -> Array:
+    def update_committed_jump(self) -> Array:
         """Let ways be counted between pairs that were found anew; ``u`` is the committed one.
 
         Collective.

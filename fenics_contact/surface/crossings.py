@@ -9,13 +9,13 @@ import numpy as np
 import scipy.spatial
 from numpy.polynomial.polynomial import polyval
 
-from fenics_contact.parallel import gather_rows
+from fenics_contact.parallel import gather_rows, global_max, global_min
 from fenics_contact.surface.facets import across
 from fenics_contact.surface.projection import near_pairs
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["Crossings", "MovingFacets", "find_crossings"]
+__all__ = ["Crossings", "MovingFacets", "find_crossings", "largest_depth_on_path"]
 
 # Of the time at which the plane of a facet is crossed.
 _BISECTIONS = 40
@@ -35,6 +35,12 @@ class MovingFacets:
     end: Array
     sign: Array
     vertices: Index
+
+    def pieces(self) -> list[list[int]]:
+        """Corners of the simplices that each of them is divided into."""
+        if self.start.shape[2] == 2:
+            return [[0, 1]]
+        return [[0, 1, 2], [0, 2, 3]][: self.start.shape[1] - 2]
 
     def normals(self) -> Array:
         """Outward unit normals at the end of the increment, (m, d)."""
@@ -93,12 +99,66 @@ def find_crossings(
     return Crossings(number[order], time, inward, normal, depth, found[:, -1].astype(np.int64))
 
 
-def _crossings(start: Array, end: Array, vertices: Index, facets: MovingFacets) -> Array:
-    """Rows of place, time, inward, depth, normal and facet, of facets of this rank."""
-    d = start.shape[1]
-    nothing: Array = np.zeros((0, 5 + d))
+def largest_depth_on_path(
+    comm: Any, start: Array, end: Array, since: Array, vertices: Index, facets: MovingFacets
+) -> Array:
+    """How deep places of this rank get below the facets that they are under. Collective.
+
+    At each of some times, by which none moves on by more than half of a facet, below the nearest
+    facet that a place is in front of or behind. A place that comes in through the surface and
+    leaves the body sideways, where no facets are, has been no deeper than that.
+
+    Args:
+        comm: The ranks.
+        start: Of the places, (n, d) (length).
+        end: Of the places, (n, d) (length).
+        since: Time from which on to look, (n,).
+        vertices: See `find_crossings`.
+        facets: Those of this rank.
+
+    Returns:
+        (n,) (length); 0 for places that are under none.
+    """
+    first, n = comm.exscan(len(start)) or 0, len(start)
+    start, end, since = (gather_rows(comm, rows) for rows in (start, end, since))
+    depth: Array = np.zeros(len(start))
+    if not len(start):
+        return depth
+    vertices = np.concatenate(comm.allgather(vertices))
+    size = np.linalg.norm(facets.end[:, 1] - facets.end[:, 0], axis=1)
+    smallest = global_min(comm, size, empty=np.inf)
+    motion = np.linalg.norm(facets.end - facets.start, axis=2)
+    ways = np.linalg.norm(end - start, axis=1).max() + global_max(comm, motion)
+    times = np.linspace(0.0, 1.0, 1 + int(np.ceil(2 * ways / smallest)))[1:]
+    place, facet = _near(start, end, vertices, facets)
+    moving = [
+        _Pairs.of(start[place], end[place], facets, facet, piece) for piece in facets.pieces()
+    ]
+    for time in times:
+        nearest: Array = np.full(len(start), np.inf)
+        for pairs in moving:
+            rows = np.arange(len(place))
+            at = np.full(len(place), time)
+            there = pairs.meets(rows, at)
+            distance = pairs.distance(rows[there], time)
+            order = np.argsort(-np.abs(distance), kind="stable")
+            found: Array = np.full(len(start), np.inf)
+            found[place[there][order]] = distance[order]
+            nearest = np.where(np.abs(found) < np.abs(nearest), found, nearest)
+        distances = np.array(comm.allgather(nearest))
+        of = np.abs(distances).argmin(axis=0)
+        nearest = distances[of, np.arange(len(start))]
+        below = np.where(np.isfinite(nearest) & (time >= since), -nearest, 0.0)
+        depth = np.maximum(depth, below)
+    return depth[first : first + n]
+
+
+def _near(start: Array, end: Array, vertices: Index, facets: MovingFacets) -> tuple[Index, Index]:
+    """Places and facets of this rank, pair by pair, whose ways come near each other."""
+    none: Index = np.zeros(0, dtype=np.int64)
     if not (len(start) and len(facets.start)):
-        return nothing
+        return none, none
+    d = start.shape[1]
     # Balls around the ways: of the places, and of the facets, whose corners they hold.
     centre, radius = _ball(np.stack([start, end], axis=1))
     corners = np.concatenate([facets.start, facets.end], axis=1)
@@ -109,7 +169,7 @@ def _crossings(start: Array, end: Array, vertices: Index, facets: MovingFacets) 
     facet: Any
     known = np.flatnonzero(np.isfinite(radius))  # not where an obstacle has no normal
     if not len(known):
-        return nothing
+        return none, none
     longest, widest = radius[known].max(), reach.max()
     if np.mean((reach + longest) ** (d - 1)) < np.mean((radius[known] + widest) ** (d - 1)):
         tree = scipy.spatial.cKDTree(centre[known])
@@ -120,19 +180,19 @@ def _crossings(start: Array, end: Array, vertices: Index, facets: MovingFacets) 
     place = known[place]
     near = np.linalg.norm(centre[place] - middle[facet], axis=1) <= radius[place] + reach[facet]
     near &= ~(vertices[place][:, :, None] == facets.vertices[facet][:, None, :]).any(axis=(1, 2))
-    place, facet = place[near], facet[near]
+    return place[near], facet[near]
+
+
+def _crossings(start: Array, end: Array, vertices: Index, facets: MovingFacets) -> Array:
+    """Rows of place, time, inward, depth, normal and facet, of facets of this rank."""
+    d = start.shape[1]
+    nothing: Array = np.zeros((0, 5 + d))
+    place, facet = _near(start, end, vertices, facets)
     if not len(place):
         return nothing
-    pieces = [[0, 1]] if d == 2 else [[0, 1, 2], [0, 2, 3]][: facets.start.shape[1] - 2]
     found = [nothing]
-    for piece in pieces:
-        moving = _Pairs(
-            start[place],
-            end[place],
-            facets.start[facet][:, piece],
-            facets.end[facet][:, piece],
-            facets.sign[facet],
-        )
+    for piece in facets.pieces():
+        moving = _Pairs.of(start[place], end[place], facets, facet, piece)
         rows, time, inward = moving.through()
         met = moving.meets(rows, time)
         rows, time, inward = rows[met], time[met], inward[met]
@@ -151,6 +211,14 @@ class _Pairs:
     corners_start: Array
     corners_end: Array
     sign: Array
+
+    @classmethod
+    def of(
+        cls, start: Array, end: Array, facets: MovingFacets, facet: Index, piece: list[int]
+    ) -> _Pairs:
+        """Places, and pieces of the facets with these numbers."""
+        corners = facets.start[facet][:, piece], facets.end[facet][:, piece]
+        return cls(start, end, *corners, facets.sign[facet])
 
     def _at(self, time: Array | float, rows: Index | slice) -> tuple[Array, Array]:
         """Arms from the first corner to the place, (n, d), and tangents, (n, d - 1, d)."""
@@ -173,10 +241,10 @@ class _Pairs:
         """Outward unit normals, (n, d)."""
         return _unit(self._across(self._at(time, rows)[1], rows))
 
-    def distance(self, rows: Index) -> Array:
-        """From the plane of the facet at the end, (n,) (length)."""
-        arm, _ = self._at(1.0, rows)
-        return np.asarray(np.sum(arm * self.normal(rows, np.ones(len(rows))), axis=1))
+    def distance(self, rows: Index, time: float = 1.0) -> Array:
+        """From the plane of the facet at a time, (n,) (length)."""
+        arm, _ = self._at(time, rows)
+        return np.asarray(np.sum(arm * self.normal(rows, np.full(len(rows), time)), axis=1))
 
     def through(self) -> tuple[Index, Array, Mask]:
         """Pairs of which the place goes through the plane of the facet, when, and whether inwards.
