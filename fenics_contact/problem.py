@@ -112,8 +112,10 @@ class ContactProblem:
         prefix: Prefix of the PETSc options.
         small_displacement_tolerance: Largest relative error of the contact force and pressure
             (between two bodies: of the force) due to the assumption of small displacements. An
-            increment with a larger estimate fails; from 1 % on there is a warning. With infinity
-            no increment fails for this reason.
+            increment with a larger estimate fails, or in which points slide off the places of the
+            other body that their forces act at (`DeformableBody.update_pairs`); from 1 % on there
+            is a warning. With infinity no increment fails for this reason, and none is solved again
+            between other points.
         cross_check: Whether every solution's contact forces are compared with those that DOLFINx
             assembles from the boundary form. It costs one compiled form per contact, and one
             assembly per increment.

@@ -43,8 +43,8 @@ class Energy:
             increment, or if the state is not reached by smaller increments.
         sliding: Upper bound of the frictional work, by magnitudes of tractions and slip.
         imbalance: Work minus elastic minus the work of the tractions on Γc, which vanishes by
-            equilibrium at both ends up to the solver's tolerance. Between bodies with finite
-            kinematics, whose pairs change, it only decreases with the increment size.
+            equilibrium at both ends up to the solver's tolerance. Between bodies whose opposite
+            points change (finite kinematics, or sliding) it only decreases with the increment size.
         friction_energy_gain: Energy that friction has supplied, relative to the energy exchanged,
             the largest over groups of interacting bodies; 0 if none. Where works cancel in a
             reversal within one increment, it is relative to ``sliding``.

@@ -466,8 +466,8 @@ class Contact(PointResults):
     def pair(self, u: fem.Function | None = None) -> None:
         """Find the opposite points of all points. Collective.
 
-        Points without an opposite point are open, and `n_unpaired` counts them. If they are more
-        than half of all points, a warning states the reasons.
+        Points without an opposite point are open, and `n_unpaired` counts them. If at first these
+        are more than half of all points, a warning states the reasons.
 
         Args:
             u: Displacement of the bodies in which to search; None: the undeformed bodies.

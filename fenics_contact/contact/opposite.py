@@ -143,14 +143,14 @@ class Opposite(ABC):
         given, sampled: What else laws see, as expressions on Γc, and as numbers at the points.
         in_form, at_points: Kinematics of laws in the form on Γc, and at numbers at the points.
         committed_jump: The jump at the last commit, that of the obstacle taken away, (n_points,
-            gdim), between the places that are opposite each other from then on; zero before the
-            first.
+            gdim), between the places that are opposite each other now; zero before the first.
         committed_angle: By which the obstacle had turned then (radians).
         is_finite: Whether displacements may be of any size.
         is_rigid: Whether it is a rigid obstacle, whose reactions are external to the mesh.
         follows: Whether the pairs follow the bodies wherever they go.
         carries: Whether it is an obstacle that takes along what sticks to it by any amount.
-        pairs_anew: Whether pairs are found anew, on the deformed bodies, at every commit.
+        pairs_anew: Whether pairs are found anew, on the deformed bodies, at every commit and in
+            increments in which bodies slide.
         degenerate: Whether Γc has lost its tangent plane somewhere, where pairs follow the bodies.
         sampler: What evaluates a rigid obstacle anywhere; None where it is known on Γc alone, or
             the opposite is another body.

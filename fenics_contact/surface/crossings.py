@@ -104,9 +104,10 @@ def largest_depth_on_path(
 ) -> Array:
     """How deep places of this rank get below the facets that they are under. Collective.
 
-    At each of some times, by which none moves on by more than half of a facet, below the nearest
-    facet that a place is in front of or behind. A place that comes in through the surface and
-    leaves the body sideways, where no facets are, has been no deeper than that.
+    At each of some times, between which none moves on by more than half of a facet, below the
+    nearest facet that a place is in front of or behind, and no farther aside of than that. A place
+    that comes in through the surface and leaves the body sideways, where no facets are, has been no
+    deeper than that.
 
     Args:
         comm: The ranks.
@@ -137,13 +138,12 @@ def largest_depth_on_path(
     for time in times:
         nearest: Array = np.full(len(start), np.inf)
         for pairs in moving:
-            rows = np.arange(len(place))
-            at = np.full(len(place), time)
-            there = pairs.meets(rows, at)
-            distance = pairs.distance(rows[there], time)
-            order = np.argsort(-np.abs(distance), kind="stable")
+            rows, at = np.arange(len(place)), np.full(len(place), time)
+            distance = pairs.distance(rows, time)
+            there = pairs.aside(rows, at) <= np.abs(distance)
+            order = np.argsort(-np.abs(distance[there]), kind="stable")
             found: Array = np.full(len(start), np.inf)
-            found[place[there][order]] = distance[order]
+            found[place[there][order]] = distance[there][order]
             nearest = np.where(np.abs(found) < np.abs(nearest), found, nearest)
         distances = np.array(comm.allgather(nearest))
         of = np.abs(distances).argmin(axis=0)
@@ -274,15 +274,30 @@ class _Pairs:
 
     def meets(self, rows: Index, time: Array) -> Mask:
         """Whether the place is on the facet then."""
+        shares, _ = self._barycentric(rows, time)
+        return np.asarray(np.all(shares >= -NEGLIGIBLE, axis=1))
+
+    def aside(self, rows: Index, time: Array) -> Array:
+        """How far places are aside of the facet, in its plane, (n,) (length)."""
+        shares, heights = self._barycentric(rows, time)
+        return np.asarray(np.max(-shares * heights, axis=1, initial=0.0))
+
+    def _barycentric(self, rows: Index, time: Array) -> tuple[Array, Array]:
+        """Barycentric coordinates of places in the plane of the facet, and its heights, (n, d).
+
+        Of degenerate facets they are infinitely far outside.
+        """
         arm, tangents = self._at(time, rows)
         gram = np.einsum("nid,njd->nij", tangents, tangents)
         size = np.trace(gram, axis1=1, axis2=2)
         regular = np.abs(np.linalg.det(gram)) > 1e-24 * size ** gram.shape[1]
         gram[~regular] = np.eye(gram.shape[1])
-        right = np.einsum("nid,nd->ni", tangents, arm)
-        at = np.linalg.solve(gram, right[:, :, None])[:, :, 0]
-        inside = np.all(at >= -NEGLIGIBLE, axis=1) & (at.sum(axis=1) <= 1 + NEGLIGIBLE)
-        return np.asarray(regular & inside)
+        inverse = np.linalg.inv(gram)
+        at = np.einsum("nij,njd,nd->ni", inverse, tangents, arm)
+        shares = np.column_stack([1.0 - at.sum(axis=1), at])
+        slopes = np.column_stack([inverse.sum(axis=(1, 2)), np.einsum("nii->ni", inverse)])
+        shares[~regular] = -np.inf
+        return shares, 1.0 / np.sqrt(slopes)
 
 
 def _ball(points: Array) -> tuple[Array, Array]:
