@@ -397,10 +397,7 @@ class ContactProblem:
         self.solver.equations.factorisations = 0
         start_unknowns, diagonal = self.full.state(), self.full.diagonal.copy()
         at_present = self._is_present(start_unknowns)
-        for contact in self.contacts if self._trial is not None else ():
-            pairs = contact.state.opposite.pairs
-            if not contact.opposite.follows and contact.pairs.jump_map is not pairs.jump_map:
-                contact.restore()  # the trial has other pairs than the committed state
+        self._take_committed_pairs()
         follows = self.small_displacement_tolerance < np.inf
         points = OppositePoints(self.contacts if follows else [])
         try:
@@ -415,6 +412,7 @@ class ContactProblem:
                     if step is None:  # what it starts from may have been completed meanwhile
                         began = self._present.unknowns if at_present else start_unknowns
                         self._go_back(began)
+                        self._take_committed_pairs()
                         points.begin(self.contacts)
                         self.full.set_state(began)
                     # Outside, lest a SNES that is made anew takes its options for the caller's.
@@ -434,6 +432,13 @@ class ContactProblem:
             if self._comm.rank == 0:
                 self.solver.options.warn_of_unread(self.prefix)
         return step
+
+    def _take_committed_pairs(self) -> None:
+        """Go back to the committed state of contacts that have other pairs now. Collective."""
+        for contact in self.contacts:
+            pairs = contact.state.opposite.pairs
+            if not contact.opposite.follows and contact.pairs.jump_map is not pairs.jump_map:
+                contact.restore()
 
     def _is_present(self, unknowns: Array) -> bool:
         """Whether they are those of the present state. Collective."""
@@ -537,6 +542,7 @@ class ContactProblem:
                 cold=cold,
                 stiffness_changed=stiffness_changed,
                 load_before=self.state.load,
+                balance=points.end is None,
             )
         # Points outside of what is kept have to be looked at, and it takes all of u to do so.
         lags = not field and not solver.system.confined and self._may_lag()

@@ -32,7 +32,7 @@ NEGLIGIBLE_SLIDE = 1e-2
 
 
 class BodyOpposite(Opposite):
-    """Another body, paired with the points on the undeformed bodies or at every commit."""
+    """Another body, paired with the points of the undeformed bodies, or of deformed ones."""
 
     is_rigid = False
 
@@ -46,6 +46,7 @@ class BodyOpposite(Opposite):
         pairs = pairs or parts.new_pairs()
         assert pairs.distance is not None
         normal = ufl.FacetNormal(parts.quadrature.surface.mesh)
+        self._follow_from_now_on = False  # said once
         super().__init__(parts, pairs, parts.new_jump(), Placement(pairs.distance, normal))
 
     def told(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
@@ -125,6 +126,7 @@ class BodyOpposite(Opposite):
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
         """See `Opposite`."""
         self.update_data()
+        self._parts.displacement.follow()
         self.pairs.find(self.data.values["x"], self.data.values["normal"], depth, u)
 
     def resume(self, depth: Array, evaluate: Callable[[], PointValues], *, anew: bool) -> None:
@@ -137,11 +139,12 @@ class BodyOpposite(Opposite):
 
     def commit(self, values: PointValues) -> Array | None:
         """See `Opposite`."""
-        due = self.pairs_due(values)
+        due, first = self.pairs_due(values), not self._follow_from_now_on
         super().commit(values)
         if not due:
             return None
-        if not self.pairs_anew and self._mesh.comm.rank == 0:
+        self._follow_from_now_on = True
+        if first and self._update == "auto" and self._mesh.comm.rank == 0:
             logger.info(
                 "%s: opposite points are those at the end of every increment from now on, because "
                 "points have slid along the opposing surface",

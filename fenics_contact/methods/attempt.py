@@ -14,7 +14,7 @@ class Attempt:
     Attributes:
         method: A method of `ContactProblem`; or "cut", if `increments` halved the increment.
         iterations: Number of SNES iterations.
-        outcome: "converged", or the reason of the failure in words.
+        outcome: "converged", or in words why the increment was solved again or not at all.
     """
 
     method: str

@@ -9,7 +9,6 @@ a body that is pushed along a curved surface answers to other pairs by more than
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -24,8 +23,6 @@ from fenics_contact.types import Array
 
 __all__ = ["OppositePoints"]
 
-logger = logging.getLogger("fenics_contact")
-
 # How often pairs of a contact are found in an increment: with relaxation 2 to 4 times do.
 _MOST = 10
 # Least and largest share of the way to where the increment ended, by relaxation.
@@ -38,7 +35,8 @@ class _Pairing:
 
     Attributes:
         state: The state in which they were found.
-        slide: How far points had slid from the pairs before, (n_points, gdim) (length).
+        slide: How far points had slid from the pairs before, in sizes of their facets, (n_points,
+            gdim); NaN where they did not transmit forces.
         depth: Of the points in the opposing body where the increment had ended, (n_points,)
             (length).
         share: Of the way from the state before to the end of the increment.
@@ -108,11 +106,12 @@ class OppositePoints:
         self.end = end
         for contact in contacts:
             values, last = contact.values, self._pairings.get(contact.name)
-            slide = np.where(contact.opposite.transmits(values)[:, None], values.slide, 0.0)
+            slide = values.slide / contact.quadrature.facet_sizes[:, None]
+            slide[~contact.opposite.transmits(values)] = np.nan
             share, state, number = 1.0, end, 1
             if last is not None:
                 change = slide - last.slide
-                sums = [np.sum(last.slide * change), np.sum(change * change)]
+                sums = [np.nansum(last.slide * change), np.nansum(change * change)]
                 along, size = global_sum(contact.surface.mesh.comm, sums)
                 if size > 0:
                     relaxed = -last.share * float(along / size)
@@ -129,15 +128,9 @@ class OppositePoints:
         """
         new = [c for c in self._contacts if self._is_chosen(c)]
         for contact in new:
-            pairing, opposite = self._pairings[contact.name], contact.opposite
-            if not opposite.pairs_anew and contact.surface.mesh.comm.rank == 0:
-                logger.info(
-                    "%s: opposite points are those at the end of every increment from now on, "
-                    "because points have slid along the opposing surface",
-                    contact.name,
-                )
+            pairing = self._pairings[contact.name]
             full.set_state(pairing.state)
-            opposite.find_pairs(contact.displacement.u, pairing.depth)
+            contact.opposite.find_pairs(contact.displacement.u, pairing.depth)
         full.set_state(committed)
         for contact in new:
             contact.opposite.update_committed_jump()

@@ -453,6 +453,7 @@ class Solver:
         cold: bool,
         stiffness_changed: bool,
         load_before: Array,
+        balance: bool = True,
     ) -> tuple[int, list[Attempt], int]:
         """Solve, let multipliers take over what the springs bear, and again. Collective.
 
@@ -460,6 +461,7 @@ class Solver:
             cold: Whether nothing was borne before.
             stiffness_changed: Whether the bulk's tangent is another one than in the last increment.
             load_before: External forces at this rank's unknowns in the committed state (force).
+            balance: Whether to raise a ValueError for a load that contact cannot balance.
 
         Returns:
             Reason of the last solution, what was tried, and how many solutions there were.
@@ -470,12 +472,12 @@ class Solver:
         equations.loads = equations.motions.generalised_load(self._full.load)
 
         def iterate(first_round: bool) -> tuple[int, list[Attempt]]:
-            return self._iterate(first_round, cold, first_round and stiffness_changed)
+            return self._iterate(first_round, cold, first_round and stiffness_changed, balance)
 
         return solve_in_rounds(equations, iterate, load_before)
 
     def _iterate(
-        self, first_round: bool, cold: bool, stiffness_changed: bool
+        self, first_round: bool, cold: bool, stiffness_changed: bool, balance: bool
     ) -> tuple[int, list[Attempt]]:
         """Iterate by one method after another from the same start. Collective.
 
@@ -503,7 +505,7 @@ class Solver:
             if reason == OVERLOADED:
                 break
             if len(attempts) == 1:
-                chain += self._fallbacks(start)
+                chain += self._fallbacks(start, balance=balance)
         equations.set_state(equations.solution)
         own = self.methods.get(method)
         newton = (self._factors if own is None else own.by_newton) and not self._quasi_newton
@@ -514,7 +516,7 @@ class Solver:
             self.starts.keep(predict=own is None or not self._full.bulk.linear)
         return int(reason), attempts
 
-    def _fallbacks(self, start: Array) -> list[str]:
+    def _fallbacks(self, start: Array, *, balance: bool) -> list[str]:
         """What is tried after a failure, in this order, if loads can be balanced. Collective.
 
         Minimisation problems, which tell whether friction can bear the load, come first where the
@@ -533,7 +535,7 @@ class Solver:
         x.destroy()
         for contact in self._full.contacts:
             contact.evaluate()
-        if not self._full.bulk.linear:
+        if balance and not self._full.bulk.linear:
             LoadBalance(equations.motions).check(self._full.load, self._full.operators)
         if not goes_on:
             return []

@@ -19,6 +19,8 @@ __all__ = ["Crossings", "MovingFacets", "find_crossings", "largest_depth_on_path
 
 # Of the time at which the plane of a facet is crossed.
 _BISECTIONS = 40
+# Times at which paths are looked at, at most.
+_MOST_TIMES = 1000
 
 
 @dataclass(frozen=True)
@@ -105,9 +107,8 @@ def largest_depth_on_path(
     """How deep places of this rank get below the facets that they are under. Collective.
 
     At each of some times, between which none moves on by more than half of a facet, below the
-    nearest facet that a place is in front of or behind, and no farther aside of than that. A place
-    that comes in through the surface and leaves the body sideways, where no facets are, has been no
-    deeper than that.
+    nearest facet that a place is in front of or behind, and no farther aside of than that: so deep
+    was one that comes in through the surface and leaves the body sideways, where no facets are.
 
     Args:
         comm: The ranks.
@@ -118,38 +119,42 @@ def largest_depth_on_path(
         facets: Those of this rank.
 
     Returns:
-        (n,) (length); 0 for places that are under none.
+        (n,) (length); 0 for places that are under none, infinite where they move too far to tell.
     """
     first, n = comm.exscan(len(start)) or 0, len(start)
     start, end, since = (gather_rows(comm, rows) for rows in (start, end, since))
-    depth: Array = np.zeros(len(start))
     if not len(start):
-        return depth
+        return np.zeros(0)
     vertices = np.concatenate(comm.allgather(vertices))
-    size = np.linalg.norm(facets.end[:, 1] - facets.end[:, 0], axis=1)
-    smallest = global_min(comm, size, empty=np.inf)
-    motion = np.linalg.norm(facets.end - facets.start, axis=2)
-    ways = np.linalg.norm(end - start, axis=1).max() + global_max(comm, motion)
-    times = np.linspace(0.0, 1.0, 1 + int(np.ceil(2 * ways / smallest)))[1:]
     place, facet = _near(start, end, vertices, facets)
+    corners = [facets.start[facet], facets.end[facet]]
+    edges = [np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2) for x in corners]
+    smallest = global_min(comm, np.stack(edges), empty=np.inf)
+    ways = np.linalg.norm(end - start, axis=1)[place]
+    ways = ways + np.linalg.norm(corners[1] - corners[0], axis=2).max(axis=1, initial=0.0)
+    steps = 2 * global_max(comm, ways) / smallest if smallest > 0 else np.inf
+    if not steps <= _MOST_TIMES:
+        return np.full(n, np.inf)
+    times = np.linspace(0.0, 1.0, 1 + int(np.ceil(steps)))[1:]
     moving = [
         _Pairs.of(start[place], end[place], facets, facet, piece) for piece in facets.pieces()
     ]
-    for time in times:
-        nearest: Array = np.full(len(start), np.inf)
+    nearest: Array = np.full((len(times), len(start)), np.inf)
+    for number in range(len(times)):
+        time = float(times[number])
+        rows = np.flatnonzero(since[place] <= time)
         for pairs in moving:
-            rows, at = np.arange(len(place)), np.full(len(place), time)
             distance = pairs.distance(rows, time)
-            there = pairs.aside(rows, at) <= np.abs(distance)
+            there = pairs.aside(rows, np.full(len(rows), time)) <= np.abs(distance)
             order = np.argsort(-np.abs(distance[there]), kind="stable")
             found: Array = np.full(len(start), np.inf)
-            found[place[there][order]] = distance[there][order]
-            nearest = np.where(np.abs(found) < np.abs(nearest), found, nearest)
-        distances = np.array(comm.allgather(nearest))
-        of = np.abs(distances).argmin(axis=0)
-        nearest = distances[of, np.arange(len(start))]
-        below = np.where(np.isfinite(nearest) & (time >= since), -nearest, 0.0)
-        depth = np.maximum(depth, below)
+            found[place[rows[there]][order]] = distance[there][order]
+            row = nearest[number]
+            nearest[number] = np.where(np.abs(found) < np.abs(row), found, row)
+    everywhere = np.array(comm.allgather(nearest))
+    of = np.abs(everywhere).argmin(axis=0)[None]
+    nearest = np.take_along_axis(everywhere, of, axis=0)[0]
+    depth = -np.where(np.isfinite(nearest), nearest, 0.0).min(axis=0, initial=0.0)
     return depth[first : first + n]
 
 
