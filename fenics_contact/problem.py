@@ -414,7 +414,6 @@ class ContactProblem:
                         self._go_back(began)
                         self._take_committed_pairs()
                         points.begin(self.contacts)
-                        self.full.set_state(began)
                     # Outside, lest a SNES that is made anew takes its options for the caller's.
                     if step is None and not (tried and tried[-1].outcome == _SLID):
                         spread = sum(attempt.outcome == _SPREADS for attempt in tried)
@@ -555,7 +554,6 @@ class ContactProblem:
             tried += [*attempts[:-1], replace(attempts[-1], outcome=_SPREADS)]
             return None
         tried += attempts
-
         if reason > 0 and (contacts := points.to_update()):
             self._find_opposite_points(points, contacts, tried, interior)
             return None

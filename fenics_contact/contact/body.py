@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -22,12 +21,10 @@ from fenics_contact.types import Array, Mask
 
 __all__ = ["MAX_SLIDE", "NEGLIGIBLE_SLIDE", "BodyOpposite", "FollowedOpposite"]
 
-logger = logging.getLogger("fenics_contact")
-
-# Way along the opposite, in sizes of the point's facet, from which on pairs are found anew. In
-# partial slip of fine meshes ways are half of a facet, and nothing is gained by other pairs.
+# Slide relative to the facet size from which on pairs of the undeformed bodies are replaced. In
+# partial slip of fine meshes the slide is half of a facet, and nothing is gained by other pairs.
 MAX_SLIDE = 1.0
-# Below which pairs where the points are now are those of before.
+# Slide relative to the facet size below which pairs need not be found anew.
 NEGLIGIBLE_SLIDE = 1e-2
 
 
@@ -46,7 +43,6 @@ class BodyOpposite(Opposite):
         pairs = pairs or parts.new_pairs()
         assert pairs.distance is not None
         normal = ufl.FacetNormal(parts.quadrature.surface.mesh)
-        self._follow_from_now_on = False  # said once
         super().__init__(parts, pairs, parts.new_jump(), Placement(pairs.distance, normal))
 
     def told(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
@@ -93,7 +89,7 @@ class BodyOpposite(Opposite):
         if self.pairs_anew or self._update != "auto":
             return self.pairs_anew
         comm, paired = self._mesh.comm, self.pairs.paired
-        if comm.allreduce(int(np.any(self.transmits(values)))):
+        if comm.allreduce(int(np.any(self.transmitting_points(values)))):
             return self.largest_slide(values) > MAX_SLIDE
         # Of open points, to whom pairs are nothing yet, only where a body was carried elsewhere;
         # where there are no pairs at all it may come to some.
@@ -105,13 +101,13 @@ class BodyOpposite(Opposite):
         """See `Opposite`."""
         return self.may_pair_anew and self.largest_slide(values) > self.slide_limit
 
-    def transmits(self, values: PointValues) -> Mask:
+    def transmitting_points(self, values: PointValues) -> Mask:
         """See `Opposite`."""
         return self.pairs.paired & (np.abs(values.total_traction).max(axis=1) > 0)
 
     def largest_slide(self, values: PointValues) -> float:
         """See `Opposite`."""
-        return self._farthest(values.slide, self.transmits(values))
+        return self._farthest(values.slide, self.transmitting_points(values))
 
     @property
     def slide_limit(self) -> float:
@@ -119,7 +115,7 @@ class BodyOpposite(Opposite):
         return NEGLIGIBLE_SLIDE if self.pairs_anew else MAX_SLIDE
 
     def _farthest(self, ways: Array, points: Mask) -> float:
-        """The longest of the ways of some points, in sizes of their facets. Collective."""
+        """The largest displacement of some points relative to their facet sizes. Collective."""
         lengths = np.linalg.norm(ways, axis=1) / self._parts.quadrature.facet_sizes
         return global_max(self._mesh.comm, lengths[points])
 
@@ -139,17 +135,10 @@ class BodyOpposite(Opposite):
 
     def commit(self, values: PointValues) -> Array | None:
         """See `Opposite`."""
-        due, first = self.pairs_due(values), not self._follow_from_now_on
+        due = self.pairs_due(values)
         super().commit(values)
         if not due:
             return None
-        self._follow_from_now_on = True
-        if first and self._update == "auto" and self._mesh.comm.rank == 0:
-            logger.info(
-                "%s: opposite points are those at the end of every increment from now on, because "
-                "points have slid along the opposing surface",
-                self._parts.name,
-            )
         # The traction stays with the points of Γc; what they slip over has moved on.
         self.find_pairs(self._parts.displacement.u, values.depth)
         return self.update_committed_jump()

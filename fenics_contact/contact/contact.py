@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -32,6 +33,8 @@ from fenics_contact.surface.surface import ContactSurface, tagged_facets
 from fenics_contact.types import Array, Mask
 
 __all__ = ["Contact", "ContactState", "ContactTrial"]
+
+logger = logging.getLogger("fenics_contact")
 
 
 @dataclass(frozen=True)
@@ -476,7 +479,7 @@ class Contact(PointResults):
         self.state = replace(self.state, opposite=self.opposite.state())
 
     def _find_pairs(self, u: fem.Function | None) -> None:
-        """See `pair`; the committed state keeps the pairs that it has. Collective."""
+        """Find the pairs in a displacement, for the constructor and `pair`. Collective."""
         self.opposite.update()
         none = np.zeros(self.quadrature.n_points)
         self.opposite.find_pairs(u, none if u is None else self._evaluate().depth)
@@ -708,7 +711,14 @@ class Contact(PointResults):
         if moved is not None and self.law.has_friction:
             history["jump"] = history["jump"] + moved
         rows, commits = self.history.packed(history), self.state.commits + 1
-        self.set_state(ContactState(rows, self.opposite.state(), trial.points, commits))
+        before, opposite = self.state.opposite.pairs.found_at, self.opposite.state()
+        self.set_state(ContactState(rows, opposite, trial.points, commits))
+        replaced = before is None and opposite.pairs.found_at is not None
+        if replaced and self.surface.mesh.comm.rank == 0:
+            logger.info(
+                "%s: opposite points are those of the deformed bodies from this increment on",
+                self.name,
+            )
 
     def set_state(self, state: ContactState) -> None:
         """Make a state the committed one, and the present one. Collective."""

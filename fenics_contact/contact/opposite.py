@@ -506,7 +506,7 @@ class Opposite(ABC):
         """Whether pairs are, or may come to be, other ones than those of the undeformed bodies."""
         return False
 
-    def transmits(self, values: PointValues) -> Mask:
+    def transmitting_points(self, values: PointValues) -> Mask:
         """Mask of the points that transmit forces to another body, (n_points,).
 
         Args:
@@ -516,17 +516,17 @@ class Opposite(ABC):
 
     @property
     def slide_limit(self) -> float:
-        """Largest `largest_slide` in a solution."""
+        """Largest slide that a solution may have, see `largest_slide`."""
         return np.inf
 
     def largest_slide(self, values: PointValues) -> float:
-        """How far they have slid from the places that their forces act at. Collective.
+        """Return the largest slide of points that transmit forces to another body. Collective.
+
+        The slide is the tangential displacement relative to the opposing body since the pairs were
+        found, divided by the size of the point's facet. It is 0 where pairs follow the bodies.
 
         Args:
             values: Of the last evaluation.
-
-        Returns:
-            The farthest, in sizes of its facet; 0 where forces act where the points are.
         """
         return 0.0
 
@@ -549,7 +549,7 @@ class Opposite(ABC):
         return None
 
     def needs_new_pairs(self, values: PointValues) -> bool:
-        """Whether they have left pairs that may be found where the bodies are. Collective.
+        """Whether the slide exceeds its limit and pairs may be found anew. Collective.
 
         Args:
             values: Of a solution.

@@ -23,8 +23,8 @@ from fenics_contact.types import Array
 
 __all__ = ["OppositePoints"]
 
-# How often pairs of a contact are found in an increment: with relaxation 2 to 4 times do.
-_MOST = 10
+# Number of times that pairs of a contact are found in an increment: with relaxation 2 to 4 do.
+_MAX_PAIRINGS = 10
 # Least and largest share of the way to where the increment ended, by relaxation.
 _LEAST_SHARE, _LARGEST_SHARE = 0.1, 2.0
 
@@ -94,7 +94,9 @@ class OppositePoints:
 
     def _unfinished(self) -> list[Contact]:
         made = self._pairings
-        return [c for c in self._contacts if c.name not in made or made[c.name].number < _MOST]
+        return [
+            c for c in self._contacts if c.name not in made or made[c.name].number < _MAX_PAIRINGS
+        ]
 
     def choose_states(self, contacts: Sequence[Contact], end: Array) -> None:
         """Choose the states in which to find the pairs of evaluated contacts next. Collective.
@@ -107,7 +109,7 @@ class OppositePoints:
         for contact in contacts:
             values, last = contact.values, self._pairings.get(contact.name)
             slide = values.slide / contact.quadrature.facet_sizes[:, None]
-            slide[~contact.opposite.transmits(values)] = np.nan
+            slide[~contact.opposite.transmitting_points(values)] = np.nan
             share, state, number = 1.0, end, 1
             if last is not None:
                 change = slide - last.slide

@@ -19,8 +19,8 @@ __all__ = ["Crossings", "MovingFacets", "find_crossings", "largest_depth_on_path
 
 # Of the time at which the plane of a facet is crossed.
 _BISECTIONS = 40
-# Times at which paths are looked at, at most.
-_MOST_TIMES = 1000
+# Largest number of times at which the depth along paths is evaluated.
+_MAX_PATH_TIMES = 1000
 
 
 @dataclass(frozen=True)
@@ -133,15 +133,14 @@ def largest_depth_on_path(
     ways = np.linalg.norm(end - start, axis=1)[place]
     ways = ways + np.linalg.norm(corners[1] - corners[0], axis=2).max(axis=1, initial=0.0)
     steps = 2 * global_max(comm, ways) / smallest if smallest > 0 else np.inf
-    if not steps <= _MOST_TIMES:
+    if not steps <= _MAX_PATH_TIMES:
         return np.full(n, np.inf)
     times = np.linspace(0.0, 1.0, 1 + int(np.ceil(steps)))[1:]
     moving = [
         _Pairs.of(start[place], end[place], facets, facet, piece) for piece in facets.pieces()
     ]
     nearest: Array = np.full((len(times), len(start)), np.inf)
-    for number in range(len(times)):
-        time = float(times[number])
+    for number, time in enumerate(map(float, times)):
         rows = np.flatnonzero(since[place] <= time)
         for pairs in moving:
             distance = pairs.distance(rows, time)
