@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ from fenics_contact.methods.first_touch import FirstTouch
 from fenics_contact.methods.load_balance import LoadBalance
 from fenics_contact.methods.opposite_points import OppositePoints
 from fenics_contact.methods.solver import Settings, Solver
-from fenics_contact.parallel import fail_together, global_max, warn
+from fenics_contact.parallel import fail_together, global_max, global_sum, warn
 from fenics_contact.state import State, Trial
 from fenics_contact.step import Step
 from fenics_contact.systems import linear
@@ -53,10 +54,12 @@ __all__ = ["ContactProblem"]
 
 logger = logging.getLogger("fenics_contact")
 
-# Outcome of an attempt that retained too few unknowns.
-_SPREADS = "contact spreads beyond the retained dofs"
-# Outcome of one after which points are not opposite each other any more.
-_SLID = "converged; opposite points updated, solved again"
+
+class _Again(Enum):
+    """Why an increment is solved again: the outcome of the last attempt."""
+
+    UNKNOWNS = "contact spreads beyond the retained dofs"
+    PAIRS = "converged; opposite points updated, solved again"
 
 
 class ContactProblem:
@@ -239,16 +242,18 @@ class ContactProblem:
     def _initial_state(self) -> State:
         """Return a body at rest, or the state that another problem has left. Collective."""
         unknowns, mark = self.full.state(), self.full.mark
+        none = np.zeros_like(unknowns)
         contacts = tuple(contact.state for contact in self.contacts)
         if any(state.commits for state in contacts):
             load = self.present_load()
             self.full.begin(load)
             bulk = self.full.with_obstacles(self.bulk.assemble_residual())
             forces: dict[object, Forces] = {mark: self.full.present_forces(bulk)}
-            return State(unknowns, contacts, load, EnergyState.at(forces, self.contacts))
+            energy = EnergyState.at(forces, self.contacts)
+            return State(unknowns, contacts, load, energy, none, none)
         forces = {mark: Forces.none(unknowns, self.full.label)}
         energy = EnergyState.unloaded(forces, self.contacts)
-        return State(unknowns, contacts, np.zeros_like(unknowns), energy)
+        return State(unknowns, contacts, none, energy, none, none)
 
     @property
     def increment(self) -> int:
@@ -405,18 +410,18 @@ class ContactProblem:
             # it: a warning, on the rank that has the point, must not become an error there alone.
             with np.errstate(all="ignore"):
                 tried: list[Attempt] = []
-                step = None
-                while step is None:
+                while True:
                     with self.solver.options.present():
                         step = self._solve(start, recover_interior, tried, points)
-                    if step is None:  # what it starts from may have been completed meanwhile
-                        began = self._present.unknowns if at_present else start_unknowns
-                        self._go_back(began)
-                        self._take_committed_pairs()
-                        points.begin(self.contacts)
+                    if isinstance(step, Step):
+                        break
+                    # What it starts from may have been completed meanwhile.
+                    self._go_back(self._present.unknowns if at_present else start_unknowns)
+                    self._take_committed_pairs()
+                    points.begin(self.contacts)
                     # Outside, lest a SNES that is made anew takes its options for the caller's.
-                    if step is None and not (tried and tried[-1].outcome == _SLID):
-                        spread = sum(attempt.outcome == _SPREADS for attempt in tried)
+                    if step is _Again.UNKNOWNS:
+                        spread = sum(attempt.outcome == step.value for attempt in tried)
                         self.solver.change(anew=spread <= 1)
                 release_interrupt()
         except BaseException as error:
@@ -474,6 +479,41 @@ class ContactProblem:
         for contact, trial in zip(self.contacts, trials, strict=True):
             contact.restore(trial)
 
+    def _expect_opposite_points(self, points: OppositePoints, load: Array) -> None:
+        """Find opposite points where the increment ends if it goes on as the last one. Collective.
+
+        Args:
+            points: The iteration for them.
+            load: External forces (force).
+        """
+        lags = any(state.interior is not None for state in (self._present, self.state))
+        if lags or not points.contacts:
+            return
+        share = self._share_of_last_increment(load)
+        if share <= 0:  # nothing leads on, or back
+            return
+        before, began = self.full.state(), self.state.unknowns
+        points.expect(began + share * self.state.change, self.full, began)
+        points.begin(self.contacts)
+        self.full.set_state(before)
+        for contact in self.contacts:
+            contact.forget()
+
+    def _share_of_last_increment(self, load: Array) -> float:
+        """How far loads and prescribed values go on as in the last increment. Collective.
+
+        Values count by the stiffness of the bulk.
+
+        Returns:
+            The share of their last change: 1 in equal increments, 0 if nothing goes on.
+        """
+        state, held, stiffness = self.state, self.constrained, self.bulk.scale
+        moved = self.prescribed_values() - state.unknowns
+        last = np.where(held, stiffness * state.change, state.load_change)
+        now = np.where(held, stiffness * moved, load - state.load)
+        along, size = global_sum(self._comm, [last @ now, last @ last])
+        return float(along / size) if size > 0 else 0.0
+
     def _find_opposite_points(
         self,
         points: OppositePoints,
@@ -489,7 +529,7 @@ class ContactProblem:
             tried: What was tried; the last outcome is replaced.
             interior: What recovers the interior displacement there; None: u is up to date.
         """
-        tried[-1] = replace(tried[-1], outcome=_SLID)
+        tried[-1] = replace(tried[-1], outcome=_Again.PAIRS.value)
         if interior is not None:
             self.solver.system.complete(interior)
         points.choose_states(contacts, self.full.state())
@@ -502,8 +542,8 @@ class ContactProblem:
 
     def _solve(
         self, start: float, field: bool, tried: list[Attempt], points: OppositePoints
-    ) -> Step | None:
-        """`solve`; None if it takes other unknowns than are kept, or other pairs. Collective.
+    ) -> Step | _Again:
+        """`solve`; or why it takes other unknowns than are kept, or other pairs. Collective.
 
         Args:
             start: When it began.
@@ -513,7 +553,9 @@ class ContactProblem:
         """
         solver = self.solver
         # Between points of its end a load that nothing balances is a failure of the increment.
-        load = self._check_before(balance=points.end is None)
+        load = self._check_before(balance=not points.replaced)
+        if not (tried or points.replaced):
+            self._expect_opposite_points(points, load)
         before = self.full.state()
         for bc in self._bcs:
             bc.set(self.u.x.array)
@@ -524,13 +566,14 @@ class ContactProblem:
             self._modulus.measure()
         cold = self._approach.lead(load, before, first=self.increment == 0)
         if solver.chooses():
-            return None
+            return _Again.UNKNOWNS
         solver.update_system(stiffness_changed)
         self.full.scales.begin(self.operators)
         solver.system.begin(load)
         solver.equations.began = self.state.unknowns
         led = np.where(self.constrained, before, self.full.state())
         self._first_touch.count_slip(led, solver.end_without)
+        solver.starts.change = self.state.change
         solver.starts.carried = self._approach.carried
         if self._first_touch.end is not None:
             solver.starts.carried = self._first_touch.end
@@ -541,7 +584,7 @@ class ContactProblem:
                 cold=cold,
                 stiffness_changed=stiffness_changed,
                 load_before=self.state.load,
-                balance=points.end is None,
+                balance=not points.replaced,
             )
         # Points outside of what is kept have to be looked at, and it takes all of u to do so.
         lags = not field and not solver.system.confined and self._may_lag()
@@ -551,12 +594,12 @@ class ContactProblem:
         for contact in self.contacts:
             contact.evaluate()
         if solver.misses(found=reason > 0):
-            tried += [*attempts[:-1], replace(attempts[-1], outcome=_SPREADS)]
-            return None
+            tried += [*attempts[:-1], replace(attempts[-1], outcome=_Again.UNKNOWNS.value)]
+            return _Again.UNKNOWNS
         tried += attempts
         if reason > 0 and (contacts := points.to_update()):
             self._find_opposite_points(points, contacts, tried, interior)
-            return None
+            return _Again.PAIRS
         kinematics = reason > 0  # a solver that failed may have no factors for it
         if lags:
             self._begin_condensed_energy()
@@ -566,11 +609,11 @@ class ContactProblem:
             verdict, energies = self._judge_all(kinematics=kinematics, assemble=assemble)
         if reason > 0 and (contacts := points.to_update_for(verdict.pairing_errors)):
             self._find_opposite_points(points, contacts, tried, interior)
-            return None
+            return _Again.PAIRS
         if reason <= 0 or verdict.failures:
             raise self._not_converged(reason, verdict, tried)
         began = self.state.energy
-        if points.end is not None:
+        if points.replaced:
             began = began.between([c.opposite.committed_jump for c in self.contacts])
         energy = energies.since(began, self.contacts, self.full.scales)
         verdict = replace(verdict, friction_energy_gain=energy.friction_energy_gain)
@@ -776,6 +819,8 @@ class ContactProblem:
             contacts=tuple(contact.state for contact in self.contacts),
             load=trial.load,
             energy=trial.energy.between([c.opposite.committed_jump for c in self.contacts]),
+            change=trial.unknowns - start.unknowns,
+            load_change=trial.load - start.load,
             interior=trial.interior,
             increment=start.increment + 1,
         )
@@ -816,8 +861,10 @@ class ContactProblem:
             kept[self.solver.system.unknowns.kept] = True
         return CommittedState(
             state=state.unknowns,
+            change=state.change,
             internal=forces.internal,
             external=forces.external,
+            load_change=state.load_change,
             kept=kept,
             constrained=self.constrained,
             increment=state.increment,
@@ -899,6 +946,8 @@ class ContactProblem:
             contacts=tuple(contact.state for contact in self.contacts),
             load=load,
             energy=energy.between([c.opposite.committed_jump for c in self.contacts]),
+            change=taken.change.copy(),
+            load_change=taken.load_change.copy(),
             increment=taken.increment,
         )
         self.restart_solver()

@@ -20,6 +20,8 @@ class State:
         contacts: The state of every contact.
         load: External forces at the unknowns (force).
         energy: Forces and energies.
+        change: Of the unknowns in the last increment (length).
+        load_change: Of the external forces in the last increment (force).
         interior: What recovers the interior displacement after static condensation; None if the
             unknowns are up to date.
         increment: Number of increments so far.
@@ -29,6 +31,8 @@ class State:
     contacts: tuple[ContactState, ...]
     load: Array
     energy: EnergyState
+    change: Array
+    load_change: Array
     interior: Array | None = None
     increment: int = 0
 

@@ -92,8 +92,11 @@ def moment(led):
     return assemble_number(compiled(ufl.replace(bodies.F, {bodies.v: only})), COMM)
 
 
-def on_slab(start, law=None, *, width=3.0, soft=1.0, **options):
-    """A block on a slab, its top pressed down by 0.002; beyond x = 1.5 the slab may be softer."""
+def on_slab(start, law=None, *, width=3.0, soft=1.0, spring=None, **options):
+    """A block on a slab, its top pressed down by 0.002; beyond x = 1.5 the slab may be softer.
+
+    It is led by its top, or by the end of a spring on it.
+    """
     boxes = {
         "slab": Box((0.0, 0.0), (width, 0.5), (8 * round(width), 4)),
         "block": Box((start, 0.5), (1.0, 0.5), (8, 4)),
@@ -104,7 +107,10 @@ def on_slab(start, law=None, *, width=3.0, soft=1.0, **options):
     bodies.F = ufl.inner(modulus * bodies.stress, strain(bodies.v)) * ufl.dx(bodies.mesh)
     along = bodies.constant(0.0)
     scene.hold("slab", BOTTOM, 0, 1)
-    scene.hold("block", TOP, 0, value=along)
+    if spring is None:
+        scene.hold("block", TOP, 0, value=along)
+    else:
+        scene.load("block", TOP, 0, spring * (along - bodies.u[0]))
     scene.hold("block", TOP, 1, value=-0.002)
     law = fc.Frictionless() if law is None else law
     return Led(scene, along, scene.contact("block", BOTTOM, ("slab", TOP), law, **options))
@@ -186,6 +192,37 @@ def test_what_is_solved_again():
     assert close(again.contact.resultants().force, once.contact.resultants().force, 1e-8)
     again.problem.restore()
     assert close(again.contact.resultants().force, state_of(once), 1e-8)
+
+
+def solutions_of(step):
+    """How often an increment was solved between other points."""
+    return 1 + sum("solved again" in attempt.outcome for attempt in step.attempts)
+
+
+@pytest.mark.parametrize("spring", [None, 1e4])
+def test_points_are_those_where_the_last_increment_leads(spring):
+    """One solution for an increment that goes on as the last one, of the same size or another.
+
+    Led by prescribed values, or pulled by a force; the forces are those of fewer increments.
+    """
+
+    def make():
+        return on_slab(0.25, fc.Coulomb(0.2), spring=spring).press()
+
+    led, numbers = make(), []
+    for way in (0.1, 0.3, 0.5, 0.6, 0.9, 0.95, 0.7):
+        led.along.value = way
+        numbers.append(solutions_of(led.problem.solve()))
+        led.problem.commit()
+    # Friction sets in in the first, and the last turns round.
+    assert numbers[2:6] == [1] * 4
+    assert 1 < numbers[6] < 5
+    fewer = make()
+    for way in (0.95, 0.7):
+        fewer.along.value = way
+        fewer.problem.solve()
+        fewer.problem.commit()
+    assert close(led.contact.resultants().force, fewer.contact.resultants().force, 1e-3)
 
 
 def state_of(led):

@@ -2,7 +2,8 @@
 
 With small displacements pairs of points are found in one state of the bodies and stay as they are
 while the increment is solved. Where it ends points may have slid off their pairs; then it is solved
-again between others. This is an iteration for the state in which pairs are found. It is relaxed by
+again between others. This is an iteration for the state in which pairs are found. It begins where
+the increment will end if it goes on as the last one, and is relaxed by
 Aitken's method [U. Küttler, W. A. Wall, Comput. Mech. 43 (2008) 61-72, eq. 44], contact by contact:
 a body that is pushed along a curved surface answers to other pairs by more than their change.
 """
@@ -40,7 +41,7 @@ class _Pairing:
         depth: Of the points in the opposing body where the increment had ended, (n_points,)
             (length).
         share: Of the way from the state before to the end of the increment.
-        number: How often they have been found in this increment.
+        number: How often they have been found in this increment after a solution.
         opposite: The pairs, and the committed jump between them.
     """
 
@@ -56,19 +57,45 @@ class OppositePoints:
     """The iteration for the pairs of an increment.
 
     Attributes:
-        end: The state in which the increment ended between the pairs before; None: those of the
-            committed state have not been replaced.
+        contacts: Those whose pairs may be found anew.
+        end: The state in which the increment ended between the pairs before; None: it is not solved
+            yet.
     """
 
     def __init__(self, contacts: Sequence[Contact]) -> None:
         """Begin with the pairs of the committed state.
 
         Args:
-            contacts: Those whose pairs may be found anew.
+            contacts: Of the problem, all or none.
         """
         self.end: Array | None = None
-        self._contacts = [c for c in contacts if c.opposite.may_pair_anew]
+        self.contacts = [c for c in contacts if c.opposite.may_pair_anew]
         self._pairings: dict[str, _Pairing] = {}
+
+    @property
+    def replaced(self) -> bool:
+        """Whether others are in the place of the committed pairs."""
+        return bool(self._pairings)
+
+    def expect(self, end: Array, full: FullSystem, committed: Array) -> None:
+        """Find pairs where the increment is expected to end. Collective.
+
+        Only of contacts of which points that transmit forces leave their pairs by then.
+
+        Args:
+            end: The state expected.
+            full: The system on all unknowns.
+            committed: The committed state, complete.
+        """
+        full.set_state(end)
+        for contact in self.contacts:
+            contact.evaluate()
+        for contact in self.to_update():
+            # That slide is of no solution, and says nothing of how the next one answers.
+            unknown = np.full_like(contact.values.slide, np.nan)
+            depth = contact.values.depth
+            self._pairings[contact.name] = _Pairing(end, unknown, depth, share=1.0, number=0)
+        self.find(full, committed)
 
     def to_update(self) -> list[Contact]:
         """Contacts of which points that transmit forces have left their pairs. Collective."""
@@ -84,7 +111,7 @@ class OppositePoints:
             names: Of contacts with a large error.
         """
         found: list[Contact] = []
-        if not any(contact.name in names for contact in self._contacts):
+        if not any(contact.name in names for contact in self.contacts):
             return found
         for contact in self._unfinished():
             slid = contact.opposite.largest_slide(contact.values) > NEGLIGIBLE_SLIDE
@@ -95,7 +122,7 @@ class OppositePoints:
     def _unfinished(self) -> list[Contact]:
         made = self._pairings
         return [
-            c for c in self._contacts if c.name not in made or made[c.name].number < _MAX_PAIRINGS
+            c for c in self.contacts if c.name not in made or made[c.name].number < _MAX_PAIRINGS
         ]
 
     def choose_states(self, contacts: Sequence[Contact], end: Array) -> None:
@@ -128,7 +155,7 @@ class OppositePoints:
             full: The system on all unknowns.
             committed: The committed state, complete.
         """
-        new = [c for c in self._contacts if self._is_chosen(c)]
+        new = [c for c in self.contacts if self._is_chosen(c)]
         for contact in new:
             pairing = self._pairings[contact.name]
             full.set_state(pairing.state)

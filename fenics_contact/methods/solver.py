@@ -428,7 +428,6 @@ class Solver:
         """Drop what is kept from earlier increments. Collective."""
         self.system.forget()
         self._make_matrices()
-        self.starts.restart()
 
     def recover(self) -> None:
         """Replace what an error of PETSc may have left locked or half done. Collective."""

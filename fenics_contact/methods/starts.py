@@ -43,6 +43,7 @@ class Starts:
     Attributes:
         factored: Whether the consistent tangent factored last is that of a solution.
         predict: Whether a step on it may be chosen.
+        change: By what the last committed increment changed the state of the full system.
         carried: The state in which bodies have gone with obstacles that moved; None: none has.
     """
 
@@ -50,24 +51,18 @@ class Starts:
         """Nothing is known yet."""
         self.factored = self.predict = False
         self.carried: Array | None = None
+        self.change: Array = np.zeros(0)
         self._equations = equations
         self._moved: Array | None = None  # of the values prescribed, since the last increment
-        self._ended: Array | None = None  # the state in which that did
-        self._change: Array | None = None  # of the state, in the last increment that changed it
         self._borne: list[_Borne] = []  # by contact, in the solution found last
 
     def moved_from(self, before: Array) -> None:
-        """Take note of what the last increment and the values prescribed now changed. Collective.
+        """Take note of what the values prescribed now changed. Collective.
 
         Args:
             before: The state of the full system in which the last increment ended.
         """
         full = self._equations.full
-        if self._ended is not None:
-            last = before - self._ended
-            if global_max(full.unknowns.comm, np.abs(last)) > 0.0:  # it is not tried once more
-                self._change = last
-        self._ended = before
         self._moved = None
         if not full.bulk.linear:
             change = full.vector()
@@ -77,11 +72,6 @@ class Starts:
     def forget(self) -> None:
         """Another tangent is factored than that of the solution found last."""
         self.factored = self.predict = False
-
-    def restart(self) -> None:
-        """Know no more than a run that is taken up here."""
-        self.forget()
-        self._ended = self._change = None
 
     def keep(self, *, predict: bool) -> None:
         """Take note of what contacts bear in the solution that was just found. Collective.
@@ -165,8 +155,8 @@ class Starts:
                     step = add(stepped)
                     turned = self._friction_works()
         self._moved = None
-        if first_round and not predicts and not cold and self._change is not None:
-            add(self._continued(present, forces, self._change))
+        if first_round and not predicts and not cold:
+            add(self._continued(present, forces))
         if self.carried is not None and first_round:
             add(system.part(self.carried))
         if first_round and any(c.free_angle is not None for c in equations.contacts):
@@ -175,7 +165,7 @@ class Starts:
             return starts[step]
         return starts[int(np.argmin(residuals))]
 
-    def _continued(self, present: Array, forces: Array, change: Array) -> Array:
+    def _continued(self, present: Array, forces: Array) -> Array:
         """Where a change like that of the last increment leaves no force along it. Collective.
 
         By the secant between none and all of it, so that the sizes of the increments do not matter.
@@ -183,10 +173,9 @@ class Starts:
         Args:
             present: The state.
             forces: The residual there.
-            change: Of the state of the full system, in that increment.
         """
         equations, system = self._equations, self._equations.system
-        way = system.part(change).copy()
+        way = system.part(self.change).copy()
         way[system.constrained] = 0.0
         equations.residual_at(present + way)
         along = np.array([forces @ way, equations.function.array_r @ way])

@@ -14,9 +14,9 @@ from fenics_contact.types import Array, Mask
 
 __all__ = ["N_ROWS", "CommittedState"]
 
-# How many arrays a state has over the unknowns: displacements, then forces, then masks; and how
-# many of them have a unit.
-N_ROWS, _PHYSICAL = 5, 3
+# How many arrays a state has over the unknowns: displacements, then forces, then masks.
+_DISPLACEMENTS, _FORCES, _MASKS = 2, 3, 2
+N_ROWS = _DISPLACEMENTS + _FORCES + _MASKS
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,10 @@ class CommittedState:
 
     Attributes:
         state: Values of the unknowns.
+        change: Of these in the last increment.
         internal: Internal forces at them (force).
         external: External ones.
+        load_change: Of the external ones in the last increment.
         kept: Mask of those kept when condensed.
         constrained: Mask of those with Dirichlet conditions.
         increment: Number of increments so far.
@@ -35,8 +37,10 @@ class CommittedState:
     """
 
     state: Array
+    change: Array
     internal: Array
     external: Array
+    load_change: Array
     kept: Mask
     constrained: Mask
     increment: int
@@ -50,8 +54,9 @@ class CommittedState:
 
     def rows(self, unknowns: Unknowns, bulk: Bulk) -> Array:
         """The arrays in the user's units, (N_ROWS, n_local)."""
-        found = (self.state, self.internal, self.external, self.kept, self.constrained)
-        return _converted(np.stack(found).astype(np.float64), unknowns, bulk, back=False)
+        forces = (self.internal, self.external, self.load_change)
+        found = np.stack((self.state, self.change, *forces, self.kept, self.constrained))
+        return _converted(found.astype(np.float64), unknowns, bulk, back=False)
 
     @classmethod
     def from_rows(
@@ -60,16 +65,26 @@ class CommittedState:
         """What gave these `rows` and `numbers`."""
         increment, expected, *anew = (int(number) for number in numbers)
         arrays = _converted(rows, unknowns, bulk, back=True)
-        state, internal, external, kept, constrained = arrays
-        masks = kept > 0, constrained > 0
-        pairs = tuple(bool(found) for found in anew)
-        return cls(state, internal, external, *masks, increment, expected, pairs)
+        state, change, internal, external, load_change = arrays[:-_MASKS]
+        kept, constrained = arrays[-_MASKS:] > 0
+        return cls(
+            state,
+            change,
+            internal,
+            external,
+            load_change,
+            kept,
+            constrained,
+            increment,
+            expected,
+            pairs_anew=tuple(bool(found) for found in anew),
+        )
 
 
 def _converted(rows: Array, unknowns: Unknowns, bulk: Bulk, *, back: bool) -> Array:
     """Displacements and forces of the body in the user's units, or ``back`` from them."""
     n, found = unknowns.n_dofs, rows.copy()
     convert = (bulk.in_units, bulk.from_units)
-    for i in range(_PHYSICAL):
-        found[i, :n] = convert[(i == 0) != back](rows[i, :n])
+    for i in range(N_ROWS - _MASKS):
+        found[i, :n] = convert[(i < _DISPLACEMENTS) != back](rows[i, :n])
     return found
