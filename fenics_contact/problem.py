@@ -48,6 +48,7 @@ from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Unknowns
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
 __all__ = ["ContactProblem"]
@@ -55,11 +56,16 @@ __all__ = ["ContactProblem"]
 logger = logging.getLogger("fenics_contact")
 
 
+# Largest extrapolation of the last increment: beyond, contact hardly goes on as it did.
+_MAX_RATIO = 2.0
+
+
 class _Again(Enum):
     """Why an increment is solved again: the outcome of the last attempt."""
 
     UNKNOWNS = "contact spreads beyond the retained dofs"
     PAIRS = "converged; opposite points updated, solved again"
+    FROM_COMMITTED = "failed between predicted opposite points, solved again between committed ones"
 
 
 class ContactProblem:
@@ -249,11 +255,10 @@ class ContactProblem:
             self.full.begin(load)
             bulk = self.full.with_obstacles(self.bulk.assemble_residual())
             forces: dict[object, Forces] = {mark: self.full.present_forces(bulk)}
-            energy = EnergyState.at(forces, self.contacts)
-            return State(unknowns, contacts, load, energy, none, none)
+            return State(unknowns, contacts, load, EnergyState.at(forces, self.contacts), none)
         forces = {mark: Forces.none(unknowns, self.full.label)}
         energy = EnergyState.unloaded(forces, self.contacts)
-        return State(unknowns, contacts, none, energy, none, none)
+        return State(unknowns, contacts, none, energy, none)
 
     @property
     def increment(self) -> int:
@@ -479,40 +484,52 @@ class ContactProblem:
         for contact, trial in zip(self.contacts, trials, strict=True):
             contact.restore(trial)
 
-    def _expect_opposite_points(self, points: OppositePoints, load: Array) -> None:
+    def _predict_opposite_points(self, points: OppositePoints, load: Array) -> None:
         """Find opposite points where the increment ends if it goes on as the last one. Collective.
 
         Args:
             points: The iteration for them.
             load: External forces (force).
         """
+        change, began = self.state.change, self.state.unknowns
         lags = any(state.interior is not None for state in (self._present, self.state))
-        if lags or not points.contacts:
+        if change is None or lags or not points.contacts:
             return
-        share = self._share_of_last_increment(load)
-        if share <= 0:  # nothing leads on, or back
+        ratio = self._increment_ratio(change, load)
+        if not 0 < ratio <= _MAX_RATIO:
             return
-        before, began = self.full.state(), self.state.unknowns
-        points.expect(began + share * self.state.change, self.full, began)
+        before = self.full.state()
+        points.predict(began + ratio * change, self.full, began)
         points.begin(self.contacts)
         self.full.set_state(before)
         for contact in self.contacts:
             contact.forget()
 
-    def _share_of_last_increment(self, load: Array) -> float:
-        """How far loads and prescribed values go on as in the last increment. Collective.
+    def _increment_ratio(self, change: Array, load: Array) -> float:
+        """Loads and prescribed values of this increment relative to the last one's. Collective.
 
-        Values count by the stiffness of the bulk.
+        By projection. Prescribed displacements count by the stiffness of the bulk.
+
+        Args:
+            change: Of the state in the last increment.
+            load: External forces (force).
 
         Returns:
-            The share of their last change: 1 in equal increments, 0 if nothing goes on.
+            1 in equal increments, negative where loads turn round; 0 if the last one had none.
         """
-        state, held, stiffness = self.state, self.constrained, self.bulk.scale
-        moved = self.prescribed_values() - state.unknowns
-        last = np.where(held, stiffness * state.change, state.load_change)
-        now = np.where(held, stiffness * moved, load - state.load)
-        along, size = global_sum(self._comm, [last @ now, last @ last])
-        return float(along / size) if size > 0 else 0.0
+        state, n = self.state, self._n_owned  # without motions of obstacles
+        held, stiffness = self.constrained[:n], self.bulk.scale
+
+        def forces(displacement: Array, force: Array) -> Array:
+            return np.where(held, stiffness * displacement[:n], force[:n])
+
+        all_of_it = forces(state.unknowns, state.load)
+        last = forces(change, state.load_change)
+        now = forces(self.prescribed_values() - state.unknowns, load - state.load)
+        along, size, whole = global_sum(
+            self._comm, [last @ now, last @ last, all_of_it @ all_of_it]
+        )
+        return float(along / size) if size > NEGLIGIBLE**2 * whole else 0.0
 
     def _find_opposite_points(
         self,
@@ -555,7 +572,7 @@ class ContactProblem:
         # Between points of its end a load that nothing balances is a failure of the increment.
         load = self._check_before(balance=not points.replaced)
         if not (tried or points.replaced):
-            self._expect_opposite_points(points, load)
+            self._predict_opposite_points(points, load)
         before = self.full.state()
         for bc in self._bcs:
             bc.set(self.u.x.array)
@@ -610,6 +627,9 @@ class ContactProblem:
         if reason > 0 and (contacts := points.to_update_for(verdict.pairing_errors)):
             self._find_opposite_points(points, contacts, tried, interior)
             return _Again.PAIRS
+        if (reason <= 0 or verdict.failures) and points.drop_prediction():
+            tried[-1] = replace(tried[-1], outcome=_Again.FROM_COMMITTED.value)
+            return _Again.FROM_COMMITTED
         if reason <= 0 or verdict.failures:
             raise self._not_converged(reason, verdict, tried)
         began = self.state.energy
@@ -814,12 +834,13 @@ class ContactProblem:
                 contact.set_state(state)
             self.restore()
             raise
+        complete = trial.interior is None and start.interior is None
         self.state = State(
             unknowns=self.full.state(),
             contacts=tuple(contact.state for contact in self.contacts),
             load=trial.load,
             energy=trial.energy.between([c.opposite.committed_jump for c in self.contacts]),
-            change=trial.unknowns - start.unknowns,
+            change=trial.unknowns - start.unknowns if complete else None,
             load_change=trial.load - start.load,
             interior=trial.interior,
             increment=start.increment + 1,
@@ -861,7 +882,7 @@ class ContactProblem:
             kept[self.solver.system.unknowns.kept] = True
         return CommittedState(
             state=state.unknowns,
-            change=state.change,
+            change=np.zeros_like(state.load) if state.change is None else state.change,
             internal=forces.internal,
             external=forces.external,
             load_change=state.load_change,
@@ -946,7 +967,7 @@ class ContactProblem:
             contacts=tuple(contact.state for contact in self.contacts),
             load=load,
             energy=energy.between([c.opposite.committed_jump for c in self.contacts]),
-            change=taken.change.copy(),
+            change=taken.change.copy() if global_max(self._comm, np.abs(taken.change)) else None,
             load_change=taken.load_change.copy(),
             increment=taken.increment,
         )

@@ -20,8 +20,9 @@ class State:
         contacts: The state of every contact.
         load: External forces at the unknowns (force).
         energy: Forces and energies.
-        change: Of the unknowns in the last increment (length).
         load_change: Of the external forces in the last increment (force).
+        change: Of the unknowns in the last increment (length); None: there was none, or the
+            interior was out of date.
         interior: What recovers the interior displacement after static condensation; None if the
             unknowns are up to date.
         increment: Number of increments so far.
@@ -31,8 +32,8 @@ class State:
     contacts: tuple[ContactState, ...]
     load: Array
     energy: EnergyState
-    change: Array
     load_change: Array
+    change: Array | None = None
     interior: Array | None = None
     increment: int = 0
 

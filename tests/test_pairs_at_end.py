@@ -210,15 +210,15 @@ def test_points_are_those_where_the_last_increment_leads(spring):
         return on_slab(0.25, fc.Coulomb(0.2), spring=spring).press()
 
     led, numbers = make(), []
-    for way in (0.1, 0.3, 0.5, 0.6, 0.9, 0.95, 0.7):
+    for way in (0.1, 0.25, 0.4, 0.5, 0.65, 0.7, 0.55):
         led.along.value = way
         numbers.append(solutions_of(led.problem.solve()))
         led.problem.commit()
-    # Friction sets in in the first, and the last turns round.
+    # Pairs are of the undeformed bodies, then friction sets in, and the last turns round.
     assert numbers[2:6] == [1] * 4
     assert 1 < numbers[6] < 5
     fewer = make()
-    for way in (0.95, 0.7):
+    for way in (0.7, 0.55):
         fewer.along.value = way
         fewer.problem.solve()
         fewer.problem.commit()

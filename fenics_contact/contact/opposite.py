@@ -519,7 +519,7 @@ class Opposite(ABC):
         """Largest slide that a solution may have, see `largest_slide`."""
         return np.inf
 
-    def largest_slide(self, values: PointValues) -> float:
+    def largest_slide(self, values: PointValues, of: PointValues | None = None) -> float:
         """Return the largest slide of points that transmit forces to another body. Collective.
 
         The slide is the tangential displacement relative to the opposing body since the pairs were
@@ -527,6 +527,7 @@ class Opposite(ABC):
 
         Args:
             values: Of the last evaluation.
+            of: Of the state in which the points transmit forces; by default the same.
         """
         return 0.0
 
@@ -547,14 +548,6 @@ class Opposite(ABC):
     def local_map(self) -> PETSc.Mat | None:
         """See the class."""
         return None
-
-    def needs_new_pairs(self, values: PointValues) -> bool:
-        """Whether the slide exceeds its limit and pairs may be found anew. Collective.
-
-        Args:
-            values: Of a solution.
-        """
-        return False
 
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
         """Find what lies opposite the points; see `Contact.pair`. Collective.

@@ -2,8 +2,8 @@
 
 With small displacements pairs of points are found in one state of the bodies and stay as they are
 while the increment is solved. Where it ends points may have slid off their pairs; then it is solved
-again between others. This is an iteration for the state in which pairs are found. It begins where
-the increment will end if it goes on as the last one, and is relaxed by
+again between others. This is an iteration for the state in which pairs are found. It begins with a
+predictor, the state in which the increment ends if it goes on as the last one, and is relaxed by
 Aitken's method [U. Küttler, W. A. Wall, Comput. Mech. 43 (2008) 61-72, eq. 44], contact by contact:
 a body that is pushed along a curved surface answers to other pairs by more than their change.
 """
@@ -36,17 +36,17 @@ class _Pairing:
 
     Attributes:
         state: The state in which they were found.
-        slide: How far points had slid from the pairs before, in sizes of their facets, (n_points,
-            gdim); NaN where they did not transmit forces.
-        depth: Of the points in the opposing body where the increment had ended, (n_points,)
-            (length).
+        slide: How far points had slid from the pairs before in the solution between them, in sizes
+            of their facets, (n_points, gdim), NaN where they did not transmit forces; None: there
+            is no solution yet.
+        depth: Of the points in the opposing body there, or by the predictor, (n_points,) (length).
         share: Of the way from the state before to the end of the increment.
         number: How often they have been found in this increment after a solution.
         opposite: The pairs, and the committed jump between them.
     """
 
     state: Array
-    slide: Array
+    slide: Array | None
     depth: Array
     share: float
     number: int
@@ -77,53 +77,66 @@ class OppositePoints:
         """Whether others are in the place of the committed pairs."""
         return bool(self._pairings)
 
-    def expect(self, end: Array, full: FullSystem, committed: Array) -> None:
-        """Find pairs where the increment is expected to end. Collective.
+    def predict(self, end: Array, full: FullSystem, committed: Array) -> None:
+        """Find the pairs of the state in which the increment may end. Collective.
 
-        Only of contacts of which points that transmit forces leave their pairs by then.
+        Of those contacts whose pairs are found anew at every commit, and of which points that
+        transmit forces leave these by then.
 
         Args:
-            end: The state expected.
+            end: That state.
             full: The system on all unknowns.
             committed: The committed state, complete.
         """
         full.set_state(end)
         for contact in self.contacts:
+            before = contact.state.points
+            if before is None or not contact.opposite.pairs_anew:
+                continue
             contact.evaluate()
-        for contact in self.to_update():
-            # That slide is of no solution, and says nothing of how the next one answers.
-            unknown = np.full_like(contact.values.slide, np.nan)
-            depth = contact.values.depth
-            self._pairings[contact.name] = _Pairing(end, unknown, depth, share=1.0, number=0)
+            if contact.opposite.largest_slide(contact.values, before) > NEGLIGIBLE_SLIDE:
+                self._pairings[contact.name] = _Pairing(end, None, contact.values.depth, 1.0, 0)
         self.find(full, committed)
+
+    def drop_prediction(self) -> bool:
+        """Go back to the committed pairs if nothing was solved between others; whether so."""
+        predicted = self.replaced and self.end is None
+        if predicted:
+            self._pairings.clear()
+        return predicted
 
     def to_update(self) -> list[Contact]:
         """Contacts of which points that transmit forces have left their pairs. Collective."""
-        return [c for c in self._unfinished() if c.opposite.needs_new_pairs(c.values)]
+        return [
+            c
+            for c in self.contacts
+            if self._number_of(c) < _MAX_PAIRINGS
+            and c.opposite.largest_slide(c.values) > c.opposite.slide_limit
+        ]
 
     def to_update_for(self, names: Sequence[str]) -> list[Contact]:
         """Contacts whose pairs may cause a large small-displacement error. Collective.
 
-        All of which points have slid; and those with the error if their pairs are committed ones,
-        for points without a pair do not tell how far they have come.
+        All of which points have slid; and those with the error if their pairs are not of this
+        increment, for points without a pair do not tell how far they have come.
 
         Args:
             names: Of contacts with a large error.
         """
-        found: list[Contact] = []
-        if not any(contact.name in names for contact in self.contacts):
-            return found
-        for contact in self._unfinished():
+        if not any(c.name in names for c in self.contacts):
+            return []
+        found = []
+        for contact in self.contacts:
+            number = self._number_of(contact)
             slid = contact.opposite.largest_slide(contact.values) > NEGLIGIBLE_SLIDE
-            if slid or (contact.name in names and contact.name not in self._pairings):
-                found.append(contact)
+            due = slid or (contact.name in names and number == 0)
+            found += [contact] if due and number < _MAX_PAIRINGS else []
         return found
 
-    def _unfinished(self) -> list[Contact]:
-        made = self._pairings
-        return [
-            c for c in self.contacts if c.name not in made or made[c.name].number < _MAX_PAIRINGS
-        ]
+    def _number_of(self, contact: Contact) -> int:
+        """How often its pairs have been found in this increment after a solution."""
+        pairing = self._pairings.get(contact.name)
+        return 0 if pairing is None else pairing.number
 
     def choose_states(self, contacts: Sequence[Contact], end: Array) -> None:
         """Choose the states in which to find the pairs of evaluated contacts next. Collective.
@@ -139,13 +152,15 @@ class OppositePoints:
             slide[~contact.opposite.transmitting_points(values)] = np.nan
             share, state, number = 1.0, end, 1
             if last is not None:
+                number = last.number + 1
+            if last is not None and last.slide is not None:
                 change = slide - last.slide
                 sums = [np.nansum(last.slide * change), np.nansum(change * change)]
                 along, size = global_sum(contact.surface.mesh.comm, sums)
                 if size > 0:
                     relaxed = -last.share * float(along / size)
                     share = min(max(relaxed, _LEAST_SHARE), _LARGEST_SHARE)
-                state, number = last.state + share * (end - last.state), last.number + 1
+                state = last.state + share * (end - last.state)
             self._pairings[contact.name] = _Pairing(state, slide, values.depth, share, number)
 
     def find(self, full: FullSystem, committed: Array) -> None:

@@ -43,7 +43,8 @@ class Starts:
     Attributes:
         factored: Whether the consistent tangent factored last is that of a solution.
         predict: Whether a step on it may be chosen.
-        change: By what the last committed increment changed the state of the full system.
+        change: By what the last committed increment changed the state of the full system; None:
+            it is not known.
         carried: The state in which bodies have gone with obstacles that moved; None: none has.
     """
 
@@ -51,7 +52,7 @@ class Starts:
         """Nothing is known yet."""
         self.factored = self.predict = False
         self.carried: Array | None = None
-        self.change: Array = np.zeros(0)
+        self.change: Array | None = None
         self._equations = equations
         self._moved: Array | None = None  # of the values prescribed, since the last increment
         self._borne: list[_Borne] = []  # by contact, in the solution found last
@@ -155,8 +156,8 @@ class Starts:
                     step = add(stepped)
                     turned = self._friction_works()
         self._moved = None
-        if first_round and not predicts and not cold:
-            add(self._continued(present, forces))
+        if first_round and not predicts and not cold and self.change is not None:
+            add(self._continued(present, forces, self.change))
         if self.carried is not None and first_round:
             add(system.part(self.carried))
         if first_round and any(c.free_angle is not None for c in equations.contacts):
@@ -165,7 +166,7 @@ class Starts:
             return starts[step]
         return starts[int(np.argmin(residuals))]
 
-    def _continued(self, present: Array, forces: Array) -> Array:
+    def _continued(self, present: Array, forces: Array, change: Array) -> Array:
         """Where a change like that of the last increment leaves no force along it. Collective.
 
         By the secant between none and all of it, so that the sizes of the increments do not matter.
@@ -173,9 +174,10 @@ class Starts:
         Args:
             present: The state.
             forces: The residual there.
+            change: Of the state of the full system, in that increment.
         """
         equations, system = self._equations, self._equations.system
-        way = system.part(self.change).copy()
+        way = system.part(change).copy()
         way[system.constrained] = 0.0
         equations.residual_at(present + way)
         along = np.array([forces @ way, equations.function.array_r @ way])
