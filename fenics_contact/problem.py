@@ -577,7 +577,7 @@ class ContactProblem:
         for bc in self._bcs:
             bc.set(self.u.x.array)
         self.u.x.scatter_forward()
-        solver.follow(before)
+        solver.starts.moved_from(before)
         stiffness_changed = self.full.update_stiffness()
         if stiffness_changed and self.bulk.linear:
             self._modulus.measure()

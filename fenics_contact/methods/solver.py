@@ -415,15 +415,6 @@ class Solver:
             self._configure_anew()
         self._kept.was_chosen()
 
-    def follow(self, before: Array) -> None:
-        """Take note of how far the values prescribed now have moved, for a start. Collective.
-
-        Args:
-            before: The state in which the last increment ended.
-        """
-        self.starts.moved_from(before)
-        self._update_pairs()
-
     def restart(self) -> None:
         """Drop what is kept from earlier increments. Collective."""
         self.system.forget()
