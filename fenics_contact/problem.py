@@ -35,7 +35,7 @@ from fenics_contact.methods.first_touch import FirstTouch
 from fenics_contact.methods.load_balance import LoadBalance
 from fenics_contact.methods.opposite_points import OppositePoints
 from fenics_contact.methods.solver import Settings, Solver
-from fenics_contact.parallel import fail_together, global_max, global_sum, warn
+from fenics_contact.parallel import fail_together, global_max, warn
 from fenics_contact.state import State, Trial
 from fenics_contact.step import Step
 from fenics_contact.systems import linear
@@ -48,16 +48,11 @@ from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Unknowns
-from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
 __all__ = ["ContactProblem"]
 
 logger = logging.getLogger("fenics_contact")
-
-
-# Largest extrapolation of the last increment: beyond, contact hardly goes on as it did.
-_MAX_RATIO = 2.0
 
 
 class _Again(Enum):
@@ -409,7 +404,7 @@ class ContactProblem:
         at_present = self._is_present(start_unknowns)
         self._take_committed_pairs()
         follows = self.small_displacement_tolerance < np.inf
-        points = OppositePoints(self.contacts if follows else [])
+        points = OppositePoints(self.full, self.contacts if follows else [])
         try:
             # A trial of a line search may overflow, and the convergence test and the verdict see
             # it: a warning, on the rank that has the point, must not become an error there alone.
@@ -491,45 +486,15 @@ class ContactProblem:
             points: The iteration for them.
             load: External forces (force).
         """
-        change, began = self.state.change, self.state.unknowns
         lags = any(state.interior is not None for state in (self._present, self.state))
-        if change is None or lags or not points.contacts:
-            return
-        ratio = self._increment_ratio(change, load)
-        if not 0 < ratio <= _MAX_RATIO:
+        if lags or not points.contacts:
             return
         before = self.full.state()
-        points.predict(began + ratio * change, self.full, began)
+        points.predict(self.state, self.prescribed_values(), load)
         points.begin(self.contacts)
         self.full.set_state(before)
         for contact in self.contacts:
             contact.forget()
-
-    def _increment_ratio(self, change: Array, load: Array) -> float:
-        """Loads and prescribed values of this increment relative to the last one's. Collective.
-
-        By projection. Prescribed displacements count by the stiffness of the bulk.
-
-        Args:
-            change: Of the state in the last increment.
-            load: External forces (force).
-
-        Returns:
-            1 in equal increments, negative where loads turn round; 0 if the last one had none.
-        """
-        state, n = self.state, self._n_owned  # without motions of obstacles
-        held, stiffness = self.constrained[:n], self.bulk.scale
-
-        def forces(displacement: Array, force: Array) -> Array:
-            return np.where(held, stiffness * displacement[:n], force[:n])
-
-        all_of_it = forces(state.unknowns, state.load)
-        last = forces(change, state.load_change)
-        now = forces(self.prescribed_values() - state.unknowns, load - state.load)
-        along, size, whole = global_sum(
-            self._comm, [last @ now, last @ last, all_of_it @ all_of_it]
-        )
-        return float(along / size) if size > NEGLIGIBLE**2 * whole else 0.0
 
     def _find_opposite_points(
         self,
@@ -555,7 +520,7 @@ class ContactProblem:
             # those of a trial from.
             self._go_back(self._present.unknowns)
             self._complete_all()
-        points.find(self.full, self.state.unknowns)
+        points.find(self.state.unknowns)
 
     def _solve(
         self, start: float, field: bool, tried: list[Attempt], points: OppositePoints

@@ -19,7 +19,9 @@ from fenics_contact.contact.body import NEGLIGIBLE_SLIDE
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.opposite import OppositeState
 from fenics_contact.parallel import global_sum
+from fenics_contact.state import State
 from fenics_contact.systems.full import FullSystem
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
 __all__ = ["OppositePoints"]
@@ -28,6 +30,8 @@ __all__ = ["OppositePoints"]
 _MAX_PAIRINGS = 10
 # Least and largest share of the way to where the increment ended, by relaxation.
 _LEAST_SHARE, _LARGEST_SHARE = 0.1, 2.0
+# Largest extrapolation of the last increment: beyond, contact hardly goes on as it did.
+_MAX_RATIO = 2.0
 
 
 @dataclass(frozen=True)
@@ -62,13 +66,15 @@ class OppositePoints:
             yet.
     """
 
-    def __init__(self, contacts: Sequence[Contact]) -> None:
+    def __init__(self, full: FullSystem, contacts: Sequence[Contact]) -> None:
         """Begin with the pairs of the committed state.
 
         Args:
+            full: The system on all unknowns.
             contacts: Of the problem, all or none.
         """
         self.end: Array | None = None
+        self._full = full
         self.contacts = [c for c in contacts if c.opposite.may_pair_anew]
         self._pairings: dict[str, _Pairing] = {}
 
@@ -77,18 +83,24 @@ class OppositePoints:
         """Whether others are in the place of the committed pairs."""
         return bool(self._pairings)
 
-    def predict(self, end: Array, full: FullSystem, committed: Array) -> None:
-        """Find the pairs of the state in which the increment may end. Collective.
+    def predict(self, state: State, prescribed: Array, load: Array) -> None:
+        """Find the pairs of where the increment ends if it goes on as the last one. Collective.
 
         Of those contacts whose pairs are found anew at every commit, and of which points that
         transmit forces leave these by then.
 
         Args:
-            end: That state.
-            full: The system on all unknowns.
-            committed: The committed state, complete.
+            state: The committed state, complete.
+            prescribed: The unknowns with the present values of the Dirichlet conditions (length).
+            load: The present external forces (force).
         """
-        full.set_state(end)
+        if state.change is None:
+            return
+        ratio = self._increment_ratio(state, state.change, prescribed, load)
+        if not 0 < ratio <= _MAX_RATIO:
+            return
+        end = state.unknowns + ratio * state.change
+        self._full.set_state(end)
         for contact in self.contacts:
             before = contact.state.points
             if before is None or not contact.opposite.pairs_anew:
@@ -96,7 +108,30 @@ class OppositePoints:
             contact.evaluate()
             if contact.opposite.largest_slide(contact.values, before) > NEGLIGIBLE_SLIDE:
                 self._pairings[contact.name] = _Pairing(end, None, contact.values.depth, 1.0, 0)
-        self.find(full, committed)
+        self.find(state.unknowns)
+
+    def _increment_ratio(
+        self, state: State, change: Array, prescribed: Array, load: Array
+    ) -> float:
+        """Loads and prescribed values of this increment relative to the last one's. Collective.
+
+        By projection. Prescribed displacements count by the stiffness of the bulk.
+
+        Returns:
+            1 in equal increments, negative where loads turn round; 0 if the last one had none.
+        """
+        n = self._full.unknowns.n_dofs  # without motions of obstacles
+        held, stiffness = self._full.constrained[:n], self._full.bulk.scale
+
+        def forces(displacement: Array, force: Array) -> Array:
+            return np.where(held, stiffness * displacement[:n], force[:n])
+
+        whole = forces(state.unknowns, state.load)
+        last = forces(change, state.load_change)
+        now = forces(prescribed - state.unknowns, load - state.load)
+        sums = [last @ now, last @ last, whole @ whole]
+        along, size, largest = global_sum(self._full.unknowns.comm, sums)
+        return float(along / size) if size > NEGLIGIBLE**2 * largest else 0.0
 
     def drop_prediction(self) -> bool:
         """Go back to the committed pairs if nothing was solved between others; whether so."""
@@ -163,19 +198,18 @@ class OppositePoints:
                 state = last.state + share * (end - last.state)
             self._pairings[contact.name] = _Pairing(state, slide, values.depth, share, number)
 
-    def find(self, full: FullSystem, committed: Array) -> None:
+    def find(self, committed: Array) -> None:
         """Find the pairs whose states were chosen. Collective.
 
         Args:
-            full: The system on all unknowns.
             committed: The committed state, complete.
         """
         new = [c for c in self.contacts if self._is_chosen(c)]
         for contact in new:
             pairing = self._pairings[contact.name]
-            full.set_state(pairing.state)
+            self._full.set_state(pairing.state)
             contact.opposite.find_pairs(contact.displacement.u, pairing.depth)
-        full.set_state(committed)
+        self._full.set_state(committed)
         for contact in new:
             contact.opposite.update_committed_jump()
             found = replace(self._pairings[contact.name], opposite=contact.opposite.state())
