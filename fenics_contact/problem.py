@@ -1,13 +1,10 @@
-"""ContactProblem: solves one increment of a contact problem by PETSc SNES and verifies it."""
+"""ContactProblem: bodies in contact, their committed state, and the increment solved from it."""
 
 from __future__ import annotations
 
-import logging
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -20,7 +17,6 @@ from fenics_contact.checks.energy import EnergyState
 from fenics_contact.checks.given import (
     check_contacts,
     check_start,
-    check_values,
     constrained_unknowns,
     find_displacement,
 )
@@ -28,10 +24,8 @@ from fenics_contact.checks.judge import Judge
 from fenics_contact.checks.verdict import Verdict
 from fenics_contact.contact.contact import Contact
 from fenics_contact.failure import NotConverged
-from fenics_contact.methods.approach import Approach
-from fenics_contact.methods.attempt import Attempt
+from fenics_contact.increment import Again, Increment, IncrementSolver
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
-from fenics_contact.methods.first_touch import FirstTouch
 from fenics_contact.methods.load_balance import LoadBalance
 from fenics_contact.methods.opposite_points import OppositePoints
 from fenics_contact.methods.solver import Settings, Solver
@@ -46,21 +40,10 @@ from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
-from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array
 
 __all__ = ["ContactProblem"]
-
-logger = logging.getLogger("fenics_contact")
-
-
-class _Again(Enum):
-    """Why an increment is solved again: the outcome of the last attempt."""
-
-    UNKNOWNS = "contact spreads beyond the retained dofs"
-    PAIRS = "converged; opposite points updated, solved again"
-    FROM_COMMITTED = "failed between predicted opposite points, solved again between committed ones"
 
 
 class ContactProblem:
@@ -189,7 +172,6 @@ class ContactProblem:
         self._comm = u.function_space.mesh.comm
         n_motions = sum(len(contact.motions) for contact in self.contacts)
         self.unknowns = Unknowns(u.function_space, n_motions)
-        self._n_owned = self.unknowns.n_dofs
         self.constrained = constrained_unknowns(
             self._bcs, u, self.unknowns, mixed=self.displacement.mixed
         )
@@ -201,7 +183,7 @@ class ContactProblem:
         self.bulk.check_finite()
         self.full.update_stiffness()
         self.bulk.check_elastic()
-        self._modulus = FollowedModulus(self.bulk, self.displacement, self.contacts)
+        modulus = FollowedModulus(self.bulk, self.displacement, self.contacts)
         obstacles = [
             (contact.name, motion) for contact in self.contacts for motion in contact.motions
         ]
@@ -212,33 +194,27 @@ class ContactProblem:
             [f"{m.kind} {m.way} of the obstacle of {name}" for name, m in obstacles],
             turning=[motion.turns for _, motion in obstacles],
         )
-        self._balance = LoadBalance(self.motions)
+        balance = LoadBalance(self.motions)
         self.initial_penetration = check_start(self.contacts)
-        self._find_free_motions()
+        balance.find_free_modes(self.full)
         self.full.scales.begin(self.operators)
-        self._judge = Judge(self.full, self.motions, tolerance=tolerance, cross_check=cross_check)
+        judge = Judge(self.full, self.motions, tolerance=tolerance, cross_check=cross_check)
         self.solver = Solver(self.full, self.motions, settings)
-
-        self._approach = Approach(self.full, self.motions)
-        self._first_touch = FirstTouch(self.full)
+        self._increments = IncrementSolver(
+            self.full,
+            self.solver,
+            judge,
+            bcs=self._bcs,
+            modulus=modulus,
+            balance=balance,
+            prefix=prefix,
+        )
         for contact in self.contacts:
             contact.evaluate()
         self.state = self._initial_state()
         self._trial: Trial | None = None
         self._fresh = True  # nothing was solved yet
         self._told = False  # of an increment that was not committed
-
-    def _find_free_motions(self) -> None:
-        """Find the rigid motions that are free with the present data of F. Collective.
-
-        Raises:
-            ValueError: Nothing will ever hold one of them.
-        """
-        with self.full.stiffness_at_rest() as stiffness:
-            self.full.scales.measure_stiffness(stiffness)
-            self.motions.find_free(stiffness, self.constrained)
-        self._balance.check_constraints(self.operators)
-        self.bulk.note_data()
 
     def _initial_state(self) -> State:
         """Return a body at rest, or the state that another problem has left. Collective."""
@@ -280,11 +256,11 @@ class ContactProblem:
 
         It limits the errors of contact force and pressure, between two bodies that of the force.
         """
-        return self._judge.small_displacement_tolerance
+        return self._increments.judge.small_displacement_tolerance
 
     @small_displacement_tolerance.setter
     def small_displacement_tolerance(self, tolerance: float) -> None:
-        self._judge.small_displacement_tolerance = tolerance
+        self._increments.judge.small_displacement_tolerance = tolerance
 
     @property
     def expected_increments(self) -> int:
@@ -385,7 +361,6 @@ class ContactProblem:
             ValueError: The input is not finite or out of range, or no contact force can balance
                 the load.
         """
-        start = time.perf_counter()
         check_bool("recover_interior", recover_interior)
         self._check_committed()
         self._check_histories()
@@ -395,7 +370,7 @@ class ContactProblem:
                 contact.begin()
             self.state = replace(self.state, contacts=tuple(c.state for c in self.contacts))
             if not self.bulk.linear:  # whose tangent is that of u, and E may be another by now
-                self._modulus.measure()
+                self._increments.modulus.measure()
         behind = any(state.interior is not None for state in (self._present, self.state))
         if behind and not self.solver.is_current():
             self._complete_all()  # what it takes is about to go
@@ -405,23 +380,25 @@ class ContactProblem:
         self._take_committed_pairs()
         follows = self.small_displacement_tolerance < np.inf
         points = OppositePoints(self.full, self.contacts if follows else [])
+        increment = Increment(recover_interior, points)
         try:
             # A trial of a line search may overflow, and the convergence test and the verdict see
             # it: a warning, on the rank that has the point, must not become an error there alone.
             with np.errstate(all="ignore"):
-                tried: list[Attempt] = []
                 while True:
                     with self.solver.options.present():
-                        step = self._solve(start, recover_interior, tried, points)
-                    if isinstance(step, Step):
+                        found = self._increments.attempt(increment, self.state, self._present)
+                    if not isinstance(found, Again):
                         break
+                    if found is Again.PAIRS:
+                        self._find_pairs(points)
                     # What it starts from may have been completed meanwhile.
                     self._go_back(self._present.unknowns if at_present else start_unknowns)
                     self._take_committed_pairs()
                     points.begin(self.contacts)
                     # Outside, lest a SNES that is made anew takes its options for the caller's.
-                    if step is _Again.UNKNOWNS:
-                        spread = sum(attempt.outcome == step.value for attempt in tried)
+                    if found is Again.UNKNOWNS:
+                        spread = sum(each.outcome == found.value for each in increment.tried)
                         self.solver.change(anew=spread <= 1)
                 release_interrupt()
         except BaseException as error:
@@ -435,7 +412,17 @@ class ContactProblem:
         finally:
             if self._comm.rank == 0:
                 self.solver.options.warn_of_unread(self.prefix)
+        self._trial, step = found
         return step
+
+    def _find_pairs(self, points: OppositePoints) -> None:
+        """Find the opposite points of an increment where that was chosen. Collective."""
+        if any(state.interior is not None for state in (self._present, self.state)):
+            # Other parts of the committed u are needed, and other pairs leave nothing to recover
+            # those of a trial from.
+            self._go_back(self._present.unknowns)
+            self._complete_all()
+        points.find(self.state.unknowns)
 
     def _take_committed_pairs(self) -> None:
         """Go back to the committed state of contacts that have other pairs now. Collective."""
@@ -479,194 +466,6 @@ class ContactProblem:
         for contact, trial in zip(self.contacts, trials, strict=True):
             contact.restore(trial)
 
-    def _predict_opposite_points(self, points: OppositePoints, load: Array) -> None:
-        """Find opposite points where the increment ends if it goes on as the last one. Collective.
-
-        Args:
-            points: The iteration for them.
-            load: External forces (force).
-        """
-        lags = any(state.interior is not None for state in (self._present, self.state))
-        if lags or not points.contacts:
-            return
-        before = self.full.state()
-        points.predict(self.state, self.prescribed_values(), load)
-        points.begin(self.contacts)
-        self.full.set_state(before)
-        for contact in self.contacts:
-            contact.forget()
-
-    def _find_opposite_points(
-        self,
-        points: OppositePoints,
-        contacts: Sequence[Contact],
-        tried: list[Attempt],
-        interior: Array | None,
-    ) -> None:
-        """Find the opposite points of contacts where the increment has ended. Collective.
-
-        Args:
-            points: The iteration for them.
-            contacts: Contacts, evaluated there.
-            tried: What was tried; the last outcome is replaced.
-            interior: What recovers the interior displacement there; None: u is up to date.
-        """
-        tried[-1] = replace(tried[-1], outcome=_Again.PAIRS.value)
-        if interior is not None:
-            self.solver.system.complete(interior)
-        points.choose_states(contacts, self.full.state())
-        if any(state.interior is not None for state in (self._present, self.state)):
-            # Other parts of the committed u are needed, and other pairs leave nothing to recover
-            # those of a trial from.
-            self._go_back(self._present.unknowns)
-            self._complete_all()
-        points.find(self.state.unknowns)
-
-    def _solve(
-        self, start: float, field: bool, tried: list[Attempt], points: OppositePoints
-    ) -> Step | _Again:
-        """`solve`; or why it takes other unknowns than are kept, or other pairs. Collective.
-
-        Args:
-            start: When it began.
-            field: Whether to recover the interior, see `solve`.
-            tried: What was tried before; what is tried here is added.
-            points: Between which points of bodies it is solved.
-        """
-        solver = self.solver
-        # Between points of its end a load that nothing balances is a failure of the increment.
-        load = self._check_before(balance=not points.replaced)
-        if not (tried or points.replaced):
-            self._predict_opposite_points(points, load)
-        before = self.full.state()
-        for bc in self._bcs:
-            bc.set(self.u.x.array)
-        self.u.x.scatter_forward()
-        solver.starts.moved_from(before)
-        stiffness_changed = self.full.update_stiffness()
-        if stiffness_changed and self.bulk.linear:
-            self._modulus.measure()
-        cold = self._approach.lead(load, before, first=self.increment == 0)
-        if solver.chooses():
-            return _Again.UNKNOWNS
-        solver.update_system(stiffness_changed)
-        self.full.scales.begin(self.operators)
-        solver.system.begin(load)
-        solver.equations.began = self.state.unknowns
-        led = np.where(self.constrained, before, self.full.state())
-        self._first_touch.count_slip(led, solver.end_without)
-        solver.starts.change = self.state.change
-        solver.starts.carried = self._approach.carried
-        if self._first_touch.end is not None:
-            solver.starts.carried = self._first_touch.end
-        if points.end is not None:
-            solver.starts.carried = points.end
-        with solver.system.acting():
-            reason, attempts, rounds = solver.solve(
-                cold=cold,
-                stiffness_changed=stiffness_changed,
-                load_before=self.state.load,
-                balance=not points.replaced,
-            )
-        # Points outside of what is kept have to be looked at, and it takes all of u to do so.
-        lags = not field and not solver.system.confined and self._may_lag()
-        interior = solver.system.pending_field if lags else None
-        if not lags:
-            solver.system.complete(solver.system.pending_field)
-        for contact in self.contacts:
-            contact.evaluate()
-        if solver.misses(found=reason > 0):
-            tried += [*attempts[:-1], replace(attempts[-1], outcome=_Again.UNKNOWNS.value)]
-            return _Again.UNKNOWNS
-        tried += attempts
-        if reason > 0 and (contacts := points.to_update()):
-            self._find_opposite_points(points, contacts, tried, interior)
-            return _Again.PAIRS
-        kinematics = reason > 0  # a solver that failed may have no factors for it
-        if lags:
-            self._begin_condensed_energy()
-            verdict, energies = self._judge_kept(kinematics=kinematics)
-        else:
-            assemble = field or not solver.system.confined
-            verdict, energies = self._judge_all(kinematics=kinematics, assemble=assemble)
-        if reason > 0 and (contacts := points.to_update_for(verdict.pairing_errors)):
-            self._find_opposite_points(points, contacts, tried, interior)
-            return _Again.PAIRS
-        if (reason <= 0 or verdict.failures) and points.drop_prediction():
-            tried[-1] = replace(tried[-1], outcome=_Again.FROM_COMMITTED.value)
-            return _Again.FROM_COMMITTED
-        if reason <= 0 or verdict.failures:
-            raise self._not_converged(reason, verdict, tried)
-        began = self.state.energy
-        if points.replaced:
-            began = began.between([c.opposite.committed_jump for c in self.contacts])
-        energy = energies.since(began, self.contacts, self.full.scales)
-        verdict = replace(verdict, friction_energy_gain=energy.friction_energy_gain)
-        if verdict.failures:
-            raise self._not_converged(reason, verdict, tried)
-        self._judge.warn_of_large_motion(verdict)
-        self._judge.warn_of_round_off(verdict)
-        self._judge.warn_of_few_points()
-        loaded = [verdict.equations[contact.name].is_loaded for contact in self.contacts]
-        trials = (c.trial(is_loaded=some) for c, some in zip(self.contacts, loaded, strict=True))
-        self._trial = Trial(self.full.state(), tuple(trials), load, energies, interior)
-        return Step(
-            increment=self.increment + 1,
-            reason=reason,
-            iterations=sum(attempt.iterations for attempt in tried),
-            augmentations=rounds,
-            method=tried[-1].method,
-            factorisations=solver.equations.factorisations,
-            verdict=verdict,
-            contacts={c.name: c.resultants() for c in self.contacts},
-            energy=energy,
-            attempts=tuple(tried),
-            wall_seconds=time.perf_counter() - start,
-            complete=not lags,
-        )
-
-    def _not_converged(
-        self, reason: int, verdict: Verdict, attempts: Sequence[Attempt]
-    ) -> NotConverged:
-        told = {name for contact in self.contacts for name in contact.law.parameters()}
-        return NotConverged(
-            self.increment + 1,
-            reason,
-            verdict,
-            attempts,
-            prefix=self.prefix,
-            stiffnesses=[name for name in ("k_t", "k_n") if name in told],
-            driven=any(m.force and not m.turns for c in self.contacts for m in c.motions),
-        )
-
-    def _may_lag(self) -> bool:
-        """Whether u can stay behind: energies and pairs must be found without it. Collective."""
-        if not (self.solver.condensed and self.bulk.symmetric):
-            return False
-        for contact in self.contacts:
-            # A body that has come to no pairs yet is looked for where it is.
-            alone = contact.opposite.may_pair_anew and not self._comm.allreduce(
-                int(contact.paired.any())
-            )
-            if alone or contact.opposite.pairs_anew:
-                return False
-        # Of nodes that the quadrature points do not carry only a complete u tells where they are.
-        carried = (
-            c.opposite.sampler is None or c.facet_places.points_are_nodes for c in self.contacts
-        )
-        if not all(carried):
-            return False
-        if self.solver.system.mark in self.state.energy.forces:
-            return True
-        return self.increment == 0 and not self._comm.allreduce(int(self.state.unknowns.any()))
-
-    def _begin_condensed_energy(self) -> None:
-        """Give the committed state its forces at the retained dofs: none, at rest."""
-        mark, energy = self.solver.system.mark, self.state.energy
-        if mark not in energy.forces:
-            nothing = Forces.none(np.zeros(1), np.zeros(1, dtype=np.intp))
-            self.state = replace(self.state, energy=energy.with_forces(mark, nothing))
-
     def complete(self) -> Verdict | None:
         """Recover the interior displacement of the increment solved last. Collective.
 
@@ -689,7 +488,9 @@ class ContactProblem:
         before = self.full.state()
         self.solver.system.complete(present.interior)
         self.full.begin(present.load)
-        verdict, forces = self._judged(self.full, self.full.product_force(), laws=False)
+        verdict, forces = self._increments.judge_system(
+            self.full, self.full.product_force(), laws=False
+        )
         if verdict.failures:
             self.full.set_state(before)
             number = self.increment + (not is_committed)
@@ -715,64 +516,6 @@ class ContactProblem:
         finally:
             self._trial = trial
             self._go_back(unknowns)
-
-    def _check_before(self, *, balance: bool) -> Array:
-        """Look at all that was given; the external forces (force). Collective.
-
-        Args:
-            balance: Whether to raise a ValueError for a load that contact cannot balance.
-        """
-        self.bulk.check_finite()
-        for contact in self.contacts:
-            contact.check_input()
-        load = self.present_load()
-        size = global_max(self._comm, np.abs(load))
-        if not np.isfinite(size):
-            raise ValueError(
-                "the external load, F at u = 0, is not finite (NaN or inf) at some dof: check the "
-                "loads, and the denominators in F (λ = E ν/((1 + ν)(1 - 2ν)) is infinite at "
-                "ν = 0.5)"
-            )
-        check_values(self._bcs, self.u)
-        if self.bulk.has_new_data():
-            self._find_free_motions()
-        if balance and self.bulk.linear:
-            self._balance.check(load, self.operators)
-        return load
-
-    def _judge_all(self, *, kinematics: bool, assemble: bool) -> tuple[Verdict, EnergyState]:
-        """Judge a complete u by assembly, past SNES and its residual, or by K u. Collective."""
-        if assemble:
-            bulk = self.full.with_obstacles(self.bulk.assemble_residual())
-        else:
-            bulk = self.full.product_force()
-        verdict, found = self._judged(self.full, bulk, kinematics=kinematics)
-        forces: dict[object, Forces] = {self.full.mark: found}
-        if self.solver.condensed and self.bulk.symmetric:
-            forces[self.solver.system.mark] = self.solver.system.present_forces()
-        return verdict, EnergyState.at(forces, self.contacts)
-
-    def _judge_kept(self, *, kinematics: bool) -> tuple[Verdict, EnergyState]:
-        """Judge the condensed equations; u stays behind. Collective."""
-        system = self.solver.system
-        verdict, found = self._judged(system, system.bulk_force(), kinematics=kinematics)
-        return verdict, EnergyState.at({system.mark: found}, self.contacts)
-
-    def _judged(
-        self, system: System, bulk: Array, *, laws: bool = True, kinematics: bool = False
-    ) -> tuple[Verdict, Forces]:
-        """`Judge.judge` for the increment that was solved last. Collective."""
-        equations = self.solver.equations
-        return self._judge.judge(
-            system,
-            bulk,
-            start=equations.start,
-            began=equations.began,
-            rtol=equations.rtol,
-            laws=laws,
-            respond=self.solver.respond if kinematics else None,
-            before=self.full.displacement_at(self.state.unknowns) if laws else None,
-        )
 
     @interrupts_held()
     def commit(self) -> None:
@@ -865,15 +608,16 @@ class ContactProblem:
         With a linear bulk, stiffnesses that are multiples of E/h follow its present data within
         the block, as in `solve`.
         """
-        before, modulus = self.full.state(), self._modulus.present
+        modulus = self._increments.modulus
+        before, measured = self.full.state(), modulus.present
         try:
             self.full.set_state(state)
             if self.bulk.linear:
-                self._modulus.measure()
+                modulus.measure()
             yield
         finally:
             self.full.set_state(before)
-            self._modulus.put_back(modulus)
+            modulus.put_back(measured)
 
     def reads(self, constant: fem.Constant) -> bool:
         """Return whether F, a Dirichlet condition or a contact depends on a constant.
@@ -893,15 +637,11 @@ class ContactProblem:
 
     def present_load(self) -> Array:
         """Return the present external forces at this rank's unknowns (force). Collective."""
-        return -self.full.with_obstacles(self.bulk.update_load())
+        return self.full.present_load()
 
     def prescribed_values(self) -> Array:
         """Return this rank's unknowns with the present values of the Dirichlet conditions."""
-        values = self.u.x.array.copy()
-        for bc in self._bcs:
-            bc.set(values)
-        values = self.bulk.in_units(values[: self._n_owned])
-        return self.unknowns.joined(values, np.zeros(self.unknowns.n_motions))
+        return self._increments.prescribed_values()
 
     def set_committed(
         self, taken: CommittedState, points: Sequence[tuple[Array, Mapping[str, Array]]]

@@ -25,6 +25,7 @@ ROOMS = [
     "methods",
     "step",
     "failure",
+    "increment",
     "problem",
     "results",
     "estimates",

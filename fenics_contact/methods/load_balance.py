@@ -14,6 +14,7 @@ import scipy.sparse.csgraph
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import agreed, gather_rows
+from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.tolerances import ROUND_OFF
@@ -42,6 +43,21 @@ class LoadBalance:
         self._geometry: list[Array] = []
         self._rays: Array = np.zeros((0, 0))
         self._groups: list[tuple[Index, Array]] = []
+
+    def find_free_modes(self, full: FullSystem) -> None:
+        """Find the rigid-body modes that are free with the present data of the bulk. Collective.
+
+        Args:
+            full: The system on all unknowns.
+
+        Raises:
+            ValueError: Nothing will ever hold one of them.
+        """
+        with full.stiffness_at_rest() as stiffness:
+            full.scales.measure_stiffness(stiffness)
+            self._modes.find_free(stiffness, full.constrained)
+        self.check_constraints(full.operators)
+        full.bulk.note_data()
 
     def check_constraints(self, operators: Sequence[ContactOperator]) -> None:
         """Refuse a free mode that no contact resists, even if all of Γc were closed. Collective.

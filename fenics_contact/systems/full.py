@@ -105,6 +105,10 @@ class FullSystem(System):
         values = self.bulk.in_units(self.u.x.array[: self.unknowns.n_dofs])
         return self.unknowns.joined(values, self.motions()) if self.unknowns.n_motions else values
 
+    def present_load(self) -> Array:
+        """Return the present external forces at this rank's unknowns (force). Collective."""
+        return -self.with_obstacles(self.bulk.update_load())
+
     def set_state(self, state: Array) -> None:
         """Make a state the present one. Collective."""
         n = self.unknowns.n_dofs

@@ -1,0 +1,359 @@
+"""One increment: the nonlinear equations solved from a committed state, and verified."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+
+import numpy as np
+from dolfinx import fem
+
+from fenics_contact.checks.energy import Energy, EnergyState
+from fenics_contact.checks.given import check_values
+from fenics_contact.checks.judge import Judge
+from fenics_contact.checks.verdict import Verdict
+from fenics_contact.contact.contact import Contact
+from fenics_contact.failure import NotConverged
+from fenics_contact.methods.approach import Approach
+from fenics_contact.methods.attempt import Attempt
+from fenics_contact.methods.first_touch import FirstTouch
+from fenics_contact.methods.load_balance import LoadBalance
+from fenics_contact.methods.opposite_points import OppositePoints
+from fenics_contact.methods.solver import Solver
+from fenics_contact.parallel import global_max
+from fenics_contact.state import State, Trial
+from fenics_contact.step import Step
+from fenics_contact.systems.followed import FollowedModulus
+from fenics_contact.systems.forces import Forces
+from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.system import System
+from fenics_contact.types import Array
+
+__all__ = ["Again", "Increment", "IncrementSolver"]
+
+
+class Again(Enum):
+    """Why an increment is solved again: the outcome of the last attempt."""
+
+    UNKNOWNS = "contact spreads beyond the retained dofs"
+    PAIRS = "converged; opposite points updated, solved again"
+    FROM_COMMITTED = "failed between predicted opposite points, solved again between committed ones"
+
+
+@dataclass
+class Increment:
+    """An increment that is being solved.
+
+    Attributes:
+        recover_interior: See `ContactProblem.solve`.
+        points: Between which points of bodies it is solved.
+        started: When it was begun, by `time.perf_counter`.
+        tried: What was tried.
+    """
+
+    recover_interior: bool
+    points: OppositePoints
+    started: float = field(default_factory=time.perf_counter)
+    tried: list[Attempt] = field(default_factory=list)
+
+    def ends(self, outcome: Again) -> Again:
+        """Let this be the outcome of the last attempt, and return it."""
+        self.tried[-1] = replace(self.tried[-1], outcome=outcome.value)
+        return outcome
+
+
+class IncrementSolver:
+    """Solves increments of a problem. It changes u and the contacts, and no state.
+
+    Attributes:
+        judge: What verifies a solution.
+        modulus: Young's modulus at Γc, as far as it follows the data of the bulk.
+    """
+
+    def __init__(
+        self,
+        full: FullSystem,
+        solver: Solver,
+        judge: Judge,
+        *,
+        bcs: Sequence[fem.DirichletBC],
+        modulus: FollowedModulus,
+        balance: LoadBalance,
+        prefix: str,
+    ) -> None:
+        """Take the parts of a problem.
+
+        Args:
+            full: The system on all unknowns.
+            solver: What solves it.
+            judge: See the attributes.
+            bcs: Dirichlet conditions.
+            modulus: See the attributes.
+            balance: Whether contact can balance a load.
+            prefix: Of PETSc options, for messages.
+        """
+        self.judge, self.modulus = judge, modulus
+        self._full, self._solver, self._bcs = full, solver, bcs
+        self._balance, self._prefix = balance, prefix
+        self._bulk, self._contacts, self._comm = full.bulk, full.contacts, full.unknowns.comm
+        self._u = full.displacement.whole
+        self._approach = Approach(full, solver.equations.motions)
+        self._first_touch = FirstTouch(full)
+
+    # ---- what is given ---------------------------------------------------------------------------
+
+    def prescribed_values(self) -> Array:
+        """Return this rank's unknowns with the present values of the Dirichlet conditions."""
+        values = self._u.x.array.copy()
+        for bc in self._bcs:
+            bc.set(values)
+        unknowns = self._full.unknowns
+        values = self._bulk.in_units(values[: unknowns.n_dofs])
+        return unknowns.joined(values, np.zeros(unknowns.n_motions))
+
+    def _check_before(self, *, balance: bool) -> Array:
+        """Look at all that was given; the external forces (force). Collective.
+
+        Args:
+            balance: Whether to raise a ValueError for a load that contact cannot balance.
+        """
+        self._bulk.check_finite()
+        for contact in self._contacts:
+            contact.check_input()
+        load = self._full.present_load()
+        size = global_max(self._comm, np.abs(load))
+        if not np.isfinite(size):
+            raise ValueError(
+                "the external load, F at u = 0, is not finite (NaN or inf) at some dof: check the "
+                "loads, and the denominators in F (λ = E ν/((1 + ν)(1 - 2ν)) is infinite at "
+                "ν = 0.5)"
+            )
+        check_values(self._bcs, self._u)
+        if self._bulk.has_new_data():
+            self._balance.find_free_modes(self._full)
+        if balance and self._bulk.linear:
+            self._balance.check(load, self._full.operators)
+        return load
+
+    # ---- solving ---------------------------------------------------------------------------------
+
+    def attempt(
+        self, increment: Increment, state: State, present: State | Trial
+    ) -> tuple[Trial, Step] | Again:
+        """Solve an increment between its present pairs, on the unknowns retained. Collective.
+
+        Args:
+            increment: The increment.
+            state: The committed state.
+            present: The state that u is of.
+
+        Returns:
+            The trial state and what is reported of it; or why to solve it again.
+
+        Raises:
+            NotConverged, ValueError: See `ContactProblem.solve`.
+        """
+        solver, points = self._solver, increment.points
+        # Between points of its end a load that nothing balances is a failure of the increment.
+        load = self._check_before(balance=not points.replaced)
+        complete = present.interior is None and state.interior is None
+        if complete and points.contacts and not (increment.tried or points.replaced):
+            self._predict_opposite_points(points, state, load)
+        before = self._full.state()
+        for bc in self._bcs:
+            bc.set(self._u.x.array)
+        self._u.x.scatter_forward()
+        solver.starts.moved_from(before)
+        stiffness_changed = self._full.update_stiffness()
+        if stiffness_changed and self._bulk.linear:
+            self.modulus.measure()
+        cold = self._approach.lead(load, before, first=state.increment == 0)
+        if solver.chooses():
+            return Again.UNKNOWNS
+        solver.update_system(stiffness_changed)
+        self._full.scales.begin(self._full.operators)
+        solver.system.begin(load)
+        solver.equations.began = state.unknowns
+        led = np.where(self._full.constrained, before, self._full.state())
+        self._first_touch.count_slip(led, solver.end_without)
+        solver.starts.change = state.change
+        # The latest of the states to which bodies were led before the iteration.
+        ends = self._approach.carried, self._first_touch.end, points.end
+        solver.starts.carried = next((end for end in reversed(ends) if end is not None), None)
+        with solver.system.acting():
+            reason, attempts, rounds = solver.solve(
+                cold=cold,
+                stiffness_changed=stiffness_changed,
+                load_before=state.load,
+                balance=not points.replaced,
+            )
+        # Points outside of what is kept have to be looked at, and it takes all of u to do so.
+        lags = not (increment.recover_interior or solver.system.confined) and self._may_lag(state)
+        interior = solver.system.pending_field if lags else None
+        if not lags:
+            solver.system.complete(solver.system.pending_field)
+        for contact in self._contacts:
+            contact.evaluate()
+        increment.tried += attempts
+        if solver.misses(found=reason > 0):
+            return increment.ends(Again.UNKNOWNS)
+        if reason > 0 and (slid := points.to_update()):
+            return self._choose_pairs(increment, slid, interior)
+        kinematics = reason > 0  # a solver that failed may have no factors for it
+        if lags:
+            verdict, energies = self._judge_kept(kinematics=kinematics)
+        else:
+            assemble = increment.recover_interior or not solver.system.confined
+            verdict, energies = self._judge_all(kinematics=kinematics, assemble=assemble)
+        if reason > 0 and (slid := points.to_update_for(verdict.pairing_errors)):
+            return self._choose_pairs(increment, slid, interior)
+        energy = None
+        if reason > 0 and not verdict.failures:
+            energy = self._energy(state, energies, points)
+            verdict = replace(verdict, friction_energy_gain=energy.friction_energy_gain)
+        if energy is None or verdict.failures:
+            if points.drop_prediction():
+                return increment.ends(Again.FROM_COMMITTED)
+            raise self._not_converged(state, reason, verdict, increment.tried)
+        self.judge.warn_of_large_motion(verdict)
+        self.judge.warn_of_round_off(verdict)
+        self.judge.warn_of_few_points()
+        loaded = [verdict.equations[contact.name].is_loaded for contact in self._contacts]
+        trials = (c.trial(is_loaded=some) for c, some in zip(self._contacts, loaded, strict=True))
+        trial = Trial(self._full.state(), tuple(trials), load, energies, interior)
+        step = Step(
+            increment=state.increment + 1,
+            reason=reason,
+            iterations=sum(attempt.iterations for attempt in increment.tried),
+            augmentations=rounds,
+            method=increment.tried[-1].method,
+            factorisations=solver.equations.factorisations,
+            verdict=verdict,
+            contacts={c.name: c.resultants() for c in self._contacts},
+            energy=energy,
+            attempts=tuple(increment.tried),
+            wall_seconds=time.perf_counter() - increment.started,
+            complete=not lags,
+        )
+        return trial, step
+
+    def _predict_opposite_points(self, points: OppositePoints, state: State, load: Array) -> None:
+        """Find opposite points where the increment ends if it goes on as the last one. Collective.
+
+        Args:
+            points: The iteration for them.
+            state: The committed state, complete.
+            load: External forces (force).
+        """
+        before = self._full.state()
+        points.predict(state, self.prescribed_values(), load)
+        points.begin(self._contacts)
+        self._full.set_state(before)
+        for contact in self._contacts:
+            contact.forget()
+
+    def _choose_pairs(
+        self, increment: Increment, contacts: Sequence[Contact], interior: Array | None
+    ) -> Again:
+        """Choose where to find the pairs of contacts next, by where it has ended. Collective.
+
+        Args:
+            increment: The increment.
+            contacts: Contacts, evaluated there.
+            interior: What recovers the interior displacement there; None: u is up to date.
+        """
+        if interior is not None:
+            self._solver.system.complete(interior)
+        increment.points.choose_states(contacts, self._full.state())
+        return increment.ends(Again.PAIRS)
+
+    def _may_lag(self, state: State) -> bool:
+        """Whether u can stay behind: energies and pairs must be found without it. Collective."""
+        if not (self._solver.condensed and self._bulk.symmetric):
+            return False
+        for contact in self._contacts:
+            # A body that has come to no pairs yet is looked for where it is.
+            alone = contact.opposite.may_pair_anew and not self._comm.allreduce(
+                int(contact.paired.any())
+            )
+            if alone or contact.opposite.pairs_anew:
+                return False
+        # Of nodes that the quadrature points do not carry only a complete u tells where they are.
+        carried = (
+            c.opposite.sampler is None or c.facet_places.points_are_nodes for c in self._contacts
+        )
+        if not all(carried):
+            return False
+        if self._solver.system.mark in state.energy.forces:
+            return True
+        return state.increment == 0 and not self._comm.allreduce(int(state.unknowns.any()))
+
+    def _not_converged(
+        self, state: State, reason: int, verdict: Verdict, attempts: Sequence[Attempt]
+    ) -> NotConverged:
+        told = {name for contact in self._contacts for name in contact.law.parameters()}
+        return NotConverged(
+            state.increment + 1,
+            reason,
+            verdict,
+            attempts,
+            prefix=self._prefix,
+            stiffnesses=[name for name in ("k_t", "k_n") if name in told],
+            driven=any(m.force and not m.turns for c in self._contacts for m in c.motions),
+        )
+
+    # ---- verifying -------------------------------------------------------------------------------
+
+    def _energy(self, state: State, energies: EnergyState, points: OppositePoints) -> Energy:
+        """The energies of the increment that has ended in a state. Collective."""
+        began, mark = state.energy, self._solver.system.mark
+        if mark not in began.forces:  # of the retained dofs: none, at rest
+            nothing = Forces.none(np.zeros(1), np.zeros(1, dtype=np.intp))
+            began = began.with_forces(mark, nothing)
+        if points.replaced:
+            began = began.between([c.opposite.committed_jump for c in self._contacts])
+        return energies.since(began, self._contacts, self._full.scales)
+
+    def _judge_all(self, *, kinematics: bool, assemble: bool) -> tuple[Verdict, EnergyState]:
+        """Judge a complete u by assembly, past SNES and its residual, or by K u. Collective."""
+        if assemble:
+            bulk = self._full.with_obstacles(self._bulk.assemble_residual())
+        else:
+            bulk = self._full.product_force()
+        verdict, found = self.judge_system(self._full, bulk, kinematics=kinematics)
+        forces: dict[object, Forces] = {self._full.mark: found}
+        if self._solver.condensed and self._bulk.symmetric:
+            forces[self._solver.system.mark] = self._solver.system.present_forces()
+        return verdict, EnergyState.at(forces, self._contacts)
+
+    def _judge_kept(self, *, kinematics: bool) -> tuple[Verdict, EnergyState]:
+        """Judge the condensed equations; u stays behind. Collective."""
+        system = self._solver.system
+        verdict, found = self.judge_system(system, system.bulk_force(), kinematics=kinematics)
+        return verdict, EnergyState.at({system.mark: found}, self._contacts)
+
+    def judge_system(
+        self, system: System, bulk: Array, *, laws: bool = True, kinematics: bool = False
+    ) -> tuple[Verdict, Forces]:
+        """`Judge.judge` for the increment that was solved last. Collective.
+
+        Args:
+            system: The unknowns on which the residual is looked at.
+            bulk: Residual of the bulk on these (force).
+            laws: Whether to check the laws, too.
+            kinematics: Whether to look at what small displacements leave out.
+        """
+        equations = self._solver.equations
+        began = equations.began
+        return self.judge.judge(
+            system,
+            bulk,
+            start=equations.start,
+            began=began,
+            rtol=equations.rtol,
+            laws=laws,
+            respond=self._solver.respond if kinematics else None,
+            before=self._full.displacement_at(began) if laws else None,
+        )
