@@ -134,6 +134,7 @@ class Parts:
         constrained: Mask,
         outside: Array,
         start: Array,
+        released: Array,
     ) -> Norms:
         """Norms at one state. Collective.
 
@@ -145,6 +146,8 @@ class Parts:
             constrained: Mask of the unknowns with Dirichlet conditions.
             outside: Norms of load and product at unknowns outside of the space, (2, n_bodies).
             start: Norms of the product where the increment began, (n_bodies,).
+            released: Norms of the largest contact force then, (n_bodies,): forces that are taken
+                away leave their round-off.
         """
         n, free = self.n_bodies, np.where(constrained, 0.0, residual)
         held = residual - free
@@ -175,9 +178,12 @@ class Parts:
         none = np.append(_ROUND_OFF * self._scales.least_force, np.zeros(len(self._motions)))
         loaded = loads > np.where(fixed, none, 0.0)
         limited = loaded | (acts.any(axis=0) & ~fixed)
-        floor = np.where(limited, np.minimum(round_off, MOST_EXCUSED * force), round_off)
+        most, most_of_contacts = (
+            np.maximum(MOST_EXCUSED * acting, _ROUND_OFF * released) for acting in (force, pushes)
+        )
+        floor = np.where(limited, np.minimum(round_off, most), round_off)
         floor = np.maximum(floor, _LEAST)
-        floors = np.where(acts, np.minimum(round_off, MOST_EXCUSED * pushes), round_off)
+        floors = np.where(acts, np.minimum(round_off, most_of_contacts), round_off)
         blurs = np.where(acts, round_off, 0.0)
         sides = [
             _governing(pairs, *rows)

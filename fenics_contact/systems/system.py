@@ -79,6 +79,7 @@ class System(ABC):
         self.load: Array = np.zeros(unknowns.n_local)
         self.diagonal: Array = np.zeros(unknowns.n_local)
         self.outside: Array = np.zeros((2, n_bodies))
+        self._released: Array = np.zeros(n_bodies)
         self._motions = [motion for contact in contacts for motion in contact.motions]
         self._contact_vector = unknowns.vector()
         counts = [len(contact.motions) for contact in contacts]
@@ -171,7 +172,22 @@ class System(ABC):
             self.constrained,
             self.outside,
             start,
+            self._released,
         )
+
+    def take_committed_forces(self) -> None:
+        """Let contact forces of the committed state be those that an increment starts from.
+
+        Collective.
+        """
+        self._released[:] = 0.0
+        for operator in self.operators:
+            points = operator.contact.state.points
+            if points is not None:
+                self._contact_vector.set(0.0)
+                operator.add_force(self._contact_vector, points.total_traction)
+                force = np.where(self.constrained, 0.0, self._contact_vector.array_r)
+                self._released = np.maximum(self._released, self.by_body(force)[0])
 
     @property
     def confined(self) -> bool:
