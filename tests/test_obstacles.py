@@ -10,7 +10,8 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact.checks.tunnelling import RigidObstacleProbe, TunnellingCheck
+from fenics_contact.checks.obstacle_probe import RigidObstacleProbe
+from fenics_contact.checks.tunnelling import TunnellingCheck
 from fenics_contact.elasticity import NeoHookean
 from scenes.blocks import BOTTOM, TOP, block, kirchhoff
 from scenes.comparing import close, gathered, raised_everywhere
