@@ -35,7 +35,7 @@ __all__ = ["Again", "Increment", "IncrementSolver"]
 
 
 class Again(Enum):
-    """Why an increment is solved again: the outcome of the last attempt."""
+    """Why an increment is solved again; the outcome of the last attempt, if there was one."""
 
     UNKNOWNS = "contact spreads beyond the retained dofs"
     PAIRS = "converged; opposite points updated, solved again"
@@ -197,6 +197,8 @@ class IncrementSolver:
         for contact in self._contacts:
             contact.evaluate()
         increment.tried += attempts
+        if reason <= 0 and points.drop_prediction():
+            return increment.ends(Again.FROM_COMMITTED)
         if solver.misses(found=reason > 0):
             return increment.ends(Again.UNKNOWNS)
         if reason > 0 and (slid := points.to_update()):
@@ -309,7 +311,8 @@ class IncrementSolver:
     def _energy(self, state: State, energies: EnergyState, points: OppositePoints) -> Energy:
         """The energies of the increment that has ended in a state. Collective."""
         began, mark = state.energy, self._solver.system.mark
-        if mark not in began.forces:  # of the retained dofs: none, at rest
+        if self._full.mark not in energies.forces and mark not in began.forces:
+            # From rest, of the retained dofs alone.
             nothing = Forces.none(np.zeros(1), np.zeros(1, dtype=np.intp))
             began = began.with_forces(mark, nothing)
         if points.replaced:

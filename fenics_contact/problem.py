@@ -362,6 +362,9 @@ class ContactProblem:
                 the load.
         """
         check_bool("recover_interior", recover_interior)
+        follows = self.small_displacement_tolerance < np.inf
+        points = OppositePoints(self.full, self.contacts if follows else [])
+        increment = Increment(recover_interior, points)
         self._check_committed()
         self._check_histories()
         first, self._fresh = self._fresh, False
@@ -378,9 +381,6 @@ class ContactProblem:
         start_unknowns, diagonal = self.full.state(), self.full.diagonal.copy()
         at_present = self._is_present(start_unknowns)
         self._take_committed_pairs()
-        follows = self.small_displacement_tolerance < np.inf
-        points = OppositePoints(self.full, self.contacts if follows else [])
-        increment = Increment(recover_interior, points)
         try:
             # A trial of a line search may overflow, and the convergence test and the verdict see
             # it: a warning, on the rank that has the point, must not become an error there alone.
@@ -396,6 +396,8 @@ class ContactProblem:
                     self._go_back(self._present.unknowns if at_present else start_unknowns)
                     self._take_committed_pairs()
                     points.begin(self.contacts)
+                    if not self.bulk.linear:  # that of a failure would excuse any residual
+                        self.full.diagonal = diagonal.copy()
                     # Outside, lest a SNES that is made anew takes its options for the caller's.
                     if found is Again.UNKNOWNS:
                         spread = sum(each.outcome == found.value for each in increment.tried)

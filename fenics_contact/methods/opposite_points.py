@@ -74,7 +74,7 @@ class OppositePoints:
             contacts: Of the problem, all or none.
         """
         self.end: Array | None = None
-        self._full = full
+        self._full, self._predicted = full, False
         self.contacts = [c for c in contacts if c.opposite.may_pair_anew]
         self._pairings: dict[str, _Pairing] = {}
 
@@ -108,6 +108,7 @@ class OppositePoints:
             contact.evaluate()
             if contact.opposite.largest_slide(contact.values, before) > NEGLIGIBLE_SLIDE:
                 self._pairings[contact.name] = _Pairing(end, None, contact.values.depth, 1.0, 0)
+        self._predicted = self.replaced
         self.find(state.unknowns)
 
     def _increment_ratio(
@@ -134,10 +135,10 @@ class OppositePoints:
         return float(along / size) if size > NEGLIGIBLE**2 * largest else 0.0
 
     def drop_prediction(self) -> bool:
-        """Go back to the committed pairs if nothing was solved between others; whether so."""
-        predicted = self.replaced and self.end is None
+        """Go back to the committed pairs if others were predicted; whether so."""
+        predicted, self._predicted = self._predicted, False
         if predicted:
-            self._pairings.clear()
+            self._pairings, self.end = {}, None
         return predicted
 
     def to_update(self) -> list[Contact]:

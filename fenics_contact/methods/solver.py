@@ -349,20 +349,14 @@ class Solver:
 
     def update_system(self, stiffness_changed: bool) -> None:
         """Follow changes of the pairs and of the bulk's tangent. Collective."""
-        self._update_pairs()
-        if stiffness_changed or not self.system.ready:
-            self.equations.factorisations += self.system.update()
-
-    def _update_pairs(self) -> None:
-        """Take the system and the matrices of the present pairs. Collective."""
         if self._pairings != self._present_pairings():
-            if not self.condensed:
-                self._set_system()
-            elif self._kept.grows():
+            if not self.condensed or self._kept.grows():
                 self._set_system()
             self._pairings = self._present_pairings()
             self.snes.reset()
             self._make_matrices()
+        if stiffness_changed or not self.system.ready:
+            self.equations.factorisations += self.system.update()
 
     # ---- the unknowns that are kept --------------------------------------------------------------
 
@@ -457,7 +451,7 @@ class Solver:
             Reason of the last solution, what was tried, and how many solutions there were.
         """
         equations = self.equations
-        equations.start = np.zeros_like(equations.start)
+        equations.start = self.system.start()
         equations.has_round_off = False
         equations.loads = equations.motions.generalised_load(self._full.load)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from petsc4py import PETSc
@@ -122,7 +122,8 @@ class Starts:
         # The last matrix may be that of a step that overflowed. Later rounds of multipliers have
         # the round-off of the first one's start, too.
         terms = np.where(np.isfinite(terms), terms, 0.0)
-        equations.start = np.maximum(equations.start, terms)
+        begun = equations.start
+        equations.start = replace(begun, terms=np.maximum(begun.terms, terms))
         starts: list[Array] = []
         residuals: list[float] = []
 

@@ -2,7 +2,7 @@
 
 A residual says nothing until it is compared with forces. Those of another body, of another contact
 or of an earlier increment are no measure: a body loaded by 1e-4 beside one loaded by 10 would be
-left to itself.
+left to itself. But where forces are unloaded their round-off is left.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["MOST_EXCUSED", "Labels", "Norms", "Parts", "by_body"]
+__all__ = ["MOST_EXCUSED", "Labels", "Norms", "Parts", "Start", "by_body"]
 
 Labels = npt.NDArray[np.intp]
 
@@ -35,6 +35,19 @@ _LEAST = np.finfo(float).tiny / np.finfo(float).eps
 
 
 @dataclass(frozen=True)
+class Start:
+    """What an increment begins with, of which round-off may be left at its end.
+
+    Attributes:
+        terms: Norms of the product of matrix and unknowns, (n_bodies,) (force).
+        pushes: Norms of the committed contact forces, (n_contacts, n_bodies) (force).
+    """
+
+    terms: Array
+    pushes: Array
+
+
+@dataclass(frozen=True)
 class Norms:
     """Norms of one state by part, equal on every rank; bodies first, then obstacles and contacts.
 
@@ -42,8 +55,8 @@ class Norms:
         residual: Of the free unknowns, (n_parts,) (force).
         force: Of the forces that act now, the largest of load, reactions and contact, (n_parts,).
         floor: What round-off excuses, (n_parts,) (force).
-        round_off: That of the parts on which forces act, all of it, 0 for others, (n_parts,)
-            (force).
+        round_off: That of the parts on which forces act that are more than what others left, all
+            of it, 0 for others, (n_parts,) (force).
         n_bodies: Bodies and free obstacles, which share the unknowns between them.
     """
 
@@ -133,8 +146,7 @@ class Parts:
         product: Array,
         constrained: Mask,
         outside: Array,
-        start: Array,
-        released: Array,
+        start: Start,
     ) -> Norms:
         """Norms at one state. Collective.
 
@@ -145,9 +157,7 @@ class Parts:
             product: Size of the terms of the matrix times the unknowns, (n_local,).
             constrained: Mask of the unknowns with Dirichlet conditions.
             outside: Norms of load and product at unknowns outside of the space, (2, n_bodies).
-            start: Norms of the product where the increment began, (n_bodies,).
-            released: Norms of the largest contact force then, (n_bodies,): forces that are taken
-                away leave their round-off.
+            start: What the increment began with.
         """
         n, free = self.n_bodies, np.where(constrained, 0.0, residual)
         held = residual - free
@@ -165,7 +175,7 @@ class Parts:
             # What acts on a free obstacle may cancel; what it is the sum of does not.
             contact[body] = _root(pushes[number])
         force = np.max([loads, reaction, contact], axis=0)
-        round_off = np.maximum(_ROUND_OFF * np.maximum(terms, start), _LEAST)
+        round_off = np.maximum(_ROUND_OFF * np.maximum(terms, start.terms), _LEAST)
         # A contact force is as exact as the softer of both bodies has it.
         exact = np.tile(round_off, (len(contacts), 1))
         for row, pairs in zip(exact, self._pairs, strict=True):
@@ -178,19 +188,22 @@ class Parts:
         none = np.append(_ROUND_OFF * self._scales.least_force, np.zeros(len(self._motions)))
         loaded = loads > np.where(fixed, none, 0.0)
         limited = loaded | (acts.any(axis=0) & ~fixed)
+        # Contact forces that are unloaded leave their round-off.
+        unloaded = _ROUND_OFF * np.maximum(start.pushes - pushes, 0.0).max(axis=0, initial=0.0)
         most, most_of_contacts = (
-            np.maximum(MOST_EXCUSED * acting, _ROUND_OFF * released) for acting in (force, pushes)
+            np.maximum(MOST_EXCUSED * acting, unloaded) for acting in (force, pushes)
         )
         floor = np.where(limited, np.minimum(round_off, most), round_off)
         floor = np.maximum(floor, _LEAST)
         floors = np.where(acts, np.minimum(round_off, most_of_contacts), round_off)
-        blurs = np.where(acts, round_off, 0.0)
+        blurs = np.where(acts & (unloaded <= MOST_EXCUSED * pushes), round_off, 0.0)
         sides = [
             _governing(pairs, *rows)
             for pairs, *rows in zip(self._pairs, own, pushes, floors, blurs, strict=True)
         ]
         of_contacts = np.reshape(sides, (len(contacts), 4)).T
         acted_on = loaded | acts.any(axis=0)
+        acted_on &= unloaded <= MOST_EXCUSED * force
         of_bodies = np.array([left, force, floor, np.where(acted_on, round_off, 0.0)])
         residual, force, floor, round_off = np.concatenate([of_bodies, of_contacts], axis=1)
         return Norms(residual, force, floor, round_off, n)

@@ -167,7 +167,6 @@ class CondensedSystem(System):
         for vector in outside:
             vector[self.unknowns.kept] = 0.0
         self.outside = self._full.by_body(*outside)
-        self.take_committed_forces()
 
     def extended(self, change: Array) -> Array:
         """One back-substitution; see `System.extended`."""

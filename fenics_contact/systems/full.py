@@ -161,7 +161,6 @@ class FullSystem(System):
         """Start an increment under a load, u with its conditions. Collective."""
         self.load = load
         self.prescribed = self.state()[self.constrained]
-        self.take_committed_forces()
 
     @property
     def pending_field(self) -> Array | None:

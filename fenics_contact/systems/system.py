@@ -19,7 +19,7 @@ from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_max
-from fenics_contact.systems.balance import Norms, Parts, by_body
+from fenics_contact.systems.balance import Norms, Parts, Start, by_body
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.operator import ContactOperator
@@ -79,7 +79,6 @@ class System(ABC):
         self.load: Array = np.zeros(unknowns.n_local)
         self.diagonal: Array = np.zeros(unknowns.n_local)
         self.outside: Array = np.zeros((2, n_bodies))
-        self._released: Array = np.zeros(n_bodies)
         self._motions = [motion for contact in contacts for motion in contact.motions]
         self._contact_vector = unknowns.vector()
         counts = [len(contact.motions) for contact in contacts]
@@ -156,13 +155,13 @@ class System(ABC):
         """Their sum, (n_local,). Collective."""
         return sum(self.contact_forces(), np.zeros(self.unknowns.n_local))
 
-    def norms(self, total: Array, contacts: Sequence[Array], start: Array) -> Norms:
+    def norms(self, total: Array, contacts: Sequence[Array], start: Start) -> Norms:
         """How large residual and forces are at the present state, by part. Collective.
 
         Args:
             total: The residual with reactions, (n_local,) (force).
             contacts: Of every contact the part that is its own, (n_local,) each.
-            start: Norms of `terms` where the increment began, (n_bodies,).
+            start: What the increment began with.
         """
         return self.parts.norms(
             total,
@@ -172,22 +171,18 @@ class System(ABC):
             self.constrained,
             self.outside,
             start,
-            self._released,
         )
 
-    def take_committed_forces(self) -> None:
-        """Let contact forces of the committed state be those that an increment starts from.
-
-        Collective.
-        """
-        self._released[:] = 0.0
-        for operator in self.operators:
+    def start(self) -> Start:
+        """What an increment from the committed state begins with, terms zero. Collective."""
+        forces = [np.zeros(self.unknowns.n_local) for _ in self.contacts]
+        for operator, force in zip(self.operators, forces, strict=True):
             points = operator.contact.state.points
             if points is not None:
                 self._contact_vector.set(0.0)
                 operator.add_force(self._contact_vector, points.total_traction)
-                force = np.where(self.constrained, 0.0, self._contact_vector.array_r)
-                self._released = np.maximum(self._released, self.by_body(force)[0])
+                force[:] = np.where(self.constrained, 0.0, self._contact_vector.array_r)
+        return Start(np.zeros(self.n_bodies), self.by_body(*forces))
 
     @property
     def confined(self) -> bool:
