@@ -188,6 +188,7 @@ class IncrementSolver:
                 stiffness_changed=stiffness_changed,
                 load_before=state.load,
                 balance=not points.replaced,
+                fallback=not points.predicted,
             )
         # Points outside of what is kept have to be looked at, and it takes all of u to do so.
         lags = not (increment.recover_interior or solver.system.confined) and self._may_lag(state)

@@ -16,7 +16,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.beside import BUSY, Beside, Box
-from scenes.blocks import BOTTOM, LEFT, TOP
+from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP
 from scenes.comparing import assemble_number, close, compiled, raised_everywhere
 from scenes.elasticity import strain
 from scenes.laws import Bond
@@ -92,7 +92,7 @@ def moment(led):
     return assemble_number(compiled(ufl.replace(bodies.F, {bodies.v: only})), COMM)
 
 
-def on_slab(start, law=None, *, width=3.0, soft=1.0, spring=None, **options):
+def on_slab(start, law=None, busy=(), *, width=3.0, soft=1.0, spring=None, **options):
     """A block on a slab, its top pressed down by 0.002; beyond x = 1.5 the slab may be softer.
 
     It is led by its top, or by the end of a spring on it.
@@ -101,7 +101,7 @@ def on_slab(start, law=None, *, width=3.0, soft=1.0, spring=None, **options):
         "slab": Box((0.0, 0.0), (width, 0.5), (8 * round(width), 4)),
         "block": Box((start, 0.5), (1.0, 0.5), (8, 4)),
     }
-    scene = Beside(boxes, E=1e5)
+    scene = Beside(boxes, busy, E=1e5)
     bodies, x = scene.bodies, ufl.SpatialCoordinate(scene.bodies.mesh)
     modulus = ufl.conditional(ufl.And(ufl.gt(x[0], 1.5), ufl.lt(x[1], 0.5)), soft, 1.0)
     bodies.F = ufl.inner(modulus * bodies.stress, strain(bodies.v)) * ufl.dx(bodies.mesh)
@@ -223,6 +223,98 @@ def test_points_are_those_where_the_last_increment_leads(spring):
         fewer.problem.solve()
         fewer.problem.commit()
     assert close(led.contact.resultants().force, fewer.contact.resultants().force, 1e-3)
+
+
+def between_walls(law, ways, downs, start=0.5, **options):
+    """A block on a slab 4 long, pushed along by walls, each way in one increment.
+
+    Its top is led down, or loaded where a number is greater than 1.
+    """
+    boxes = {
+        "slab": Box((0.0, 0.0), (4.0, 0.5), (32, 4)),
+        "block": Box((start, 0.5), (1.0, 0.5), (8, 4)),
+    }
+    scene = Beside(boxes, E=1e5)
+    push, down = fem.Constant(scene.bodies.mesh, (0.0, 0.0)), scene.bodies.constant(0.0)
+    scene.hold("slab", BOTTOM, 0, 1)
+    if np.abs(downs).max() > 1:
+        scene.load("block", TOP, 1, down)
+    else:
+        scene.hold("block", TOP, 1, value=down)
+    walls = [
+        fc.HalfSpace((start, 0), (1, 0), displacement=push),
+        fc.HalfSpace((start + 1, 0), (-1, 0), displacement=push),
+    ]
+    contact = scene.contact("block", BOTTOM, ("slab", TOP), law, **options)
+    left, right = (
+        scene.contact("block", side, wall, fc.Frictionless(), name=f"wall {side}")
+        for side, wall in zip((LEFT, RIGHT), walls, strict=True)
+    )
+    problem = scene.problem(contact, left, right)
+    steps = []
+    for push.value[0], down.value in zip(ways, downs, strict=True):
+        steps.append(problem.solve())
+        problem.commit()
+    return [step.contacts["contact"].force for step in steps], steps
+
+
+@pytest.mark.parametrize(
+    ("law", "sign"), [(fc.Frictionless(), 1), (fc.Foundation(1e6), -1)], ids=["pressed", "pulled"]
+)
+def test_a_wrong_prediction_leaves_no_block_without_forces(law, sign):
+    """Walls turn the block round near the slab's end, while it is led down as before.
+
+    So it is predicted beyond the end, where nothing opposes it. Reference: the block meshed where
+    it ends, 1e-3. The force was 0.
+    """
+    gap = {"gap": 0.0}
+    downs = -sign * np.linspace(2e-3, 2.4e-3, 5)
+    found, _ = between_walls(law, (0.0, 0.3, 2.4, 2.3, 2.2), downs, **gap)
+    there, _ = between_walls(law, (0.0,), downs[3:4], start=2.8, **gap)
+    assert close(found[3], there[0], 1e-3)
+
+
+def test_a_failed_prediction_costs_one_method():
+    """A block that is predicted off the slab has no equilibrium there.
+
+    It is solved between its own points after one method, by 23 iterations. It took 604.
+    """
+    _, steps = between_walls(
+        fc.Coulomb(0.2), (0.0, 0.3, 2.3, 2.0), (-200.0, -210.0, -220.0, -230.0)
+    )
+    assert sum("predicted" in attempt.outcome for attempt in steps[3].attempts) == 1
+    assert steps[3].iterations < 50
+
+
+@pytest.mark.parametrize("law", [fc.Frictionless(), fc.Foundation(1e5)], ids=["bare", "springs"])
+def test_a_block_that_left_comes_back(law):
+    """Off the slab altogether, and back in one increment: the block meshed there, 2e-3.
+
+    With a prescribed gap no distance tells that it is there again; the force was 0.
+    """
+    led = on_slab(0.25, law, gap=0.0).press()
+    for way in (0.2, 1.4, 3.6, 1.4):
+        led.along.value = way
+        led.problem.solve()
+        led.problem.commit()
+        if way == 3.6:
+            assert led.force == 0.0
+    there = on_slab(0.25 + 1.4, law, gap=0.0).press()
+    assert led.force == pytest.approx(there.force, rel=2e-3)
+
+
+def test_held_while_an_unrelated_body_is_led_on():
+    """As alone, to 1e-6: what goes on elsewhere predicts nothing here. It differed by 1e-4."""
+    forces = []
+    for busy in ([], [BUSY["rubbed"]]):
+        led = on_slab(0.25, fc.Coulomb(0.3), busy).press()
+        for share, way in ((1.0, 0.5), (1.5, 1.0), (2.0, 1.0)):
+            led.scene.keep_busy(share)
+            led.along.value = way
+            led.problem.solve()
+            led.problem.commit()
+        forces.append(led.contact.resultants().force)
+    assert close(*forces, 1e-6)
 
 
 def state_of(led):

@@ -98,6 +98,27 @@ class BodyOpposite(Opposite):
             return self._farthest(values.slide, paired) > MAX_SLIDE
         return self._farthest(self.pairs.own_displacement(), ~paired) > MAX_SLIDE
 
+    def needs_new_pairs(self, values: PointValues, of: PointValues | None = None) -> bool:
+        """See `Opposite`."""
+        if not self.may_pair_anew:
+            return False
+        slide = max(self.largest_slide(values, of), self._farthest_unpaired())
+        return slide > self.slide_limit
+
+    def _farthest_unpaired(self) -> float:
+        """How far at most points without a pair, and what may be opposite, have moved. Collective.
+
+        Since pairs were found, relative to their facet sizes: they may have come to a pair.
+        """
+        pairs = self.pairs
+        if pairs.n_unpaired == 0:
+            return 0.0
+        own, other = pairs.moved_since_found()
+        lengths = np.linalg.norm(own, axis=1) + global_max(self._mesh.comm, other)
+        return global_max(
+            self._mesh.comm, (lengths / self._parts.quadrature.facet_sizes)[~pairs.paired]
+        )
+
     def transmitting_points(self, values: PointValues) -> Mask:
         """See `Opposite`."""
         return self.pairs.paired & (np.abs(values.total_traction).max(axis=1) > 0)

@@ -549,6 +549,18 @@ class Opposite(ABC):
         """See the class."""
         return None
 
+    def needs_new_pairs(self, values: PointValues, of: PointValues | None = None) -> bool:
+        """Whether points have left their pairs, or may have come to some. Collective.
+
+        Those that transmit forces by more than `slide_limit`; and those without a pair, if they or
+        what may be opposite have moved by as much. False where pairs stay or follow the bodies.
+
+        Args:
+            values: Of the last evaluation.
+            of: Of the state in which the points transmit forces; by default the same.
+        """
+        return False
+
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
         """Find what lies opposite the points; see `Contact.pair`. Collective.
 

@@ -155,6 +155,20 @@ class Pairs:
         depth = normal_displacement - self.distance.x.array[: self._quadrature.n_points]
         return np.where(self.paired, np.maximum(depth, 0.0), 0.0)
 
+    def moved_since_found(self) -> tuple[Array, Array]:
+        """Ways since pairs were found, of the points and of the surface opposite. Collective.
+
+        Returns:
+            (n_points, gdim) (length), and of this rank's nodes of that surface the lengths.
+        """
+        assert self.search is not None
+        change = self._u.copy()
+        if self.found_at is not None:
+            change.x.array[:] -= self.found_at.x.array
+        nodes = self.search.rays.there.facets.nodes.ravel()
+        other = change.x.array.reshape(-1, self._gdim)[nodes]
+        return self._product(self.own_map, change), np.linalg.norm(other, axis=1)
+
     def own_displacement(self) -> Array:
         """Of the body that has Γc, at the points, (n_points, gdim) (length). Collective."""
         return self._product(self.own_map, self._u)

@@ -30,8 +30,9 @@ __all__ = ["OppositePoints"]
 _MAX_PAIRINGS = 10
 # Least and largest share of the way to where the increment ended, by relaxation.
 _LEAST_SHARE, _LARGEST_SHARE = 0.1, 2.0
-# Largest extrapolation of the last increment: beyond, contact hardly goes on as it did.
-_MAX_RATIO = 2.0
+# Largest extrapolation of the last increment, doubled ones included: beyond, contact hardly goes on
+# as it did.
+_MAX_RATIO = 2.1
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ class OppositePoints:
 
     Attributes:
         contacts: Those whose pairs may be found anew.
+        predicted: Whether the first pairs are predicted ones.
         end: The state in which the increment ended between the pairs before; None: it is not solved
             yet.
     """
@@ -74,7 +76,8 @@ class OppositePoints:
             contacts: Of the problem, all or none.
         """
         self.end: Array | None = None
-        self._full, self._predicted = full, False
+        self.predicted = False
+        self._full = full
         self.contacts = [c for c in contacts if c.opposite.may_pair_anew]
         self._pairings: dict[str, _Pairing] = {}
 
@@ -97,7 +100,7 @@ class OppositePoints:
         if state.change is None:
             return
         ratio = self._increment_ratio(state, state.change, prescribed, load)
-        if not 0 < ratio <= _MAX_RATIO:
+        if not self._full.unknowns.comm.allreduce(int(ratio.any())):
             return
         end = state.unknowns + ratio * state.change
         self._full.set_state(end)
@@ -106,23 +109,26 @@ class OppositePoints:
             if before is None or not contact.opposite.pairs_anew:
                 continue
             contact.evaluate()
-            if contact.opposite.largest_slide(contact.values, before) > NEGLIGIBLE_SLIDE:
+            if contact.opposite.needs_new_pairs(contact.values, before):
                 self._pairings[contact.name] = _Pairing(end, None, contact.values.depth, 1.0, 0)
-        self._predicted = self.replaced
+        self.predicted = self.replaced
         self.find(state.unknowns)
 
     def _increment_ratio(
         self, state: State, change: Array, prescribed: Array, load: Array
-    ) -> float:
+    ) -> Array:
         """Loads and prescribed values of this increment relative to the last one's. Collective.
 
-        By projection. Prescribed displacements count by the stiffness of the bulk.
+        By projection, of every group of interacting bodies. Prescribed displacements count by the
+        stiffness of the bulk.
 
         Returns:
-            1 in equal increments, negative where loads turn round; 0 if the last one had none.
+            At the unknowns: 1 in equal increments; 0 where the last one had none, or loads turn
+            round or grow by much more.
         """
-        n = self._full.unknowns.n_dofs  # without motions of obstacles
-        held, stiffness = self._full.constrained[:n], self._full.bulk.scale
+        full, n = self._full, self._full.unknowns.n_dofs
+        held, stiffness = full.constrained[:n], full.bulk.scale
+        groups = full.scales.group[full.label]
 
         def forces(displacement: Array, force: Array) -> Array:
             return np.where(held, stiffness * displacement[:n], force[:n])
@@ -130,24 +136,27 @@ class OppositePoints:
         whole = forces(state.unknowns, state.load)
         last = forces(change, state.load_change)
         now = forces(prescribed - state.unknowns, load - state.load)
-        sums = [last @ now, last @ last, whole @ whole]
-        along, size, largest = global_sum(self._full.unknowns.comm, sums)
-        return float(along / size) if size > NEGLIGIBLE**2 * largest else 0.0
+        products = (last * now, last * last, whole * whole)
+        sums = [np.bincount(groups[:n], row, minlength=full.scales.n_groups) for row in products]
+        along, size, largest = full.scales.global_sum(np.array(sums))
+        known = size > NEGLIGIBLE**2 * largest
+        ratio = along / np.where(known, size, 1.0)
+        ratio[~(known & (ratio > 0.0) & (ratio < _MAX_RATIO))] = 0.0
+        return np.asarray(ratio[groups])
 
     def drop_prediction(self) -> bool:
         """Go back to the committed pairs if others were predicted; whether so."""
-        predicted, self._predicted = self._predicted, False
+        predicted, self.predicted = self.predicted, False
         if predicted:
             self._pairings, self.end = {}, None
         return predicted
 
     def to_update(self) -> list[Contact]:
-        """Contacts of which points that transmit forces have left their pairs. Collective."""
+        """Contacts of which points have left their pairs, or may have come to some. Collective."""
         return [
             c
             for c in self.contacts
-            if self._number_of(c) < _MAX_PAIRINGS
-            and c.opposite.largest_slide(c.values) > c.opposite.slide_limit
+            if self._number_of(c) < _MAX_PAIRINGS and c.opposite.needs_new_pairs(c.values)
         ]
 
     def to_update_for(self, names: Sequence[str]) -> list[Contact]:

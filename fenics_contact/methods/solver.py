@@ -438,6 +438,7 @@ class Solver:
         stiffness_changed: bool,
         load_before: Array,
         balance: bool = True,
+        fallback: bool = True,
     ) -> tuple[int, list[Attempt], int]:
         """Solve, let multipliers take over what the springs bear, and again. Collective.
 
@@ -446,6 +447,7 @@ class Solver:
             stiffness_changed: Whether the bulk's tangent is another one than in the last increment.
             load_before: External forces at this rank's unknowns in the committed state (force).
             balance: Whether to raise a ValueError for a load that contact cannot balance.
+            fallback: Whether other methods may be tried after a failure.
 
         Returns:
             Reason of the last solution, what was tried, and how many solutions there were.
@@ -456,12 +458,19 @@ class Solver:
         equations.loads = equations.motions.generalised_load(self._full.load)
 
         def iterate(first_round: bool) -> tuple[int, list[Attempt]]:
-            return self._iterate(first_round, cold, first_round and stiffness_changed, balance)
+            changed = first_round and stiffness_changed
+            return self._iterate(first_round, cold, changed, balance=balance, fallback=fallback)
 
         return solve_in_rounds(equations, iterate, load_before)
 
     def _iterate(
-        self, first_round: bool, cold: bool, stiffness_changed: bool, balance: bool
+        self,
+        first_round: bool,
+        cold: bool,
+        stiffness_changed: bool,
+        *,
+        balance: bool,
+        fallback: bool,
     ) -> tuple[int, list[Attempt]]:
         """Iterate by one method after another from the same start. Collective.
 
@@ -488,7 +497,7 @@ class Solver:
                 logger.info("%s", attempts[-1])
             if reason == OVERLOADED:
                 break
-            if len(attempts) == 1:
+            if fallback and len(attempts) == 1:
                 chain += self._fallbacks(start, balance=balance)
         equations.set_state(equations.solution)
         own = self.methods.get(method)
