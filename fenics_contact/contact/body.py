@@ -102,22 +102,19 @@ class BodyOpposite(Opposite):
         """See `Opposite`."""
         if not self.may_pair_anew:
             return False
-        slide = max(self.largest_slide(values, of), self._farthest_unpaired())
-        return slide > self.slide_limit
+        return self.largest_slide(values, of) > self.slide_limit or self._comes_to_pairs(values)
 
-    def _farthest_unpaired(self) -> float:
-        """How far at most points without a pair, and what may be opposite, have moved. Collective.
-
-        Since pairs were found, relative to their facet sizes: they may have come to a pair.
-        """
+    def _comes_to_pairs(self, values: PointValues) -> bool:
+        """Whether points without a pair that have moved would find one now. Collective."""
         pairs = self.pairs
         if pairs.n_unpaired == 0:
-            return 0.0
-        own, other = pairs.moved_since_found()
-        lengths = np.linalg.norm(own, axis=1) + global_max(self._mesh.comm, other)
-        return global_max(
-            self._mesh.comm, (lengths / self._parts.quadrature.facet_sizes)[~pairs.paired]
-        )
+            return False
+        way = pairs.moved_since_found()
+        way -= np.sum(way * values.normal, axis=1)[:, None] * values.normal
+        if not self._farthest(way, ~pairs.paired) > self.slide_limit:
+            return False
+        gap, _ = self.true_placement(values)
+        return bool(self._mesh.comm.allreduce(int(np.any(~np.isnan(gap) & ~pairs.paired))))
 
     def transmitting_points(self, values: PointValues) -> Mask:
         """See `Opposite`."""

@@ -552,8 +552,9 @@ class Opposite(ABC):
     def needs_new_pairs(self, values: PointValues, of: PointValues | None = None) -> bool:
         """Whether points have left their pairs, or may have come to some. Collective.
 
-        Those that transmit forces by more than `slide_limit`; and those without a pair, if they or
-        what may be opposite have moved by as much. False where pairs stay or follow the bodies.
+        Those that transmit forces by more than `slide_limit`; and those without a pair that have
+        moved by as much along the surface, if they would find one now. False where pairs stay or
+        follow the bodies.
 
         Args:
             values: Of the last evaluation.

@@ -11,7 +11,7 @@ from petsc4py import PETSc
 from fenics_contact.contact.values import PointValues
 from fenics_contact.obstacles.base import Obstacle
 from fenics_contact.obstacles.deformable import DeformableBody
-from fenics_contact.parallel import global_sum, warn
+from fenics_contact.parallel import global_mean, global_sum, warn
 from fenics_contact.surface.pairing import Pairing
 from fenics_contact.surface.rays import REASONS
 from fenics_contact.surface.surface import SurfaceQuadrature
@@ -155,19 +155,21 @@ class Pairs:
         depth = normal_displacement - self.distance.x.array[: self._quadrature.n_points]
         return np.where(self.paired, np.maximum(depth, 0.0), 0.0)
 
-    def moved_since_found(self) -> tuple[Array, Array]:
-        """Ways since pairs were found, of the points and of the surface opposite. Collective.
+    def moved_since_found(self) -> Array:
+        """How far points have moved relative to the surface opposite since pairs were found.
+
+        Collective. That of the surface is the mean of its nodes.
 
         Returns:
-            (n_points, gdim) (length), and of this rank's nodes of that surface the lengths.
+            (n_points, gdim) (length).
         """
         assert self.search is not None
         change = self._u.copy()
         if self.found_at is not None:
             change.x.array[:] -= self.found_at.x.array
         nodes = self.search.rays.there.facets.nodes.ravel()
-        other = change.x.array.reshape(-1, self._gdim)[nodes]
-        return self._product(self.own_map, change), np.linalg.norm(other, axis=1)
+        other = global_mean(self._mesh.comm, change.x.array.reshape(-1, self._gdim)[nodes])
+        return self._product(self.own_map, change) - other
 
     def own_displacement(self) -> Array:
         """Of the body that has Γc, at the points, (n_points, gdim) (length). Collective."""
