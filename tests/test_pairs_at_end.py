@@ -225,10 +225,10 @@ def test_points_are_those_where_the_last_increment_leads(spring):
     assert close(led.contact.resultants().force, fewer.contact.resultants().force, 1e-3)
 
 
-def between_walls(law, ways, downs, start=0.5, **options):
+def between_walls(law, ways, downs, start=0.5, *, loaded=False, **options):
     """A block on a slab 4 long, pushed along by walls, each way in one increment.
 
-    Its top is led down, or loaded where a number is greater than 1.
+    Its top is led down, or loaded by a traction.
     """
     boxes = {
         "slab": Box((0.0, 0.0), (4.0, 0.5), (32, 4)),
@@ -237,7 +237,7 @@ def between_walls(law, ways, downs, start=0.5, **options):
     scene = Beside(boxes, E=1e5)
     push, down = fem.Constant(scene.bodies.mesh, (0.0, 0.0)), scene.bodies.constant(0.0)
     scene.hold("slab", BOTTOM, 0, 1)
-    if np.abs(downs).max() > 1:
+    if loaded:
         scene.load("block", TOP, 1, down)
     else:
         scene.hold("block", TOP, 1, value=down)
@@ -267,10 +267,9 @@ def test_a_wrong_prediction_leaves_no_block_without_forces(law, sign):
     So it is predicted beyond the end, where nothing opposes it. Reference: the block meshed where
     it ends, 1e-3. The force was 0.
     """
-    gap = {"gap": 0.0}
     downs = -sign * np.linspace(2e-3, 2.4e-3, 5)
-    found, _ = between_walls(law, (0.0, 0.3, 2.4, 2.3, 2.2), downs, **gap)
-    there, _ = between_walls(law, (0.0,), downs[3:4], start=2.8, **gap)
+    found, _ = between_walls(law, (0.0, 0.3, 2.4, 2.3, 2.2), downs, gap=0.0)
+    there, _ = between_walls(law, (0.0,), downs[3:4], start=2.8, gap=0.0)
     assert close(found[3], there[0], 1e-3)
 
 
@@ -280,7 +279,7 @@ def test_a_failed_prediction_costs_one_method():
     It is solved between its own points after one method, by 23 iterations. It took 604.
     """
     _, steps = between_walls(
-        fc.Coulomb(0.2), (0.0, 0.3, 2.3, 2.0), (-200.0, -210.0, -220.0, -230.0)
+        fc.Coulomb(0.2), (0.0, 0.3, 2.3, 2.0), (-200.0, -210.0, -220.0, -230.0), loaded=True
     )
     assert sum("predicted" in attempt.outcome for attempt in steps[3].attempts) == 1
     assert steps[3].iterations < 50

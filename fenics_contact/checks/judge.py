@@ -15,7 +15,7 @@ from fenics_contact.checks.quadrature_resolution import warn_of_divided_facets, 
 from fenics_contact.checks.tunnelling import TunnellingCheck
 from fenics_contact.checks.verdict import ForceBalance, Verdict, check_laws
 from fenics_contact.parallel import global_sum, warn
-from fenics_contact.systems.balance import Start
+from fenics_contact.systems.balance import InitialForces
 from fenics_contact.systems.ejected_bodies import find_ejected_bodies
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
@@ -78,7 +78,7 @@ class Judge:
         system: System,
         bulk: Array,
         *,
-        start: Start,
+        start: InitialForces,
         began: Array,
         rtol: float,
         laws: bool = True,
@@ -90,7 +90,7 @@ class Judge:
         Args:
             system: The unknowns on which the residual is looked at.
             bulk: Residual of the bulk on these.
-            start: What the increment began with.
+            start: Forces at the beginning of the increment.
             began: The state in which the increment began.
             rtol: Residual that passes, as a share of the forces.
             laws: Whether to check the laws, too. If not, tractions are those evaluated last,

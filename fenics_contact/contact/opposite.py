@@ -550,7 +550,7 @@ class Opposite(ABC):
         return None
 
     def needs_new_pairs(self, values: PointValues, of: PointValues | None = None) -> bool:
-        """Whether points have left their pairs, or may have come to some. Collective.
+        """Whether points have left their pairs, or come to some. Collective.
 
         Those that transmit forces by more than `slide_limit`; and those without a pair that have
         moved by as much along the surface, if they would find one now. False where pairs stay or

@@ -18,7 +18,7 @@ from fenics_contact.methods.active_set_monitor import ActiveSetMonitor
 from fenics_contact.methods.limit_analysis import Overload, find_overload
 from fenics_contact.methods.regularisation import LooseModes
 from fenics_contact.parallel import global_max, global_sum
-from fenics_contact.systems.balance import Norms, Start
+from fenics_contact.systems.balance import InitialForces, Norms
 from fenics_contact.systems.ejected_bodies import find_ejected_bodies
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.hierarchy import Hierarchy
@@ -48,7 +48,7 @@ class Equations:
         length: What displacements are divided by.
         watch: What becomes of the status of the points from iteration to iteration.
         norms: Norms where `residual` was computed last.
-        start: What the increment began with.
+        start: Forces at the beginning of the increment.
         began: State of `full` there.
         has_round_off: Whether a matrix was assembled in this increment, which tells the round-off
             of its residuals.
@@ -84,7 +84,7 @@ class Equations:
         self.watch = ActiveSetMonitor(full.contacts)
         nothing: Array = np.zeros(full.n_bodies)
         self.norms = Norms(nothing, nothing, nothing, nothing, nothing.size)
-        self.start = Start(nothing, np.zeros((len(full.contacts), full.n_bodies)))
+        self.start = InitialForces(nothing, np.zeros((len(full.contacts), full.n_bodies)))
         self.rtol = self.round_rtol = 0.0
         self.solvers: dict[bool, PETSc.KSP] = {}
         self.by_cycle, self.hierarchy = False, Hierarchy()

@@ -89,8 +89,8 @@ class OppositePoints:
     def predict(self, state: State, prescribed: Array, load: Array) -> None:
         """Find the pairs of where the increment ends if it goes on as the last one. Collective.
 
-        Of those contacts whose pairs are found anew at every commit, and of which points that
-        transmit forces leave these by then.
+        Of those contacts whose pairs are found anew at every commit, and need new ones by then for
+        the points that transmit forces in the committed state.
 
         Args:
             state: The committed state, complete.
@@ -152,7 +152,7 @@ class OppositePoints:
         return predicted
 
     def to_update(self) -> list[Contact]:
-        """Contacts of which points have left their pairs, or may have come to some. Collective."""
+        """Contacts that need new pairs, see `Opposite.needs_new_pairs`. Collective."""
         return [
             c
             for c in self.contacts
@@ -170,13 +170,15 @@ class OppositePoints:
         """
         if not any(c.name in names for c in self.contacts):
             return []
-        found = []
-        for contact in self.contacts:
-            number = self._number_of(contact)
-            slid = contact.opposite.largest_slide(contact.values) > NEGLIGIBLE_SLIDE
-            due = slid or (contact.name in names and number == 0)
-            found += [contact] if due and number < _MAX_PAIRINGS else []
-        return found
+        return [
+            c
+            for c in self.contacts
+            if (number := self._number_of(c)) < _MAX_PAIRINGS
+            and (
+                c.opposite.largest_slide(c.values) > NEGLIGIBLE_SLIDE
+                or (c.name in names and number == 0)
+            )
+        ]
 
     def _number_of(self, contact: Contact) -> int:
         """How often its pairs have been found in this increment after a solution."""

@@ -453,7 +453,7 @@ class Solver:
             Reason of the last solution, what was tried, and how many solutions there were.
         """
         equations = self.equations
-        equations.start = self.system.start()
+        equations.start = self.system.initial_forces()
         equations.has_round_off = False
         equations.loads = equations.motions.generalised_load(self._full.load)
 

@@ -18,7 +18,7 @@ from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["MOST_EXCUSED", "Labels", "Norms", "Parts", "Start", "by_body"]
+__all__ = ["MOST_EXCUSED", "InitialForces", "Labels", "Norms", "Parts", "by_body"]
 
 Labels = npt.NDArray[np.intp]
 
@@ -35,8 +35,8 @@ _LEAST = np.finfo(float).tiny / np.finfo(float).eps
 
 
 @dataclass(frozen=True)
-class Start:
-    """What an increment begins with, of which round-off may be left at its end.
+class InitialForces:
+    """Forces at the beginning of an increment, of which round-off may be left at its end.
 
     Attributes:
         terms: Norms of the product of matrix and unknowns, (n_bodies,) (force).
@@ -146,7 +146,7 @@ class Parts:
         product: Array,
         constrained: Mask,
         outside: Array,
-        start: Start,
+        start: InitialForces,
     ) -> Norms:
         """Norms at one state. Collective.
 
@@ -157,7 +157,7 @@ class Parts:
             product: Size of the terms of the matrix times the unknowns, (n_local,).
             constrained: Mask of the unknowns with Dirichlet conditions.
             outside: Norms of load and product at unknowns outside of the space, (2, n_bodies).
-            start: What the increment began with.
+            start: Forces at the beginning of the increment.
         """
         n, free = self.n_bodies, np.where(constrained, 0.0, residual)
         held = residual - free
@@ -202,8 +202,7 @@ class Parts:
             for pairs, *rows in zip(self._pairs, own, pushes, floors, blurs, strict=True)
         ]
         of_contacts = np.reshape(sides, (len(contacts), 4)).T
-        acted_on = loaded | acts.any(axis=0)
-        acted_on &= unloaded <= MOST_EXCUSED * force
+        acted_on = (loaded | acts.any(axis=0)) & (unloaded <= MOST_EXCUSED * force)
         of_bodies = np.array([left, force, floor, np.where(acted_on, round_off, 0.0)])
         residual, force, floor, round_off = np.concatenate([of_bodies, of_contacts], axis=1)
         return Norms(residual, force, floor, round_off, n)

@@ -19,7 +19,7 @@ from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_max
-from fenics_contact.systems.balance import Norms, Parts, Start, by_body
+from fenics_contact.systems.balance import InitialForces, Norms, Parts, by_body
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.operator import ContactOperator
@@ -143,25 +143,28 @@ class System(ABC):
             evaluated: Whether tractions are those that `Contact.evaluate` found last, and not the
                 law's with its data as they are now.
         """
-        forces = []
-        for operator in self.operators:
-            self._contact_vector.set(0.0)
-            traction = operator.contact.traction if evaluated else None
-            operator.add_force(self._contact_vector, traction)
-            forces.append(self._contact_vector.array_r.copy())
-        return forces
+        return [
+            self._nodal_force(operator, operator.contact.traction if evaluated else None)
+            for operator in self.operators
+        ]
+
+    def _nodal_force(self, operator: ContactOperator, traction: Array | None) -> Array:
+        """See `ContactOperator.add_force`, (n_local,). Collective."""
+        self._contact_vector.set(0.0)
+        operator.add_force(self._contact_vector, traction)
+        return np.array(self._contact_vector.array_r)
 
     def contact_force(self) -> Array:
         """Their sum, (n_local,). Collective."""
         return sum(self.contact_forces(), np.zeros(self.unknowns.n_local))
 
-    def norms(self, total: Array, contacts: Sequence[Array], start: Start) -> Norms:
+    def norms(self, total: Array, contacts: Sequence[Array], start: InitialForces) -> Norms:
         """How large residual and forces are at the present state, by part. Collective.
 
         Args:
             total: The residual with reactions, (n_local,) (force).
             contacts: Of every contact the part that is its own, (n_local,) each.
-            start: What the increment began with.
+            start: Forces at the beginning of the increment.
         """
         return self.parts.norms(
             total,
@@ -173,16 +176,15 @@ class System(ABC):
             start,
         )
 
-    def start(self) -> Start:
-        """What an increment from the committed state begins with, terms zero. Collective."""
+    def initial_forces(self) -> InitialForces:
+        """Forces in the committed state, those of the bulk not evaluated yet. Collective."""
         forces = [np.zeros(self.unknowns.n_local) for _ in self.contacts]
         for operator, force in zip(self.operators, forces, strict=True):
             points = operator.contact.state.points
             if points is not None:
-                self._contact_vector.set(0.0)
-                operator.add_force(self._contact_vector, points.total_traction)
-                force[:] = np.where(self.constrained, 0.0, self._contact_vector.array_r)
-        return Start(np.zeros(self.n_bodies), self.by_body(*forces))
+                nodal = self._nodal_force(operator, points.total_traction)
+                force[:] = np.where(self.constrained, 0.0, nodal)
+        return InitialForces(np.zeros(self.n_bodies), self.by_body(*forces))
 
     @property
     def confined(self) -> bool:
