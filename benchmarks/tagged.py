@@ -30,7 +30,7 @@ def runs(case: costs.Case, friction: float) -> dict[str, Callable[[], costs.Row]
         f"{costs.YARDSTICK}, multigrid": partial(case.linear, "multigrid"),
         "1 increment": package,
         "10 increments": partial(package, 10),
-        "10 increments, interior in every increment": partial(package, 10, "every"),
+        f"10 increments{costs.AT_END}": partial(package, 10, "last"),
         costs.PLAIN["multigrid"]: partial(case.plain, friction, "multigrid"),
     }
 
