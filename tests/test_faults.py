@@ -143,8 +143,8 @@ def test_snes_is_stopped(method, monkeypatch):
 @pytest.mark.parametrize(
     ("kind", "name"),
     [
-        (dense.PartlyFactored, "factor_anew"),
-        (dense.PartlyFactored, "_solve"),
+        (dense.UpdatedLU, "factor_anew"),
+        (dense.UpdatedLU, "_solve"),
     ],
 )
 def test_an_exception_in_a_dense_solve(kind, name, method, error, monkeypatch):
@@ -222,12 +222,12 @@ def test_an_interrupt_at_any_time(method, condensation):
     goes_on(made, twin)
 
 
-@pytest.mark.parametrize("name", ["_product", "_solve"])
+@pytest.mark.parametrize("name", ["product", "_solve"])
 def test_an_exception_in_a_linearised_solve(name, monkeypatch):
     """In the products and solutions of the error estimate: it comes out, and none comes after."""
     made, twin = pair("newton")
     made.problem.solve()
-    kind = dense.Sum if name == "_product" else dense.PartlyFactored
+    kind = dense.Sum if name == "product" else dense.UpdatedLU
     with monkeypatch.context() as patch:
         patch.setattr(kind, name, failing(getattr(kind, name), 0))
         with pytest.raises(told(Fault), match="on purpose"):

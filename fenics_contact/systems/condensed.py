@@ -15,7 +15,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact.systems.condensation import Condensation
-from fenics_contact.systems.dense import PartlyFactored, Sum
+from fenics_contact.systems.dense import Sum, UpdatedLU
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.system import System
@@ -104,7 +104,6 @@ class CondensedSystem(System):
         self.ready, self.scales = False, full.scales
         self.mark = object()
         self._fixed: Array | None = None  # the constant part of the matrices
-        self._places: Array | None = None
         self._full, self._prefix = full, prefix
         # This rank's dofs among those kept; motions are behind all of them.
         self._kept_dofs = kept[kept < unknowns.whole.n_dofs]
@@ -226,17 +225,10 @@ class CondensedSystem(System):
         return matrix
 
     def prepare(self, ksp: PETSc.KSP, matrix: PETSc.Mat) -> None:
-        """Have a solver factor a matrix of `matrix` where contact acts, and the rest once."""
-        if self._places is None:
-            gdim, space = self.gdim, self.u.function_space
-            nodes = space.tabulate_dof_coordinates()[self._kept_dofs // gdim]
-            nowhere = np.full(self.unknowns.n_motions, np.nan)
-            whole, gathered = self.unknowns.whole, self.unknowns.gathered
-            columns = [gathered(whole.joined(nodes[:, i], nowhere)) for i in range(gdim)]
-            self._places = np.stack(columns, axis=1)
+        """Have a solver factor a matrix of `matrix`, and correct the factors for the next ones."""
         ksp.setOperators(matrix)
         ksp.pc.setType("python")
-        ksp.pc.setPythonContext(PartlyFactored(self._places))
+        ksp.pc.setPythonContext(UpdatedLU())
 
     def bulk_diagonal(self) -> Array:
         """See `System.bulk_diagonal`: that of S."""
