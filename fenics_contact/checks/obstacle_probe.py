@@ -2,59 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 from dolfinx import fem
 
+from fenics_contact.checks.obstacle_paths import ObstaclePaths
 from fenics_contact.checks.penetration import (
     ALLOWED_BEFORE,
     DEPTH_RESOLUTION,
     OPPOSITE_SIDES,
-    PREDICTED_DEPTH,
     ResistedDepth,
     allowed_depth,
     depth_below,
     dot,
     tangent_planes_around,
 )
+from fenics_contact.checks.surface_pieces import SurfacePieces
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.obstacle_sampler import ObstacleSampler
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import gather_rows, global_max
-from fenics_contact.surface.crossings import MovingFacets, find_crossings
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["RigidObstacleProbe"]
 
-# Cosine of the angle between the normals of two faces that meet at an edge: 60 degrees and more.
-_EDGE = 0.5
-# Rotation (radians), and round-off, over which the displacement is taken as linear in time.
-_LINEAR_ROTATION = np.pi / 2 + 1e-9
-# Bisections of a path at the place where the normal turns to the opposite side.
-_BISECTIONS = 20
 # Steps along a facet towards the place that is deepest in an obstacle.
 _DESCENT_STEPS = 12
-
-
-@dataclass(frozen=True)
-class _Surface:
-    """The flat pieces of Γc.
-
-    Attributes:
-        facets: Those of this rank, at rest.
-        allowed: Allowed depth below each of all, (n,) (length).
-        corner: Its first corner, (n, gdim) (length).
-        normal: Its outward unit normal, (n, gdim).
-        middle: Its middle on the undeformed Γc, (n, gdim) (length).
-    """
-
-    facets: MovingFacets
-    allowed: Array
-    corner: Array
-    normal: Array
-    middle: Array
 
 
 class RigidObstacleProbe:
@@ -82,7 +53,6 @@ class RigidObstacleProbe:
         """
         opposite, values = contact.opposite, contact.values
         assert opposite.sampler is not None
-        self._contact = contact
         self._places = places = contact.facet_places
         self._sampler: ObstacleSampler = opposite.sampler
         self._comm = contact.surface.mesh.comm
@@ -153,7 +123,10 @@ class RigidObstacleProbe:
         # The distance changes by no more than the way: farther obstacles do not reach the facet.
         going: Mask = distance < size[facet]
         scale: Array = np.ones(len(facet))
-        inverse, near = np.swapaxes(self._tangents(self.field), 1, 2), np.unique(facet[going])
+        inverse, near = (
+            np.swapaxes(self._places.tangents(self.field), 1, 2),
+            np.unique(facet[going]),
+        )
         inverse[near] = np.linalg.pinv(np.swapaxes(inverse[near], 1, 2))
         for _ in range(_DESCENT_STEPS):
             facet, at, scale = facet[going], at[going], scale[going]
@@ -175,20 +148,6 @@ class RigidObstacleProbe:
         facets, references, distances, normals = map(np.concatenate, zip(*found, strict=True))
         return facets, references, distances, normals
 
-    def _tangents(self, field: Array) -> Array:
-        """Edges of all facets in the obstacle's frame, (n_facets, gdim, gdim - 1) (length)."""
-        n, d = len(self._places.size), field.shape[1]
-        origin, *ends = (
-            self._places.values(field, np.arange(n), np.broadcast_to(unit, (n, d - 1)))
-            for unit in np.vstack([np.zeros(d - 1), np.eye(d - 1)])
-        )
-        return np.stack([end - origin for end in ends], axis=2)
-
-    def _outward(self, field: Array) -> Array:
-        """Outward unit normals at the first corners of all facets, (n_facets, gdim)."""
-        every = np.arange(len(self._places.size))
-        return self._places.facets.outward_normals(every, self._tangents(field))
-
     def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
         """See `Probe`: by where the points are in the frame of the obstacle."""
         committed = contact.values.x + contact.opposite.committed_jump
@@ -202,7 +161,7 @@ class RigidObstacleProbe:
         size = self._places.size[self._facet]
         clear = DEPTH_RESOLUTION * size + self._distance
         # What has entered the body may go deeper.
-        inside = dot(np.nan_to_num(self._toward), self._outward(self.field)[self._facet]) < 0
+        inside = dot(np.nan_to_num(self._toward), self._places.outward(self.field)[self._facet]) < 0
         clear -= np.where(inside, ALLOWED_BEFORE * size, 0.0)
         known = known and bool(np.all(np.linalg.norm(moved, axis=1) <= clear))
         # A point may have come to the opposite side of what is thinner.
@@ -234,7 +193,7 @@ class RigidObstacleProbe:
         facet, place, toward = self._facet[some], self._z[some], self._toward[some]
         # Half way through an obstacle there is no normal.
         depth[some[~(np.linalg.norm(toward, axis=1) > 0.5)]] = np.inf
-        inward = -self._outward(self.field)[facet]
+        inward = -self._places.outward(self.field)[facet]
         aside = np.nan_to_num(toward - dot(toward, inward)[:, None] * inward)
         length = np.linalg.norm(aside, axis=1, keepdims=True)
         aside *= size[some, None] / np.where(length > 0, length, 1.0)
@@ -242,263 +201,35 @@ class RigidObstacleProbe:
         for way in (aside, -aside):
             narrow &= self._sampler.sample(place + way)[0] >= 0
         some, place, inward = some[narrow], place[narrow], inward[narrow]
-        surface = self._surface(self.field, allowed) if self._comm.allreduce(len(some)) else None
+        surface = None
+        if self._comm.allreduce(len(some)):
+            surface = SurfacePieces.of(self._comm, self._places, self.field, self._facet, allowed)
         reach = allowed[some]
         while self._comm.allreduce(len(some)):
             assert surface is not None
             tip = place + reach[:, None] * inward
             beyond = self._sampler.sample(tip)[0] < 0
             beyond &= reach <= size[some] + allowed[some]
-            beyond &= ~self._is_shallow(tip, -inward, surface)
+            beyond &= ~surface.is_shallow(tip, -inward)
             some, place, inward = some[beyond], place[beyond], inward[beyond]
             reach = reach[beyond] + DEPTH_RESOLUTION * size[some]
             depth[some] = reach
         return depth
 
     def crossed(self, allowed: Array) -> Array:
-        """Find the places of Γc that have crossed the obstacle in the increment. Collective.
-
-        In the increment Γc moves along straight lines, while the obstacle rotates, and the
-        constants in its distance change, at constant rates. Rotations by more than a right angle
-        are divided into equal parts, as an obstacle may have passed through the body and be outside
-        of it again at the end.
-        """
-        n = max(1, int(np.ceil(abs(self._rotation.angle) / _LINEAR_ROTATION)))
-        parts = [self._crossed_between(k / n, (k + 1) / n, allowed) for k in range(n)]
-        return np.concatenate(parts)
-
-    def _points_at(self, time: float) -> Array:
-        """The nodes of Γc at a time from 0 to 1 in the increment, in the frame of the obstacle."""
-        if time in (0.0, 1.0):
-            return self.field if time else self._start
-        end = self._rotation.turned(self.field, 1.0)
-        return self._rotation.turned(self._start + time * (end - self._start), -time)
-
-    def _crossed_between(self, since: float, until: float, allowed: Array) -> Array:
-        """Find the undeformed places that cross the obstacle between two times. Collective.
-
-        Points of the obstacle are followed, those nearest to places of Γc at either time. In the
-        frame of the obstacle they are at rest; where its shape changes they go straight between the
-        old surface and the new one. It has crossed
-
-        - a facet, if a point enters the body, or has entered it before by what was allowed then,
-          and ends deeper below the facet than is allowed; its middle is returned;
-        - a place that ends on the opposite side of the obstacle, if its point has been inside of
-          the body, or what is below the place, by the largest depth that is explained, has passed
-          through the obstacle.
-        """
-        comm, size = self._comm, self._places.size[self._facet]
-        field, field_end = self._points_at(since), self._points_at(until)
-        start, end, distance_end, toward = self._at(field), self._z, self._distance, self._toward
-        if until < 1.0:
-            end = self._at(field_end)
-            distance_end, toward = self._sampler.sample(end)
-        toward = np.nan_to_num(toward)
-        angle = abs(self._rotation.angle) * (until - since)
-        way = np.linalg.norm(self._rotation.turned(end, until - since) - start, axis=1)
-        radius = np.maximum(self._rotation.radius(start), self._rotation.radius(end))
-        # A distance changes by no more than the path: what is farther away was not touched, and
-        # what is inside of the body was outside, or inside by what was allowed.
-        changed = not np.array_equal(self._sampler.committed_shape, self._shape)
-        outward_end = self._outward(field_end)
-        inside = dot(toward, outward_end[self._facet]) < 0
-        before = np.where(inside, ALLOWED_BEFORE * size, 0.0)
-        near = changed | ~(distance_end > way + angle * radius + before)
-        # A diverged state is not finite, and is refused for its residual.
-        near = np.flatnonzero(near & np.isfinite(way) & np.isfinite(distance_end))
-        if not comm.allreduce(len(near)):
-            return self.x[:0]
-        start, end, toward = start[near], end[near], toward[near]
-        distance, normal = self._sampler.sample(start, since)
-        normal = np.nan_to_num(normal)
-        feet = start + distance[:, None] * normal, end + distance_end[near, None] * toward
-        points = points_end = np.concatenate(feet)
-        if changed:
-            points = np.concatenate([feet[0], self._nearest(feet[1], since)])
-            points_end = np.concatenate([self._nearest(feet[0], until), feet[1]])
-        facet, size = self._facet[near], size[near]
-        inward, inward_end = -self._outward(field)[facet], -outward_end[facet]
-        inside = dot(normal, inward) * distance > 0
-        entered = np.append(inside & (distance < 0), np.zeros(len(near), dtype=np.bool_))
-        through = np.full(len(points), -1)
-        through[: len(near)] = self._entered_before(
-            feet[0], facet, -inward, inside & (distance >= 0), field
+        """See `Probe`."""
+        paths = ObstaclePaths(
+            comm=self._comm,
+            places=self._places,
+            sampler=self._sampler,
+            rotation=self._rotation,
+            start=self._start,
+            field=self.field,
+            facet=self._facet,
+            reference=self._reference,
+            x=self.x,
+            z=self._z,
+            distance=self._distance,
+            toward=self._toward,
         )
-        # Between times dt apart a path leaves its chord by no more than |x''| dt² / 8.
-        bend = (angle**2 * radius + 2 * angle * way)[near] / size
-        n = int(np.ceil(np.sqrt(global_max(comm, bend) / (8 * DEPTH_RESOLUTION))))
-        times: Any = np.linspace(since, until, max(n, 1) + 1)
-        self._enter(points, points_end, entered, through, times)
-        middles = self._too_deep(points_end, field_end, through, allowed)
-        opposite = np.flatnonzero(dot(normal, toward) < OPPOSITE_SIDES)
-        # On the way the tangent planes are not known.
-        depth = (allowed[near] + PREDICTED_DEPTH * size)[:, None]
-        start, end = start + depth * inward, end + depth * inward_end
-        passed = self._pass_through(start[opposite], end[opposite], since, until)
-        passed |= entered[opposite]
-        return np.concatenate([middles, self.x[near[opposite[passed]]]])
-
-    def _nearest(self, points: Array, time: float) -> Array:
-        """The nearest points of the obstacle at a time in the increment, (n, gdim). Collective."""
-        distance, normal = self._sampler.sample(points, time)
-        return points + distance[:, None] * np.nan_to_num(normal)
-
-    def _entered_before(
-        self, points: Array, facet: Index, outward: Array, some: Mask, field: Array
-    ) -> Index:
-        """Find the flat pieces of Γc through which points entered the body before. Collective.
-
-        Args:
-            points: Of the obstacle, in its frame, (n, gdim) (length).
-            facet: Facet of this rank that each is nearest to, (n,).
-            outward: Its outward unit normal, (n, gdim).
-            some: Which of the points are looked at, (n,).
-            field: The nodes of Γc in that frame, (n_nodes, gdim) (length).
-
-        Returns:
-            Their numbers among those of all ranks, (n,); -1 for points that are outside, or below
-            another surface of a thin body.
-        """
-        found = np.full(len(points), -1)
-        if self._comm.allreduce(int(some.any())):
-            size, height = self._places.size[facet[some]], self._places.facets.heights()
-            reach = np.minimum(ALLOWED_BEFORE * size, height[facet[some]] / 2)
-            facets = self._places.moving_facets(field, field)
-            _, found[some] = self._below(points[some], outward[some], reach, facets)
-        return found
-
-    def _enter(self, start: Array, end: Array, entered: Mask, through: Index, times: Array) -> None:
-        """Follow points of the obstacle through the facets of Γc. Collective.
-
-        Args:
-            start: In the frame of the obstacle at first, (n, gdim) (length).
-            end: In that at last, (n, gdim) (length).
-            entered: Which points are inside of the body at first, (n,); afterwards, which have
-                been.
-            through: The flat piece of Γc, of those of all ranks, through which each has entered the
-                body, (n,); afterwards, too, and -1 for those that have left it.
-            times: In the increment, between which Γc goes straight on in the obstacle's frame.
-        """
-        vertices = np.full((len(start), 1), -1)
-        shares = np.linspace(0.0, 1.0, len(times))[:, None, None]
-        points, fields = start + shares * (end - start), [self._points_at(t) for t in times]
-        for k in range(len(times) - 1):
-            facets = self._places.moving_facets(fields[k], fields[k + 1])
-            met = find_crossings(self._comm, points[k], points[k + 1], vertices, facets)
-            entered[met.place[met.inward]] = True
-            final = np.append(np.diff(met.place) > 0, True)[: len(met.place)]
-            through[met.place[final]] = np.where(met.inward, met.facet, -1)[final]
-
-    def _pass_through(self, start: Array, end: Array, since: float, until: float) -> Mask:
-        """Whether places pass through the obstacle, by bisection of their paths. Collective.
-
-        Args:
-            start: In the frame of the obstacle at first, (n, gdim) (length).
-            end: In that at last, (n, gdim) (length).
-            since: First time in the increment, from 0 to 1.
-            until: Last time in the increment, from 0 to 1.
-        """
-        found = np.zeros(len(start), dtype=np.bool_)
-        if not self._comm.allreduce(len(start)):
-            return found
-        share = until - since
-        distance, first = self._sampler.sample(start, since)
-        distance_end, _ = self._sampler.sample(end, until)
-        end = self._rotation.turned(end, share)
-        length = np.linalg.norm(end - start, axis=1) + np.abs(distance) + np.abs(distance_end)
-        resolution = length * 2.0 ** (2 - _BISECTIONS)
-        low: Array = np.zeros(len(start))
-        high: Array = np.ones(len(start))
-        for _ in range(_BISECTIONS):
-            middle = (low + high) / 2
-            place = start + middle[:, None] * (end - start)
-            place = self._rotation.turned(place, -middle * share)
-            distance, normal = self._sampler.sample(place, since + middle * share)
-            # Into the half in which the obstacle is entered, or its normal turns.
-            before = (distance >= 0) & (dot(first, normal) > OPPOSITE_SIDES)
-            low, high = np.where(before, middle, low), np.where(before, high, middle)
-            found |= distance <= resolution
-        return found
-
-    def _too_deep(self, points: Array, field: Array, through: Index, allowed: Array) -> Array:
-        """Find the facets below which points are deeper than is allowed there. Collective.
-
-        Args:
-            points: Of the obstacle, in its frame, (n, gdim) (length).
-            field: The nodes of Γc in that frame, (n_nodes, gdim) (length).
-            through: See `_enter`.
-            allowed: Allowed depth at the places of this rank, (n_places,) (length).
-
-        Returns:
-            Their middles on the undeformed Γc, (m, gdim) (length).
-        """
-        if not self._comm.allreduce(int((through >= 0).any())):
-            return self.x[:0]
-        surface = self._surface(field, allowed)
-        depth = -dot(points - surface.corner[through], surface.normal[through])
-        rows = np.flatnonzero((through >= 0) & (depth > surface.allowed[through]))
-        normal = surface.normal[through[rows]]
-        depth, facet = self._below(points[rows], normal, 2 * depth[rows], surface.facets)
-        deep = (facet >= 0) & (depth > surface.allowed[facet])
-        deep &= ~self._is_shallow(points[rows], normal, surface)
-        return np.asarray(surface.middle[np.unique(facet[deep])])
-
-    def _surface(self, field: Array, allowed: Array) -> _Surface:
-        """Collect the flat pieces of Γc on all ranks. Collective.
-
-        Args:
-            field: The nodes of Γc in the frame of the obstacle, (n_nodes, gdim) (length).
-            allowed: Allowed depth at the places of this rank, (n_places,) (length).
-        """
-        most: Array = np.zeros(len(self._places.size))
-        np.maximum.at(most, self._facet, allowed)
-        facets, middles = self._places.moving_facets(field, field), self._places.piece_middles()
-        most = np.repeat(most, len(middles) // max(len(most), 1))
-        table = np.column_stack([most, facets.start[:, 0], facets.normals(), middles])
-        table = gather_rows(self._comm, table)
-        return _Surface(facets, table[:, 0], *np.split(table[:, 1:], 3, axis=1))
-
-    def _is_shallow(self, points: Array, normal: Array, surface: _Surface) -> Mask:
-        """Find points that are no deeper below another face than is allowed there. Collective.
-
-        At an edge of the body what is deep below one face may have hardly entered the other one.
-        Faces opposite to the first one do not count: what is close to them has gone through.
-
-        Args:
-            points: (n, gdim) (length).
-            normal: Outward unit normal of the facet that each is deep below, (n, gdim).
-            surface: Γc.
-        """
-        depth = -np.einsum("nmd,md->nm", points[:, None] - surface.corner, surface.normal)
-        near = (depth >= 0) & (depth <= surface.allowed)
-        cosine = normal @ surface.normal.T
-        row, facet = np.nonzero(near & (cosine > OPPOSITE_SIDES) & (cosine < _EDGE))
-        reach = 2 * depth[row, facet] + DEPTH_RESOLUTION * surface.allowed[facet]
-        _, met = self._below(points[row], surface.normal[facet], reach, surface.facets)
-        found = np.zeros(len(points), dtype=np.bool_)
-        found[row[met == facet]] = True
-        return found
-
-    def _below(
-        self, points: Array, outward: Array, reach: Array, facets: MovingFacets
-    ) -> tuple[Array, Index]:
-        """How deep points are below Γc, along outward directions. Collective.
-
-        Beside Γc a point is below none of its facets.
-
-        Args:
-            points: (n, gdim) (length).
-            outward: Unit vectors, (n, gdim).
-            reach: How far Γc is looked for, (n,) (length).
-            facets: Γc, at rest.
-
-        Returns:
-            The depth, (n,) (length), and the number of the facet among those of all ranks, (n,), -1
-            for points that are not below Γc.
-        """
-        vertices, end = np.full((len(points), 1), -1), points + reach[:, None] * outward
-        met = find_crossings(self._comm, points, end, vertices, facets)
-        first = np.append(True, np.diff(met.place) > 0)[: len(met.place)] & ~met.inward
-        place, depth, facet = met.place[first], np.zeros(len(points)), np.full(len(points), -1)
-        depth[place], facet[place] = met.time[first] * reach[place], met.facet[first]
-        return depth, facet
+        return paths.crossed(allowed)

@@ -150,6 +150,20 @@ class FacetPlaces:
         """
         return self._at_nodes(field, facet, reference)
 
+    def tangents(self, field: Array) -> Array:
+        """Edges of all facets, (n_facets, gdim, gdim - 1) (length); ``field`` as in `values`."""
+        n, d = len(self.size), field.shape[1]
+        origin, *ends = (
+            self.values(field, np.arange(n), np.broadcast_to(unit, (n, d - 1)))
+            for unit in np.vstack([np.zeros(d - 1), np.eye(d - 1)])
+        )
+        return np.stack([end - origin for end in ends], axis=2)
+
+    def outward(self, field: Array) -> Array:
+        """Outward unit normals at the first corners of all facets, (n_facets, gdim)."""
+        every = np.arange(len(self.size))
+        return self.facets.outward_normals(every, self.tangents(field))
+
     def moving_facets(self, start: Array, end: Array) -> MovingFacets:
         """The facets of this rank, in flat pieces, whose nodes move from a start to an end.
 
