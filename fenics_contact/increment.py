@@ -175,7 +175,6 @@ class IncrementSolver:
         solver.update_system(stiffness_changed)
         self._full.scales.begin(self._full.operators)
         solver.system.begin(load)
-        solver.equations.began = state.unknowns
         led = np.where(self._full.constrained, before, self._full.state())
         self._first_touch.count_slip(led, solver.end_without)
         solver.starts.change = state.change
@@ -206,10 +205,12 @@ class IncrementSolver:
             return self._choose_pairs(increment, slid, interior)
         kinematics = reason > 0  # a solver that failed may have no factors for it
         if lags:
-            verdict, energies = self._judge_kept(kinematics=kinematics)
+            verdict, energies = self._judge_kept(state.unknowns, kinematics=kinematics)
         else:
             assemble = increment.recover_interior or not solver.system.confined
-            verdict, energies = self._judge_all(kinematics=kinematics, assemble=assemble)
+            verdict, energies = self._judge_all(
+                state.unknowns, kinematics=kinematics, assemble=assemble
+            )
         if reason > 0 and (slid := points.to_update_for(verdict.pairing_errors)):
             return self._choose_pairs(increment, slid, interior)
         energy = None
@@ -320,44 +321,50 @@ class IncrementSolver:
             began = began.between([c.opposite.committed_jump for c in self._contacts])
         return energies.since(began, self._contacts, self._full.scales)
 
-    def _judge_all(self, *, kinematics: bool, assemble: bool) -> tuple[Verdict, EnergyState]:
+    def _judge_all(
+        self, began: Array, *, kinematics: bool, assemble: bool
+    ) -> tuple[Verdict, EnergyState]:
         """Judge a complete u by assembly, past SNES and its residual, or by K u. Collective."""
         if assemble:
             bulk = self._full.with_obstacles(self._bulk.assemble_residual())
         else:
             bulk = self._full.product_force()
-        verdict, found = self.judge_system(self._full, bulk, kinematics=kinematics)
+        verdict, found = self.judge_system(self._full, bulk, began=began, kinematics=kinematics)
         forces: dict[object, Forces] = {self._full.mark: found}
         if self._solver.condensed and self._bulk.symmetric:
             forces[self._solver.system.mark] = self._solver.system.present_forces()
         return verdict, EnergyState.at(forces, self._contacts)
 
-    def _judge_kept(self, *, kinematics: bool) -> tuple[Verdict, EnergyState]:
+    def _judge_kept(self, began: Array, *, kinematics: bool) -> tuple[Verdict, EnergyState]:
         """Judge the condensed equations; u stays behind. Collective."""
         system = self._solver.system
-        verdict, found = self.judge_system(system, system.bulk_force(), kinematics=kinematics)
+        verdict, found = self.judge_system(
+            system, system.bulk_force(), began=began, kinematics=kinematics
+        )
         return verdict, EnergyState.at({system.mark: found}, self._contacts)
 
     def judge_system(
-        self, system: System, bulk: Array, *, laws: bool = True, kinematics: bool = False
+        self,
+        system: System,
+        bulk: Array,
+        *,
+        began: Array | None = None,
+        kinematics: bool = False,
     ) -> tuple[Verdict, Forces]:
         """`Judge.judge` for the increment that was solved last. Collective.
 
         Args:
             system: The unknowns on which the residual is looked at.
             bulk: Residual of the bulk on these (force).
-            laws: Whether to check the laws, too.
+            began: The state in which it began; None: see `Judge.judge`.
             kinematics: Whether to look at what small displacements leave out.
         """
         equations = self._solver.equations
-        began = equations.began
         return self.judge.judge(
             system,
             bulk,
             start=equations.start,
-            began=began,
             rtol=equations.rtol,
-            laws=laws,
+            began=began,
             respond=self._solver.respond if kinematics else None,
-            before=self._full.displacement_at(began) if laws else None,
         )

@@ -490,9 +490,7 @@ class ContactProblem:
         before = self.full.state()
         self.solver.system.complete(present.interior)
         self.full.begin(present.load)
-        verdict, forces = self._increments.judge_system(
-            self.full, self.full.product_force(), laws=False
-        )
+        verdict, forces = self._increments.judge_system(self.full, self.full.product_force())
         if verdict.failures:
             self.full.set_state(before)
             number = self.increment + (not is_committed)

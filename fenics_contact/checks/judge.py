@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from dolfinx import fem
 
 from fenics_contact.arguments import check_bool
 from fenics_contact.checks.cross_check import CrossCheck
+from fenics_contact.checks.ejected_bodies import find_ejected_bodies
 from fenics_contact.checks.kinematics import Linearisation, linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.quadrature_resolution import warn_of_divided_facets, warn_of_few_points
@@ -16,7 +16,6 @@ from fenics_contact.checks.tunnelling import TunnellingCheck
 from fenics_contact.checks.verdict import ForceBalance, Verdict, check_laws
 from fenics_contact.parallel import global_sum, warn
 from fenics_contact.systems.balance import InitialForces
-from fenics_contact.systems.ejected_bodies import find_ejected_bodies
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
@@ -79,11 +78,9 @@ class Judge:
         bulk: Array,
         *,
         start: InitialForces,
-        began: Array,
         rtol: float,
-        laws: bool = True,
+        began: Array | None,
         respond: Respond | None = None,
-        before: fem.Function | None = None,
     ) -> tuple[Verdict, Forces]:
         """Recompute residual, balance and laws at evaluated contacts. Collective.
 
@@ -91,17 +88,16 @@ class Judge:
             system: The unknowns on which the residual is looked at.
             bulk: Residual of the bulk on these.
             start: Forces at the beginning of the increment.
-            began: The state in which the increment began.
             rtol: Residual that passes, as a share of the forces.
-            laws: Whether to check the laws, too. If not, tractions are those evaluated last,
-                whatever has become of the laws' data since.
+            began: The state in which the increment began; None: laws, rigid obstacles and paths are
+                not judged, and tractions are those evaluated last, whatever has become of the
+                laws' data since.
             respond: To look at what small displacements leave out; None: it is not looked at.
-            before: The displacement at the last commit, to look at the paths of the increment;
-                None: those of opposite bodies are not looked at.
 
         Returns:
             The verdict, and the forces at the unknowns, reactions included.
         """
+        laws = began is not None
         contacts = system.contact_forces(evaluated=not laws)
         total = sum(contacts, bulk)
         norms = system.norms(total, contacts, start)
@@ -118,8 +114,14 @@ class Judge:
         sums = zip(names, unbalanced, sizes[1], allowed, strict=False)
         complete = system is self._full
         # Of the opposite only what Γc meets is known before u is complete; of rigid obstacles all.
-        tunnelling = self._obstacles.evaluate(before) if laws else {}
-        tunnelling |= self._bodies.evaluate(before) if complete else {}
+        before, tunnelling, ejected = None, {}, {}
+        if began is not None:
+            before = self._full.displacement_at(began)
+            tunnelling = self._obstacles.evaluate(before)
+            if complete:
+                ejected = find_ejected_bodies(self._full, self._motions, contacts, began)
+        if complete:
+            tunnelling |= self._bodies.evaluate(before)
         verdict = Verdict(
             equations={name: ForceBalance(*map(float, row)) for name, *row in equations},
             sums={name: ForceBalance(*map(float, row)) for name, *row in sums},
@@ -131,9 +133,7 @@ class Judge:
             small_displacement_error=self._linearisation(respond) if respond else {},
             small_displacement_tolerance=self.small_displacement_tolerance,
             deformation=self._deformation(),
-            ejected_bodies=find_ejected_bodies(self._full, self._motions, contacts, began)
-            if laws and complete
-            else {},
+            ejected_bodies=ejected,
             inverted=self._full.bulk.is_inverted(),
             cross_check=self._cross_check.compare() if self._cross_check and laws else {},
         )
