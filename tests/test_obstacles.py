@@ -53,12 +53,86 @@ def test_what_is_no_distance_is_refused(kinematics):
         options = {"kinematics": kinematics}
         problem, contact = scene.problem(obstacle, fc.Coulomb(0.2), contact=options)
         if true is False:
-            with pytest.raises(fc.NotConverged, match=r"has length (3\.9|4)\d* in .*must be 1"):
+            match = r"gap of the SignedDistance differs by (2\.9|3)\d* from minus its unit normal"
+            with pytest.raises(fc.NotConverged, match=match):
                 problem.solve()
         else:
             problem.solve()
             forces.append(contact.resultants().force[1])
     assert forces[0] == pytest.approx(forces[1], rel=1e-2)
+
+
+class Roller(fc.Obstacle):
+    """A cylinder as a user writes it, its gap times a factor, its direction off by an angle."""
+
+    def __init__(self, center, radius, displacement, *, factor=1.0, angle=0.0):
+        self.center, self.radius, self.displacement = center, radius, displacement
+        self.factor, self.angle = factor, angle
+
+    def place(self, x, to_ufl):
+        """See `Obstacle`."""
+        arm = x - ufl.as_vector(self.center)
+        distance = ufl.sqrt(ufl.dot(arm, arm))
+        c, s = np.cos(self.angle), np.sin(self.angle)
+        direction = (c * arm[0] - s * arm[1], s * arm[0] + c * arm[1])
+        return fc.Placement(self.factor * (distance - self.radius), -ufl.as_vector(direction))
+
+
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+@pytest.mark.parametrize(
+    ("wrong", "error"), [({}, None), ({"factor": 2.0}, "1"), ({"angle": 0.1}, r"0\.(1|0999)")]
+)
+def test_an_own_obstacle_must_be_a_distance(kinematics, wrong, error):
+    """Moved while pressed, it bears as `Cylinder` does to 1e-9; a wrong gap or normal is refused.
+
+    By |1 - factor|, and 2 sin(angle/2).
+    """
+    forces = []
+    for own in (True, False):
+        scene = rubber(n=(12, 4), linear=True)
+        shift, radius = fem.Constant(scene.mesh, (0.0, -0.01)), 2.0
+        obstacle = roller(scene, radius, shift)
+        if own:
+            obstacle = Roller((0.0, scene.height + radius), radius, shift, **wrong)
+        problem, contact = scene.problem(
+            obstacle, fc.Coulomb(0.2), contact={"kinematics": kinematics}
+        )
+        if own and error is not None:
+            match = f"gap of the Roller differs by {error}"
+            with pytest.raises(fc.NotConverged, match=match):
+                problem.solve()
+            return
+        for way in (0.0, 0.02, 0.04):
+            shift.value[0] = way
+            problem.solve()
+            problem.commit()
+        forces.append(contact.resultants().force)
+    assert np.allclose(*forces, rtol=1e-9)
+    assert abs(forces[0][0]) > 0.1 * abs(forces[0][1])
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        (lambda x: (x[1], -x), "returns a tuple"),
+        (lambda x: fc.Placement(x, -x), r"gap of shape \(2,\)"),
+        (
+            lambda x: fc.Placement(x[1], ufl.as_vector([0.0, -1.0, 0.0])),
+            r"direction of shape \(3,\)",
+        ),
+        (lambda x: fc.Placement(x[1], x + ufl.as_vector([0.0, -1.0, 0.0])), "shapes"),
+        (lambda x: {}["center"], "KeyError: 'center'"),
+    ],
+)
+def test_what_place_returns_is_checked(place, words):
+    """In words that name the class, before anything is compiled."""
+    scene = rubber(n=(2, 2), linear=True)
+
+    class Own(fc.Obstacle):
+        def place(self, x, to_ufl):
+            return place(x)
+
+    raised_everywhere(lambda: scene.problem(Own(), fc.Coulomb(0.2)), ValueError, "Own.place", words)
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])

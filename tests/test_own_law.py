@@ -309,6 +309,25 @@ def test_what_to_try_is_what_the_law_has():
         assert words in str(caught.value)
 
 
+def test_a_parameter_that_the_law_does_not_have():
+    """Its name, and those that there are, before anything is compiled."""
+
+    @dataclass(frozen=True)
+    class Capped(fc.Coulomb):
+        cap: float = 1.0
+
+        def friction_bound(self, kinematics, pressure, parameters):
+            return ufl.min_value(parameters["friction"] * pressure, parameters["capp"])
+
+    raised_everywhere(
+        lambda: block().contact(Capped(0.3)),
+        ValueError,
+        "Capped",
+        "'capp'",
+        "['cap', 'friction', 'k_n', 'k_t']",
+    )
+
+
 def test_a_parameter_with_a_name_of_the_contact():
     """The weight of the contact would be that of the law, and the other way round."""
 

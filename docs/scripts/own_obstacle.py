@@ -27,11 +27,9 @@ class Torus(fc.Obstacle):
         """More quadrature points are chosen where facets are long relative to this (length)."""
         return self.section
 
-    def place(self, x, shift, to_ufl):
-        """Signed distance from the torus at x - shift, and the direction to it."""
+    def place(self, x, to_ufl):
+        """Signed distance from the torus at x, and the direction to it."""
         arm = x - to_ufl(np.asarray(self.center, dtype=float))
-        if shift is not None:
-            arm = arm - shift
         rho = ufl.sqrt(arm[0] ** 2 + arm[1] ** 2)
         nearest = to_ufl(self.ring) / rho  # times (arm_x, arm_y): on the circle
         direction = ufl.as_vector([(nearest - 1) * arm[0], (nearest - 1) * arm[1], -arm[2]])

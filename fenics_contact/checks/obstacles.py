@@ -8,13 +8,13 @@ import numpy as np
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import global_max, global_min
+from fenics_contact.parallel import global_max
 
 __all__ = ["ObstacleCheck"]
 
 
-# By how much the gradient of a distance may differ from 1 where contact is.
-_SLOPE = 0.05
+# Largest difference of the gradient of a distance from minus its unit normal where contact is.
+_GRADIENT_ERROR = 0.05
 # Penetration by the radius of curvature that is left there: 1 is half of that of the obstacle.
 _DEEP = 1.0
 # Of the angle that an obstacle turns by in an increment (radians): a right one and round-off.
@@ -27,14 +27,17 @@ class ObstacleCheck:
     """Verification of a contact with a rigid obstacle, the same on every rank.
 
     Attributes:
-        slope: Length of the gradient of the distance at closed points, where it is farthest from 1;
-            NaN if gap or gradient are no numbers.
+        obstacle: The class of the obstacle.
+        gradient_error: Largest difference between the gradient of the gap and minus the normal, at
+            closed points; NaN if gap or gradient are no numbers. It is not known of a gap given on
+            Γc, and 0 then.
         depth: With finite kinematics, the largest penetration divided by the distance from there to
             the centre of curvature of the obstacle.
         turn: Rotation of the obstacle in this increment, with friction (radians).
     """
 
-    slope: float
+    obstacle: str
+    gradient_error: float
     depth: float
     turn: float = 0.0
 
@@ -42,35 +45,39 @@ class ObstacleCheck:
     def of(cls, contact: Contact) -> ObstacleCheck:
         """Evaluate the obstacle of a contact at its evaluated state. Collective."""
         comm, closed = contact.surface.mesh.comm, contact.status != Status.OPEN
-        slopes = contact.opposite.slope(contact.values)
-        if contact.finite:
-            # No law takes a gap for closed that is not a number, or has no normal.
-            gap, _ = contact.opposite.true_placement(contact.values)
-            slopes = np.where(np.isnan(gap), np.nan, slopes)
-            closed |= ~(gap > 0) & np.isnan(slopes)
-        slopes = slopes[closed]
-        ends = global_min(comm, slopes, empty=1.0), global_max(comm, slopes, empty=1.0)
-        slope = max(ends, key=lambda value: abs(value - 1.0))
-        depth = 0.0
+        sampler, values = contact.opposite.sampler, contact.values
+        depth = error = 0.0
+        if sampler is not None:
+            # Where the law takes it: at X with small displacements, at X + u with finite ones.
+            place = values.x + values.jump - (0.0 if contact.finite else contact.own_displacement())
+            errors = sampler.gradient_error(place)
+            if contact.finite:
+                # No law takes a gap for closed that is not a number, or has no normal.
+                gap, _ = contact.opposite.true_placement(values)
+                errors = np.where(np.isnan(gap), np.nan, errors)
+                closed |= ~(gap > 0) & np.isnan(errors)
+            error = global_max(comm, errors[closed])
         curvature = contact.opposite.largest_curvature()
         if curvature is not None and not contact.obstacle.is_flat:
             depth = global_max(comm, (contact.values.penetration * curvature)[closed])
         rubs = contact.law.has_friction and comm.allreduce(int(closed.any())) > 0
         turn = abs(contact.opposite.turned_by(contact.values)) if rubs else 0.0
-        return cls(slope, depth, turn)
+        return cls(type(contact.obstacle).__name__, error, depth, turn)
 
     def failures(self, contact: str) -> list[str]:
         """Return the conditions that are violated, in words."""
         found = []
-        if np.isnan(self.slope):
+        if np.isnan(self.gradient_error):
             found.append(
                 f"{contact}: the distance of the obstacle, or its gradient, is not a number at a "
                 "point of Γc; check its expression"
             )
-        elif not abs(self.slope - 1.0) <= _SLOPE:
+        elif not self.gradient_error <= _GRADIENT_ERROR:
             found.append(
-                f"{contact}: the gradient of the SignedDistance has length {self.slope:.3g} in the "
-                "contact zone; it must be 1: divide the function by the length of its gradient"
+                f"{contact}: in the contact zone the gradient of the gap of the {self.obstacle} "
+                f"differs by {self.gradient_error:.3g} from minus its unit normal; it must be a "
+                "distance, with a gradient of length 1, and its direction minus the gradient: "
+                "divide the function by the length of its gradient"
             )
         if not self.depth <= _DEEP:
             found.append(

@@ -7,24 +7,30 @@ from typing import Any
 from fenics_contact.arguments import is_number
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.body import BodyOpposite, FollowedOpposite
-from fenics_contact.contact.opposite import Opposite, Parts
 from fenics_contact.contact.rigid import MovingOpposite, RigidOpposite
 from fenics_contact.laws.base import Law
 from fenics_contact.laws.stiffness import NodalSprings
 from fenics_contact.obstacles.base import Obstacle
 from fenics_contact.obstacles.deformable import DeformableBody
 
-__all__ = ["enforcement_of", "is_finite", "is_regularised", "opposite_of"]
+__all__ = ["enforcement_of", "is_regularised", "kind_of_opposite"]
 
 
 _ENFORCEMENTS = ("penalty", "augmented")
-_KINEMATICS = ("small", "finite")
+OppositeKind = type[RigidOpposite] | type[BodyOpposite] | type[MovingOpposite]
+# By kinematics, of a rigid obstacle and of another body.
+_OPPOSITES: dict[str, tuple[OppositeKind, OppositeKind]] = {
+    "small": (RigidOpposite, BodyOpposite),
+    "finite": (MovingOpposite, FollowedOpposite),
+}
 # Of augmented enforcement, where nothing is said.
 _TOLERANCE = 1e-5
 
 
-def is_finite(name: str, kinematics: str, obstacle: Obstacle, law: Law, gap: Any) -> bool:
-    """Whether displacements may be of any size.
+def kind_of_opposite(
+    name: str, kinematics: str, obstacle: Obstacle, law: Law, gap: Any
+) -> OppositeKind:
+    """What lies opposite, by obstacle and kinematics: a class that is made of `Parts`.
 
     Args:
         name: Of the contact, in messages.
@@ -36,19 +42,21 @@ def is_finite(name: str, kinematics: str, obstacle: Obstacle, law: Law, gap: Any
     Raises:
         ValueError: It is no word for any, or something was given that has no sense with it.
     """
-    if kinematics not in _KINEMATICS:
+    if kinematics not in _OPPOSITES:
         raise ValueError(
-            f"{name}: kinematics is {kinematics!r}; use one of {_KINEMATICS} (a tolerance of small "
-            "displacements is ContactProblem(small_displacement_tolerance=...))"
+            f"{name}: kinematics is {kinematics!r}; use one of {tuple(_OPPOSITES)} (a tolerance of "
+            "small displacements is ContactProblem(small_displacement_tolerance=...))"
         )
-    if kinematics == "small":
+    rigid, body = _OPPOSITES[kinematics]
+    found = body if isinstance(obstacle, DeformableBody) else rigid
+    if not found.is_finite:
         if obstacle.rotation is not None:
             raise ValueError(
                 f'{name}: a Rotation of the obstacle needs Contact(kinematics="finite"); for '
                 "rotations below 0.01 rad you may give the displacement as a UFL vector instead, "
                 "with a relative error of the forces of about the angle"
             )
-        return False
+        return found
     if gap is not None:
         raise ValueError(
             f"{name}: gap is given, but with finite kinematics it follows from the positions of "
@@ -59,7 +67,7 @@ def is_finite(name: str, kinematics: str, obstacle: Obstacle, law: Law, gap: Any
             f"{name}: {type(law).__name__} bonds points to fixed points of the obstacle, which is "
             "not available with finite kinematics; use a law with friction, or omit k_t"
         )
-    return True
+    return found
 
 
 def is_regularised(law: Law) -> bool:
@@ -102,15 +110,3 @@ def enforcement_of(
             "contact"
         )
     return True, tolerance
-
-
-def opposite_of(parts: Parts, *, finite: bool) -> Opposite:
-    """What lies opposite, by obstacle and kinematics. Collective.
-
-    Args:
-        parts: Of the contact.
-        finite: Whether displacements may be of any size.
-    """
-    if isinstance(parts.obstacle, DeformableBody):
-        return FollowedOpposite(parts) if finite else BodyOpposite(parts)
-    return MovingOpposite(parts) if finite else RigidOpposite(parts)

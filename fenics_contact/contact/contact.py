@@ -16,10 +16,10 @@ from dolfinx import fem
 from fenics_contact.arguments import check_instance
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.acting import ActingLaw
-from fenics_contact.contact.choices import enforcement_of, is_finite, opposite_of
+from fenics_contact.contact.choices import enforcement_of, kind_of_opposite
 from fenics_contact.contact.inputs import FreeMotion, Inputs, varies
 from fenics_contact.contact.multipliers import Multipliers, TraceProjection
-from fenics_contact.contact.opposite import OppositeState, Parts
+from fenics_contact.contact.opposite import Opposite, OppositeState, Parts
 from fenics_contact.contact.pairs import Pairs
 from fenics_contact.contact.results import PointResults
 from fenics_contact.contact.values import PointValues
@@ -132,6 +132,7 @@ class Contact(PointResults):
         name: Name in messages and files.
         inputs: Data of law, obstacle and contact, as UFL.
         gap_prescribed: Whether the initial gap was given by ``gap``.
+        kinematics: The argument.
         finite: Whether the kinematics are finite.
         opposite: The contact kinematics, those of the obstacle or the opposing body.
         acting: The law evaluated at the points.
@@ -180,7 +181,8 @@ class Contact(PointResults):
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
         self.accuracy = None if accuracy is None else Accuracy.of(accuracy)
-        self.finite = is_finite(name, kinematics, obstacle, law, gap)
+        opposite_kind = kind_of_opposite(name, kinematics, obstacle, law, gap)
+        self.kinematics, self.finite = kinematics, opposite_kind.is_finite
         augments, self.tolerance = enforcement_of(name, enforcement, tolerance, law, self.accuracy)
         # Linear elements meet a curved gap at their nodes only (docs/enforcement.md). But between
         # two meshes, and on quadrilaterals of any shape, nodes do not transfer a uniform pressure.
@@ -236,7 +238,7 @@ class Contact(PointResults):
             history=self.history,
             multipliers=None if self.multipliers is None else self.multipliers.fields,
         )
-        self.opposite = opposite_of(parts, finite=self.finite)
+        self.opposite: Opposite = opposite_kind(parts)
         self.acting = ActingLaw(law, self.opposite, self.quadrature)
         self._values: PointValues | None = None
         if not self.rigid:

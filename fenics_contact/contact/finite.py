@@ -37,6 +37,7 @@ __all__ = [
     "View",
     "check_places",
     "check_rigid",
+    "depends_on_place",
     "is_known_everywhere",
 ]
 
@@ -342,8 +343,13 @@ def check_places(name: str, place: Callable[[Any], Placement], mesh: Any) -> Non
 
 def is_known_everywhere(place: Callable[[Any], Placement], mesh: Any) -> bool:
     """Whether gap and normal follow from the place alone, wherever it is (UFL)."""
-    anywhere = fem.Constant(mesh, np.zeros(mesh.geometry.dim))
-    placement = place(anywhere)
-    parts = placement.gap, ufl.as_vector(placement.direction)
+    placement = place(fem.Constant(mesh, np.zeros(mesh.geometry.dim)))
+    parts = placement.gap, placement.direction
     fixed = [extract_type(e, (ufl.SpatialCoordinate, ufl.Coefficient)) for e in parts]
-    return not any(fixed) and anywhere in extract_constants(placement.gap)
+    return not any(fixed) and depends_on_place(place, mesh)
+
+
+def depends_on_place(place: Callable[[Any], Placement], mesh: Any) -> bool:
+    """Whether the gap follows from the place at all: a gap that is given on Γc does not."""
+    anywhere = fem.Constant(mesh, np.zeros(mesh.geometry.dim))
+    return anywhere in extract_constants(place(anywhere).gap)

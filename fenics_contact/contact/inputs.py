@@ -17,7 +17,7 @@ from ufl.corealg.traversal import traverse_unique_terminals
 from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.contact.accuracy import DEFAULT_FACTOR, Accuracy
 from fenics_contact.contact.values import PointValues
-from fenics_contact.laws.base import Law
+from fenics_contact.laws.base import Law, Parameters
 from fenics_contact.laws.stiffness import NodalSprings, RelativeStiffness
 from fenics_contact.obstacles.base import Motion, Obstacle, Rotation, as_vector, nonzero_vector
 from fenics_contact.parallel import global_max, global_min
@@ -138,7 +138,8 @@ class Inputs:
                 f"{name}: {type(law).__name__} has a parameter {own!r}, which is a name of the "
                 "contact's own data; rename it"
             )
-        self.law = {n: self._parameter(n, v) for n, v in law.parameters().items()}
+        found = {n: self._parameter(n, v) for n, v in law.parameters().items()}
+        self.law = Parameters(law, found)
         self.stiffness_factor = fem.Constant(self._surface.mesh, 1.0)
         for n in {"k_n", "k_t"} & set(self.law):
             self.law[n] = self.stiffness_factor * self.law[n]

@@ -47,8 +47,10 @@ class ObstacleSampler:
         mesh = quadrature.surface.mesh
         self._place = fem.Function(quadrature.space(mesh.geometry.dim), name="place")
         self._time = fem.Function(quadrature.space(1), name="time")
-        placement = obstacle(self._place)
-        parts = {"gap": ufl.as_ufl(placement.gap), "normal": ufl.as_ufl(placement.normal)}
+        here = ufl.variable(self._place)
+        placement = obstacle(here)
+        parts = {"gap": placement.gap, "normal": placement.normal}
+        parts["gradient"] = ufl.diff(placement.gap, here)
         constants = {c for part in parts.values() for c in extract_constants(part)}
         self._constants = sorted(constants, key=lambda c: c.count())
         self._committed = [fem.Constant(mesh, c.value.copy()) for c in self._constants]
@@ -85,10 +87,26 @@ class ObstacleSampler:
         Returns:
             (n,) (length) and (n, gdim).
         """
+        distance, normal, _ = self._sample(place, time)
+        return distance, normal
+
+    def gradient_error(self, place: Array) -> Array:
+        """Difference of the gradient of the distance and minus the normal, (n,). Collective.
+
+        Args:
+            place: In the obstacle's frame, (n, gdim) (length).
+        """
+        _, normal, gradient = self._sample(place, 1.0)
+        return np.asarray(np.linalg.norm(gradient + normal, axis=1))
+
+    def _sample(self, place: Array, time: Array | float) -> tuple[Array, Array, Array]:
+        """See `sample`; the gradient of the distance, too."""
         if isinstance(self._obstacle, SampledObstacle):
             with collective_errors(self._comm):
                 found = self._obstacle.sample_checked(place)
-            return found.distance, found.normal
+            length = np.linalg.norm(found.normal, axis=1, keepdims=True)
+            unit = found.normal / np.where(length > 0, length, 1.0)
+            return found.distance, unit, -found.normal
         n, d = place.shape
         if self._evaluate is None:
             self._evaluate = PointEvaluator(self._quadrature, self._expressions)
@@ -96,7 +114,7 @@ class ObstacleSampler:
         # The form has as many slots as Γc has points: the places go through it in batches.
         size = max(self._quadrature.n_points, 1)
         batches = max(self._comm.allgather(-(-n // size) if self._quadrature.n_points else 0))
-        distance, normal = np.zeros(n), np.zeros((n, d))
+        distance, normal, gradient = np.zeros(n), np.zeros((n, d)), np.zeros((n, d))
         for k in range(batches):
             some = slice(k * size, (k + 1) * size)
             for field, rows in ((self._place, place[some]), (self._time, time[some])):
@@ -104,7 +122,8 @@ class ObstacleSampler:
                 field.x.scatter_forward()
             values, m = self._evaluate(), len(place[some])
             distance[some], normal[some] = values["gap"][:m], values["normal"][:m]
-        return distance, normal
+            gradient[some] = values["gradient"][:m]
+        return distance, normal, gradient
 
 
 def _values(constants: Sequence[fem.Constant]) -> Array:

@@ -30,7 +30,7 @@ from fenics_contact.contact.point_data import PointData
 from fenics_contact.contact.point_law import AnyKinematics, PointLaw, PointTangent
 from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues
-from fenics_contact.laws.base import Law
+from fenics_contact.laws.base import Law, Parameters
 from fenics_contact.obstacles.base import Obstacle, Placement, Rotation
 from fenics_contact.parallel import global_max
 from fenics_contact.surface.displacement import Displacement
@@ -245,7 +245,7 @@ class Opposite(ABC):
             data.ufl("initial_gap"),
             data.ufl("normal"),
             None if given.shift is None else data.ufl("obstacle"),
-            {n: data.ufl(f"parameter {n}") for n in given.parameters},
+            Parameters(parts.law, {n: data.ufl(f"parameter {n}") for n in given.parameters}),
         )
         return data, sampled
 
@@ -453,15 +453,6 @@ class Opposite(ABC):
         self.update_data()
         data = self.data.values
         return rotation.rate(data["x"] + jump - data["about"] - data.get("obstacle", 0.0))
-
-    def slope(self, values: PointValues) -> Array:
-        """Length of the gradient of the gap where points are, (n_points,): 1 of a distance.
-
-        At X with small displacements, at X + u with finite ones.
-        """
-        if self._parts.obstacle.is_distance:
-            return self.data.values["direction_length"].copy()
-        return np.ones(len(values.x))
 
     def curvature(self) -> Array:
         """Second derivatives of the distance at X + u, (n_points, gdim, gdim) (1/length).

@@ -17,6 +17,7 @@ from fenics_contact.contact.finite import (
     SampledView,
     check_places,
     check_rigid,
+    depends_on_place,
     is_known_everywhere,
 )
 from fenics_contact.contact.inputs import varies
@@ -49,12 +50,12 @@ class RigidOpposite(Opposite):
             moved = Frame(self._varying.moved, None)
         at_rest, self._moved = _sampled_places(parts, jump, frame, moved)
         if at_rest is None:
-            placement = _placed(parts, x, frame.shift)
+            placement = _placed(parts, x, frame)
         else:
             placement = at_rest.at(frame.into(x))
         super().__init__(parts, parts.new_pairs(), jump, placement, at_rest)
         if self._varying is not None and at_rest is None:
-            placement = _placed(parts, x, moved.shift)
+            placement = _placed(parts, x, moved)
         self._deformed = DeformedPlaces(parts.quadrature, jump, placement)
         self.sampler = _sampler(parts)
 
@@ -97,7 +98,7 @@ class MovingOpposite(Opposite):
         check_rigid(parts.name, inputs.shift, inputs.rotation)
 
         def place(z: Any) -> Placement:
-            return _placed(parts, z, None)
+            return _in_frame(parts, z)
 
         x = ufl.SpatialCoordinate(mesh)
         if at_rest is None:
@@ -157,10 +158,6 @@ class MovingOpposite(Opposite):
             traction = rotation.turned(traction, turn)
         return way, traction
 
-    def slope(self, values: PointValues) -> Array:
-        """See `Opposite`."""
-        return np.asarray(np.linalg.norm(self._view.values("slope"), axis=1))
-
     def curvature(self) -> Array:
         """See `Opposite`."""
         turns = [self._view.values(f"turn {i}") for i in range(self._gdim)]
@@ -200,9 +197,18 @@ class MovingOpposite(Opposite):
         return {"jump": self.committed_jump + gap[:, None] * normal, "normal": normal}
 
 
-def _placed(parts: Parts, x: Any, shift: Any) -> Placement:
-    """Where a rigid obstacle is, seen from x (UFL)."""
-    return parts.obstacle.place(x, shift, lambda v: parts.inputs.to_ufl("obstacle", v))
+def _in_frame(parts: Parts, z: Any) -> Placement:
+    """Where a rigid obstacle is, seen from a place in its frame (UFL)."""
+    return parts.obstacle.placed(z, lambda v: parts.inputs.to_ufl("obstacle", v))
+
+
+def _placed(parts: Parts, x: Any, frame: Frame) -> Placement:
+    """Where a displaced rigid obstacle is, seen from x (UFL)."""
+    placement, mesh = _in_frame(parts, frame.into(x)), parts.quadrature.surface.mesh
+    if frame.shift is None or depends_on_place(lambda z: _in_frame(parts, z), mesh):
+        return placement
+    # What is given on Γc is given for the obstacle at rest.
+    return replace(placement, gap=placement.gap + ufl.dot(frame.shift, placement.normal))
 
 
 def _sampler(parts: Parts) -> ObstacleSampler | None:
@@ -211,9 +217,9 @@ def _sampler(parts: Parts) -> ObstacleSampler | None:
     if isinstance(obstacle, SampledObstacle):
         return ObstacleSampler(parts.quadrature, obstacle)
     mesh = parts.quadrature.surface.mesh
-    if parts.gap is not None or not is_known_everywhere(lambda z: _placed(parts, z, None), mesh):
+    if parts.gap is not None or not is_known_everywhere(lambda z: _in_frame(parts, z), mesh):
         return None
-    return ObstacleSampler(parts.quadrature, lambda z: _placed(parts, z, None))
+    return ObstacleSampler(parts.quadrature, lambda z: _in_frame(parts, z))
 
 
 def _sampled_places(

@@ -81,7 +81,7 @@ def fixed_words(problem: ContactProblem, fields: Sequence[fem.Function]) -> dict
         n_points = int(global_sum(mesh.comm, c.quadrature.n_points))
         words[f"quadrature of {c.name}"] = f"{n_points} points"
         words[f"history of {c.name}"] = ", ".join(c.history.names)
-        words[f"kinematics of {c.name}"] = "finite" if c.finite else "small"
+        words[f"kinematics of {c.name}"] = c.kinematics
         free = ["xyz"[i] for i in c.free_motion] + ["angle"] * (c.free_angle is not None)
         words[f"free motion of {c.name}"] = ", ".join(free)
     for number, field in enumerate(fields):

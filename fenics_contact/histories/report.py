@@ -512,7 +512,7 @@ def _choices(page: _Page, problem: ContactProblem, step: Step) -> None:
         rows = [
             ("law", type(contact.law).__name__),
             ("obstacle", type(contact.obstacle).__name__),
-            ("kinematics", "finite" if contact.finite else "small"),
+            ("kinematics", contact.kinematics),
             ("enforcement", _enforcement(contact)),
             ("facets", str(facets)),
         ]

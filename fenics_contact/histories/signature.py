@@ -99,7 +99,7 @@ def signature_of_obstacle(obstacle: Obstacle, gdim: int) -> str:
         rounded = np.vectorize(lambda v: float(f"{v:.{_DIGITS}g}"), otypes=[float])(value)
         return ufl.as_ufl(float(rounded)) if rounded.ndim == 0 else ufl.as_tensor(rounded.tolist())
 
-    placement = obstacle.place(symbols.new("place", gdim), None, to_ufl)
+    placement = obstacle.placed(symbols.new("place", gdim), to_ufl)
     return _word(_hashes([placement.gap, ufl.as_vector(placement.direction)], symbols.names))
 
 

@@ -21,7 +21,14 @@ import ufl
 from fenics_contact.laws.return_maps import positive_part
 from fenics_contact.types import Expr
 
-__all__ = ["ContactTraction", "Law", "PointKinematics", "signorini", "signorini_potential"]
+__all__ = [
+    "ContactTraction",
+    "Law",
+    "Parameters",
+    "PointKinematics",
+    "signorini",
+    "signorini_potential",
+]
 
 
 @dataclass(frozen=True)
@@ -72,6 +79,22 @@ class ContactTraction:
     traction: Expr | None = None
     friction_bound: Expr | None = None
     slip: tuple[Expr, ...] = ()
+
+
+class Parameters(dict[str, Any]):
+    """Parameters of a law by name (UFL)."""
+
+    def __init__(self, law: Law, values: Mapping[str, Any]) -> None:
+        """Take the values."""
+        super().__init__(values)
+        self._law = type(law).__name__
+
+    def __missing__(self, name: str) -> Any:
+        """Say which there are."""
+        raise ValueError(
+            f"{self._law} asks for a parameter {name!r}; its fields, which are its parameters, are "
+            f"{sorted(self)}"
+        )
 
 
 class Law:

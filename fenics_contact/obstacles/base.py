@@ -42,7 +42,7 @@ class Placement:
     """Gap and contact normal of an obstacle at a point (UFL expressions).
 
     Attributes:
-        gap: Gap s along the normal, with the obstacle displaced (length).
+        gap: Gap s along the normal (length).
         direction: Direction from body to obstacle, of any length greater than zero.
     """
 
@@ -214,11 +214,6 @@ class Obstacle:
                 )
 
     @property
-    def is_distance(self) -> bool:
-        """Whether the direction that `place` returns is minus the gradient of its gap."""
-        return False
-
-    @property
     def is_flat(self) -> bool:
         """Whether the obstacle is a plane, with a constant normal and a linear gap."""
         return False
@@ -231,21 +226,48 @@ class Obstacle:
         """
         return np.inf
 
-    def place(
-        self, x: ufl.core.expr.Expr, shift: ufl.core.expr.Expr | None, to_ufl: ToUFL
-    ) -> Placement:
-        """Return gap and direction at a point, with the obstacle translated.
+    def place(self, x: ufl.core.expr.Expr, to_ufl: ToUFL) -> Placement:
+        """Return gap and direction at a point.
 
         Args:
-            x: Coordinates of the point, shape (gdim,): on the undeformed Γc, or with finite
-                kinematics the deformed position, in the frame of the obstacle.
-            shift: Displacement of the obstacle, shape (gdim,); None: not displaced.
+            x: Coordinates of the point in the frame of the obstacle, where that is neither
+                displaced nor rotated, shape (gdim,): of the undeformed Γc, or with finite
+                kinematics of the deformed one.
             to_ufl: Converts numbers, constants and expressions to UFL.
 
         Raises:
             ValueError: Data have the wrong dimension or are out of range.
         """
         raise NotImplementedError
+
+    def placed(self, x: ufl.core.expr.Expr, to_ufl: ToUFL) -> Placement:
+        """Return `place`, checked.
+
+        Raises:
+            ValueError: It fails, or does not return a gap and a direction of the mesh's dimension.
+        """
+        name, d = f"{type(self).__name__}.place", x.ufl_shape[0]
+        try:
+            found = self.place(x, to_ufl)
+        except Exception as error:
+            if type(self).__module__.split(".")[0] == __name__.split(".")[0]:
+                raise
+            raise ValueError(
+                f"{name}(x, to_ufl) fails at a position x of {d} components: "
+                f"{type(error).__name__}: {error}"
+            ) from error
+        if not isinstance(found, Placement):
+            raise ValueError(
+                f"{name} returns a {type(found).__name__}; it must return a Placement(gap, "
+                "direction)"
+            )
+        gap, direction = ufl.as_ufl(found.gap), ufl.as_vector(found.direction)
+        if gap.ufl_shape != () or direction.ufl_shape != (d,):
+            raise ValueError(
+                f"{name} returns a gap of shape {gap.ufl_shape} and a direction of shape "
+                f"{direction.ufl_shape}; they must be () and ({d},)"
+            )
+        return Placement(gap, direction)
 
 
 @dataclass(frozen=True)

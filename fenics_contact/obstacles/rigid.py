@@ -56,14 +56,12 @@ class HalfSpace(Obstacle):
         given = (self.point, self.normal)
         return not any(isinstance(value, ufl.core.expr.Expr) for value in given)
 
-    def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """Return the gap (x - point - shift)·normal and the direction -normal."""
+    def place(self, x: Any, to_ufl: ToUFL) -> Placement:
+        """Return the gap (x - point)·normal and the direction -normal."""
         gdim = x.ufl_shape[0]
         normal = to_ufl(nonzero_vector("normal of the HalfSpace", self.normal, gdim))
         normal = normal / ufl.sqrt(ufl.dot(normal, normal))
         arm = x - to_ufl(as_vector("point of the HalfSpace", self.point, gdim))
-        if shift is not None:
-            arm = arm - shift
         return Placement(ufl.dot(arm, normal), -normal)
 
 
@@ -90,14 +88,12 @@ class Ball(Obstacle):
         """Radius (length); infinite for a cavity, or if it is not known as a number."""
         return _convex_radius(self.radius, self.inside)
 
-    def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """Return the gap |x - center - shift| - radius, negated inside, and the direction."""
+    def place(self, x: Any, to_ufl: ToUFL) -> Placement:
+        """Return the gap |x - center| - radius, negated inside, and the direction."""
         gdim = x.ufl_shape[0]
         check_bool("inside of the Ball", self.inside)
         arm = x - to_ufl(as_vector("center of the Ball", self.center, gdim))
-        return _round(
-            arm, shift, to_ufl(as_positive("radius of the Ball", self.radius)), self.inside
-        )
+        return _round(arm, to_ufl(as_positive("radius of the Ball", self.radius)), self.inside)
 
 
 @dataclass(frozen=True)
@@ -126,7 +122,7 @@ class Cylinder(Obstacle):
         """Radius (length); infinite for a bore, or if it is not known as a number."""
         return _convex_radius(self.radius, self.inside)
 
-    def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
+    def place(self, x: Any, to_ufl: ToUFL) -> Placement:
         """Return the distance from the axis minus radius, negated inside, and the direction.
 
         Raises:
@@ -143,11 +139,7 @@ class Cylinder(Obstacle):
             axis = to_ufl(nonzero_vector("axis of the Cylinder", self.axis, gdim))
             axis = axis / ufl.sqrt(ufl.dot(axis, axis))
             arm = arm - ufl.dot(arm, axis) * axis
-            if shift is not None:
-                shift = shift - ufl.dot(shift, axis) * axis
-        return _round(
-            arm, shift, to_ufl(as_positive("radius of the Cylinder", self.radius)), self.inside
-        )
+        return _round(arm, to_ufl(as_positive("radius of the Cylinder", self.radius)), self.inside)
 
 
 @dataclass(frozen=True)
@@ -174,16 +166,11 @@ class RoundedCone(Obstacle):
     rotation: Rotation | None = None
 
     @property
-    def is_distance(self) -> bool:
-        """Whether the normal is minus the gradient of the gap: always True."""
-        return True
-
-    @property
     def smallest_radius(self) -> float:
         """Radius of the tip (length); infinite if it is not known as a number."""
         return _convex_radius(self.radius, inside=False)
 
-    def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
+    def place(self, x: Any, to_ufl: ToUFL) -> Placement:
         """Return the signed distance and minus its gradient.
 
         With the coordinates z along the axis and ρ across it, from the centre of the tip, the
@@ -204,7 +191,7 @@ class RoundedCone(Obstacle):
         axis = axis / ufl.sqrt(ufl.dot(axis, axis))
         tip = to_ufl(as_vector("tip of the RoundedCone", self.tip, gdim))
         c, s = ufl.cos(to_ufl(angle)), ufl.sin(to_ufl(angle))
-        here = ufl.variable(x if shift is None else x - shift)
+        here = ufl.variable(x)
         arm = here - tip - radius * axis
         z = ufl.dot(arm, axis)
         across = arm - z * axis
@@ -225,9 +212,7 @@ def _convex_radius(radius: Any, inside: bool) -> float:
     return float(radius) if is_number(radius) and radius > 0.0 and not inside else np.inf
 
 
-def _round(arm: Any, shift: Any, radius: Any, inside: bool) -> Placement:
-    if shift is not None:
-        arm = arm - shift
+def _round(arm: Any, radius: Any, inside: bool) -> Placement:
     distance = ufl.sqrt(ufl.dot(arm, arm))
     if inside:
         return Placement(radius - distance, arm)
@@ -265,19 +250,14 @@ class SignedDistance(Obstacle):
                 "such as lambda x: x[1]"
             )
 
-    @property
-    def is_distance(self) -> bool:
-        """Whether the normal is minus the gradient of the gap: always True."""
-        return True
-
-    def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """Return the signed distance at x - shift and minus its gradient.
+    def place(self, x: Any, to_ufl: ToUFL) -> Placement:
+        """Return the signed distance at x and minus its gradient.
 
         Raises:
             ValueError: The function fails, does not return a UFL scalar, or does not depend on x.
         """
         name = "distance of the SignedDistance"
-        here = ufl.variable(x if shift is None else x - shift)
+        here = ufl.variable(x)
         try:
             gap = ufl.as_ufl(self.distance(here))
         except Exception as error:
@@ -316,14 +296,12 @@ class PrescribedGap(Obstacle):
     displacement: Any = None
     rotation: Rotation | None = None
 
-    def place(self, x: Any, shift: Any, to_ufl: ToUFL) -> Placement:
-        """Return the prescribed gap plus shift·normal, and the direction."""
+    def place(self, x: Any, to_ufl: ToUFL) -> Placement:
+        """Return the prescribed gap and the direction."""
         direction = nonzero_vector("normal of the PrescribedGap", self.normal, x.ufl_shape[0])
         direction = to_ufl(direction)
         gap = to_ufl(self.gap)
         _check_scalar("gap of the PrescribedGap", gap)
-        if shift is not None:
-            gap = gap + ufl.dot(shift, direction) / ufl.sqrt(ufl.dot(direction, direction))
         return Placement(gap, direction)
 
 

@@ -62,7 +62,7 @@ class ObstacleShape:
         shift = None if inputs.shift is None else self._factor * inputs.shift
         seen: Any = Frame(shift, inputs.rotation).into(place)
         if not isinstance(self._obstacle, SampledObstacle):
-            seen = self._obstacle.place(seen, None, _to_ufl(contact)).gap
+            seen = self._obstacle.placed(seen, _to_ufl(contact)).gap
         self._given = [c for c in extract_constants(ufl.as_ufl(seen)) if c is not self._factor]
         self._own = [fem.Constant(self._mesh, c.value.copy()) for c in self._given]
         replaced = ufl.replace(seen, dict(zip(self._given, self._own, strict=True)))
@@ -76,7 +76,7 @@ class ObstacleShape:
         if isinstance(contact.obstacle, SampledObstacle):
             return True
         anywhere = fem.Constant(contact.surface.mesh, np.zeros(contact.surface.mesh.geometry.dim))
-        gap = contact.obstacle.place(anywhere, None, _to_ufl(contact)).gap
+        gap = contact.obstacle.placed(anywhere, _to_ufl(contact)).gap
         fixed = extract_type(gap, (ufl.SpatialCoordinate, ufl.Coefficient))
         return anywhere in extract_constants(gap) and not fixed
 
