@@ -301,3 +301,13 @@ def test_scripts_run(path: Path, tmp_path: Path) -> None:
     assert len((tmp_path / "output" / "history.csv").read_text().splitlines()) >= 1 + 5
     assert "INFO:fenics_contact:static condensation onto" in done.stderr
     assert done.stdout.count("increment ") == 5
+
+
+def test_every_method_is_described() -> None:
+    """In the choices and the summary, and where the argument is described."""
+    from fenics_contact.methods.solver import METHODS
+
+    pages = [ROOT / "docs" / name for name in ("choose.md", "reference/glance.md")]
+    texts = [page.read_text() for page in pages] + [fenics_contact.ContactProblem.__doc__ or ""]
+    for name in METHODS:
+        assert all(f'"{name}"' in text or f"`{name}`" in text for text in texts), name

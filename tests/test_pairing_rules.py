@@ -366,7 +366,8 @@ def test_the_warning_says_how_many_and_why():
 
 def undetected(step):
     """What the verdict of a step found at the deformed positions, in words."""
-    return [text for name, t in step.verdict.tunnelling.items() for text in t.failures(name)]
+    conditions = (c for name, t in step.verdict.tunnelling.items() for c in t.conditions(name))
+    return [each.failure for each in conditions if not each.holds]
 
 
 def indented(cell, width, depth, *, coarse=2, swap=False, both=False, raised=0.0, fine=2):

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fenics_contact.checks.condition import Condition
 from fenics_contact.contact.body import NEGLIGIBLE_SLIDE
 from fenics_contact.contact.choices import is_regularised
 from fenics_contact.contact.contact import Contact
@@ -114,16 +115,45 @@ class Linearisation:
         """Whether the error of force or pressure exceeds 1 %."""
         return self.worst > _NOTABLE
 
-    def exceeds(self, tolerance: float) -> bool:
-        """Whether the error does, or forces act too far from where they should."""
+    def conditions(self, contact: str, tolerance: float) -> list[Condition]:
+        """The conditions on a contact of this name, by the largest error accepted."""
         if tolerance == np.inf:
-            return False
-        return not (self.judged <= tolerance and self.slid <= self.slide_limit)
+            return []
+        if np.isfinite(self.judged):
+            error = (
+                "displacements are too large for the small-displacement assumption: with gap and "
+                "normals of the deformed bodies, the contact force would differ by "
+                f"{100 * self.force:.2g} % and the pressure by {100 * self.pressure:.2g} %, above "
+                f"{100 * tolerance:.2g} %. Use smaller increments, move the obstacle instead of "
+                'the body, update the pairs (update_pairs="increment"), use '
+                'Contact(kinematics="finite"), or accept the error: '
+                "ContactProblem(small_displacement_tolerance=inf)"
+            )
+        else:
+            error = (
+                "the small-displacement error could not be estimated, because the contact tangent "
+                "leaves a rigid-body mode of a body free. If all of its points slip, the load has "
+                "reached the friction limit. Constrain the body by a Dirichlet condition or a weak "
+                "spring, or accept the error: ContactProblem(small_displacement_tolerance=inf)"
+            )
+        slide = (
+            f"points have slid by {self.slid:.2g} facets from where their forces act on the "
+            f"opposing body, more than {self.slide_limit:g}. Use smaller increments, "
+            'update_pairs="auto" where it is "never", or Contact(kinematics="finite"), or accept '
+            "the error: ContactProblem(small_displacement_tolerance=inf)"
+        )
+        return [
+            Condition(f"{name}, {contact}", value, limit, f"{contact}: {failure}")
+            for name, value, limit, failure in (
+                ("small displacements", self.judged, tolerance, error),
+                ("slide off the opposite points", self.slid, self.slide_limit, slide),
+            )
+        ]
 
     def is_due_to_pairs(self, tolerance: float) -> bool:
         """Whether pairs found where the points are now may take away a notable error."""
         notable = self.judged > _NOTABLE and self.slid > NEGLIGIBLE_SLIDE
-        return notable or self.exceeds(tolerance)
+        return notable or not all(each.holds for each in self.conditions("", tolerance))
 
     def describe(self) -> str:
         """Return the errors in words."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fenics_contact.checks.condition import Condition
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_max
@@ -64,31 +65,33 @@ class ObstacleCheck:
         turn = abs(contact.opposite.turned_by(contact.values)) if rubs else 0.0
         return cls(type(contact.obstacle).__name__, error, depth, turn)
 
-    def failures(self, contact: str) -> list[str]:
-        """Return the conditions that are violated, in words."""
-        found = []
+    def conditions(self, contact: str) -> list[Condition]:
+        """The conditions on a contact of this name."""
+        distance = (
+            f"in the contact zone the gradient of the gap of the {self.obstacle} differs by "
+            f"{self.gradient_error:.3g} from minus its unit normal; it must be a distance, with a "
+            "gradient of length 1, and its direction minus the gradient: divide the function by "
+            "the length of its gradient"
+        )
         if np.isnan(self.gradient_error):
-            found.append(
-                f"{contact}: the distance of the obstacle, or its gradient, is not a number at a "
-                "point of Γc; check its expression"
+            distance = (
+                "the distance of the obstacle, or its gradient, is not a number at a point of Γc; "
+                "check its expression"
             )
-        elif not self.gradient_error <= _GRADIENT_ERROR:
-            found.append(
-                f"{contact}: in the contact zone the gradient of the gap of the {self.obstacle} "
-                f"differs by {self.gradient_error:.3g} from minus its unit normal; it must be a "
-                "distance, with a gradient of length 1, and its direction minus the gradient: "
-                "divide the function by the length of its gradient"
+        deep = (
+            "the penetration exceeds half of the radius of curvature of the obstacle, so that the "
+            "closest point may be on its other side; increase k_n, or use "
+            'enforcement="augmented"'
+        )
+        turned = (
+            f"the obstacle rotates by {self.turn:.3g} rad in one increment, over which slip is a "
+            "straight line; rotate it by no more than a right angle per increment"
+        )
+        return [
+            Condition(f"{name}, {contact}", value, limit, f"{contact}: {failure}")
+            for name, value, limit, failure in (
+                ("gradient of the gap", self.gradient_error, _GRADIENT_ERROR, distance),
+                ("depth by radius of curvature", self.depth, _DEEP, deep),
+                ("rotation of the obstacle", self.turn, _TURN, turned),
             )
-        if not self.depth <= _DEEP:
-            found.append(
-                f"{contact}: the penetration exceeds half of the radius of curvature of the "
-                "obstacle, so that the closest point may be on its other side; increase k_n, or "
-                'use enforcement="augmented"'
-            )
-        if not self.turn <= _TURN:
-            found.append(
-                f"{contact}: the obstacle rotates by {self.turn:.3g} rad in one increment, over "
-                "which slip is a straight line; rotate it by no more than a right angle per "
-                "increment"
-            )
-        return found
+        ]

@@ -21,6 +21,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from fenics_contact.checks.body_probe import OpposingBodyProbe
+from fenics_contact.checks.condition import Condition
 from fenics_contact.checks.obstacle_probe import RigidObstacleProbe
 from fenics_contact.checks.penetration import Probe, ResistedDepth
 from fenics_contact.contact.contact import Contact
@@ -66,25 +67,30 @@ class Tunnelling:
             crossed=None if crossed is None else [float(x) for x in crossed],
         )
 
-    def failures(self, contact: str) -> list[str]:
-        """What does not hold, in words."""
-        found = []
-        if self.place is not None:
-            found.append(
-                f"{contact}: what lies opposite penetrates between the quadrature points of Γc, by "
-                f"{self.depth:.3e} near {np.round(self.place, 6).tolist()} in the undeformed body, "
-                f"where the points around explain {self.allowed:.3e}; refine Γc there or give "
-                "ContactSurface a larger quadrature_degree; between two bodies let the finer "
-                "surface be Γc, or add a second contact with the surfaces swapped"
-            )
-        if self.crossed is not None:
-            found.append(
-                f"{contact}: in one increment a part of Γc has crossed what lies opposite, at "
-                f"{np.round(self.crossed, 6).tolist()} in the undeformed body; load in smaller "
-                "steps (increments() cuts them by itself), and include in Γc and in the opposite "
-                "surface all sides that may touch"
-            )
-        return found
+    def conditions(self, contact: str) -> list[Condition]:
+        """The conditions on a contact of this name."""
+        deep = (
+            f"{contact}: what lies opposite penetrates between the quadrature points of Γc, by "
+            f"{self.depth:.3e} near {_rounded(self.place)} in the undeformed body, where the "
+            f"points around explain {self.allowed:.3e}; refine Γc there or give ContactSurface a "
+            "larger quadrature_degree; between two bodies let the finer surface be Γc, or add a "
+            "second contact with the surfaces swapped"
+        )
+        through = (
+            f"{contact}: in one increment a part of Γc has crossed what lies opposite, at "
+            f"{_rounded(self.crossed)} in the undeformed body; load in smaller steps (increments() "
+            "cuts them by itself), and include in Γc and in the opposite surface all sides that "
+            "may touch"
+        )
+        return [
+            Condition(f"penetration between points, {contact}", self.depth, self.allowed, deep),
+            Condition(f"tunnelling, {contact}", float(self.crossed is not None), 0.0, through),
+        ]
+
+
+def _rounded(place: list[float] | None) -> list[float]:
+    """A place as it is said."""
+    return [] if place is None else [float(x) for x in np.round(place, 6)]
 
 
 class TunnellingCheck:

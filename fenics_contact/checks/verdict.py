@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from fenics_contact.checks.condition import Condition
 from fenics_contact.checks.kinematics import Linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.tunnelling import Tunnelling
@@ -55,6 +56,11 @@ class ForceBalance:
         """Return whether all is finite and the residual at most ``times`` the tolerance."""
         finite = np.isfinite([self.residual, self.force, self.tolerance]).all()
         return bool(finite and self.residual <= times * self.tolerance)
+
+    def condition(self, name: str, failure: str, times: float = 1.0) -> Condition:
+        """Return the condition that `holds` looks at."""
+        residual = self.residual if self.holds(np.inf) else np.nan
+        return Condition(name, residual, times * self.tolerance, failure)
 
     def excess(self) -> float:
         """Return the residual divided by the tolerance; infinite if something is not finite."""
@@ -178,20 +184,12 @@ class Verdict:
         return max(balances.values(), key=ForceBalance.excess)
 
     def _repr_html_(self) -> str:
-        """Return a table of errors and tolerances for notebooks."""
-        balances = {f"equations, {name}": b for name, b in self.equations.items()}
-        balances |= {f"sums of forces, {name}": b for name, b in self.sums.items()}
-        balances |= {f"cross-check, {name}": b for name, b in self.cross_check.items()}
-        rows = [(n, f"{b.residual:.2e}", f"{b.tolerance:.2e}") for n, b in balances.items()]
-        for contact, laws in self.laws.items():
-            for law, violation in laws.items():
-                rows.append((f"{law}, {contact}", f"{violation:.2e}", f"{_LAW_TOLERANCE:.2e}"))
-        for contact, error in self.enforcement.items():
-            allowed = f"{self.enforcement_tolerance[contact]:.2e}"
-            rows.append((f"enforcement, {contact}", f"{error:.2e}", allowed))
-        failures = self.failures
+        """Return a table of errors and limits for notebooks."""
+        conditions = self.conditions
+        rows = [(each.name, f"{each.value:.2e}", f"{each.limit:.2e}") for each in conditions]
+        failures = [each.failure for each in conditions if not each.holds]
         title = "Verdict: " + ("does not hold" if failures else "holds")
-        return shown(title, ("check", "error", "tolerance"), rows, failures)
+        return shown(title, ("condition", "error", "limit"), rows, failures)
 
     @property
     def is_finite(self) -> bool:
@@ -201,7 +199,9 @@ class Verdict:
     @property
     def only_laws_fail(self) -> bool:
         """Whether only contact laws are violated."""
-        return bool(self.failures) and not replace(self, laws={}).failures
+        return bool(self.failures) and self.failures == [
+            each.failure for each in self._conditions_of_laws() if not each.holds
+        ]
 
     @property
     def pairing_errors(self) -> list[str]:
@@ -212,98 +212,90 @@ class Verdict:
     @property
     def failures(self) -> list[str]:
         """The conditions that are violated, in words; empty for a verified solution."""
-        found = []
+        return [each.failure for each in self.conditions if not each.holds]
+
+    @property
+    def conditions(self) -> list[Condition]:
+        """All conditions of the verification."""
         # Twice: the solver's residual is a product with K, this one an assembly.
-        for name, balance in self.equations.items():
-            if not balance.holds(2.0):
-                found.append(f"residual of {name} is {balance}")
-        for name, balance in self.sums.items():
-            if not balance.holds():
-                found.append(f"forces on {name}, or their moments, do not balance: {balance}")
-        for contact, balance in self.cross_check.items():
-            if not balance.holds():
-                found.append(
-                    f"{contact}: the contact forces differ from those that DOLFINx assembles from "
-                    f"the boundary form: {balance}"
-                )
-        for contact, laws in self.laws.items():
-            found += [
-                f"{contact}: {law} violated by {value:.3e} (relative)"
-                for law, value in laws.items()
-                if not value <= _LAW_TOLERANCE
-            ]
+        found = [
+            balance.condition(f"equations, {name}", f"residual of {name} is {balance}", 2.0)
+            for name, balance in self.equations.items()
+        ]
+        found += [
+            balance.condition(
+                f"sums of forces, {name}",
+                f"forces on {name}, or their moments, do not balance: {balance}",
+            )
+            for name, balance in self.sums.items()
+        ]
+        found += [
+            balance.condition(
+                f"cross-check, {contact}",
+                f"{contact}: the contact forces differ from those that DOLFINx assembles from the "
+                f"boundary form: {balance}",
+            )
+            for contact, balance in self.cross_check.items()
+        ]
+        found += self._conditions_of_laws()
         for contact, error in self.enforcement.items():
             allowed = self.enforcement_tolerance[contact]
-            if not error <= allowed:
-                found.append(
-                    f"{contact}: the augmented Lagrangian method has not converged: the penalty "
-                    f"still carries {error:.3e} of the largest traction, above {allowed:.3e}. "
-                    "Use a larger tolerance, or k_n and k_t closer to 10 E/h. If a Dirichlet "
-                    "condition prescribes a node of Γc inside of the obstacle, its penetration "
-                    "remains: take such facets out of Γc"
-                )
-        if not self.friction_energy_gain <= _MAX_FRICTION_ENERGY_GAIN:
-            found.append(
-                "friction supplies energy, "
-                f"{100 * self.friction_energy_gain:.2g} % of the energy exchanged: the equations "
-                "have several solutions, and this one is not reached by a continuous load path. "
-                "Use smaller increments (increments() halves them where needed)"
+            failure = (
+                f"{contact}: the augmented Lagrangian method has not converged: the penalty still "
+                f"carries {error:.3e} of the largest traction, above {allowed:.3e}. Use a larger "
+                "tolerance, or k_n and k_t closer to 10 E/h. If a Dirichlet condition prescribes a "
+                "node of Γc inside of the obstacle, its penetration remains: take such facets out "
+                "of Γc"
             )
+            found.append(Condition(f"enforcement, {contact}", error, allowed, failure))
+        failure = (
+            f"friction supplies energy, {100 * self.friction_energy_gain:.2g} % of the energy "
+            "exchanged: the equations have several solutions, and this one is not reached by a "
+            "continuous load path. Use smaller increments (increments() halves them where needed)"
+        )
+        gain, limit = self.friction_energy_gain, _MAX_FRICTION_ENERGY_GAIN
+        found.append(Condition("energy supplied by friction", gain, limit, failure))
+        tolerance = self.small_displacement_tolerance
         for contact, change in self.small_displacement_error.items():
-            if self.small_displacement_tolerance == np.inf:
-                continue
-            if not np.isfinite(change.judged):
-                found.append(
-                    f"{contact}: the small-displacement error could not be estimated, because the "
-                    "contact tangent leaves a rigid-body mode of a body free. If all of its points "
-                    "slip, the load has reached the friction limit. Constrain the body by a "
-                    "Dirichlet condition or a weak spring, or accept the error: "
-                    "ContactProblem(small_displacement_tolerance=inf)"
-                )
-            elif change.judged > self.small_displacement_tolerance:
-                found.append(
-                    f"{contact}: displacements are too large for the small-displacement "
-                    "assumption: with gap and normals of the deformed bodies, the contact force "
-                    f"would differ by {100 * change.force:.2g} % and the pressure by "
-                    f"{100 * change.pressure:.2g} %, above "
-                    f"{100 * self.small_displacement_tolerance:.2g} %. Use smaller increments, "
-                    "move the obstacle instead of the body, update the pairs "
-                    '(update_pairs="increment"), use Contact(kinematics="finite"), or accept the '
-                    "error: ContactProblem(small_displacement_tolerance=inf)"
-                )
-            if not change.slid <= change.slide_limit:
-                found.append(
-                    f"{contact}: points have slid by {change.slid:.2g} facets from where their "
-                    f"forces act on the opposing body, more than {change.slide_limit:g}. "
-                    'Use smaller increments, update_pairs="auto" where it is "never", or '
-                    'Contact(kinematics="finite"), or accept the error: '
-                    "ContactProblem(small_displacement_tolerance=inf)"
-                )
-        for name, deformation in self.deformation.items():
-            if self.small_displacement_tolerance == np.inf or not deformation > _MOST_DEFORMED:
-                continue
-            found.append(
+            found += change.conditions(contact, tolerance)
+        for name, deformation in self.deformation.items() if tolerance < np.inf else ():
+            failure = (
                 f"{name} is deformed by {deformation:.2g} times its size: a part of it is not "
                 "constrained, or the units of stiffness, loads and lengths are not consistent; or "
                 "accept it: ContactProblem(small_displacement_tolerance=inf)"
             )
+            found.append(Condition(f"deformation, {name}", deformation, _MOST_DEFORMED, failure))
         for name, (way, others) in self.ejected_bodies.items():
-            found.append(
+            failure = (
                 f"{name} is ejected: it has moved by {way:.2g} and has no contact force, while "
                 f"nothing else has moved by more than {others:.2g}. Use smaller increments "
                 "(increments() halves them where needed), start with the bodies in contact, or "
                 "constrain it by a weak spring"
             )
-        if self.inverted:
-            found.append(
-                "cells are inverted, det(I + grad u) ≤ 0. Use smaller increments (increments() "
-                "halves them where needed), or refine the mesh there"
-            )
+            found.append(Condition(f"displacement without force, {name}", way, others, failure))
+        failure = (
+            "cells are inverted, det(I + grad u) ≤ 0. Use smaller increments (increments() halves "
+            "them where needed), or refine the mesh there"
+        )
+        found.append(Condition("inverted cells", float(self.inverted), 0.0, failure))
         for contact, obstacle in self.obstacles.items():
-            found += obstacle.failures(contact)
+            found += obstacle.conditions(contact)
         for contact, tunnelling in self.tunnelling.items():
-            found += tunnelling.failures(contact)
+            found += tunnelling.conditions(contact)
         return found
+
+    def _conditions_of_laws(self) -> list[Condition]:
+        """Those of the contact laws."""
+        return [
+            Condition(
+                f"{law}, {contact}",
+                value,
+                _LAW_TOLERANCE,
+                f"{contact}: {law} violated by {value:.3e} (relative)",
+            )
+            for contact, laws in self.laws.items()
+            for law, value in laws.items()
+        ]
 
 
 def check_laws(contact: Contact) -> dict[str, float]:
