@@ -98,10 +98,8 @@ class Starts:
 
         Collective. The present state; that state with one step of Newton's method on the tangent of
         the last solution (`_stepped`, with a nonlinear bulk and other prescribed values
-        `_followed`), or where there is none continued as in the last increment (`_continued`);
-        bodies that have gone with obstacles that have moved as rigid ones; and bodies
-        with obstacles that turn freely rolled to where they are now: where all points would slip no
-        tangent tells by how much.
+        `_followed`), or where there is none continued as in the last increment (`_continued`); and
+        bodies that have gone with obstacles that have moved as rigid ones.
 
         At the present state itself no point has slipped yet, and all closed ones stick: from there
         Newton's method takes ten steps to let them slip again, one after another from the edge of
@@ -139,16 +137,14 @@ class Starts:
         predicts, factored = self.predict and not cold, self.factored and not cold
         self.forget()
         step = None  # which of the starts is one on the tangent of the last solution
-        moved, turned = present, False
+        turned = False
         if self._moved is not None:
             if predicts:
                 step = add(self._followed(present))
                 turned = self._friction_works()
             if step is None or turned or not residuals[step] < residuals[0]:
                 step = None
-                moved = starts[add(self._followed(present, anew=True))]
-            else:
-                moved = starts[step]
+                add(self._followed(present, anew=True))
         else:
             tractions = self._tractions() if factored and first_round else None
             if tractions is not None or (predicts and equations.full.bulk.linear):
@@ -161,8 +157,6 @@ class Starts:
             add(self._continued(present, forces, self.change))
         if self.carried is not None and first_round:
             add(system.part(self.carried))
-        if first_round and any(c.free_angle is not None for c in equations.contacts):
-            add(system.rolled(moved))
         if step is not None and not turned and residuals[step] <= _FAR * min(residuals):
             return starts[step]
         return starts[int(np.argmin(residuals))]

@@ -249,24 +249,6 @@ class ContactOperator:
         arms = np.asarray(self.contact.opposite.turning_rate() / self._length, dtype=np.float64)
         return arms if self.within is None else np.where(self.within[:, None], arms, 0.0)
 
-    def rolling(self) -> float:
-        """Return the change of the rotation unknown for the least slip. Collective.
-
-        It is that of the evaluated state, in the mean over the loaded points: rolling.
-
-        Returns:
-            The change (length); 0 without an unknown rotation or friction.
-        """
-        contact, values = self.contact, self.contact.values
-        if self._turn is None or not contact.law.has_friction:
-            return 0.0
-        arms = values.tangential(self._arms())
-        resists = values.friction_bound_ratio > 0
-        weight = contact.measure * np.maximum(contact.pressure, 0.0) * resists
-        found = [weight @ np.sum(arms * v, axis=1) for v in (values.increment, arms)]
-        slip, size = (float(v) for v in global_sum(self.unknowns.comm, found))
-        return slip / size if size > 0 else 0.0
-
     def _present_map(self, column: int) -> PETSc.Mat:
         """D as it is now, a new matrix. Collective."""
         arms = self._arms()

@@ -266,23 +266,6 @@ class System(ABC):
         """Whether Γc has lost its tangent plane somewhere; see `Opposite.degenerate`."""
         return any(contact.opposite.degenerate for contact in self.contacts)
 
-    def rolled(self, state: Array) -> Array:
-        """A state with obstacles that turn freely turned to where they slip least. Collective.
-
-        Args:
-            state: What it is without; it becomes the present one.
-        """
-        self.set_state(state)
-        for contact in self.contacts:
-            contact.evaluate()
-        changes = [
-            operator.rolling() if motion.turns else 0.0
-            for operator in self.operators
-            for motion in operator.contact.motions
-        ]
-        here = self.unknowns.joined(np.zeros(self.unknowns.n_dofs), np.array(changes))
-        return state + here
-
     @abstractmethod
     def state(self) -> Array:
         """The present unknowns of this rank; a copy."""
