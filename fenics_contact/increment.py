@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
-from dolfinx import fem
 
 from fenics_contact.checks.energy import Energy, EnergyState
 from fenics_contact.checks.given import check_values
@@ -78,7 +77,6 @@ class IncrementSolver:
         solver: Solver,
         judge: Judge,
         *,
-        bcs: Sequence[fem.DirichletBC],
         modulus: FollowedModulus,
         balance: LoadBalance,
         prefix: str,
@@ -89,13 +87,12 @@ class IncrementSolver:
             full: The system on all unknowns.
             solver: What solves it.
             judge: See the attributes.
-            bcs: Dirichlet conditions.
             modulus: See the attributes.
             balance: Whether contact can balance a load.
             prefix: Of PETSc options, for messages.
         """
         self.judge, self.modulus = judge, modulus
-        self._full, self._solver, self._bcs = full, solver, bcs
+        self._full, self._solver = full, solver
         self._balance, self._prefix = balance, prefix
         self._bulk, self._contacts, self._comm = full.bulk, full.contacts, full.unknowns.comm
         self._u = full.displacement.whole
@@ -103,15 +100,6 @@ class IncrementSolver:
         self._first_touch = FirstTouch(full)
 
     # ---- what is given ---------------------------------------------------------------------------
-
-    def prescribed_values(self) -> Array:
-        """Return this rank's unknowns with the present values of the Dirichlet conditions."""
-        values = self._u.x.array.copy()
-        for bc in self._bcs:
-            bc.set(values)
-        unknowns = self._full.unknowns
-        values = self._bulk.in_units(values[: unknowns.n_dofs])
-        return unknowns.joined(values, np.zeros(unknowns.n_motions))
 
     def _check_before(self, *, balance: bool) -> Array:
         """Look at all that was given; the external forces (force). Collective.
@@ -130,7 +118,7 @@ class IncrementSolver:
                 "loads, and the denominators in F (λ = E ν/((1 + ν)(1 - 2ν)) is infinite at "
                 "ν = 0.5)"
             )
-        check_values(self._bcs, self._u)
+        check_values(self._full.bcs, self._u)
         if self._bulk.has_new_data():
             self._balance.find_free_modes(self._full)
         if balance and self._bulk.linear:
@@ -162,9 +150,7 @@ class IncrementSolver:
         if complete and points.contacts and not (increment.tried or points.replaced):
             self._predict_opposite_points(points, state, load)
         before = self._full.state()
-        for bc in self._bcs:
-            bc.set(self._u.x.array)
-        self._u.x.scatter_forward()
+        self._full.prescribe()
         solver.starts.moved_from(before)
         stiffness_changed = self._full.update_stiffness()
         if stiffness_changed and self._bulk.linear:
@@ -252,7 +238,7 @@ class IncrementSolver:
             load: External forces (force).
         """
         before = self._full.state()
-        points.predict(state, self.prescribed_values(), load)
+        points.predict(state, self._full.prescribed_values(), load)
         points.begin(self._contacts)
         self._full.set_state(before)
         for contact in self._contacts:

@@ -38,7 +38,6 @@ from fenics_contact.systems.committed import CommittedState
 from fenics_contact.systems.followed import FollowedModulus
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
-from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array
@@ -111,7 +110,6 @@ class ContactProblem:
         u: The function that is solved for: the displacement, or a mixed function.
         displacement: The relation of the displacement to u.
         contacts: The contacts.
-        bulk: The bulk form.
         motions: The rigid-body modes of the bodies, and which of them are free.
         solver: The solver of an increment: system, methods and SNES.
         accuracy: The strictest `Accuracy` of the contacts; None if any contact has none.
@@ -148,7 +146,7 @@ class ContactProblem:
                 "error, such as 0.2, or infinity to accept every increment"
             )
         self.contacts = listed("contacts", contacts, Contact)
-        self._bcs = listed("bcs", bcs, fem.DirichletBC)
+        bcs = listed("bcs", bcs, fem.DirichletBC)
         said = [c.accuracy for c in self.contacts if c.accuracy is not None]
         all_say = bool(said) and len(said) == len(self.contacts)
         self.accuracy = min(said, key=lambda a: a.error) if all_say else None
@@ -167,29 +165,24 @@ class ContactProblem:
         if u.function_space.mesh.comm.rank == 0:
             linear.warn_of_slow_blas()
         self.u = u
-        self.bulk = Bulk(F, self.displacement)
-        self.prefix = prefix
-        self._comm = u.function_space.mesh.comm
+        bulk = Bulk(F, self.displacement)
+        self._prefix, self._comm = prefix, u.function_space.mesh.comm
         n_motions = sum(len(contact.motions) for contact in self.contacts)
-        self.unknowns = Unknowns(u.function_space, n_motions)
-        self.constrained = constrained_unknowns(
-            self._bcs, u, self.unknowns, mixed=self.displacement.mixed
-        )
-        check_contacts(self.contacts, self.displacement, self.constrained)
-        self.full = FullSystem(
-            self.displacement, self.unknowns, self.bulk, self.contacts, self.constrained
-        )
+        unknowns = Unknowns(u.function_space, n_motions)
+        constrained = constrained_unknowns(bcs, u, unknowns, mixed=self.displacement.mixed)
+        check_contacts(self.contacts, self.displacement, constrained)
+        self.full = FullSystem(self.displacement, unknowns, bulk, self.contacts, constrained, bcs)
 
-        self.bulk.check_finite()
+        bulk.check_finite()
         self.full.update_stiffness()
-        self.bulk.check_elastic()
-        modulus = FollowedModulus(self.bulk, self.displacement, self.contacts)
+        bulk.check_elastic()
+        modulus = FollowedModulus(bulk, self.displacement, self.contacts)
         obstacles = [
             (contact.name, motion) for contact in self.contacts for motion in contact.motions
         ]
         self.motions = RigidBodyModes(
             self.displacement,
-            self.unknowns,
+            unknowns,
             self.full.scales,
             [f"{m.kind} {m.way} of the obstacle of {name}" for name, m in obstacles],
             turning=[motion.turns for _, motion in obstacles],
@@ -197,14 +190,13 @@ class ContactProblem:
         balance = LoadBalance(self.motions)
         self.initial_penetration = check_start(self.contacts)
         balance.find_free_modes(self.full)
-        self.full.scales.begin(self.operators)
+        self.full.scales.begin(self.full.operators)
         judge = Judge(self.full, self.motions, tolerance=tolerance, cross_check=cross_check)
         self.solver = Solver(self.full, self.motions, settings)
         self._increments = IncrementSolver(
             self.full,
             self.solver,
             judge,
-            bcs=self._bcs,
             modulus=modulus,
             balance=balance,
             prefix=prefix,
@@ -222,9 +214,9 @@ class ContactProblem:
         none = np.zeros_like(unknowns)
         contacts = tuple(contact.state for contact in self.contacts)
         if any(state.commits for state in contacts):
-            load = self.present_load()
+            load = self.full.present_load()
             self.full.begin(load)
-            bulk = self.full.with_obstacles(self.bulk.assemble_residual())
+            bulk = self.full.with_obstacles(self.full.bulk.assemble_residual())
             forces: dict[object, Forces] = {mark: self.full.present_forces(bulk)}
             return State(unknowns, contacts, load, EnergyState.at(forces, self.contacts), none)
         forces = {mark: Forces.none(unknowns, self.full.label)}
@@ -290,22 +282,9 @@ class ContactProblem:
         return self.accuracy.increments if self.accuracy and friction else 1
 
     @property
-    def operators(self) -> list[ContactOperator]:
-        """The `ContactOperator` of every contact over all unknowns, with the present pairs.
-
-        Collective.
-        """
-        return self.full.operators
-
-    @property
     def load(self) -> Array:
         """External forces of the last solve at this rank's unknowns (force)."""
         return self._present.load
-
-    @property
-    def committed_energy(self) -> EnergyState:
-        """Forces and energies at the last commit, the start of the increment's energy balance."""
-        return self.state.energy
 
     def present_state(self) -> Array:
         """Return a copy of this rank's present unknowns (length). Collective.
@@ -372,7 +351,7 @@ class ContactProblem:
             for contact in self.contacts:
                 contact.begin()
             self.state = replace(self.state, contacts=tuple(c.state for c in self.contacts))
-            if not self.bulk.linear:  # whose tangent is that of u, and E may be another by now
+            if not self.full.bulk.linear:  # whose tangent is that of u, and E may be another by now
                 self._increments.modulus.measure()
         behind = any(state.interior is not None for state in (self._present, self.state))
         if behind and not self.solver.is_current():
@@ -396,7 +375,7 @@ class ContactProblem:
                     self._go_back(self._present.unknowns if at_present else start_unknowns)
                     self._take_committed_pairs()
                     points.begin(self.contacts)
-                    if not self.bulk.linear:  # that of a failure would excuse any residual
+                    if not self.full.bulk.linear:  # that of a failure would excuse any residual
                         self.full.diagonal = diagonal.copy()
                     # Outside, lest a SNES that is made anew takes its options for the caller's.
                     if found is Again.UNKNOWNS:
@@ -406,14 +385,14 @@ class ContactProblem:
         except BaseException as error:
             fail_together(self._comm, error)
             self._go_back(self._present.unknowns if at_present else start_unknowns)
-            if not self.bulk.linear:  # that of cells near collapse would excuse any residual
+            if not self.full.bulk.linear:  # that of cells near collapse would excuse any residual
                 self.full.diagonal = diagonal
             if not isinstance(error, NotConverged | ValueError):
                 self.solver.recover()
             raise
         finally:
             if self._comm.rank == 0:
-                self.solver.options.warn_of_unread(self.prefix)
+                self.solver.options.warn_of_unread(self._prefix)
         self._trial, step = found
         return step
 
@@ -495,7 +474,7 @@ class ContactProblem:
             self.full.set_state(before)
             number = self.increment + (not is_committed)
             reason = int(self.snes.getConvergedReason())
-            raise NotConverged(number, reason, verdict, prefix=self.prefix)
+            raise NotConverged(number, reason, verdict, prefix=self._prefix)
         energy = present.energy.with_forces(self.full.mark, forces)
         completed = replace(present, unknowns=self.full.state(), interior=None, energy=energy)
         if isinstance(completed, State):
@@ -585,7 +564,7 @@ class ContactProblem:
         self.complete()
         state = self.state
         forces = state.energy.forces[self.full.mark]
-        kept = np.zeros(self.unknowns.n_local, dtype=bool)
+        kept = np.zeros(self.full.unknowns.n_local, dtype=bool)
         if self.solver.condensed:
             kept[self.solver.system.unknowns.kept] = True
         return CommittedState(
@@ -595,7 +574,7 @@ class ContactProblem:
             external=forces.external,
             load_change=state.load_change,
             kept=kept,
-            constrained=self.constrained,
+            constrained=self.full.constrained,
             increment=state.increment,
             expected=self.expected_increments,
             pairs_anew=tuple(contact.opposite.pairs_anew for contact in self.contacts),
@@ -612,36 +591,12 @@ class ContactProblem:
         before, measured = self.full.state(), modulus.present
         try:
             self.full.set_state(state)
-            if self.bulk.linear:
+            if self.full.bulk.linear:
                 modulus.measure()
             yield
         finally:
             self.full.set_state(before)
             modulus.put_back(measured)
-
-    def reads(self, constant: fem.Constant) -> bool:
-        """Return whether F, a Dirichlet condition or a contact depends on a constant.
-
-        Collective.
-        """
-        if constant in self.bulk.form.constants() or any(c.reads(constant) for c in self.contacts):
-            return True
-        value, prescribed = constant.value.copy(), list[Array]()
-        try:
-            for other in (value, value + 1.0):
-                constant.value = other
-                prescribed.append(self.prescribed_values())
-        finally:
-            constant.value = value
-        return bool(self._comm.allreduce(int(not np.array_equal(prescribed[0], prescribed[1]))))
-
-    def present_load(self) -> Array:
-        """Return the present external forces at this rank's unknowns (force). Collective."""
-        return self.full.present_load()
-
-    def prescribed_values(self) -> Array:
-        """Return this rank's unknowns with the present values of the Dirichlet conditions."""
-        return self._increments.prescribed_values()
 
     def set_committed(
         self, taken: CommittedState, points: Sequence[tuple[Array, Mapping[str, Array]]]
@@ -658,7 +613,7 @@ class ContactProblem:
         self._fresh, self._trial = False, None
         self.solver.keep(np.flatnonzero(taken.kept).astype(np.int32))
         self.full.set_state(taken.state)
-        load = self.present_load()
+        load = self.full.present_load()
         self.full.begin(load)
         for contact, (history, values), anew in zip(
             self.contacts, points, taken.pairs_anew, strict=True

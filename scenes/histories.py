@@ -144,10 +144,10 @@ def picture(made: History) -> dict[str, Array]:
     field = fem.Function(problem.u.function_space)
     committed = problem.committed_state()
     for name in ("state", "internal", "external"):
-        owned(field)[:] = getattr(committed, name)[: problem.unknowns.n_dofs]
+        owned(field)[:] = getattr(committed, name)[: problem.full.unknowns.n_dofs]
         found[f"committed {name}"] = _nodal(problem, field)
-    found["state of obstacles"] = problem.unknowns.motions(committed.state)
-    energy = problem.committed_energy
+    found["state of obstacles"] = problem.full.unknowns.motions(committed.state)
+    energy = problem.state.energy
     found["springs"] = np.array([COMM.allreduce(sum(map(np.sum, energy.springs)))])
     if problem.solver.condensed:
         found["kept"] = problem.solver.system.unknowns.kept

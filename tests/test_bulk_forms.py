@@ -257,7 +257,7 @@ def test_nonlinear_bulk(cell, method):
         method=method,
         petsc_options={"snes_rtol": 1e-11},
     )
-    assert not problem.bulk.linear
+    assert not problem.full.bulk.linear
     for share in (0.5, 1.0):
         scene.load(up=-share * p)
         step = problem.solve()
@@ -347,7 +347,7 @@ def test_a_corner_turned_inside_out_is_seen_by_any_rule_of_the_form():
     problem, _ = scene.problem(fc.HalfSpace((0, 2.0), (0, -1.0)), fc.Frictionless(1e4))
     for a, inverted in ((-0.45, False), (-0.55, True)):
         scene.u.interpolate(lambda x, a=a: a * (x[0] + 0.5) * x[1] * np.ones((2, 1)))
-        assert problem.bulk.is_inverted() is inverted
+        assert problem.full.bulk.is_inverted() is inverted
 
 
 def test_unsymmetric_bulk():
@@ -362,7 +362,7 @@ def test_unsymmetric_bulk():
     dx = ufl.dx(scene.mesh)
     scene.F += ufl.dot(coupling * scene.u, v) * dx
     problem, _ = scene.problem(fc.Coulomb(0.4, k_n=1e4, k_t=1e3), [])
-    assert problem.bulk.linear and not problem.bulk.symmetric
+    assert problem.full.bulk.linear and not problem.full.bulk.symmetric
     step = problem.solve()
     mean = [COMM.allreduce(fem.assemble_scalar(compiled(scene.u[i] * dx))) for i in range(2)]
     bedding = 20.0 * mean[0] + 15.0 * mean[1]
@@ -386,7 +386,7 @@ def test_a_load_that_steps_with_the_displacement():
         ufl.conditional(sunk, 2.0, 3.0) * v[1] * ufl.ds(scene.mesh, subdomain_data=scene.tags)(TOP)
     )
     problem, _ = scene.problem(fc.Frictionless(k_n=k_n), scene.rollers())
-    assert not problem.bulk.linear
+    assert not problem.full.bulk.linear
     step = problem.solve(recover_interior=False)
     assert step.complete
     assert step.contacts["contact"].normal_force == pytest.approx(2.0, rel=1e-8)

@@ -71,10 +71,10 @@ def test_schur_complement(cell, degree, symmetric):
     aside = fem.Constant(scene.mesh, 0.01)
     bcs = [scene.hold(LEFT, i, aside) for i in range(scene.dim)]
     problem, _ = scene.problem(fc.Frictionless(), bcs)
-    assert problem.bulk.symmetric == symmetric
-    K = dense(problem.bulk.stiffness)
-    n, whole = len(K), problem.unknowns
-    touches = touched(problem.operators, whole)
+    assert problem.full.bulk.symmetric == symmetric
+    K = dense(problem.full.bulk.stiffness)
+    n, whole = len(K), problem.full.unknowns
+    touches = touched(problem.full.operators, whole)
     # All components of all nodes of the bottom, no others.
     y = scene.u.function_space.tabulate_dof_coordinates()[:, scene.dim - 1]
     bottom = np.flatnonzero(np.repeat(np.abs(y) < 1e-12, scene.dim))
@@ -84,7 +84,7 @@ def test_schur_complement(cell, degree, symmetric):
         dofs = scene.facet_dofs(LEFT, i)
         mine[dofs[dofs < whole.n_local]] = True
     selection = Selection(whole, touches)
-    made = Condensation(problem.bulk.stiffness, problem.bulk, selection, mine)
+    made = Condensation(problem.full.bulk.stiffness, problem.full.bulk, selection, mine)
     held, kept = gathered(COMM, mine) > 0.5, gathered(COMM, whole.first + touches)
     assert np.array_equal(kept, selection.numbers)
     inside = np.setdiff1d(np.flatnonzero(~held), kept)
@@ -122,12 +122,12 @@ def test_nothing_holds_a_part():
     """A stiffness that is singular with the kept unknowns held is refused, on all ranks."""
     scene = block("triangle")
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
-    none = Selection(problem.unknowns, np.zeros(0, dtype=np.int32))
-    free = np.zeros(problem.unknowns.n_local, dtype=bool)
+    none = Selection(problem.full.unknowns, np.zeros(0, dtype=np.int32))
+    free = np.zeros(problem.full.unknowns.n_local, dtype=bool)
     scene.E.value = 0.0
-    problem.bulk.update()
+    problem.full.bulk.update()
     raised_everywhere(
-        lambda: Condensation(problem.bulk.stiffness, problem.bulk, none, free),
+        lambda: Condensation(problem.full.bulk.stiffness, problem.full.bulk, none, free),
         RuntimeError,
         "singular",
     )

@@ -69,7 +69,7 @@ def test_history(how):
     for step in made.increments():
         assert not step.verdict.failures and step.verdict.cross_check
         forces = assemble_owned(form, scene.u.function_space)
-        forces[~problem.constrained[: forces.size]] = 0.0
+        forces[~problem.full.constrained[: forces.size]] = 0.0
         reaction = np.zeros(scene.dim)
         for i in range(scene.dim):
             held.x.array[:] = 0.0
@@ -268,7 +268,7 @@ def test_cells_turned_inside_out_by_bubbles_are_seen():
     for size, inverted in ((1e-3, False), (1.0, True)):
         scene.u.x.array[:] = 0.0
         scene.u.x.array[bubbles] = size
-        assert problem.bulk.is_inverted() is inverted
+        assert problem.full.bulk.is_inverted() is inverted
 
 
 def test_pressures_have_a_unit_by_which_their_equations_are_forces():
@@ -280,16 +280,16 @@ def test_pressures_have_a_unit_by_which_their_equations_are_forces():
     for name in MIXED:
         scene = rubber("triangle", n=(8, 4), mixed=name, nu=0.4999, E=E)
         problem, _ = scene.problem(disc(scene, 0.8), fc.Frictionless(1e4))
-        units, parts = problem.bulk.units, [problem.displacement.dofs]
+        units, parts = problem.full.bulk.units, [problem.displacement.dofs]
         parts += [dofs for _, dofs in problem.displacement.others]
         for dofs, expected in zip(parts, [1.0, *[1.0] * (len(parts) - 2), 4 * E], strict=True):
             for unit in np.unique(units[dofs]):
                 assert expected / 2.5 <= unit <= 2.5 * expected, (name, expected)
-        owned(scene.u)[:] = 1e-3 * np.cos(np.arange(problem.unknowns.n_dofs) ** 2.0)
+        owned(scene.u)[:] = 1e-3 * np.cos(np.arange(problem.full.unknowns.n_dofs) ** 2.0)
         scene.u.x.scatter_forward()
         raw = assemble_owned(compiled(scene.F), scene.u.function_space)
         expected = raw * units[: raw.size]
-        assert np.abs(problem.bulk.assemble_residual() - expected).max(initial=0.0) < 1e-12 * E
+        assert np.abs(problem.full.bulk.assemble_residual() - expected).max(initial=0.0) < 1e-12 * E
 
 
 def test_the_stiffness_of_springs_follows_the_shear_modulus():
@@ -298,7 +298,7 @@ def test_the_stiffness_of_springs_follows_the_shear_modulus():
         scene = rubber("triangle", n=(4, 2), mixed="Taylor-Hood", nu=nu, E=1e3)
         problem, contact = scene.problem(disc(scene, 0.8), fc.Frictionless())
         k_n, h = contact.values.parameters["k_n"], 0.5
-        assert problem.bulk.displacement.mixed
+        assert problem.full.bulk.displacement.mixed
         assert close(k_n, np.full_like(k_n, 10 * 3 * 1e3 / (2 * (1 + nu)) / h), 1e-9)
 
 

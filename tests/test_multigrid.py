@@ -163,7 +163,7 @@ def krylov_iterations(n: int, *, rotations: bool) -> int:
     if not rotations:
         matrix.setNearNullSpace(PETSc.NullSpace())
     force, found = matrix.createVecs()
-    force.array[:] = np.where(problem.constrained, 0.0, 1.0)
+    force.array[:] = np.where(problem.full.constrained, 0.0, 1.0)
     with problem.solver.options.present():
         solver.solve(force, found)
     assert solver.getConvergedReason() > 0
@@ -260,7 +260,7 @@ def test_chosen_by_the_number_of_increments(monkeypatch):
     scene = block("hexahedron", n=2)
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
     monkeypatch.setattr(linear, "_MANY", 0)
-    monkeypatch.setattr(linear, "_MANY_PER_INCREMENT", problem.unknowns.n_global / 2.5)
+    monkeypatch.setattr(linear, "_MANY_PER_INCREMENT", problem.full.unknowns.n_global / 2.5)
     assert problem.solver.condensed
     problem.expected_increments = 2
     assert not problem.solver.condensed and problem.full.linear_kind == "multigrid"
@@ -324,9 +324,9 @@ def test_memory_of_factors(cell, n, symmetric):
     scene = block(cell, n=n)
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers(), condensation=False)
     matrix = problem.full.stiffness.copy()
-    held = np.flatnonzero(problem.constrained).astype(np.int32)
-    matrix.zeroRowsColumns(held, diag=problem.bulk.scale)
-    matrix.shift(problem.bulk.scale * 1e-6)  # nothing holds the height
+    held = np.flatnonzero(problem.full.constrained).astype(np.int32)
+    matrix.zeroRowsColumns(held, diag=problem.full.bulk.scale)
+    matrix.shift(problem.full.bulk.scale * 1e-6)  # nothing holds the height
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
     pc = PETSc.PC().create(COMM)
     pc.setOperators(matrix)
@@ -334,7 +334,7 @@ def test_memory_of_factors(cell, n, symmetric):
     pc.setFactorSolverType("mumps")
     pc.setUp()
     taken = 1e6 * pc.getFactorMatrix().getMumpsInfog(22)
-    estimate = linear.factor_bytes(problem.unknowns.n_local, scene.dim, symmetric=symmetric)
+    estimate = linear.factor_bytes(problem.full.unknowns.n_local, scene.dim, symmetric=symmetric)
     assert taken / 1.5 < estimate < 1.5 * taken
 
 
@@ -343,7 +343,7 @@ def test_monitors_outlive_the_choice_of_the_solver(monkeypatch):
     scene = block("hexahedron", n=2, up=-1.0)
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
     monkeypatch.setattr(linear, "_MANY", 0)
-    monkeypatch.setattr(linear, "_MANY_PER_INCREMENT", problem.unknowns.n_global / 2.5)
+    monkeypatch.setattr(linear, "_MANY_PER_INCREMENT", problem.full.unknowns.n_global / 2.5)
     before, seen = problem.snes, []
 
     def watch(snes, iteration, norm, name, *, unit):

@@ -49,7 +49,7 @@ def same(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
 def test_an_operator_does_not_change():
     """Not by increments, confined laws or other operators; pairs found anew take another."""
     slider = Slider("triangle", LAW, start=1.0, n=(8, 3))
-    contact, unknowns = slider.contact, slider.problem.unknowns
+    contact, unknowns = slider.contact, slider.problem.full.unknowns
     kept = np.arange(0, unknowns.n_dofs, 2, dtype=np.int32)
     whole = ContactOperator(contact, unknowns)
     part = ContactOperator(contact, Selection(unknowns, kept))

@@ -37,7 +37,7 @@ def twisted(law, n=6, **options):
 
 def overload(problem):
     """What is found at the present state under the present load."""
-    return find_overload(problem.motions, problem.operators, problem.present_load())
+    return find_overload(problem.motions, problem.full.operators, problem.full.present_load())
 
 
 def test_a_twist():

@@ -521,7 +521,7 @@ def test_round_off_is_allowed_for_wherever_a_body_comes_to_be_touched():
     bcs = [hold(pair.u, pair.tags, tag, i) for tag in (BOTTOM, TOP) for i in range(2)]
     form = residual(pair.u, ufl.TestFunction(pair.u.function_space), 100.0, 0.3)
     problem = fc.ContactProblem(form, pair.u, bcs=bcs, contacts=[pair.contact])
-    system, at_rest = problem.full, np.zeros(problem.unknowns.n_local)
+    system, at_rest = problem.full, np.zeros(problem.full.unknowns.n_local)
     touched = []
     for along in (0.0, 0.2):
         pair.place(pair.pressed(pair.nodes, 0.01, along))

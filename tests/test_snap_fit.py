@@ -75,7 +75,7 @@ def step_of(gap, force, parked=(), *, along=None):
         contacts.append(scene.contact("arm", RIGHT, wall, fc.Frictionless(), name="parked"))
     problem = scene.problem(*contacts, condensation=False, method="newton")
     equations = problem.solver.equations
-    equations.system.begin(problem.present_load())
+    equations.system.begin(problem.full.present_load())
     x = equations.solution
     x.array[:] = problem.full.state() / equations.length
     equations.residual(x, equations.function)

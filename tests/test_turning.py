@@ -74,7 +74,7 @@ def difference(problem, contact, state, way):
     Returns:
         Of all rows, and of those of the obstacle's unknowns, relative to the largest of each.
     """
-    operator, unknowns, step = problem.operators[0], problem.unknowns, 1e-6
+    operator, unknowns, step = problem.full.operators[0], problem.full.unknowns, 1e-6
 
     def force(share):
         problem.full.set_state(state + share * step * way)
@@ -106,7 +106,7 @@ def test_derivatives(cell, shape):
     seen = np.zeros(3)
     for law in (fc.Frictionless(K), fc.Coulomb(0.3, K, K), fc.Coulomb(5.0, K, K)):
         problem, contact = scene_of(cell, law, shape)
-        d, unknowns, u = contact.points.shape[1], problem.unknowns, problem.u
+        d, unknowns, u = contact.points.shape[1], problem.full.unknowns, problem.u
         n_motions = unknowns.n_motions
         assert n_motions == 2
         for seed in range(3):
@@ -126,7 +126,7 @@ def test_derivatives(cell, shape):
             for way in ways:
                 assert max(difference(problem, contact, state, way)) < 1e-6
             if contact.acting.has_potential:
-                tangent = problem.operators[0].tangent()
+                tangent = problem.full.operators[0].tangent()
                 mirrored = tangent.copy().transpose()
                 mirrored.axpy(-1.0, tangent)
                 assert 0 < tangent.norm() and mirrored.norm() < 1e-13 * tangent.norm()
@@ -429,7 +429,7 @@ def test_a_turn_of_more_than_a_right_angle_is_no_trial():
     """A residual there is no number, so that a line search takes a shorter step."""
     tool = Tool(driven=True, n=(4, 2))
     roll(tool, 0.0, -0.05, 0.0)
-    system, unknowns = tool.problem.full, tool.problem.unknowns
+    system, unknowns = tool.problem.full, tool.problem.full.unknowns
     start = system.state()
     for angle, twisted in ((1.5, False), (-1.5, False), (1.6, True), (-7.0, True)):
         turned = angle * tool.contact.motions[-1].length

@@ -277,7 +277,7 @@ def _displacement(problem: ContactProblem, state: Array) -> float:
     comm, load = problem.u.function_space.mesh.comm, problem.load
     of_nodes = np.linalg.norm(problem.displacement.vectors(load), axis=1)
     others = load.copy()  # forces on free obstacles
-    others[: problem.unknowns.n_dofs] = 0.0
+    others[: problem.full.unknowns.n_dofs] = 0.0
     size, work = global_sum(comm, [of_nodes.sum() + np.abs(others).sum(), load @ state])
     if size > 0:
         return float(work / size)
@@ -291,7 +291,7 @@ def _linear_parts(
     problem: ContactProblem, values: Mapping[str, float]
 ) -> dict[str, dict[str, float]]:
     """What the springs and the residual that is left have changed in the quantities."""
-    contacts, operators = problem.contacts, problem.operators
+    contacts, operators = problem.contacts, problem.full.operators
     springs = [LinearSprings.of(contact) for contact in contacts]
     found = {}
 
@@ -450,8 +450,8 @@ def _smooth_peak(contact: Contact) -> float:
 
 
 def _largest_is_prescribed(problem: ContactProblem, state: Array) -> bool:
-    n = problem.unknowns.n_dofs
-    held, size = problem.constrained[:n], np.abs(state[:n])
+    n = problem.full.unknowns.n_dofs
+    held, size = problem.full.constrained[:n], np.abs(state[:n])
     comm = problem.u.function_space.mesh.comm
     return global_max(comm, size[held]) >= global_max(comm, size[~held])
 

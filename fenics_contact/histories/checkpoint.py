@@ -106,11 +106,11 @@ def save(
     check_fields(problem, state_fields)
     check_places(problem)
     committed = problem.committed_state()
-    rows = committed.rows(problem.unknowns, problem.bulk)
+    rows = committed.rows(problem.full.unknowns, problem.full.bulk)
     arrays = {
         "numbers": np.array(numbers, dtype=np.float64),
         "state": committed.numbers,
-        "motions": np.stack([problem.unknowns.motions(row) for row in rows]),
+        "motions": np.stack([problem.full.unknowns.motions(row) for row in rows]),
         **probe(problem),
     }
     for part in parts_of(problem):
@@ -285,16 +285,16 @@ def take_up(
     refuse(stored, why_another_scene(stored, problem, state_fields))
     size = problem.full.scales.mesh_size
     motions = stored.arrays["motions"]
-    rows = np.zeros((len(motions), problem.unknowns.n_dofs))
+    rows = np.zeros((len(motions), problem.full.unknowns.n_dofs))
     for part in parts_of(problem):
         nodes = find(comm, stored, part.name, node_places(part.space), size)
         # A rank may have no nodes, of which no shape can be told.
         width = nodes.shape[1] // len(motions)
         by_row = nodes.reshape(len(nodes), len(motions), width).swapaxes(0, 1)
         rows[:, part.dofs] = by_row.reshape(len(motions), len(nodes) * width)
-    joined = (problem.unknowns.joined(row, motions[i]) for i, row in enumerate(rows))
+    joined = (problem.full.unknowns.joined(row, motions[i]) for i, row in enumerate(rows))
     committed = CommittedState.from_rows(
-        np.stack(list(joined)), stored.arrays["state"], problem.unknowns, problem.bulk
+        np.stack(list(joined)), stored.arrays["state"], problem.full.unknowns, problem.full.bulk
     )
     points, given = [], []
     for contact in problem.contacts:

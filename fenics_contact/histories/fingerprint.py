@@ -140,10 +140,10 @@ def probe(problem: ContactProblem) -> dict[str, Array]:
     parts = [(part.dofs, part.space.dofmap.bs, positions(part.space)) for part in parts_of(problem)]
     low = parts[0][2].min(axis=0, initial=np.inf)
     comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-    n_owned = problem.unknowns.n_dofs
+    n_owned = problem.full.unknowns.n_dofs
     smooth, images = [], []
     field, image = fem.Function(space), fem.Function(space)
-    with problem.bulk.present_stiffness() as stiffness:
+    with problem.full.bulk.present_stiffness() as stiffness:
         for k in range(3):
             for dofs, bs, x in parts:
                 phases = 1.0 + k + 2.0 * np.arange(bs)
@@ -154,7 +154,7 @@ def probe(problem: ContactProblem) -> dict[str, Array]:
             stiffness.mult(field.x.petsc_vec, image.x.petsc_vec)
             smooth.append(field.x.array[:n_owned].copy())
             images.append(image.x.array[:n_owned].copy())
-    load = problem.present_load()
+    load = problem.full.present_load()
     v, w, f = np.array(smooth), np.array(images), load[:n_owned]
     products = v @ w.T
     sums = global_sum(comm, np.concatenate([products.ravel(), v @ f]))
@@ -162,7 +162,7 @@ def probe(problem: ContactProblem) -> dict[str, Array]:
         comm, np.concatenate([np.sum(v**2, axis=1), np.sum(w**2, axis=1), [f @ f]])
     )
     nv, nw, nf = np.split(np.sqrt(squares), [3, 6])
-    motions = problem.unknowns.motions(load)
+    motions = problem.full.unknowns.motions(load)
     return {
         "stiffness": np.stack([sums[:9], np.outer(nv, nw).ravel()]),
         "loads": np.stack(
@@ -183,7 +183,7 @@ def _compare_shapes(
     stored: Stored, problem: ContactProblem, fields: Sequence[fem.Function]
 ) -> list[str]:
     """Whether the arrays are those of such a problem, but for the numbers of places."""
-    gdim, n_motions = len(problem.displacement.u), problem.unknowns.n_motions
+    gdim, n_motions = len(problem.displacement.u), problem.full.unknowns.n_motions
     wanted: dict[str, tuple[int | None, ...]] = {
         "numbers": (None,),
         "state": (2 + len(problem.contacts),),
@@ -216,7 +216,7 @@ def _compare_shapes(
 def _compare_probes(problem: ContactProblem, theirs: dict[str, Array]) -> list[str]:
     """Stiffness and loads."""
     ours, differences = probe(problem), []
-    rigid = problem.bulk.scale * problem.full.scales.mesh_size * np.finfo(float).eps
+    rigid = problem.full.bulk.scale * problem.full.scales.mesh_size * np.finfo(float).eps
     for name, words in (
         ("stiffness", "stiffness of the bulk, by smooth fields v·Kw,"),
         ("loads", "loads of the bulk and on free obstacles, by smooth fields v·f,"),
@@ -233,14 +233,14 @@ def _compare_probes(problem: ContactProblem, theirs: dict[str, Array]) -> list[s
 def _compare_conditions(problem: ContactProblem, committed: CommittedState) -> list[str]:
     """Which components are prescribed, and their values, at a state."""
     comm, mask = problem.u.function_space.mesh.comm, committed.constrained
-    differ = int(global_sum(comm, np.count_nonzero(mask != problem.constrained)))
+    differ = int(global_sum(comm, np.count_nonzero(mask != problem.full.constrained)))
     if differ:
-        theirs, ours = global_sum(comm, [mask.sum(), problem.constrained.sum()])
+        theirs, ours = global_sum(comm, [mask.sum(), problem.full.constrained.sum()])
         return [
             f"Dirichlet conditions: {theirs:.0f} components of nodes are prescribed in the file "
             f"and {ours:.0f} here, and {differ} of them are not the same"
         ]
-    now, then = problem.prescribed_values(), committed.state
+    now, then = problem.full.prescribed_values(), committed.state
     # A direct solver leaves its round-off where values are prescribed, too.
     floor = _ROUND_OFF * global_max(comm, np.abs(then))
     return _largest_difference(

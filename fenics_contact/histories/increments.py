@@ -27,7 +27,7 @@ from fenics_contact.step import Step
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
-__all__ = ["increments"]
+__all__ = ["increments", "reads"]
 
 logger = logging.getLogger("fenics_contact")
 
@@ -200,10 +200,28 @@ def _check_folder(checkpoint: Path) -> None:
         raise OSError(f"{words}: {error.strerror}") from error
 
 
+def reads(problem: ContactProblem, constant: fem.Constant) -> bool:
+    """Return whether F, a Dirichlet condition or a contact of a problem depends on a constant.
+
+    Collective.
+    """
+    full = problem.full
+    if constant in full.bulk.form.constants() or any(c.reads(constant) for c in problem.contacts):
+        return True
+    value, prescribed = constant.value.copy(), list[Array]()
+    try:
+        for other in (value, value + 1.0):
+            constant.value = other
+            prescribed.append(full.prescribed_values())
+    finally:
+        constant.value = value
+    return bool(full.unknowns.comm.allreduce(int(not np.array_equal(prescribed[0], prescribed[1]))))
+
+
 def _check_constant(problem: ContactProblem, load: fem.Constant, start: float, end: float) -> None:
     """Warn of a load that nothing depends on, and of one that would jump. Collective."""
     comm, now = problem.u.function_space.mesh.comm, float(load.value)
-    if not problem.reads(load):
+    if not reads(problem, load):
         warn(
             comm,
             "load is a constant on which neither F, nor a Dirichlet condition, nor a contact "
@@ -515,7 +533,7 @@ class _Watch:
 
     def __init__(self, problem: ContactProblem, fields: Sequence[fem.Function]) -> None:
         kept = {id(problem.u), *(id(field) for field in fields)}
-        coefficients = problem.bulk.form.coefficients()
+        coefficients = problem.full.bulk.form.coefficients()
         self._functions = [f for f in coefficients if id(f) not in kept]
         self._values: list[Array] = []
         self._comm = problem.u.function_space.mesh.comm

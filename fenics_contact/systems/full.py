@@ -44,8 +44,10 @@ class FullSystem(System):
         bulk: Bulk,
         contacts: Sequence[Contact],
         constrained: Mask,
+        bcs: Sequence[fem.DirichletBC],
     ) -> None:
         """Take over the parts of a problem. Collective."""
+        self.bcs = bcs
         u, space = displacement.whole, displacement.u.function_space
         n, body = connected_bodies(space)
         n_motions = sum(len(contact.motions) for contact in contacts)
@@ -108,6 +110,22 @@ class FullSystem(System):
     def present_load(self) -> Array:
         """Return the present external forces at this rank's unknowns (force). Collective."""
         return -self.with_obstacles(self.bulk.update_load())
+
+    def prescribed_values(self) -> Array:
+        """Return this rank's unknowns with the present values of the Dirichlet conditions."""
+        values = self.u.x.array.copy()
+        for bc in self.bcs:
+            bc.set(values)
+        unknowns = self.unknowns
+        return unknowns.joined(
+            self.bulk.in_units(values[: unknowns.n_dofs]), np.zeros(unknowns.n_motions)
+        )
+
+    def prescribe(self) -> None:
+        """Give u the present values of the Dirichlet conditions. Collective."""
+        for bc in self.bcs:
+            bc.set(self.u.x.array)
+        self.u.x.scatter_forward()
 
     def set_state(self, state: Array) -> None:
         """Make a state the present one. Collective."""
