@@ -187,7 +187,7 @@ def test_every_error_is_told() -> None:
     told = {(m.module, m.line) for m in messages.read() if m.kind not in ("warning", "log")}
     missing = [text for place, text in raised().items() if place not in told]
     assert sorted(missing) == [
-        "NotConverged(number, reason, verdict, prefix=self.prefix)",
+        "NotConverged(number, reason, verdict, prefix=self._prefix)",
         "OSError(text)",
         "SystemExit(main())",
         "ValueError(f'{name}: {error}')",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -242,7 +242,8 @@ class Contact(PointResults):
         self.acting = ActingLaw(law, self.opposite, self.quadrature)
         self._values: PointValues | None = None
         if not self.rigid:
-            self._find_pairs(None)
+            self.opposite.update()
+            self.opposite.find_pairs(None, np.zeros(self.quadrature.n_points))
         self.opposite.begins_anew()
         self.state = ContactState(self.history.rows(), self.opposite.state())
         self._start()
@@ -468,25 +469,6 @@ class Contact(PointResults):
         """Number of points without an opposite point, on all ranks."""
         return self.pairs.n_unpaired
 
-    def pair(self, u: fem.Function | None = None) -> None:
-        """Find the opposite points of all points. Collective.
-
-        Points without an opposite point are open, and `n_unpaired` counts them. If at first these
-        are more than half of all points, a warning states the reasons.
-
-        Args:
-            u: Displacement of the bodies in which to search; None: the undeformed bodies.
-        """
-        self._find_pairs(u)
-        self.state = replace(self.state, opposite=self.opposite.state())
-
-    def _find_pairs(self, u: fem.Function | None) -> None:
-        """Find the pairs in a displacement, for the constructor and `pair`. Collective."""
-        self.opposite.update()
-        none = np.zeros(self.quadrature.n_points)
-        self.opposite.find_pairs(u, none if u is None else self._evaluate().depth)
-        self.forget()
-
     def begin_between(self, opposite: OppositeState) -> None:
         """Count an increment from its start between other pairs; `restore` undoes it. Collective.
 
@@ -515,14 +497,6 @@ class Contact(PointResults):
         """
         x = self.values.x
         return x + self.own_displacement() if self.finite else x
-
-    def true_placement(self) -> tuple[Array, Array]:
-        """Return the gap and the normal at the deformed position X + u. Collective.
-
-        Returns:
-            Arrays (n_points,) (length) and (n_points, gdim).
-        """
-        return self.opposite.true_placement(self.values)
 
     @cached_property
     def traces(self) -> TraceProjection:
@@ -652,28 +626,14 @@ class Contact(PointResults):
         history = self.opposite.committed_fields(values)
         return ContactTrial(points, history, self.history.rows(), self.opposite.state())
 
-    def set_down(self, moved: Mask) -> None:
-        """Measure slip from the state evaluated last at points that were unloaded. Collective.
-
-        It is called after the initial positioning of bodies. `restore` undoes it.
-
-        Args:
-            moved: Mask of the points that the positioning moved, (n_points,).
-        """
-        self._count_from_here(moved & (self.history.values("normal_traction") == 0.0))
-
     def count_slip_from_here(self, points: Mask) -> None:
-        """Measure slip from the state evaluated last, at which surfaces first touch. Collective.
+        """Measure slip at some points from the state evaluated last, where they touch. Collective.
 
         `restore` undoes it.
 
         Args:
-            points: Mask of the points of these surfaces, (n_points,).
+            points: Mask of the points, (n_points,).
         """
-        self._count_from_here(points)
-
-    def _count_from_here(self, points: Mask) -> None:
-        """Measure slip at some points from the state evaluated last. Collective."""
         if not self.law.has_friction:
             return
         kept = {name: self.history.values(name) for name in self.history.names}
