@@ -164,9 +164,8 @@ class IncrementSolver:
         led = np.where(self._full.constrained, before, self._full.state())
         self._first_touch.count_slip(led, solver.end_without)
         solver.starts.change = state.change
-        # The latest of the states to which bodies were led before the iteration.
-        ends = self._approach.carried, self._first_touch.end, points.end
-        solver.starts.carried = next((end for end in reversed(ends) if end is not None), None)
+        ended = self._first_touch.end if points.end is None else points.end
+        solver.starts.expected = ended
         with solver.system.acting():
             reason, attempts, rounds = solver.solve(
                 cold=cold,

@@ -194,7 +194,7 @@ REFUSED = {
     pushed_aside: "no contact force can balance",
     without_number: "not finite",
     out_of_range: "friction",
-    half_as_steep: "has length 2",
+    half_as_steep: "gradient of the gap of the SignedDistance differs by 1",
     through_a_plate: "has crossed",
     beyond_its_limit: "overload",
 }

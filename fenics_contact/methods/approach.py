@@ -57,12 +57,7 @@ def _feeling(jumps: Array) -> Mask:
 
 
 class Approach:
-    """Where bodies without contact come from and go to.
-
-    Attributes:
-        carried: The state in which bodies have gone with obstacles that moved, as `lead` found it;
-            None: none has.
-    """
+    """Where bodies without contact come from and go to."""
 
     def __init__(self, full: FullSystem, motions: RigidBodyModes) -> None:
         """Nothing has moved yet.
@@ -72,7 +67,6 @@ class Approach:
             motions: Rigid motions of the bodies.
         """
         self._full, self._motions = full, motions
-        self.carried: Array | None = None
 
     def lead(self, load: Array, before: Array, *, first: bool) -> bool:
         """Set bodies that nothing holds yet down, or move them to first touch. Collective.
@@ -89,7 +83,6 @@ class Approach:
             Whether nothing was borne before.
         """
         full, motions = self._full, self._motions
-        self.carried = None
         if not len(motions.free):
             return first
         for contact in full.contacts:
@@ -110,58 +103,11 @@ class Approach:
             # point that does not tell.
             untouched = untouched[motions.of_any_body()[untouched]]
         which = np.union1d(untouched, np.flatnonzero(idle))
-        carried = self._carried(~idle) if finite and not first and not idle.all() else None
-        if carried is not None:
-            # Bodies slip then by what they did: set down they slip by what has moved, too.
-            here = full.state()
-            self._move(np.arange(len(idle)), carried)
-            self.carried = full.state()
-            if not idle.any() and len(which) == len(idle) and not len(self._untouched()):
-                self._follow_stiffness()
-                return False
-            self._go(here)
         # Groups of coupled bodies come to rest apart, and those without load stay.
-        positioned = np.zeros(len(idle), dtype=np.bool_)
         for group in np.unique(groups[which]):
             if load_size[group] > 0:
-                positioned |= groups == group
                 self._set_down(load, before, which[groups[which] == group])
-        if carried is not None and positioned.any():  # the others are carried beside them
-            here = full.state()
-            self._move(np.arange(len(idle)), np.where(positioned, 0.0, carried))
-            self.carried = full.state()
-            self._go(here)
         return first or bool(idle.any())
-
-    def _carried(self, chosen: Mask) -> Array | None:
-        """How obstacles that have moved take bodies along. Collective.
-
-        Args:
-            chosen: Which of the free motions may be taken along, (n_free,).
-
-        Returns:
-            Coefficients of the free motions; None: no obstacle has moved.
-        """
-        contacts, comm = self._full.contacts, self._full.unknowns.comm
-        n_free = len(self._motions.free)
-        gram: Array = np.zeros((n_free, n_free))
-        work: Array = np.zeros(n_free)
-        for contact, jumps in zip(contacts, self._felt(np.arange(n_free))[1], strict=True):
-            points, way = contact.state.points, np.zeros(contact.points.shape)
-            if points is None:
-                continue
-            if contact.opposite.carries:
-                way, _ = contact.opposite.carried(points, points.total_traction)
-            if not contact.law.has_tangential:
-                jumps = np.sum(jumps * points.normal, axis=2, keepdims=True) * points.normal
-            weights = contact.measure * np.abs(contact.history.values("normal_traction"))
-            jumps = np.where(chosen[:, None, None], jumps, 0.0)
-            gram += np.einsum("mqd,q,nqd->mn", jumps, weights, jumps)
-            work += np.einsum("mqd,q,qd->m", jumps, weights, way)
-        gram, work = global_sum(comm, gram), global_sum(comm, work)
-        if not np.abs(work).max() > 0:
-            return None
-        return agreed(comm, np.linalg.lstsq(gram, work, rcond=NEGLIGIBLE)[0])
 
     def _untouched(self) -> Index:
         """Free motions of what no closed point touches, by their numbers. Collective."""

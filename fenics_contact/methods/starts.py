@@ -45,13 +45,14 @@ class Starts:
         predict: Whether a step on it may be chosen.
         change: By what the last committed increment changed the state of the full system; None:
             it is not known.
-        carried: The state in which bodies have gone with obstacles that moved; None: none has.
+        expected: The state in which the increment ends if nothing touches that was apart, or in
+            which it ended between other pairs; None: it is not known.
     """
 
     def __init__(self, equations: Equations) -> None:
         """Nothing is known yet."""
         self.factored = self.predict = False
-        self.carried: Array | None = None
+        self.expected: Array | None = None
         self.change: Array | None = None
         self._equations = equations
         self._moved: Array | None = None  # of the values prescribed, since the last increment
@@ -99,7 +100,7 @@ class Starts:
         Collective. The present state; that state with one step of Newton's method on the tangent of
         the last solution (`_stepped`, with a nonlinear bulk and other prescribed values
         `_followed`), or where there is none continued as in the last increment (`_continued`); and
-        bodies that have gone with obstacles that have moved as rigid ones.
+        where it is expected to end.
 
         At the present state itself no point has slipped yet, and all closed ones stick: from there
         Newton's method takes ten steps to let them slip again, one after another from the edge of
@@ -155,8 +156,8 @@ class Starts:
         self._moved = None
         if first_round and not predicts and not cold and self.change is not None:
             add(self._continued(present, forces, self.change))
-        if self.carried is not None and first_round:
-            add(system.part(self.carried))
+        if self.expected is not None and first_round:
+            add(system.part(self.expected))
         if step is not None and not turned and residuals[step] <= _FAR * min(residuals):
             return starts[step]
         return starts[int(np.argmin(residuals))]
