@@ -498,6 +498,14 @@ class Contact(PointResults):
         x = self.values.x
         return x + self.own_displacement() if self.finite else x
 
+    def true_placement(self) -> tuple[Array, Array]:
+        """Return the gap and the normal at the deformed position X + u. Collective.
+
+        Returns:
+            Arrays (n_points,) (length) and (n_points, gdim).
+        """
+        return self.opposite.true_placement(self.values)
+
     @cached_property
     def traces(self) -> TraceProjection:
         """The L² projection onto the multiplier space on Γc. Collective."""
@@ -626,6 +634,16 @@ class Contact(PointResults):
         history = self.opposite.committed_fields(values)
         return ContactTrial(points, history, self.history.rows(), self.opposite.state())
 
+    def set_down(self, moved: Mask) -> None:
+        """Measure slip from the state evaluated last at points that were unloaded. Collective.
+
+        It is called after the initial positioning of bodies. `restore` undoes it.
+
+        Args:
+            moved: Mask of the points that the positioning moved, (n_points,).
+        """
+        self._count_from_here(moved & (self.history.values("normal_traction") == 0.0))
+
     def count_slip_from_here(self, points: Mask) -> None:
         """Measure slip at some points from the state evaluated last, where they touch. Collective.
 
@@ -634,6 +652,10 @@ class Contact(PointResults):
         Args:
             points: Mask of the points, (n_points,).
         """
+        self._count_from_here(points)
+
+    def _count_from_here(self, points: Mask) -> None:
+        """Measure slip at some points from the state evaluated last. Collective."""
         if not self.law.has_friction:
             return
         kept = {name: self.history.values(name) for name in self.history.names}
