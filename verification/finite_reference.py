@@ -665,7 +665,7 @@ class FiniteJudge(fuzz_judge.Judge):
         load = self._load(record["stage"], record["load"])
         super().check_increment(record)
         self.problem.before = self._other.before = load
-        whole = self.problem.full.bulk(self._u)[2]
+        whole = self.problem.bulk(self._u)[2]
         name = f"stage {record['stage']} at {record['load']:.4g}"
         self._check(name, "inverted cells", 0.0 if whole else 2.0, 1.0)
 
