@@ -161,6 +161,7 @@ class IncrementSolver:
         solver.update_system(stiffness_changed)
         self._full.scales.begin(self._full.operators)
         solver.system.begin(load)
+        solver.equations.began = state.unknowns
         led = np.where(self._full.constrained, before, self._full.state())
         self._first_touch.count_slip(led, solver.end_without)
         solver.starts.change = state.change

@@ -13,8 +13,8 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact.checks.ejected_bodies import find_ejected_bodies
 from fenics_contact.elasticity import LinearElastic, NeoHookean
+from fenics_contact.systems.ejected_bodies import find_ejected_bodies
 from scenes.beside import Beside, Box
 from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block_mesh, dimension
 from scenes.bodies import Bodies, boxes

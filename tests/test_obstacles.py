@@ -111,17 +111,46 @@ def test_an_own_obstacle_must_be_a_distance(kinematics, wrong, error):
     assert abs(forces[0][0]) > 0.1 * abs(forces[0][1])
 
 
+@pytest.mark.parametrize("data", ["function", "coordinates"])
+def test_a_distance_with_data_on_the_mesh_must_be_one(data):
+    """2 (level - x_1) has a gradient of 2, level a function or an expression of coordinates."""
+    forces = []
+    for factor in (1.0, 2.0):
+        scene = rubber(n=(4, 2), linear=True)
+        level = fem.Function(fem.functionspace(scene.mesh, ("Lagrange", 1)))
+        level.x.array[:] = scene.height - 0.01
+        if data == "coordinates":
+            level = scene.height - 0.01 + 0 * ufl.SpatialCoordinate(scene.mesh)[0]
+
+        def distance(x, factor=factor, level=level):
+            return factor * (level - x[1])
+
+        small = {"kinematics": "small"}
+        obstacle = fc.SignedDistance(distance)
+        problem, contact = scene.problem(obstacle, fc.Frictionless(), contact=small)
+        if factor == 2.0:
+            with pytest.raises(fc.NotConverged, match="SignedDistance differs by 1 from"):
+                problem.solve()
+        else:
+            problem.solve()
+            forces.append(contact.resultants().normal_force)
+    assert forces[0] > 0
+
+
 @pytest.mark.parametrize(
     ("place", "words"),
     [
         (lambda x: (x[1], -x), "returns a tuple"),
-        (lambda x: fc.Placement(x, -x), r"gap of shape \(2,\)"),
+        (lambda x: fc.Placement(x, -x), "gap of shape (2,)"),
         (
             lambda x: fc.Placement(x[1], ufl.as_vector([0.0, -1.0, 0.0])),
-            r"direction of shape \(3,\)",
+            "direction of shape (3,)",
         ),
         (lambda x: fc.Placement(x[1], x + ufl.as_vector([0.0, -1.0, 0.0])), "shapes"),
         (lambda x: {}["center"], "KeyError: 'center'"),
+        (lambda x: fc.Placement(None, -x), "conver"),
+        (lambda x: fc.Placement(x[1], 1.0), "Expecting"),
+        (lambda x: fc.Placement(x[1], ufl.as_vector([0.0, 0.0])), "zero"),
     ],
 )
 def test_what_place_returns_is_checked(place, words):

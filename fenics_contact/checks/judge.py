@@ -8,7 +8,6 @@ import numpy as np
 
 from fenics_contact.arguments import check_bool
 from fenics_contact.checks.cross_check import CrossCheck
-from fenics_contact.checks.ejected_bodies import find_ejected_bodies
 from fenics_contact.checks.kinematics import Linearisation, linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.quadrature_resolution import warn_of_divided_facets, warn_of_few_points
@@ -16,6 +15,7 @@ from fenics_contact.checks.tunnelling import TunnellingCheck
 from fenics_contact.checks.verdict import ForceBalance, Verdict, check_laws
 from fenics_contact.parallel import global_sum, warn
 from fenics_contact.systems.balance import InitialForces
+from fenics_contact.systems.ejected_bodies import find_ejected_bodies
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes

@@ -30,8 +30,8 @@ class ObstacleCheck:
     Attributes:
         obstacle: The class of the obstacle.
         gradient_error: Largest difference between the gradient of the gap and minus the normal, at
-            closed points; NaN if gap or gradient are no numbers. It is not known of a gap given on
-            Γc, and 0 then.
+            closed points; NaN if gap or gradient are no numbers. 0 of a gap given on Γc, which has
+            no gradient; of a `SampledObstacle` by how much its normal is no unit vector.
         depth: With finite kinematics, the largest penetration divided by the distance from there to
             the centre of curvature of the obstacle.
         turn: Rotation of the obstacle in this increment, with friction (radians).
@@ -46,18 +46,13 @@ class ObstacleCheck:
     def of(cls, contact: Contact) -> ObstacleCheck:
         """Evaluate the obstacle of a contact at its evaluated state. Collective."""
         comm, closed = contact.surface.mesh.comm, contact.status != Status.OPEN
-        sampler, values = contact.opposite.sampler, contact.values
-        depth = error = 0.0
-        if sampler is not None:
-            # Where the law takes it: at X with small displacements, at X + u with finite ones.
-            place = values.x + values.jump - (0.0 if contact.finite else contact.own_displacement())
-            errors = sampler.gradient_error(place)
-            if contact.finite:
-                # No law takes a gap for closed that is not a number, or has no normal.
-                gap, _ = contact.opposite.true_placement(values)
-                errors = np.where(np.isnan(gap), np.nan, errors)
-                closed |= ~(gap > 0) & np.isnan(errors)
-            error = global_max(comm, errors[closed])
+        errors, depth = contact.opposite.gradient_error(contact.values), 0.0
+        if contact.finite:
+            # No law takes a gap for closed that is not a number, or has no normal.
+            gap, _ = contact.opposite.true_placement(contact.values)
+            errors = np.where(np.isnan(gap), np.nan, errors)
+            closed |= ~(gap > 0) & np.isnan(errors)
+        error = global_max(comm, errors[closed])
         curvature = contact.opposite.largest_curvature()
         if curvature is not None and not contact.obstacle.is_flat:
             depth = global_max(comm, (contact.values.penetration * curvature)[closed])
@@ -71,7 +66,7 @@ class ObstacleCheck:
             f"in the contact zone the gradient of the gap of the {self.obstacle} differs by "
             f"{self.gradient_error:.3g} from minus its unit normal; it must be a distance, with a "
             "gradient of length 1, and its direction minus the gradient: divide the function by "
-            "the length of its gradient"
+            "the length of its gradient, or give a gap along another direction as PrescribedGap"
         )
         if np.isnan(self.gradient_error):
             distance = (

@@ -454,6 +454,19 @@ class Opposite(ABC):
         data = self.data.values
         return rotation.rate(data["x"] + jump - data["about"] - data.get("obstacle", 0.0))
 
+    def gradient_error(self, values: PointValues) -> Array:
+        """Difference of the gradient of a rigid obstacle's gap from minus the unit normal.
+
+        At X with small displacements, at X + u with finite ones. Collective.
+
+        Args:
+            values: Of the last evaluation.
+
+        Returns:
+            (n_points,); 0 of a gap that is given on Γc, and between bodies.
+        """
+        return np.zeros(len(values.x))
+
     def curvature(self) -> Array:
         """Second derivatives of the distance at X + u, (n_points, gdim, gdim) (1/length).
 

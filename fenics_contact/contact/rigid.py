@@ -27,6 +27,7 @@ from fenics_contact.contact.point_law import PointLaw, PointTangent
 from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues
 from fenics_contact.obstacles.base import Placement, SampledObstacle
+from fenics_contact.surface.surface import PointEvaluator
 from fenics_contact.types import Array
 
 __all__ = ["MovingOpposite", "RigidOpposite"]
@@ -58,11 +59,26 @@ class RigidOpposite(Opposite):
             placement = _placed(parts, x, moved)
         self._deformed = DeformedPlaces(parts.quadrature, jump, placement)
         self.sampler = _sampler(parts)
+        self._errors_on_surface: PointEvaluator | None = None
+        if at_rest is None and self.sampler is None and _has_gradient(parts):
+            here = ufl.variable(frame.into(x))
+            placement = _in_frame(parts, here)
+            error = ufl.diff(placement.gap, here) + placement.normal
+            self._errors_on_surface = PointEvaluator(parts.quadrature, {"error": error})
 
     @property
     def is_flat(self) -> bool:
         """See `Opposite`."""
         return self._parts.obstacle.is_flat and self._varying is None
+
+    def gradient_error(self, values: PointValues) -> Array:
+        """See `Opposite`."""
+        if self.sampler is not None:
+            place = values.x + values.jump - self.pairs.own_displacement()
+            return self.sampler.gradient_error(place)
+        if self._errors_on_surface is None:
+            return super().gradient_error(values)
+        return np.asarray(np.linalg.norm(self._errors_on_surface()["error"], axis=1))
 
     def true_placement(self, values: PointValues) -> tuple[Array, Array]:
         """See `Opposite`."""
@@ -158,6 +174,11 @@ class MovingOpposite(Opposite):
             traction = rotation.turned(traction, turn)
         return way, traction
 
+    def gradient_error(self, values: PointValues) -> Array:
+        """See `Opposite`."""
+        assert self.sampler is not None
+        return self.sampler.gradient_error(values.x + values.jump)
+
     def curvature(self) -> Array:
         """See `Opposite`."""
         turns = [self._view.values(f"turn {i}") for i in range(self._gdim)]
@@ -204,11 +225,21 @@ def _in_frame(parts: Parts, z: Any) -> Placement:
 
 def _placed(parts: Parts, x: Any, frame: Frame) -> Placement:
     """Where a displaced rigid obstacle is, seen from x (UFL)."""
-    placement, mesh = _in_frame(parts, frame.into(x)), parts.quadrature.surface.mesh
-    if frame.shift is None or depends_on_place(lambda z: _in_frame(parts, z), mesh):
+    placement = _in_frame(parts, frame.into(x))
+    if frame.shift is None or _depends_on_place(parts):
         return placement
     # What is given on Γc is given for the obstacle at rest.
     return replace(placement, gap=placement.gap + ufl.dot(frame.shift, placement.normal))
+
+
+def _depends_on_place(parts: Parts) -> bool:
+    """Whether the gap is a function of the place; else it is one on Γc."""
+    return depends_on_place(lambda z: _in_frame(parts, z), parts.quadrature.surface.mesh)
+
+
+def _has_gradient(parts: Parts) -> bool:
+    """Whether the gap that acts is a function of the place."""
+    return parts.gap is None and _depends_on_place(parts)
 
 
 def _sampler(parts: Parts) -> ObstacleSampler | None:

@@ -19,6 +19,7 @@ from fenics_contact.methods.limit_analysis import Overload, find_overload
 from fenics_contact.methods.regularisation import LooseModes
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.systems.balance import InitialForces, Norms
+from fenics_contact.systems.ejected_bodies import find_ejected_bodies
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.hierarchy import Hierarchy
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
@@ -48,6 +49,7 @@ class Equations:
         watch: What becomes of the status of the points from iteration to iteration.
         norms: Norms where `residual` was computed last.
         start: Forces at the beginning of the increment.
+        began: State of `full` there.
         has_round_off: Whether a matrix was assembled in this increment, which tells the round-off
             of its residuals.
         rtol: Residual that ends the whole solution, as a share of the forces.
@@ -95,6 +97,7 @@ class Equations:
         self._h0_is_made = False
         self._hardness: tuple[Any, float] | None = None  # of what, and how much
         self.system: System = full
+        self.began = full.state()
         self.has_round_off = False
         self.solution, self.function = full.vector(), full.vector()
 
@@ -115,14 +118,18 @@ class Equations:
     def residual(self, x: PETSc.Vec, f: PETSc.Vec) -> Norms:
         """Compute the residual at ``x`` into ``f``, and its norms, kept too. Collective.
 
-        It is not a number where cells are turned inside out, obstacles have turned too far, or Γc
-        has no tangent plane.
+        It is not a number where cells are turned inside out, obstacles have turned too far, Γc has
+        no tangent plane, or bodies are ejected.
         """
         self.set_state(x)
         contacts = self.system.contact_forces()
         total = sum(contacts, self.system.bulk_force())
         system = self.system
-        if self._bulk.is_inverted() or system.is_twisted() or system.is_degenerate():
+        # Newton's method would end there: nothing acts on such a body.
+        ejected = system is self.full and find_ejected_bodies(
+            self.full, self.motions, contacts, self.began
+        )
+        if ejected or self._bulk.is_inverted() or system.is_twisted() or system.is_degenerate():
             total[:] = np.nan  # a line search takes a shorter step
         self.norms = self.system.norms(total, contacts, self.start)
         # No line search is to follow the round-off of a stiff body beside what is left on others.

@@ -249,6 +249,9 @@ class Obstacle:
         name, d = f"{type(self).__name__}.place", x.ufl_shape[0]
         try:
             found = self.place(x, to_ufl)
+            if isinstance(found, Placement):
+                found = Placement(ufl.as_ufl(found.gap), ufl.as_vector(found.direction))
+                ufl.as_ufl(found.normal)  # which a direction of zeros does not have
         except Exception as error:
             if type(self).__module__.split(".")[0] == __name__.split(".")[0]:
                 raise
@@ -261,13 +264,13 @@ class Obstacle:
                 f"{name} returns a {type(found).__name__}; it must return a Placement(gap, "
                 "direction)"
             )
-        gap, direction = ufl.as_ufl(found.gap), ufl.as_vector(found.direction)
-        if gap.ufl_shape != () or direction.ufl_shape != (d,):
+        gap, direction = found.gap.ufl_shape, found.direction.ufl_shape
+        if gap != () or direction != (d,):
             raise ValueError(
-                f"{name} returns a gap of shape {gap.ufl_shape} and a direction of shape "
-                f"{direction.ufl_shape}; they must be () and ({d},)"
+                f"{name} returns a gap of shape {gap} and a direction of shape {direction}; they "
+                f"must be () and ({d},)"
             )
-        return Placement(gap, direction)
+        return found
 
 
 @dataclass(frozen=True)
