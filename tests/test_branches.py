@@ -99,7 +99,7 @@ def test_a_locked_wedge_is_not_taken_for_a_released_one(pull, method):
 
 def test_popping_out_is_no_solution(monkeypatch):
     """Led there by a start that goes on sliding, it is refused with the reason; all else stays."""
-    monkeypatch.setattr(Starts, "_turned_groups", lambda self, start: np.zeros(9, dtype=bool))
+    monkeypatch.setattr(Starts, "turned_groups", lambda self, start: np.zeros(9, dtype=bool))
     scene, problem, contacts = wedge(method="newton")
     scene.load(up=-PRESS)
     with warnings.catch_warnings():

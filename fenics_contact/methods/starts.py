@@ -143,7 +143,7 @@ class Starts:
         if self._moved is not None:
             if predicts:
                 step = add(self._followed(present))
-                turns = self._turned_groups(starts[step]).any()
+                turns = self.turned_groups(starts[step]).any()
                 step = step if residuals[step] < residuals[0] and not turns else None
             if step is None:
                 add(self._followed(present, anew=True))
@@ -152,7 +152,7 @@ class Starts:
             if tractions is not None or (predicts and equations.full.bulk.linear):
                 stepped = self._stepped(present, tractions)
                 if stepped is not None:
-                    turned = self._turned_groups(stepped)
+                    turned = self.turned_groups(stepped)
                     if tractions is None:
                         stays = turned[scales.group[system.label]]
                         step = add(np.where(stays, present, stepped))
@@ -187,7 +187,7 @@ class Starts:
         stiff = abs(first - last) > FLAT * abs(first)  # else the way feels no stiffness
         return present + first / (first - last) * way if stiff and np.isfinite(last) else present
 
-    def _turned_groups(self, start: Array) -> Mask:
+    def turned_groups(self, start: Array) -> Mask:
         """Groups on which committed friction does work on the way to a start. Collective."""
         equations, scales = self._equations, self._equations.full.scales
         equations.system.set_state(start)
