@@ -119,18 +119,18 @@ def _cost(folder: Path) -> list[str]:
     for name, runs in SIZES.items():
         largest = max(int(row["dofs"]) for row in tables[name])
         solves = {r["run"]: r["linear solves"] for r in tables[name] if int(r["dofs"]) == largest}
-        costs = "; ".join(f"{run} {report.number(solves[run])}" for run in runs[1:])
+        times = "; ".join(f"{run} {report.number(solves[run])}" for run in runs[1:])
         data = f"[sizes](benchmarks/{name}/{name}_sizes.csv), [runs](benchmarks/{name}/{name}.csv)"
-        items.append(f"- **{TITLES[name]}**, {largest} dofs: {costs} ({data})")
+        items.append(f"- **{TITLES[name]}**, {largest} dofs: {times} ({data})")
     joint = report.read(folder / "bolted_joint/bolted_joint.csv")
     refused = [row for row in joint if row["method"].startswith("refused")]
     solved = [float(row["linear solves"]) for row in joint if row not in refused]
-    costs = " and ".join(report.number(row["linear solves"]) for row in refused)
+    refusals = " and ".join(report.number(row["linear solves"]) for row in refused)
     lines += report.text(
         *items,
         "- **bolted joint**, three bodies, quadratic tetrahedra, "
         f"{joint[0]['dofs']} dofs: {min(solved):.1f} to {max(solved):.1f} for an increment; "
-        f"{costs} for the refusal of a load above the friction limit, on one and two ranks "
+        f"{refusals} for the refusal of a load above the friction limit, on one and two ranks "
         "([all runs](benchmarks/bolted_joint/bolted_joint.csv))",
         '"Interior at the end": `increments(..., recover_interior="last")`. Newton iterations at '
         "large strains are in [finite.csv](benchmarks/finite/finite.csv).",

@@ -41,7 +41,10 @@ def runs(case: costs.Case) -> dict[str, Callable[[], Row]]:
         name = f"μ = {friction:g}: {costs.PLAIN['direct']}"
         found[name] = partial(case.plain, friction)
     for friction, steps in HISTORIES:
-        found[f"μ = {friction:g}, {steps} increments"] = partial(case.package, friction, steps)
+        name, field = f"μ = {friction:g}, {steps} increments", "every"
+        if steps > 1:
+            name, field = name + costs.AT_END, "last"
+        found[name] = partial(case.package, friction, steps, field)
     return found
 
 

@@ -165,8 +165,7 @@ class IncrementSolver:
         led = np.where(self._full.constrained, before, self._full.state())
         self._first_touch.count_slip(led, solver.end_without)
         solver.starts.change = state.change
-        ended = self._first_touch.end if points.end is None else points.end
-        solver.starts.expected = ended
+        solver.starts.expected = self._first_touch.end if points.end is None else points.end
         with solver.system.acting():
             reason, attempts, rounds = solver.solve(
                 cold=cold,

@@ -12,7 +12,6 @@ import pytest
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact.methods.starts import Starts
 from scenes.blocks import LEFT, RIGHT, block
 from scenes.comparing import close
 
@@ -62,11 +61,10 @@ def released(steps, **options):
 
 @pytest.mark.parametrize("method", [None, "newton", "continuation"])
 def test_a_locked_wedge_stays(method):
-    """Let go in one increment: the force of eight, within 2 %."""
+    """Let go in one increment that is cut where it pops out: the force of eight, within 2 %."""
     expected, steps = released(8)
     assert len(steps) == 8 and np.all(expected > 5.0)
-    found, taken = released(1, method=method)
-    assert len(taken) == 1 or method == "continuation"  # which is cut
+    found, _ = released(1, method=method)
     assert close(found, expected, 0.02)
 
 
@@ -97,9 +95,8 @@ def test_a_locked_wedge_is_not_taken_for_a_released_one(pull, method):
     assert close(np.array(forces[0]), np.array(forces[1]), 0.02)
 
 
-def test_popping_out_is_no_solution(monkeypatch):
-    """Led there by a start that goes on sliding, it is refused with the reason; all else stays."""
-    monkeypatch.setattr(Starts, "turned_groups", lambda self, start: np.zeros(9, dtype=bool))
+def test_popping_out_is_no_solution():
+    """Without increments to cut it is refused, with the reason, and u and history stay."""
     scene, problem, contacts = wedge(method="newton")
     scene.load(up=-PRESS)
     with warnings.catch_warnings():

@@ -313,7 +313,7 @@ def test_a_body_that_is_thrown_out_is_told_of():
         forces = problem.full.contact_forces()
         found = find_ejected_bodies(problem.full, problem.motions, forces, before)
         assert [name.split(",")[0] for name in found] == names
-        assert all(close(np.array(ways), [2.0, 0.0], 1e-12) for ways in found.values())
+        assert all(close(np.array(ways)[[0, 2]], [2.0, 0.0], 1e-12) for ways in found.values())
 
 
 @pytest.mark.parametrize("bulk", ["linear", "rubber"])

@@ -5,6 +5,8 @@ import pytest
 from mpi4py import MPI
 
 import fenics_contact as fc
+from scenes.beside import Beside, Box
+from scenes.blocks import BOTTOM, TOP
 from scenes.comparing import close, owned, raised_everywhere, shared_folder
 from scenes.rubbing import SAME, Rub, limited, same_states
 
@@ -198,3 +200,18 @@ def test_wrong_field():
             fc.increments(made.problem, made.load, recover_interior=field)
         )
         raised_everywhere(call, ValueError, "every")
+
+
+def test_a_body_that_no_contact_touches_beside_one_that_lags():
+    """It has no retained dof, and the sum of forces on these is 0 of 0; all of it balances."""
+    scene = Beside({"block": Box(), "other": Box((3.0, 0.0))})
+    scene.hold("block", TOP, 0, 1, value=-1e-3)
+    scene.hold("other", BOTTOM, 0, 1)
+    scene.load("other", TOP, 0, scene.bodies.constant(1e-3))
+    floor = fc.HalfSpace((0.0, 0.0), (0.0, 1.0))
+    contact = scene.contact("block", BOTTOM, floor, fc.Frictionless(), name="floor")
+    problem = scene.problem(contact, condensation=True)
+    step = problem.solve(recover_interior=False)
+    assert not step.complete and step.verdict.failures == []
+    whole = problem.complete()
+    assert whole is not None and whole.failures == []

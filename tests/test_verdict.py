@@ -6,6 +6,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
+from fenics_contact.checks.verdict import ForceBalance
 from scenes.comparing import identical
 from scenes.rubbing import PATH, Rub, snapshot, walk
 
@@ -154,3 +155,19 @@ def test_the_verdict_of_a_solution():
         assert verdict.imbalance <= verdict.imbalance_tolerance <= 1e-6 * verdict.force
         assert set(verdict.laws["contact"]) >= {"complementarity", "cone", "slip", "dissipation"}
         assert max(verdict.laws["contact"].values()) <= 1e-10
+
+
+@pytest.mark.parametrize(
+    ("residual", "tolerance", "holds"),
+    [
+        (0.0, 0.0, True),
+        (1.0, 2.0, True),
+        (3.0, 2.0, False),
+        (np.nan, 1.0, False),
+        (1.0, np.inf, False),
+    ],
+)
+def test_a_balance_and_its_condition(residual, tolerance, holds):
+    """Both hold where all is finite and the residual no larger than the tolerance, 0 included."""
+    balance = ForceBalance(residual, 0.0, tolerance)
+    assert balance.holds() == balance.condition("", "").holds == holds

@@ -52,19 +52,23 @@ class ForceBalance:
         """Whether there are forces, that is, more than the residual accepted."""
         return self.force > self.tolerance
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether residual, force and tolerance are finite numbers."""
+        return bool(np.isfinite([self.residual, self.force, self.tolerance]).all())
+
     def holds(self, times: float = 1.0) -> bool:
         """Return whether all is finite and the residual at most ``times`` the tolerance."""
-        finite = np.isfinite([self.residual, self.force, self.tolerance]).all()
-        return bool(finite and self.residual <= times * self.tolerance)
+        return self.is_finite and self.residual <= times * self.tolerance
 
     def condition(self, name: str, failure: str, times: float = 1.0) -> Condition:
         """Return the condition that `holds` looks at."""
-        residual = self.residual if self.holds(np.inf) else np.nan
+        residual = self.residual if self.is_finite else np.nan
         return Condition(name, residual, times * self.tolerance, failure)
 
     def excess(self) -> float:
         """Return the residual divided by the tolerance; infinite if something is not finite."""
-        if not self.holds(np.inf):
+        if not self.is_finite:
             return np.inf
         return self.residual / self.tolerance if self.residual > 0 else 0.0
 
@@ -112,7 +116,7 @@ class Verdict:
         deformation: By body, the largest displacement without rigid-body motion, divided by the
             size of the body or the range of its Dirichlet values, whichever is larger.
         ejected_bodies: By body without contact force that has moved much farther than all others:
-            its displacement, and the largest other one (length).
+            its displacement, the largest one accepted, and the largest other one (length).
         friction_energy_gain: Energy supplied by friction, relative to the energy exchanged.
         inverted: Whether cells of a nonlinear bulk are inverted, det(I + grad u) ≤ 0.
         cross_check: By contact, the largest difference of its nodal forces from those that DOLFINx
@@ -129,7 +133,7 @@ class Verdict:
     small_displacement_error: dict[str, Linearisation] = field(default_factory=dict)
     small_displacement_tolerance: float = np.inf
     deformation: dict[str, float] = field(default_factory=dict)
-    ejected_bodies: dict[str, tuple[float, float]] = field(default_factory=dict)
+    ejected_bodies: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     friction_energy_gain: float = 0.0
     inverted: bool = False
     cross_check: dict[str, ForceBalance] = field(default_factory=dict)
@@ -194,7 +198,7 @@ class Verdict:
     @property
     def is_finite(self) -> bool:
         """Whether all residuals, forces and tolerances of the equations are finite numbers."""
-        return all(balance.holds(np.inf) for balance in self.equations.values())
+        return all(balance.is_finite for balance in self.equations.values())
 
     @property
     def only_laws_fail(self) -> bool:
@@ -264,15 +268,16 @@ class Verdict:
                 "constrained, or the units of stiffness, loads and lengths are not consistent; or "
                 "accept it: ContactProblem(small_displacement_tolerance=inf)"
             )
-            found.append(Condition(f"deformation, {name}", deformation, _MOST_DEFORMED, failure))
-        for name, (way, others) in self.ejected_bodies.items():
+            value = float(np.nan_to_num(deformation))  # a NaN is a failure of the equations
+            found.append(Condition(f"deformation, {name}", value, _MOST_DEFORMED, failure))
+        for name, (way, limit, others) in self.ejected_bodies.items():
             failure = (
                 f"{name} is ejected: it has moved by {way:.2g} and has no contact force, while "
                 f"nothing else has moved by more than {others:.2g}. Use smaller increments "
                 "(increments() halves them where needed), start with the bodies in contact, or "
                 "constrain it by a weak spring"
             )
-            found.append(Condition(f"displacement without force, {name}", way, others, failure))
+            found.append(Condition(f"displacement without force, {name}", way, limit, failure))
         failure = (
             "cells are inverted, det(I + grad u) ≤ 0. Use smaller increments (increments() halves "
             "them where needed), or refine the mesh there"

@@ -40,7 +40,7 @@ def kind_of_opposite(
         gap: Likewise.
 
     Raises:
-        ValueError: It is no word for any, or something was given that has no sense with it.
+        ValueError: ``kinematics`` is unknown, or something was given that has no sense with it.
     """
     if kinematics not in _OPPOSITES:
         raise ValueError(

@@ -524,12 +524,8 @@ class Contact(PointResults):
         The history is not changed.
         """
         self.opposite.update()
-        self._values = self._evaluate()
-
-    def _evaluate(self) -> PointValues:
-        """Return all fields at the points, as they were updated last. Collective."""
         arrays = {**self.opposite.data.values, **self.acting.own.evaluate()}
-        return PointValues.of(arrays | self.opposite.told(arrays))
+        self._values = PointValues.of(arrays | self.opposite.told(arrays))
 
     def evaluate_yield(self) -> tuple[Array, Array]:
         """Evaluate the law's yield functions and their gradients at the present ``u``. Collective.

@@ -105,8 +105,9 @@ class ObstacleSampler:
             with collective_errors(self._comm):
                 found = self._obstacle.sample_checked(place)
             length = np.linalg.norm(found.normal, axis=1, keepdims=True)
-            unit = found.normal / np.where(length > 0, length, 1.0)
-            return found.distance, unit, -found.normal
+            # No gradient is known but the normal, which is one of length 1.
+            gradient = -found.normal / np.where(length > 0, length, np.nan)
+            return found.distance, found.normal, gradient
         n, d = place.shape
         if self._evaluate is None:
             self._evaluate = PointEvaluator(self._quadrature, self._expressions)

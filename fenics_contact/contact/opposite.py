@@ -567,7 +567,7 @@ class Opposite(ABC):
         return False
 
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
-        """Find what lies opposite the points; see `Contact.pair`. Collective.
+        """Find what lies opposite the points; those without an opposite are open. Collective.
 
         On a rigid obstacle there is nothing to find.
 

@@ -72,7 +72,7 @@ class Pairs:
             self.acts = fem.Function(quadrature.space(), name="paired")
 
     def find(self, x: Array, normal: Array, depth: Array, u: fem.Function | None) -> None:
-        """Find the opposites of all points; see `Contact.pair`. Collective.
+        """Find the opposites of all points; those without one are open. Collective.
 
         Args:
             x: Places of the points, (n_points, gdim).

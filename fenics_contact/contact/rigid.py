@@ -59,12 +59,13 @@ class RigidOpposite(Opposite):
             placement = _placed(parts, x, moved)
         self._deformed = DeformedPlaces(parts.quadrature, jump, placement)
         self.sampler = _sampler(parts)
-        self._errors_on_surface: PointEvaluator | None = None
-        if at_rest is None and self.sampler is None and _has_gradient(parts):
+        # Of a distance with data on the mesh, which can be sampled on Γc alone.
+        self._gradient_error: PointEvaluator | None = None
+        if self.sampler is None and parts.gap is None and _depends_on_place(parts):
             here = ufl.variable(frame.into(x))
             placement = _in_frame(parts, here)
             error = ufl.diff(placement.gap, here) + placement.normal
-            self._errors_on_surface = PointEvaluator(parts.quadrature, {"error": error})
+            self._gradient_error = PointEvaluator(parts.quadrature, {"error": error})
 
     @property
     def is_flat(self) -> bool:
@@ -76,9 +77,9 @@ class RigidOpposite(Opposite):
         if self.sampler is not None:
             place = values.x + values.jump - self.pairs.own_displacement()
             return self.sampler.gradient_error(place)
-        if self._errors_on_surface is None:
+        if self._gradient_error is None:
             return super().gradient_error(values)
-        return np.asarray(np.linalg.norm(self._errors_on_surface()["error"], axis=1))
+        return np.asarray(np.linalg.norm(self._gradient_error()["error"], axis=1))
 
     def true_placement(self, values: PointValues) -> tuple[Array, Array]:
         """See `Opposite`."""
@@ -176,8 +177,8 @@ class MovingOpposite(Opposite):
 
     def gradient_error(self, values: PointValues) -> Array:
         """See `Opposite`."""
-        assert self.sampler is not None
-        return self.sampler.gradient_error(values.x + values.jump)
+        error = self._view.values("slope") + self._view.values("normal")
+        return np.asarray(np.linalg.norm(error, axis=1))
 
     def curvature(self) -> Array:
         """See `Opposite`."""
@@ -235,11 +236,6 @@ def _placed(parts: Parts, x: Any, frame: Frame) -> Placement:
 def _depends_on_place(parts: Parts) -> bool:
     """Whether the gap is a function of the place; else it is one on Γc."""
     return depends_on_place(lambda z: _in_frame(parts, z), parts.quadrature.surface.mesh)
-
-
-def _has_gradient(parts: Parts) -> bool:
-    """Whether the gap that acts is a function of the place."""
-    return parts.gap is None and _depends_on_place(parts)
 
 
 def _sampler(parts: Parts) -> ObstacleSampler | None:

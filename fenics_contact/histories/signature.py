@@ -100,7 +100,7 @@ def signature_of_obstacle(obstacle: Obstacle, gdim: int) -> str:
         return ufl.as_ufl(float(rounded)) if rounded.ndim == 0 else ufl.as_tensor(rounded.tolist())
 
     placement = obstacle.placed(symbols.new("place", gdim), to_ufl)
-    return _word(_hashes([placement.gap, ufl.as_vector(placement.direction)], symbols.names))
+    return _word(_hashes([placement.gap, placement.direction], symbols.names))
 
 
 def _word(parts: Iterable[str]) -> str:

@@ -99,8 +99,7 @@ class Approach:
                 untouched = np.union1d(untouched, self._untouched())
             self._go(here)
         if len(untouched) < len(motions.free) and motions.turning:
-            # An obstacle that turns freely is rolled by what its points slip, and first touch is a
-            # point that does not tell.
+            # Where bodies touch, an obstacle that turns freely follows in the iteration.
             untouched = untouched[motions.of_any_body()[untouched]]
         which = np.union1d(untouched, np.flatnonzero(idle))
         # Groups of coupled bodies come to rest apart, and those without load stay.

@@ -88,10 +88,10 @@ class OwnMethod(Method):
     """A method with solvers of its own; a new one is such a class, and a line in `METHODS`.
 
     `solve` starts from ``equations.solution`` and leaves there what it has found, with the data of
-    the contacts as they were; it has converged where ``equations.solved()`` after a
+    the contacts as they were; it has converged where ``equations.solved()`` after an
     ``equations.residual``. Newton's method of `Tools.newton` does both: `Newton.attach` it before
-    every solution, and return what its ``solve`` returns. It fails after 14 iterations without a
-    lower residual, for the methods that follow.
+    every solution, and return what its ``solve`` returns. It gives up after 14 iterations without a
+    lower residual, so that the methods that follow get their turn.
 
     Attributes:
         by_newton: Whether Newton's method found the last solution, so that the consistent tangent

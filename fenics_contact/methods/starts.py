@@ -14,7 +14,7 @@ from fenics_contact.parallel import global_max
 from fenics_contact.systems import dense, linear
 from fenics_contact.systems.system import System
 from fenics_contact.tolerances import FLAT, NEGLIGIBLE
-from fenics_contact.types import Array, Mask
+from fenics_contact.types import Array
 
 __all__ = ["Starts"]
 
@@ -107,15 +107,13 @@ class Starts:
         the contact inwards; and a body that others slide over is dragged along by all of the way,
         in a state that is near equilibrium and far from the solution. The start by a step on the
         tangent of the last solution has the right ones slipping, and is chosen unless it is far
-        off. Groups of bodies that go where friction pulls do not take the step: their load has
-        turned round, and they stick.
+        off, or goes where friction pulls: then the load has turned round, and they stick.
 
         Args:
             first_round: Whether loads and obstacles, and not multipliers, are what changed.
             cold: Whether nothing was borne before.
         """
         equations, system = self._equations, self._equations.system
-        scales = equations.full.scales
         present: Array = system.state()
         # What a step from here takes away leaves the round-off of what was there.
         terms: Array = system.by_body(system.terms(present))[0]
@@ -140,31 +138,27 @@ class Starts:
         predicts, factored = self.predict and not cold, self.factored and not cold
         self.forget()
         step = None  # which of the starts is one on the tangent of the last solution
+        turned = False
         if self._moved is not None:
             if predicts:
                 step = add(self._followed(present))
-                turns = self.turned_groups(starts[step]).any()
-                step = step if residuals[step] < residuals[0] and not turns else None
-            if step is None:
+                turned = self._friction_works()
+            if step is None or turned or not residuals[step] < residuals[0]:
+                step = None
                 add(self._followed(present, anew=True))
         else:
             tractions = self._tractions() if factored and first_round else None
             if tractions is not None or (predicts and equations.full.bulk.linear):
                 stepped = self._stepped(present, tractions)
                 if stepped is not None:
-                    turned = self.turned_groups(stepped)
-                    if tractions is None:
-                        stays = turned[scales.group[system.label]]
-                        step = add(np.where(stays, present, stepped))
-                    else:  # where nothing sticks to an obstacle that has moved
-                        start = add(stepped)
-                        step = None if turned.any() else start
+                    step = add(stepped)
+                    turned = self._friction_works()
         self._moved = None
         if first_round and not predicts and not cold and self.change is not None:
             add(self._continued(present, forces, self.change))
         if self.expected is not None and first_round:
             add(system.part(self.expected))
-        if step is not None and residuals[step] <= _FAR * min(residuals):
+        if step is not None and not turned and residuals[step] <= _FAR * min(residuals):
             return starts[step]
         return starts[int(np.argmin(residuals))]
 
@@ -187,17 +181,15 @@ class Starts:
         stiff = abs(first - last) > FLAT * abs(first)  # else the way feels no stiffness
         return present + first / (first - last) * way if stiff and np.isfinite(last) else present
 
-    def turned_groups(self, start: Array) -> Mask:
-        """Groups on which committed friction does work on the way to a start. Collective."""
-        equations, scales = self._equations, self._equations.full.scales
-        equations.system.set_state(start)
-        work: Array = np.zeros(scales.n_groups)
-        for number, contact in enumerate(equations.contacts):
+    def _friction_works(self) -> bool:
+        """Whether committed friction does work on the way to the start added last. Collective."""
+        work = 0.0
+        for contact in self._equations.contacts:
             contact.evaluate()
             values = contact.values
             power = np.einsum("qi,qi->q", values.old_traction, values.increment)
-            np.add.at(work, scales.group_of_points(number), contact.measure * power)
-        return scales.global_sum(work) > 0.0
+            work += float(contact.measure @ power)
+        return bool(self._equations.full.unknowns.comm.allreduce(work) > 0.0)
 
     def _followed(self, present: Array, *, anew: bool = False) -> Array:
         """Where the body goes with the values prescribed now, by one step from before. Collective.

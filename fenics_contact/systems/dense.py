@@ -89,16 +89,16 @@ class UpdatedLU:
         """Nothing is factored yet."""
         self.error: BaseException | None = None
         self._operator = Sum()
+        nothing: Array = np.zeros((0, 0))
+        none: Index = np.zeros(0, dtype=np.intp)
         # LU of S + C, which S, and the entries of which C.
-        self._factor: tuple[Array, Index]
+        self._factor = nothing, none
         self._factored: tuple[Array, Index, Index, Array] | None = None
         # Columns of the inverse, and of which unknowns; of these those that have changed since, the
         # change, and LU of the system that corrects by it.
-        nothing: Array = np.zeros((0, 0))
-        none: Index = np.zeros(0, dtype=np.intp)
         self._known, self._changed = none, none
         self._columns, self._answers, self._change = nothing, nothing, nothing
-        self._core: tuple[Array, Index]
+        self._core = nothing, none
 
     def raise_kept(self) -> None:
         """Raise what this, or the operator, ran into when PETSc called it last."""

@@ -21,7 +21,7 @@ _FAR = 3.0
 
 def find_ejected_bodies(
     full: FullSystem, motions: RigidBodyModes, contacts: Sequence[Array], began: Array
-) -> dict[str, tuple[float, float]]:
+) -> dict[str, tuple[float, float, float]]:
     """Bodies that have gone away, and on which no force acts. Collective.
 
     Such a body is in equilibrium wherever it is, and a step of an iteration that throws it out of
@@ -36,8 +36,8 @@ def find_ejected_bodies(
         began: The state in which the increment began.
 
     Returns:
-        By its name how far a body has gone, and how far anything else of the bodies that it may
-        touch has, or its own change of shape (length).
+        By its name how far a body has gone, how far it may, and how far anything else of the bodies
+        that it may touch has, or its own change of shape (length).
     """
     scales = full.scales
     fixed = [not contact.opposite.follows for contact in full.contacts]
@@ -63,6 +63,7 @@ def find_ejected_bodies(
     for b in np.flatnonzero(gone):
         way = float(np.linalg.norm(ways[b]))
         rest = float(most[~gone & scales.coupled_with(int(b))].max(initial=most[b]))
-        if way > max(_FAR * rest, FLAT * scales.size[b]):
-            found[full.parts.names[b]] = way, rest
+        limit = max(_FAR * rest, FLAT * float(scales.size[b]))
+        if way > limit:
+            found[full.parts.names[b]] = way, limit, rest
     return found

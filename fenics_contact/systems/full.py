@@ -30,6 +30,7 @@ class FullSystem(System):
     """All unknowns: the dofs of what is solved for and the free motions of obstacles.
 
     Attributes:
+        bcs: Dirichlet conditions.
         displacement: What of it is one.
         stiffness: The bulk's tangent over all unknowns, after `update_stiffness`.
     """
