@@ -162,6 +162,7 @@ def test_the_verdict_of_a_solution():
     [
         (0.0, 0.0, True),
         (1.0, 2.0, True),
+        (1.0, 0.0, False),
         (3.0, 2.0, False),
         (np.nan, 1.0, False),
         (1.0, np.inf, False),
@@ -170,4 +171,5 @@ def test_the_verdict_of_a_solution():
 def test_a_balance_and_its_condition(residual, tolerance, holds):
     """Both hold where all is finite and the residual no larger than the tolerance, 0 included."""
     balance = ForceBalance(residual, 0.0, tolerance)
+    assert (balance.excess() <= 1.0) == holds
     assert balance.holds() == balance.condition("", "").holds == holds

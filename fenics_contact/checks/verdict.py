@@ -68,9 +68,9 @@ class ForceBalance:
 
     def excess(self) -> float:
         """Return the residual divided by the tolerance; infinite if something is not finite."""
-        if not self.is_finite:
-            return np.inf
-        return self.residual / self.tolerance if self.residual > 0 else 0.0
+        if self.is_finite and self.residual == 0.0:
+            return 0.0
+        return self.residual / self.tolerance if self.is_finite and self.tolerance > 0.0 else np.inf
 
     def __str__(self) -> str:
         """Return residual, tolerance and forces in words."""
