@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["check_bool", "check_cells", "check_instance", "is_number", "listed"]
+__all__ = ["check_bool", "check_cells", "check_instance", "is_built_in", "is_number", "listed"]
 
 _CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 
@@ -38,6 +38,11 @@ def check_cells(name: str, kind: str) -> None:
     """
     if kind not in _CELLS:
         raise ValueError(f"{name} has cells of type {kind}; use one of {_CELLS}")
+
+
+def is_built_in(item: object) -> bool:
+    """Whether its class is one of this package, and not of a user."""
+    return type(item).__module__.split(".")[0] == __name__.split(".")[0]
 
 
 def is_number(value: Any) -> bool:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
-from fenics_contact.arguments import check_instance
+from fenics_contact.arguments import check_instance, is_built_in
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.acting import ActingLaw
 from fenics_contact.contact.choices import enforcement_of, kind_of_opposite
@@ -434,8 +434,7 @@ class Contact(PointResults):
 
         Returns True if that cannot be decided: for a `SampledObstacle` and for user-defined laws.
         """
-        own = type(self.law).__module__.split(".")[0] == __name__.split(".")[0]
-        seen = own and not isinstance(self.obstacle, SampledObstacle)
+        seen = is_built_in(self.law) and not isinstance(self.obstacle, SampledObstacle)
         loads = [motion.load() for motion in self.motions]
         return not seen or self.opposite.data.reads(constant) or any(f is constant for f in loads)
 

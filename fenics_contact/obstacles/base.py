@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import ufl
 
-from fenics_contact.arguments import is_number
+from fenics_contact.arguments import is_built_in, is_number
 from fenics_contact.types import Array
 
 __all__ = [
@@ -253,7 +253,7 @@ class Obstacle:
                 found = Placement(ufl.as_ufl(found.gap), ufl.as_vector(found.direction))
                 ufl.as_ufl(found.normal)  # which a direction of zeros does not have
         except Exception as error:
-            if type(self).__module__.split(".")[0] == __name__.split(".")[0]:
+            if is_built_in(self):
                 raise
             raise ValueError(
                 f"{name}(x, to_ufl) fails at a position x of {d} components: "
