@@ -190,7 +190,7 @@ class ContactProblem:
         balance = LoadBalance(self.motions)
         self.initial_penetration = check_start(self.contacts)
         balance.find_free_modes(self.full)
-        self.full.scales.begin(self.full.operators)
+        self.full.scales.begin(self.full.operators, np.zeros_like(self.full.load))
         judge = Judge(self.full, self.motions, tolerance=tolerance, cross_check=cross_check)
         self.solver = Solver(self.full, self.motions, settings)
         self._increments = IncrementSolver(

@@ -222,32 +222,41 @@ def test_a_block_that_was_let_go_is_set_down_on_a_slab():
     assert close(scene.contact.resultants().force, [0.0, 1.0], 1e-8, scale=1.0)
 
 
-def _between_two(n: int, m: int) -> tuple[fc.ContactProblem, fem.Constant, Bodies]:
-    """Blocks of rubber, E = 1000, n, m and m + 2 cells wide, 0.01 apart, the highest moved down."""
-    across = [np.linspace(*ends, k + 1) for ends, k in (((0, 1), n), ((0.2, 0.8), m))]
-    across.append(np.linspace(0.3, 0.7, m + 3))
-    upright = [np.linspace(*ends, 3) for ends in ((0, 0.3), (0.31, 0.51), (0.52, 0.72))]
-    faces = {
-        1: near(1, 0.0),
-        2: between(1, 0.3, above=False),
-        3: between(1, 0.31, above=True),
-        4: between(1, 0.51, above=False),
-        5: between(1, 0.52, above=True),
-        6: near(1, 0.72),
-    }
-    made = boxes(list(zip(across, upright, strict=True)), faces)
-    blocks = Bodies(made, 1e3, 0.3)
-    blocks.F = NeoHookean(blocks.u, 1e3, 0.3, "plane strain").residual(blocks.v)
-    down = blocks.constant()
-    blocks.hold(1, 0, 1)
-    blocks.hold(6, 0)
-    blocks.hold(6, 1, value=down)
-    law = fc.Coulomb(0.6)
+def _stack(
+    blocks: list[tuple[float, float, int, float, float]], friction: float
+) -> tuple[fc.ContactProblem, fem.Constant, fem.Constant, Bodies]:
+    """Blocks of rubber, E = 1000, one above the other, 2 cells high, of which the highest is moved.
+
+    Args:
+        blocks: Left and right end, cells along it, lower and upper end of each, from below.
+        friction: Coefficient.
+
+    Returns:
+        The problem, the displacements of the top up and aside, and the bodies.
+    """
+    axes = [[np.linspace(a, b, n + 1), np.linspace(*ends, 3)] for a, b, n, *ends in blocks]
+    faces = {}
+    for number, (_, _, _, low, high) in enumerate(blocks, 1):
+        faces |= {2 * number - 1: near(1, low), 2 * number: near(1, high)}
+    bodies = Bodies(boxes(axes, faces), 1e3, 0.3)
+    bodies.F = NeoHookean(bodies.u, 1e3, 0.3, "plane strain").residual(bodies.v)
+    up, aside = bodies.constant(), bodies.constant()
+    bodies.hold(1, 0, 1)
+    bodies.hold(2 * len(blocks), 0, value=aside)
+    bodies.hold(2 * len(blocks), 1, value=up)
+    law = fc.Coulomb(friction)
     contacts = [
-        blocks.contact(own, opposite, law, name=name, kinematics="finite")
-        for own, opposite, name in ((3, 2, "lower joint"), (5, 4, "upper joint"))
+        bodies.contact(2 * n + 1, 2 * n, law, name=f"joint {n}", kinematics="finite")
+        for n in range(1, len(blocks))
     ]
-    return blocks.problem(*contacts), down, blocks
+    return bodies.problem(*contacts), up, aside, bodies
+
+
+def _between_two(n: int, m: int) -> tuple[fc.ContactProblem, fem.Constant, Bodies]:
+    """A block m cells wide, 0.01 from both others, n and m + 2 cells wide."""
+    blocks = [(0, 1, n, 0, 0.3), (0.2, 0.8, m, 0.31, 0.51), (0.3, 0.7, m + 2, 0.52, 0.72)]
+    problem, up, _, bodies = _stack(blocks, 0.6)
+    return problem, up, bodies
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
@@ -292,9 +301,32 @@ def test_no_block_is_thrown_out_from_between_two_others(n, m):
     """
     problem, down, _ = _between_two(n, m)
     (step,) = fc.increments(problem, down, 0.0, -0.05, steps=1, max_cuts=0)
-    upper, lower = (step.contacts[f"{name} joint"].force for name in ("upper", "lower"))
+    upper, lower = (step.contacts[f"joint {n}"].force for n in (2, 1))
     assert close(upper, lower, 1e-6)
     assert close(upper[1], 0.0265 * 1e3, 0.05)
+
+
+def test_no_block_that_has_borne_force_is_thrown_out():
+    """Five blocks pressed together, then the top is moved aside, in four increments.
+
+    The middle one went aside by 0.74, off the others, and all was verified, at no force at all.
+    Reference: (-3.967, 21.321) on the lowest joint in forty increments, to 1 %; the path counts.
+    """
+    blocks = [
+        (0, 1, 4, 0, 0.184),
+        (0.263, 0.853, 4, 0.187, 0.375),
+        (0.381, 0.795, 5, 0.378, 0.694),
+        (0.128, 0.757, 7, 0.697, 0.905),
+        (0.290, 0.702, 5, 0.908, 1.199),
+    ]
+    problem, up, aside, _ = _stack(blocks, 0.3)
+
+    def load(t):
+        up.value, aside.value = -0.0607 * min(1, 2 * t), 0.05 * max(0, 2 * t - 1)
+
+    *_, last = fc.increments(problem, load, 0.0, 1.0, steps=4, max_cuts=4)
+    force = last.contacts["joint 1"].force
+    assert np.linalg.norm(force - [-3.967, 21.321]) < 0.01 * 21.7
 
 
 def test_a_body_that_is_thrown_out_is_told_of():
@@ -314,6 +346,25 @@ def test_a_body_that_is_thrown_out_is_told_of():
         found = find_ejected_bodies(problem.full, problem.motions, forces, before)
         assert [name.split(",")[0] for name in found] == names
         assert all(close(np.array(ways)[[0, 2]], [2.0, 0.0], 1e-12) for ways in found.values())
+
+
+@pytest.mark.parametrize("way", [2.5, 3.5])
+def test_a_body_that_a_floor_has_thrown_is_told_of(way):
+    """One that is farther away than three times what the floor has moved by.
+
+    References: the displacements given: the block by `way`, above the floor, which moves by 1.
+    """
+    scene = Free("quadrilateral", "linear", kinematics="finite")
+    problem, u = scene.problem, scene.u
+    scene.shift.value[0] = 1.0
+    before = problem.full.state()
+    u.interpolate(lambda x: np.vstack([way + 0.0 * x[0], 0.5 + 0.0 * x[0]]))
+    scene.contact.evaluate()
+    forces = problem.full.contact_forces()
+    found = find_ejected_bodies(problem.full, problem.motions, forces, before)
+    assert len(found) == (way > 3.0)
+    expected = np.hypot(way, 0.5), 3.0, 1.0
+    assert all(close(np.array(ways), expected, 1e-12) for ways in found.values())
 
 
 @pytest.mark.parametrize("bulk", ["linear", "rubber"])

@@ -25,9 +25,8 @@ def find_ejected_bodies(
     """Bodies that have gone away, and on which no force acts. Collective.
 
     Such a body is in equilibrium wherever it is, and a step of an iteration that throws it out of
-    sight of all others leaves no residual. A wedge that was pressed in may come out as far: only a
-    body that bore nothing at the start of the increment is looked at, and none that a contact with
-    a rigid obstacle touches, whose points may go any way.
+    sight of all others leaves no residual. What its load has pressed in may come out as far as it
+    went in.
 
     Args:
         full: The system at its present state.
@@ -36,14 +35,11 @@ def find_ejected_bodies(
         began: The state in which the increment began.
 
     Returns:
-        By its name how far a body has gone, how far it may, and how far anything else of the bodies
-        that it may touch has, or its own change of shape (length).
+        By its name how far a body has gone, how far it may, and how far anything else of what it
+        may touch has, it has changed its shape, or its load had moved it before (length).
     """
     scales = full.scales
-    fixed = [not contact.opposite.follows for contact in full.contacts]
-    looked_at = (
-        motions.unconstrained_bodies() & scales.unloaded & ~scales.touching[fixed].any(axis=0)
-    )
+    looked_at = motions.unconstrained_bodies()
     if not looked_at.any():
         return {}
     # What has a load is not in equilibrium, and may be on its way to be set down.
@@ -52,18 +48,45 @@ def find_ejected_bodies(
     if not gone.any():
         return {}
     change, bodies = full.state() - began, motions.of_bodies[:, : full.gdim]
-    sums = np.column_stack([bodies @ change, bodies[:, 0].sum(axis=1)])
-    sums = global_sum(full.unknowns.comm, sums)
-    ways = sums[:, :-1] / sums[:, -1:]
-    # Of a body that has gone away it is the change of its shape, or its turn.
+    ways, before, count = global_sum(
+        full.unknowns.comm, np.stack([bodies @ change, bodies @ began, bodies.sum(axis=-1)])
+    )
+    ways /= count
+    before = np.where(scales.unloaded, 0.0, np.linalg.norm(before / count, axis=1))
+    # Of a body that has gone away it is the change of its shape, its turn, or what is prescribed.
     shift = np.where(gone[:, None], ways, 0.0)
-    others = change - np.einsum("bd,bdi->i", shift, bodies)
+    others = change - np.where(full.constrained, 0.0, np.einsum("bd,bdi->i", shift, bodies))
     most = scales.largest(np.where(np.any(bodies != 0.0, axis=(0, 1)), others, 0.0))
+    obstacles = _obstacle_motions(full, change)
+    nearby = np.where(gone, obstacles, np.maximum(most, obstacles))
     found = {}
     for b in np.flatnonzero(gone):
         way = float(np.linalg.norm(ways[b]))
-        rest = float(most[~gone & scales.coupled_with(int(b))].max(initial=most[b]))
+        own = max(most[b], before[b], obstacles[b])
+        rest = float(nearby[scales.coupled_with(int(b))].max(initial=own))
         limit = max(_FAR * rest, FLAT * float(scales.size[b]))
         if way > limit:
             found[full.parts.names[b]] = way, limit, rest
+    return found
+
+
+def _obstacle_motions(full: FullSystem, change: Array) -> Array:
+    """How far rigid obstacles have moved at the points of every body, (n_bodies,) (length).
+
+    Collective. It is what the displacement relative to the obstacle has not changed by with that
+    of the body.
+
+    Args:
+        full: The system at its present state.
+        change: Of its unknowns since the last commit.
+    """
+    scales = full.scales
+    found: Array = np.zeros(scales.n_bodies)
+    of_bodies = np.where(full.label < scales.n_bodies, change, 0.0)
+    for number, operator in enumerate(full.operators):
+        opposite = operator.contact.opposite
+        if not opposite.follows:
+            relative = operator.contact.values.jump - opposite.committed_jump
+            motion = np.linalg.norm(operator.jump(of_bodies) - relative, axis=1)
+            found = np.maximum(found, scales.largest_at_points(number, motion))
     return found

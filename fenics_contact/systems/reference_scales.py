@@ -50,7 +50,7 @@ class ReferenceScales:
             (n_contacts, n_bodies).
         held: Which parts Dirichlet conditions, or springs of the bulk, hold against every rigid
             motion, (n_parts,).
-        unloaded: Which bodies bore no contact force at the start of the increment, (n_bodies,).
+        unloaded: Which bodies no load acted on at the start of the increment, (n_bodies,).
     """
 
     def __init__(
@@ -100,9 +100,7 @@ class ReferenceScales:
         self._turning = n_bodies + np.flatnonzero(turns)
         self.held: Mask = np.ones(n_bodies + n_motions, dtype=np.bool_)
         self._own = [body_of_points(contact, space, body) for contact in contacts]
-        # Pairings whose coupling was found, and the parts on both sides of the points by contact.
-        self._coupled: list[int] | None = None
-        self._partners: list[tuple[Index, Index]] = []
+        self._coupled: list[int] | None = None  # numbers of the pairs whose coupling was found
 
     @property
     def force(self) -> Array:
@@ -130,6 +128,18 @@ class ReferenceScales:
         self._comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
         return found[: self.n_bodies]
 
+    def largest_at_points(self, number: int, values: Array) -> Array:
+        """Largest value of every body at the points of a contact, (n_bodies,). Collective.
+
+        Args:
+            number: Of the contact.
+            values: At this rank's points, (n_points,), not negative.
+        """
+        found: Array = np.zeros(self.n_bodies)
+        np.maximum.at(found, self._own[number], values)
+        self._comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
+        return found
+
     def spread(self, values: Array, chosen: Mask) -> Array:
         """Largest less smallest of some values of every body, (n_bodies,). Collective.
 
@@ -148,37 +158,25 @@ class ReferenceScales:
         found = np.bincount(self.label, np.abs(values), minlength=len(self.group))
         return global_sum(self._comm, found)[: self.n_bodies]
 
-    def begin(self, operators: Sequence[ContactOperator]) -> None:
-        """Find which parts are coupled, and what each bore at the last commit. Collective.
+    def begin(self, operators: Sequence[ContactOperator], load: Array) -> None:
+        """Find which parts are coupled, and which no load acted on at the last commit. Collective.
 
         Args:
             operators: Of the contacts, over all unknowns, at the start of an increment.
+            load: External forces at the last commit, (n_local,) (force).
         """
-        n = len(self.group)
         if self._coupled != (coupled := [o.contact.pairs.number for o in operators]):
             self._coupled = coupled
             self._couple(operators)
-        borne: Array = np.zeros(n)
-        for operator, (one, other) in zip(operators, self._partners, strict=True):
-            committed = operator.contact.state.points
-            if committed is not None:
-                force = operator.contact.measure * np.abs(committed.total_traction).sum(axis=1)
-                borne += np.bincount(one, force, minlength=n)
-                for partner in other.T:
-                    both = np.where(partner == one, 0.0, force)
-                    borne += np.bincount(partner, both, minlength=n)
-        borne = global_sum(self._comm, borne)
-        self.unloaded = self.is_unloaded(borne[: self.n_bodies])
+        self.unloaded = self.is_unloaded(self.sums(load))
 
     def _couple(self, operators: Sequence[ContactOperator]) -> None:
         """Find which parts the pairs of the contacts couple. Collective."""
-        n, self._partners = len(self.group), []
+        n = len(self.group)
         self.touching = np.zeros((len(operators), self.n_bodies), dtype=np.bool_)
         every: list[Any] = [np.zeros((0, 2), dtype=np.intp)]
         for number, operator in enumerate(operators):
-            sides = self._sides(operator, number, self.label)
-            self._partners.append(sides)
-            pairs = self._pairs(*sides, number)
+            pairs = self.pairs(operator, number, self.label)
             self.touching[number, pairs[pairs < self.n_bodies]] = True
             every.append(pairs)
         links = np.concatenate(every)
@@ -247,10 +245,7 @@ class ReferenceScales:
             number: Of the contact.
             label: Part of each of these unknowns.
         """
-        return self._pairs(*self._sides(operator, number, label), number)
-
-    def _pairs(self, own: Index, opposite: Index, number: int) -> Index:
-        """`pairs` of what `_sides` gave. Collective."""
+        own, opposite = self._sides(operator, number, label)
         others = [*opposite.T, *(np.full_like(own, m) for m in self._motions[number])]
         n = len(self.group)
         mine = np.unique(np.concatenate([n * own + other for other in others]))
