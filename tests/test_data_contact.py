@@ -9,6 +9,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from fenics_contact.contact.obstacle_sampler import ObstacleSampler
 from scenes.blocks import TOP, block
 from scenes.comparing import close, gathered, raised_everywhere, shared_folder, sorted_by_place
 from scenes.rubber import TIGHT, disc, domed, rubber
@@ -171,6 +172,69 @@ def test_an_obstacle_of_ones_own_in_numbers():
         return Bubble((0.0, 1.8), 0.8, shift, fc.Rotation(angle, (0.0, 1.8)))
 
     assert close(pressed("triangle", bubble), pressed("triangle", tool(2, "ball")), 1e-9)
+
+
+class NoDistance(Bubble):
+    """A ball whose distance, or whose normal, is not one."""
+
+    def __init__(self, scale, tilt, shift):
+        """``scale`` times the distance, and the normal turned by ``tilt`` (radians)."""
+        super().__init__((0.5, -0.8), 0.8, shift, None)
+        self.scale, self.tilt = scale, tilt
+
+    def sample(self, x):
+        """See `SampledObstacle.sample`."""
+        c, s = np.cos(self.tilt), np.sin(self.tilt)
+        found = super().sample(x)
+        normal = found.normal @ np.array([[c, s], [-s, c]])
+        return fc.Sample(self.scale * found.distance, normal, found.curvature)
+
+
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+@pytest.mark.parametrize(("scale", "tilt"), [(1.0, 0.0), (2.0, 0.0), (0.9, 0.0), (1.0, 0.1)])
+def test_numbers_that_are_no_distance(scale, tilt, kinematics):
+    """Twice the distance was verified, with twice the force, and so was a normal that leans."""
+    scene = block("triangle", 1, n=6)
+    up = fem.Constant(scene.mesh, np.zeros(2))
+    given = {"obstacle": NoDistance(scale, tilt, up), "kinematics": kinematics}
+    bcs = [scene.hold(TOP, 0), scene.hold(TOP, 1)]
+    problem, _ = scene.problem(
+        fc.Frictionless(1e3), bcs, contact=given, small_displacement_tolerance=np.inf
+    )
+    up.value[1] = 0.02
+    if scale == 1.0 and tilt == 0.0:
+        problem.solve()
+    else:
+        words = "the gradient of the gap of the NoDistance differs by", "it must be a distance"
+        raised_everywhere(problem.solve, fc.NotConverged, *words)
+
+
+@pytest.mark.parametrize("spread", [1e-2, 1e-6])
+@pytest.mark.parametrize("shape", ["profile", "facets"])
+def test_differences_across_edges(shape, spread):
+    """Around the edges and corners of an L in the plane, and of a cube: at most 4 % of the normal.
+
+    Reference: the distance to a corner, of which a step of 0.05 sideways takes 2.5 % in each
+    direction.
+    """
+    rng = np.random.default_rng(1)
+    if shape == "profile":
+        corners = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2.0]])
+        obstacle: fc.SampledObstacle = fc.RigidProfile(corners, closed=True)
+        share = rng.uniform(size=(500, 1)) * (rng.uniform(size=(500, 1)) < 0.7)
+        k = rng.integers(len(corners), size=500)
+        x = (1 - share) * corners[k] + share * np.roll(corners, -1, axis=0)[k]
+    else:
+        corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1.0)])
+        sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+        facets = [f for a, b, c, d in sides for f in ((a, b, c), (a, c, d))]
+        obstacle = fc.RigidSurface(corners, facets)
+        x = rng.uniform(size=(500, 3)).clip(0.1, 0.9).round(2)
+        x[np.arange(500), rng.integers(3, size=500)] = rng.integers(2, size=500)
+        x[:100] = corners[rng.integers(8, size=100)]
+    x += spread * rng.normal(size=x.shape)
+    sampler = ObstacleSampler(block("triangle", 1).contact(fc.Frictionless()).quadrature, obstacle)
+    assert sampler.gradient_error(x).max() < 0.04
 
 
 class Faulty(fc.SampledObstacle):

@@ -31,7 +31,7 @@ class ObstacleCheck:
         obstacle: The class of the obstacle.
         gradient_error: Largest difference between the gradient of the gap and minus the normal, at
             closed points; NaN if gap or gradient are no numbers. 0 of a gap given on Γc, which has
-            no gradient; of a `SampledObstacle` by how much its normal is no unit vector.
+            no gradient.
         depth: With finite kinematics, the largest penetration divided by the distance from there to
             the centre of curvature of the obstacle.
         turn: Rotation of the obstacle in this increment, with friction (radians).

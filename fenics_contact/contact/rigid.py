@@ -177,6 +177,8 @@ class MovingOpposite(Opposite):
 
     def gradient_error(self, values: PointValues) -> Array:
         """See `Opposite`."""
+        if self._moved is not None and self.sampler is not None:
+            return self.sampler.gradient_error(self._moved.values("place"))
         error = self._view.values("slope") + self._view.values("normal")
         return np.asarray(np.linalg.norm(error, axis=1))
 
