@@ -210,7 +210,9 @@ class IncrementSolver:
         self.judge.warn_of_round_off(verdict)
         self.judge.warn_of_few_points()
         loaded = [verdict.equations[contact.name].is_loaded for contact in self._contacts]
-        trials = (c.trial(is_loaded=some) for c, some in zip(self._contacts, loaded, strict=True))
+        trials = (
+            c.states.trial(is_loaded=some) for c, some in zip(self._contacts, loaded, strict=True)
+        )
         trial = Trial(self._full.state(), tuple(trials), load, energies, interior)
         step = Step(
             increment=state.increment + 1,
@@ -241,7 +243,7 @@ class IncrementSolver:
         points.begin(self._contacts)
         self._full.set_state(before)
         for contact in self._contacts:
-            contact.forget()
+            contact.states.forget()
 
     def _choose_pairs(
         self, increment: Increment, contacts: Sequence[Contact], interior: Array | None

@@ -212,7 +212,7 @@ class ContactProblem:
         """Return a body at rest, or the state that another problem has left. Collective."""
         unknowns, mark = self.full.state(), self.full.mark
         none = np.zeros_like(unknowns)
-        contacts = tuple(contact.state for contact in self.contacts)
+        contacts = tuple(contact.states.committed for contact in self.contacts)
         if any(state.commits for state in contacts):
             load = self.full.present_load()
             self.full.begin(load)
@@ -349,8 +349,10 @@ class ContactProblem:
         first, self._fresh = self._fresh, False
         if first:
             for contact in self.contacts:
-                contact.begin()
-            self.state = replace(self.state, contacts=tuple(c.state for c in self.contacts))
+                contact.states.begin()
+            self.state = replace(
+                self.state, contacts=tuple(c.states.committed for c in self.contacts)
+            )
             if not self.full.bulk.linear:  # whose tangent is that of u, and E may be another by now
                 self._increments.modulus.measure()
         behind = any(state.interior is not None for state in (self._present, self.state))
@@ -408,9 +410,9 @@ class ContactProblem:
     def _take_committed_pairs(self) -> None:
         """Go back to the committed state of contacts that have other pairs now. Collective."""
         for contact in self.contacts:
-            pairs = contact.state.opposite.pairs
+            pairs = contact.states.committed.opposite.pairs
             if not contact.opposite.follows and contact.pairs.jump_map is not pairs.jump_map:
-                contact.restore()
+                contact.states.restore()
 
     def _is_present(self, unknowns: Array) -> bool:
         """Whether they are those of the present state. Collective."""
@@ -432,7 +434,7 @@ class ContactProblem:
     def _check_histories(self) -> None:
         """Raise a ValueError if a contact was committed elsewhere since the last commit."""
         for contact, state in zip(self.contacts, self.state.contacts, strict=True):
-            if contact.state.commits != state.commits:
+            if contact.states.committed.commits != state.commits:
                 raise ValueError(
                     f"{contact.name}: its history was committed by another problem or by "
                     "Contact.commit() since this problem's last commit, so that this problem "
@@ -445,7 +447,7 @@ class ContactProblem:
         self.full.set_state(unknowns)
         trials = [None] * len(self.contacts) if self._trial is None else self._trial.contacts
         for contact, trial in zip(self.contacts, trials, strict=True):
-            contact.restore(trial)
+            contact.states.restore(trial)
 
     def complete(self) -> Verdict | None:
         """Recover the interior displacement of the increment solved last. Collective.
@@ -465,7 +467,7 @@ class ContactProblem:
             return None
         if is_committed:
             for contact in self.contacts:
-                contact.restore()
+                contact.states.restore()
         before = self.full.state()
         self.solver.system.complete(present.interior)
         self.full.begin(present.load)
@@ -514,17 +516,17 @@ class ContactProblem:
         try:
             self.full.set_state(trial.unknowns)
             for contact, found in zip(self.contacts, trial.contacts, strict=True):
-                contact.commit(found)
+                contact.states.commit(found)
         except BaseException as error:
             fail_together(self._comm, error)
             for contact, state in zip(self.contacts, start.contacts, strict=True):
-                contact.set_state(state)
+                contact.states.set_state(state)
             self.restore()
             raise
         complete = trial.interior is None and start.interior is None
         self.state = State(
             unknowns=self.full.state(),
-            contacts=tuple(contact.state for contact in self.contacts),
+            contacts=tuple(contact.states.committed for contact in self.contacts),
             load=trial.load,
             energy=trial.energy.between([c.opposite.committed_jump for c in self.contacts]),
             change=trial.unknowns - start.unknowns if complete else None,
@@ -607,7 +609,7 @@ class ContactProblem:
 
         Args:
             taken: The state.
-            points: For every contact, the history and values that `Contact.load_restart` takes.
+            points: For every contact, the history and values that `ContactStates.load_restart` takes.
         """
         self.expected_increments = taken.expected
         self._fresh, self._trial = False, None
@@ -618,13 +620,13 @@ class ContactProblem:
         for contact, (history, values), anew in zip(
             self.contacts, points, taken.pairs_anew, strict=True
         ):
-            contact.load_restart(history, values, anew=anew)
+            contact.states.load_restart(history, values, anew=anew)
         found = Forces(taken.state, taken.internal, taken.external, self.full.label)
         forces: dict[object, Forces] = {self.full.mark: found}
         energy = EnergyState.at(forces, self.contacts)
         self.state = State(
             unknowns=taken.state.copy(),
-            contacts=tuple(contact.state for contact in self.contacts),
+            contacts=tuple(contact.states.committed for contact in self.contacts),
             load=load,
             energy=energy.between([c.opposite.committed_jump for c in self.contacts]),
             change=taken.change.copy() if global_max(self._comm, np.abs(taken.change)) else None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fenics_contact.checks.energy import EnergyState
-from fenics_contact.contact.contact import ContactState, ContactTrial
+from fenics_contact.contact.states import ContactState, ContactTrial
 from fenics_contact.types import Array
 
 __all__ = ["State", "Trial"]

@@ -54,7 +54,7 @@ def changed(problem, contact):
 def moved(problem, contact):
     """The displacement itself, set by hand."""
     problem.u.x.array[:] += 1.0
-    contact.forget()
+    contact.states.forget()
 
 
 def twice(problem, contact):

@@ -179,7 +179,7 @@ def test_what_is_not_committed_leaves_no_trace():
             constant.value = value
         scene.problem.solve()
         forces.append(scene.contact.resultants().force)
-        assert np.array_equal(scene.contact.state.history, before)
+        assert np.array_equal(scene.contact.states.committed.history, before)
         scene.problem.restore()
         assert np.array_equal(scene.contact.history.rows(), before)
     assert close(forces[1], forces[0], 1e-9)

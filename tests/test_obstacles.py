@@ -284,7 +284,7 @@ def test_sliding_round_an_obstacle_is_no_passage():
         centre = np.array([[0.0], [scene.height + 1.0]])
         turn = np.array([[c, -s], [s, c]])
         scene.u.interpolate(lambda x, t=turn, m=centre: t @ (x[:2] - m) + m - x[:2])
-        contact.forget()
+        contact.states.forget()
         assert TunnellingCheck([contact]).evaluate(contact.u)[contact.name].crossed is None
 
 

@@ -205,7 +205,7 @@ def test_what_is_not_committed_leaves_no_trace(enforcement):
         problem.solve()
         forces.append(contact.resultants().tangential_force)
         assert not np.array_equal(contact.history.rows(), before) or not len(before)
-        assert np.array_equal(contact.state.history, before)
+        assert np.array_equal(contact.states.committed.history, before)
         problem.restore()
         assert np.array_equal(contact.history.rows(), before)
     scene.traction.value[:] = (5.0, -1.0)  # more than friction holds

@@ -574,10 +574,10 @@ def _record_slip_resets(setup: SceneSetup, contact: fc.Contact) -> None:
         setup.paired_at[contact.name] = _gather_displacement(setup, opposite.pairs.found_at)
         begin(opposite)
 
-    begin, contact.begin_between = contact.begin_between, begin_between  # type: ignore[method-assign]
-    contact.set_down = wrap(contact.set_down, rigid=True)  # type: ignore[method-assign]
-    contact.count_slip_from_here = wrap(  # type: ignore[method-assign]
-        contact.count_slip_from_here, rigid=False
+    begin, contact.states.begin_between = contact.states.begin_between, begin_between  # type: ignore[method-assign]
+    contact.states.set_down = wrap(contact.states.set_down, rigid=True)  # type: ignore[method-assign]
+    contact.states.count_slip_from_here = wrap(  # type: ignore[method-assign]
+        contact.states.count_slip_from_here, rigid=False
     )
 
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -19,9 +16,10 @@ from fenics_contact.contact.acting import ActingLaw
 from fenics_contact.contact.choices import enforcement_of, kind_of_opposite
 from fenics_contact.contact.inputs import FreeMotion, Inputs, varies
 from fenics_contact.contact.multipliers import Multipliers, TraceProjection
-from fenics_contact.contact.opposite import Opposite, OppositeState, Parts
+from fenics_contact.contact.opposite import Opposite, Parts
 from fenics_contact.contact.pairs import Pairs
 from fenics_contact.contact.results import PointResults
+from fenics_contact.contact.states import ContactStates
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law
 from fenics_contact.obstacles.base import Obstacle, SampledObstacle
@@ -32,45 +30,7 @@ from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import ContactSurface, tagged_facets
 from fenics_contact.types import Array, Mask
 
-__all__ = ["Contact", "ContactState", "ContactTrial"]
-
-logger = logging.getLogger("fenics_contact")
-
-
-@dataclass(frozen=True)
-class ContactState:
-    """A committed state of a contact: its history, and the results of the increment before it.
-
-    Attributes:
-        history: Committed tractions, slip and slip reference, and multipliers: `PointFields.rows`.
-        opposite: Committed place of the obstacle, and the pairs.
-        points: All fields at this rank's points; None before the first commit.
-        commits: Number of commits so far.
-    """
-
-    history: Array
-    opposite: OppositeState
-    points: PointValues | None = None
-    commits: int = 0
-
-
-@dataclass(frozen=True)
-class ContactTrial:
-    """A solved state of a contact, which `Contact.commit` makes the committed one.
-
-    Attributes:
-        points: All fields at this rank's quadrature points.
-        history: The fields that become history, by name.
-        reference: The history that the increment started from, with the slip reference of bodies
-            that were positioned: `PointFields.rows`.
-        opposite: Committed place of the obstacle, and the pairs of this state, between which it is
-            measured.
-    """
-
-    points: PointValues
-    history: Mapping[str, Array]
-    reference: Array
-    opposite: OppositeState
+__all__ = ["Contact"]
 
 
 class Contact(PointResults):
@@ -136,7 +96,7 @@ class Contact(PointResults):
         finite: Whether the kinematics are finite.
         opposite: The contact kinematics, those of the obstacle or the opposing body.
         acting: The law evaluated at the points.
-        state: The committed state.
+        states: The committed state, and the results evaluated last.
 
     Raises:
         ValueError: ``u`` is not a displacement on this mesh; data of obstacle or law are invalid.
@@ -240,13 +200,12 @@ class Contact(PointResults):
         )
         self.opposite: Opposite = opposite_kind(parts)
         self.acting = ActingLaw(law, self.opposite, self.quadrature)
-        self._values: PointValues | None = None
         if not self.rigid:
             self.opposite.update()
             self.opposite.find_pairs(None, np.zeros(self.quadrature.n_points))
-        self.opposite.begins_anew()
-        self.state = ContactState(self.history.rows(), self.opposite.state())
-        self._start()
+        self.states = ContactStates(
+            name, law, self.history, self.multipliers, self.opposite, self.acting
+        )
 
     # ---- forms -----------------------------------------------------------------------------------
 
@@ -343,7 +302,7 @@ class Contact(PointResults):
             points: Mask of the points, (n_points,); None: all points.
         """
         self.acting.confine(points)
-        self.forget()
+        self.states.forget()
 
     def springs(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> Array:
         """Return the symmetric stiffness a K_n + b K_t of the quasi-Newton method at the points.
@@ -412,7 +371,7 @@ class Contact(PointResults):
         self.surface.check_places(self.name)
         self.inputs.update()
         self.opposite.update()
-        self.forget()
+        self.states.forget()
         self.inputs.check(self.opposite.data.values, undeformed=not self.finite)
 
     def given(self) -> dict[str, Array]:
@@ -468,19 +427,6 @@ class Contact(PointResults):
         """Number of points without an opposite point, on all ranks."""
         return self.pairs.n_unpaired
 
-    def begin_between(self, opposite: OppositeState) -> None:
-        """Count an increment from its start between other pairs; `restore` undoes it. Collective.
-
-        Args:
-            opposite: The pairs, with the jump between them in the committed state.
-        """
-        moved = opposite.jump - self.opposite.committed_jump
-        self.opposite.set_state(opposite)
-        if self.law.has_friction:
-            kept = {name: self.history.values(name) for name in self.history.names}
-            self.history.assign(kept | {"jump": kept["jump"] + moved})
-        self.forget()
-
     def own_displacement(self) -> Array:
         """Return the displacement of the body that has Γc, (n_points, gdim) (length). Collective.
 
@@ -517,14 +463,21 @@ class Contact(PointResults):
 
     # ---- state -----------------------------------------------------------------------------------
 
+    @property
+    def values(self) -> PointValues:
+        """All fields of the last evaluation at this rank's points."""
+        return self.states.values
+
     def evaluate(self) -> None:
         """Evaluate gap, tractions and slip at the present ``u``. Collective.
 
         The history is not changed.
         """
-        self.opposite.update()
-        arrays = {**self.opposite.data.values, **self.acting.own.evaluate()}
-        self._values = PointValues.of(arrays | self.opposite.told(arrays))
+        self.states.evaluate()
+
+    def commit(self) -> None:
+        """Make the state at the present ``u`` the history of the next increment. Collective."""
+        self.states.commit()
 
     def evaluate_yield(self) -> tuple[Array, Array]:
         """Evaluate the law's yield functions and their gradients at the present ``u``. Collective.
@@ -534,25 +487,6 @@ class Contact(PointResults):
         """
         self.opposite.update()
         return self.acting.own.evaluate_yield()
-
-    def forget(self) -> None:
-        """Discard the last evaluation: the next access to a result evaluates the present ``u``."""
-        self._values = None
-
-    def restore(self, trial: ContactTrial | None = None) -> None:
-        """Restore history, multipliers, pairs and results of the last commit. Collective.
-
-        The results are restored, not evaluated again: at the committed state the law would return
-        stick at points that slipped to it. Before the first commit there are no results.
-
-        Args:
-            trial: A state solved since then, whose results are restored instead.
-        """
-        self.history.set_rows(self.state.history if trial is None else trial.reference)
-        if self.multipliers is not None:
-            self.multipliers.restore(self.history)
-        self.opposite.set_state((trial or self.state).opposite)
-        self._values = (trial or self.state).points
 
     def enforcement_error(self) -> float:
         """Return the traction that is left to the penalty, relative to the largest. Collective.
@@ -586,7 +520,7 @@ class Contact(PointResults):
         self.evaluate()
         error = multipliers.error(self.values, self.history, self.moved())
         multipliers.update(self.values)
-        self.forget()
+        self.states.forget()
         return error
 
     def moved(self) -> Array:
@@ -605,134 +539,3 @@ class Contact(PointResults):
                 'enforcement="augmented"'
             )
         return self.multipliers
-
-    def trial(self, *, is_loaded: bool = True) -> ContactTrial:
-        """Return a copy of the evaluated state, for `commit`.
-
-        Args:
-            is_loaded: Whether there is a contact force (`ForceBalance.is_loaded`). Without one all
-                normal tractions are smaller than the accepted residual, and zero is committed.
-        """
-        points = self.values
-        values = {n: points.arrays[n] for n in ("opening", "penetration", "normal_traction")}
-        if not is_loaded:
-            values["normal_traction"] = np.zeros_like(values["normal_traction"])
-        if self.law.has_friction:
-            values |= {
-                "traction": points.framed_traction,
-                "jump": points.foot,
-                "normal": points.framed_normal,
-                "slip": self.history.values("slip") + points.slip_increment,
-            }
-        if self.multipliers is not None:
-            values |= self.multipliers.committed(points)
-        history = self.opposite.committed_fields(values)
-        return ContactTrial(points, history, self.history.rows(), self.opposite.state())
-
-    def set_down(self, moved: Mask) -> None:
-        """Measure slip from the state evaluated last at points that were unloaded. Collective.
-
-        It is called after the initial positioning of bodies. `restore` undoes it.
-
-        Args:
-            moved: Mask of the points that the positioning moved, (n_points,).
-        """
-        self._count_from_here(moved & (self.history.values("normal_traction") == 0.0))
-
-    def count_slip_from_here(self, points: Mask) -> None:
-        """Measure slip at some points from the state evaluated last, where they touch. Collective.
-
-        `restore` undoes it.
-
-        Args:
-            points: Mask of the points, (n_points,).
-        """
-        self._count_from_here(points)
-
-    def _count_from_here(self, points: Mask) -> None:
-        """Measure slip at some points from the state evaluated last. Collective."""
-        if not self.law.has_friction:
-            return
-        kept = {name: self.history.values(name) for name in self.history.names}
-        feet = self.opposite.feet(self.values)
-        counted = {n: np.where(points[:, None], v, kept[n]) for n, v in feet.items()}
-        self.history.assign(kept | counted)
-        self.forget()
-
-    def begin(self) -> None:
-        """Measure slip from the present ``u`` if nothing has been committed yet. Collective.
-
-        The obstacle is taken in its initial position. The constructor does so with the ``u`` at
-        construction, and `ContactProblem` again before its first increment.
-        """
-        if not self.state.commits and self.opposite.begins_anew():
-            self._start()
-
-    def _start(self) -> None:
-        """Make the present ``u`` the state before the first increment. Collective."""
-        if self.law.has_friction:
-            start = {name: self.history.values(name) for name in self.history.names}
-            self.history.assign(start | self.opposite.start())
-        self.set_state(ContactState(self.history.rows(), self.opposite.state()))
-
-    def commit(self, trial: ContactTrial | None = None) -> None:
-        """Make a solved state the history of the next increment. Collective.
-
-        Args:
-            trial: A state returned by `trial`; by default the state at the present ``u``.
-        """
-        if trial is None:
-            self.evaluate()
-            trial = self.trial()
-        # Results stay those of the solution, whatever its pairs.
-        moved = self.opposite.commit(trial.points)
-        history = dict(trial.history)
-        if moved is not None and self.law.has_friction:
-            history["jump"] = history["jump"] + moved
-        rows, commits = self.history.packed(history), self.state.commits + 1
-        before, opposite = self.state.opposite.pairs.found_at, self.opposite.state()
-        self.set_state(ContactState(rows, opposite, trial.points, commits))
-        replaced = before is None and opposite.pairs.found_at is not None
-        if replaced and self.surface.mesh.comm.rank == 0:
-            logger.info(
-                "%s: opposite points are those of the deformed bodies from this increment on",
-                self.name,
-            )
-
-    def set_state(self, state: ContactState) -> None:
-        """Make a state the committed one, and the present one. Collective."""
-        self.state = state
-        self.restore()
-
-    def load_restart(self, history: Array, values: Mapping[str, Array], *, anew: bool) -> None:
-        """Make a state of another run the committed one. Collective.
-
-        ``u`` and the loads must be those of that run.
-
-        Args:
-            history: `PointFields.rows` of that run.
-            values: The arrays of its `values`, which become the results.
-            anew: Whether pairs are found again at every commit of that run.
-        """
-        commits = self.state.commits + 1
-        self.set_state(ContactState(history, self.opposite.state()))
-
-        def present() -> PointValues:
-            self.forget()
-            return self.values
-
-        unknown = np.zeros(self.quadrature.n_points)
-        self.opposite.resume(values.get("depth", unknown), present, anew=anew)
-        points = self.values
-        shapes = {n: v.shape for n, v in points.arrays.items()}
-        if {n: v.shape for n, v in values.items()} == shapes:
-            points = PointValues.of(values)
-        self.set_state(ContactState(history, self.opposite.state(), points, commits))
-
-    @property
-    def values(self) -> PointValues:
-        """All fields of the last evaluation at this rank's points."""
-        if self._values is None:
-            self.evaluate()
-            assert self._values is not None
-        return self._values

@@ -37,7 +37,7 @@ class PointResults(ABC):
     """The results of a contact at the quadrature points of Γc.
 
     After `ContactProblem.solve` and `Contact.evaluate` the results are available without
-    communication. After `Contact.forget` or a change of state, the first access evaluates the
+    communication. After `ContactStates.forget` or a change of state, the first access evaluates the
     present displacement, which is collective.
 
     Attributes:

@@ -151,7 +151,7 @@ class Approach:
                 if self._find_rest_position(load, which):
                     along = self._fit_obstacle_motion(which, motions)
                     for contact, jumps in zip(full.contacts, self._felt(of_bodies)[1], strict=True):
-                        contact.set_down(_feeling(jumps))
+                        contact.states.set_down(_feeling(jumps))
             self._go(aloft)
             if along is not None:
                 self._move(which, along)

@@ -75,7 +75,7 @@ class FirstTouch:
                 share = shares[groups == group].min()
                 if share < 1.0:
                     path.gap(share)
-                    path.part.contact.count_slip_from_here(path.part.points)
+                    path.part.contact.states.count_slip_from_here(path.part.points)
             self.end = end if shares.min() == 1.0 else None
         full.set_state(present)
         for contact in full.contacts:

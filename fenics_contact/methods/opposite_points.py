@@ -105,7 +105,7 @@ class OppositePoints:
         end = state.unknowns + ratio * state.change
         self._full.set_state(end)
         for contact in self.contacts:
-            before = contact.state.points
+            before = contact.states.committed.points
             if before is None or not contact.opposite.pairs_anew:
                 continue
             contact.evaluate()
@@ -241,7 +241,7 @@ class OppositePoints:
         if not self._pairings:
             return
         for contact in contacts:
-            contact.restore()
+            contact.states.restore()
             pairing = self._pairings.get(contact.name)
             if pairing is not None and pairing.opposite is not None:
-                contact.begin_between(pairing.opposite)
+                contact.states.begin_between(pairing.opposite)

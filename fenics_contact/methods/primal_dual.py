@@ -99,7 +99,7 @@ class PrimalDual(OwnMethod):
             return self._newton.solve()
         finally:
             for contact in self._equations.contacts:
-                contact.forget()  # it was evaluated elsewhere
+                contact.states.forget()  # it was evaluated elsewhere
 
 
 class _MixedNewton(SnesMethod):

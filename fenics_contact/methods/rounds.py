@@ -118,7 +118,7 @@ def _shrink(equations: Equations, load_before: Array) -> None:
         now, before = (float(np.linalg.norm(size[mine])) for size in sizes)
         if _NOTHING * before < now < _FELL * before:
             operator.contact.multipliers.shrink(now / before)
-            operator.contact.forget()
+            operator.contact.states.forget()
 
 
 def _append(attempts: list[Attempt], tried: Sequence[Attempt]) -> None:

@@ -231,7 +231,7 @@ class FullSystem(System):
         """
         total: Array = np.zeros(self.scales.n_groups)
         for number, contact in enumerate(self.contacts):
-            points = contact.state.points if committed else contact.values
+            points = contact.states.committed.points if committed else contact.values
             if points is not None:
                 force = contact.measure * np.abs(points.total_traction).sum(axis=1)
                 np.add.at(total, self.scales.group_of_points(number), force)

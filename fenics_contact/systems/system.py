@@ -180,7 +180,7 @@ class System(ABC):
         """Forces in the committed state, those of the bulk not evaluated yet. Collective."""
         forces = [np.zeros(self.unknowns.n_local) for _ in self.contacts]
         for operator, force in zip(self.operators, forces, strict=True):
-            points = operator.contact.state.points
+            points = operator.contact.states.committed.points
             if points is not None:
                 nodal = self._nodal_force(operator, points.total_traction)
                 force[:] = np.where(self.constrained, 0.0, nodal)

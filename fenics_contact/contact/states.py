@@ -1,0 +1,266 @@
+"""The states of a contact: committed, solved and not committed, and evaluated at the present u."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fenics_contact.contact.acting import ActingLaw
+from fenics_contact.contact.multipliers import Multipliers
+from fenics_contact.contact.opposite import Opposite, OppositeState
+from fenics_contact.contact.values import PointValues
+from fenics_contact.laws.base import Law
+from fenics_contact.surface.fields import PointFields
+from fenics_contact.types import Array, Mask
+
+__all__ = ["ContactState", "ContactStates", "ContactTrial"]
+
+logger = logging.getLogger("fenics_contact")
+
+
+@dataclass(frozen=True)
+class ContactState:
+    """A committed state of a contact: its history, and the results of the increment before it.
+
+    Attributes:
+        history: Committed tractions, slip and slip reference, and multipliers: `PointFields.rows`.
+        opposite: Committed place of the obstacle, and the pairs.
+        points: All fields at this rank's points; None before the first commit.
+        commits: Number of commits so far.
+    """
+
+    history: Array
+    opposite: OppositeState
+    points: PointValues | None = None
+    commits: int = 0
+
+
+@dataclass(frozen=True)
+class ContactTrial:
+    """A solved state of a contact, which `ContactStates.commit` makes the committed one.
+
+    Attributes:
+        points: All fields at this rank's quadrature points.
+        history: The fields that become history, by name.
+        reference: The history that the increment started from, with the slip reference of bodies
+            that were positioned: `PointFields.rows`.
+        opposite: Committed place of the obstacle, and the pairs of this state, between which it is
+            measured.
+    """
+
+    points: PointValues
+    history: Mapping[str, Array]
+    reference: Array
+    opposite: OppositeState
+
+
+class ContactStates:
+    """The committed state of a contact, and what is evaluated from it at the present ``u``.
+
+    Attributes:
+        committed: The committed state.
+        history: Its history variables, of which an increment may count slip from elsewhere.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        law: Law,
+        history: PointFields,
+        multipliers: Multipliers | None,
+        opposite: Opposite,
+        acting: ActingLaw,
+    ) -> None:
+        """Begin at the present ``u``. Collective.
+
+        Args:
+            name: Of the contact.
+            law: The contact law.
+            history: Fields for the history variables.
+            multipliers: Of the augmented Lagrangian method.
+            opposite: The contact kinematics.
+            acting: The law evaluated at the points.
+        """
+        self.history = history
+        self._name, self._law, self._multipliers = name, law, multipliers
+        self._opposite, self._acting = opposite, acting
+        self._values: PointValues | None = None
+        opposite.begins_anew()
+        self.committed = ContactState(history.rows(), opposite.state())
+        self._start()
+
+    @property
+    def values(self) -> PointValues:
+        """All fields of the last evaluation at this rank's points."""
+        if self._values is None:
+            self.evaluate()
+            assert self._values is not None
+        return self._values
+
+    def evaluate(self) -> None:
+        """Evaluate gap, tractions and slip at the present ``u``. Collective.
+
+        The history is not changed.
+        """
+        self._opposite.update()
+        arrays = {**self._opposite.data.values, **self._acting.own.evaluate()}
+        self._values = PointValues.of(arrays | self._opposite.told(arrays))
+
+    def forget(self) -> None:
+        """Discard the last evaluation: the next access to a result evaluates the present ``u``."""
+        self._values = None
+
+    def begin(self) -> None:
+        """Measure slip from the present ``u`` if nothing has been committed yet. Collective.
+
+        The obstacle is taken in its initial position. The constructor does so with the ``u`` at
+        construction, and `ContactProblem` again before its first increment.
+        """
+        if not self.committed.commits and self._opposite.begins_anew():
+            self._start()
+
+    def _start(self) -> None:
+        """Make the present ``u`` the state before the first increment. Collective."""
+        if self._law.has_friction:
+            start = {name: self.history.values(name) for name in self.history.names}
+            self.history.assign(start | self._opposite.start())
+        self.set_state(ContactState(self.history.rows(), self._opposite.state()))
+
+    def begin_between(self, opposite: OppositeState) -> None:
+        """Count an increment from its start between other pairs; `restore` undoes it. Collective.
+
+        Args:
+            opposite: The pairs, with the jump between them in the committed state.
+        """
+        moved = opposite.jump - self._opposite.committed_jump
+        self._opposite.set_state(opposite)
+        if self._law.has_friction:
+            kept = {name: self.history.values(name) for name in self.history.names}
+            self.history.assign(kept | {"jump": kept["jump"] + moved})
+        self.forget()
+
+    def set_down(self, moved: Mask) -> None:
+        """Measure slip from the state evaluated last at points that were unloaded. Collective.
+
+        It is called after the initial positioning of bodies. `restore` undoes it.
+
+        Args:
+            moved: Mask of the points that the positioning moved, (n_points,).
+        """
+        self._count_from_here(moved & (self.history.values("normal_traction") == 0.0))
+
+    def count_slip_from_here(self, points: Mask) -> None:
+        """Measure slip at some points from the state evaluated last, where they touch. Collective.
+
+        `restore` undoes it.
+
+        Args:
+            points: Mask of the points, (n_points,).
+        """
+        self._count_from_here(points)
+
+    def _count_from_here(self, points: Mask) -> None:
+        """Measure slip at some points from the state evaluated last. Collective."""
+        if not self._law.has_friction:
+            return
+        kept = {name: self.history.values(name) for name in self.history.names}
+        feet = self._opposite.feet(self.values)
+        counted = {n: np.where(points[:, None], v, kept[n]) for n, v in feet.items()}
+        self.history.assign(kept | counted)
+        self.forget()
+
+    def trial(self, *, is_loaded: bool = True) -> ContactTrial:
+        """Return a copy of the evaluated state, for `commit`.
+
+        Args:
+            is_loaded: Whether there is a contact force (`ForceBalance.is_loaded`). Without one all
+                normal tractions are smaller than the accepted residual, and zero is committed.
+        """
+        points = self.values
+        values = {n: points.arrays[n] for n in ("opening", "penetration", "normal_traction")}
+        if not is_loaded:
+            values["normal_traction"] = np.zeros_like(values["normal_traction"])
+        if self._law.has_friction:
+            values |= {
+                "traction": points.framed_traction,
+                "jump": points.foot,
+                "normal": points.framed_normal,
+                "slip": self.history.values("slip") + points.slip_increment,
+            }
+        if self._multipliers is not None:
+            values |= self._multipliers.committed(points)
+        history = self._opposite.committed_fields(values)
+        return ContactTrial(points, history, self.history.rows(), self._opposite.state())
+
+    def commit(self, trial: ContactTrial | None = None) -> None:
+        """Make a solved state the history of the next increment. Collective.
+
+        Args:
+            trial: A state returned by `trial`; by default the state at the present ``u``.
+        """
+        if trial is None:
+            self.evaluate()
+            trial = self.trial()
+        # Results stay those of the solution, whatever its pairs.
+        moved = self._opposite.commit(trial.points)
+        history = dict(trial.history)
+        if moved is not None and self._law.has_friction:
+            history["jump"] = history["jump"] + moved
+        rows, commits = self.history.packed(history), self.committed.commits + 1
+        before, opposite = self.committed.opposite.pairs.found_at, self._opposite.state()
+        self.set_state(ContactState(rows, opposite, trial.points, commits))
+        replaced = before is None and opposite.pairs.found_at is not None
+        comm = self.history.function.function_space.mesh.comm
+        if replaced and comm.rank == 0:
+            logger.info(
+                "%s: opposite points are those of the deformed bodies from this increment on",
+                self._name,
+            )
+
+    def set_state(self, state: ContactState) -> None:
+        """Make a state the committed one, and the present one. Collective."""
+        self.committed = state
+        self.restore()
+
+    def restore(self, trial: ContactTrial | None = None) -> None:
+        """Restore history, multipliers, pairs and results of the last commit. Collective.
+
+        The results are restored, not evaluated again: at the committed state the law would return
+        stick at points that slipped to it. Before the first commit there are no results.
+
+        Args:
+            trial: A state solved since then, whose results are restored instead.
+        """
+        self.history.set_rows(self.committed.history if trial is None else trial.reference)
+        if self._multipliers is not None:
+            self._multipliers.restore(self.history)
+        self._opposite.set_state((trial or self.committed).opposite)
+        self._values = (trial or self.committed).points
+
+    def load_restart(self, history: Array, values: Mapping[str, Array], *, anew: bool) -> None:
+        """Make a state of another run the committed one. Collective.
+
+        ``u`` and the loads must be those of that run.
+
+        Args:
+            history: `PointFields.rows` of that run.
+            values: The arrays of its `values`, which become the results.
+            anew: Whether pairs are found again at every commit of that run.
+        """
+        commits = self.committed.commits + 1
+        self.set_state(ContactState(history, self._opposite.state()))
+
+        def present() -> PointValues:
+            self.forget()
+            return self.values
+
+        unknown = np.zeros(len(self.history.rows()))
+        self._opposite.resume(values.get("depth", unknown), present, anew=anew)
+        points = self.values
+        shapes = {n: v.shape for n, v in points.arrays.items()}
+        if {n: v.shape for n, v in values.items()} == shapes:
+            points = PointValues.of(values)
+        self.set_state(ContactState(history, self._opposite.state(), points, commits))
