@@ -609,7 +609,7 @@ class ContactProblem:
 
         Args:
             taken: The state.
-            points: For every contact, the history and values that `ContactStates.load_restart` takes.
+            points: For every contact, what `ContactStates.load_restart` takes: history, values.
         """
         self.expected_increments = taken.expected
         self._fresh, self._trial = False, None

@@ -231,7 +231,7 @@ def test_stiffness_is_the_tangent_of_closed_and_sticking(cell, law):
     v, du = ufl.TestFunction(scene.space), ufl.TrialFunction(scene.space)
     tangent = assemble_matrix(compiled(scene.contact.tangent(v, du), scene.contact))
     scene.contact.evaluate()
-    stiffness = fc.ContactOperator(scene.contact).springs(scene.contact.springs(1.0, 1.0))
+    stiffness = fc.ContactOperator(scene.contact).springs(scene.contact.values.springs(1.0, 1.0))
     size = tangent.norm()
     stiffness.axpy(-1.0, tangent, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
     assert size > 1.0 and stiffness.norm() <= 1e-13 * size

@@ -116,7 +116,7 @@ def test_a_matrix_in_space_has_no_entries_for_points_that_are_open():
     slider = Slider("tetrahedron", LAW, start=1.0, n=(6, 2), condensation=False)
     slider.step(0.002, 0.0)
     system, contact = slider.problem.full, slider.contact
-    operator, springs = system.operators[0], contact.springs(1.0, 1.0)
+    operator, springs = system.operators[0], contact.values.springs(1.0, 1.0)
     some = contact.places()[:, 0] < 1.5
     matrix = system.matrix(symmetric=True)
     entries = []

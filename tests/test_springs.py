@@ -82,7 +82,7 @@ def test_springs_of_an_inclined_surface(cell, n, weight):
         weight=None if weight == "none" else 3.0 + x[0] * x[1],
     )
     for shares, block_of_node in (((1, 0), K_N * along), ((0, 1), K_T * (np.eye(d) - along))):
-        matrix = dense(fc.ContactOperator(contact).springs(contact.springs(*shares)), d)
+        matrix = dense(fc.ContactOperator(contact).springs(contact.values.springs(*shares)), d)
         expected = np.zeros_like(matrix)
         for node in np.flatnonzero(on_surface):
             expected[node, node] = block_of_node
@@ -120,7 +120,7 @@ def test_springs_between_two_bodies(cell):
     assert contact.n_unpaired == 0
     along = np.outer(q[:, -1], q[:, -1])
     for shares, block_of_pair in (((1, 0), K_N * along), ((0, 1), K_T * (np.eye(d) - along))):
-        matrix = dense(fc.ContactOperator(contact).springs(contact.springs(*shares)), d)
+        matrix = dense(fc.ContactOperator(contact).springs(contact.values.springs(*shares)), d)
         expected = np.zeros_like(matrix)
         for i in middle:
             (j,) = (j for j in middle if j != i and np.allclose(x[i], x[j], atol=1e-12))
@@ -140,7 +140,7 @@ def test_springs_follow_their_parameters():
     contact.parameters["k_n"].value = 5.0
     contact.parameters["weight"].value = 11.0
     contact.check_input()
-    matrix = dense(fc.ContactOperator(contact).springs(contact.springs(1, 0)), 2)
+    matrix = dense(fc.ContactOperator(contact).springs(contact.values.springs(1, 0)), 2)
     assert np.count_nonzero(np.abs(matrix) > 1e-13) == 3
     assert matrix.max() == pytest.approx(5.0, rel=1e-13)
     contact.parameters["weight"].value = 0.0

@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
@@ -303,25 +302,6 @@ class Contact(PointResults):
         """
         self.acting.confine(points)
         self.states.forget()
-
-    def springs(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> Array:
-        """Return the symmetric stiffness a K_n + b K_t of the quasi-Newton method at the points.
-
-        Args:
-            normal: The factor a, a number or one per point of this rank.
-            tangential: The factor b, a number or one per point of this rank.
-
-        Returns:
-            Array (n_points, gdim, gdim) (stress/length).
-        """
-        values = self.values
-        n = self.quadrature.n_points
-        along = np.einsum("qi,qj->qij", values.normal, values.normal)
-        stiffness = np.asarray(normal) * values.normal_stiffness
-        share = np.broadcast_to(np.asarray(tangential), (n,))
-        return np.asarray(
-            stiffness[:, None, None] * along + share[:, None, None] * values.tangential_stiffness
-        )
 
     # ---- data ------------------------------------------------------------------------------------
 

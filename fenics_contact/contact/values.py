@@ -228,6 +228,23 @@ class PointValues:
         """Normal gap g_N = s - u_n = δ₊ - δ₋, eq. (6)."""
         return self.opening - self.penetration
 
+    def springs(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> Array:
+        """Return the symmetric stiffness a K_n + b K_t of the quasi-Newton method at the points.
+
+        Args:
+            normal: The factor a, a number or one per point of this rank.
+            tangential: The factor b, a number or one per point of this rank.
+
+        Returns:
+            Array (n_points, gdim, gdim) (stress/length).
+        """
+        along = np.einsum("qi,qj->qij", self.normal, self.normal)
+        stiffness = np.asarray(normal) * self.normal_stiffness
+        share = np.broadcast_to(np.asarray(tangential), self.normal_stiffness.shape)
+        return np.asarray(
+            stiffness[:, None, None] * along + share[:, None, None] * self.tangential_stiffness
+        )
+
     @property
     def total_traction(self) -> Array:
         """r_n n + τ on the body."""

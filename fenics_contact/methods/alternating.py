@@ -222,7 +222,9 @@ class Alternation(OwnMethod):
             equations.assemble(matrix, equations.stiffnesses(everywhere=True))
             return
         # Where all slips, what nothing but friction holds would be loose.
-        still = (o.springs(o.contact.springs(0.0, _STILL)) for o in equations.system.operators)
+        still = (
+            o.springs(o.contact.values.springs(0.0, _STILL)) for o in equations.system.operators
+        )
         equations.assemble(matrix, chain(equations.tangents(), still))
 
 

@@ -309,7 +309,7 @@ class Equations:
             tangent = contact.acting.tangent().scaled(1.0 - slips)
             yield operator.tangent(tangent)
             secant = slips * _secant(contact)
-            yield operator.springs(contact.springs(opens + slips, opens + secant))
+            yield operator.springs(contact.values.springs(opens + slips, opens + secant))
 
     def _loose_modes(self) -> LooseModes | None:
         """Rigid-body modes that contact leaves free at the evaluated state. Collective."""
@@ -338,12 +338,12 @@ class Equations:
             if not everywhere:
                 normal = np.where(contact.status != Status.OPEN, 1.0, _OPEN_SHARE)
                 tangential = np.where(contact.status == Status.STICK, 1.0, _OPEN_SHARE)
-            springs = contact.springs(self._alpha * normal, self._phi * tangential)
+            springs = contact.values.springs(self._alpha * normal, self._phi * tangential)
             yield operator.springs(springs)
 
     def hardness(self) -> float:
         """Largest ratio of contact's stiffness to the bulk's at an unknown. Collective."""
-        springs = [c.springs(1.0, 1.0) for c in self.contacts]
+        springs = [c.values.springs(1.0, 1.0) for c in self.contacts]
         stiffest = [global_max(self._comm, s) for s in springs]
         pairings = [c.pairs.number for c in self.contacts]
         given = self.system.mark, self._bulk.scale, pairings, stiffest

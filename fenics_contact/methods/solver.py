@@ -602,7 +602,9 @@ class Solver:
                 if not (np.isfinite(largest) and self.equations.is_constrained()):
                     return None
                 closed = [contact.status != Status.OPEN for contact in full.contacts]
-                springs = [c.springs(s, s) for c, s in zip(full.contacts, closed, strict=True)]
+                springs = [
+                    c.values.springs(s, s) for c, s in zip(full.contacts, closed, strict=True)
+                ]
                 self.starts.forget()  # the matrix that is about to be used is another one
                 with linearised(self.equations, springs, prescribed=moved) as solve:
                     return present + solve(None)

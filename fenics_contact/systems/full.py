@@ -263,7 +263,7 @@ class FullSystem(System):
         matrix = self.stiffness.copy()
         for operator in self.operators:
             if operator.contact.couples and not self.pattern_changes:
-                part = operator.springs(operator.contact.springs(1.0, 1.0))
+                part = operator.springs(operator.contact.values.springs(1.0, 1.0))
                 matrix.axpy(1.0, part, different)
                 part.destroy()
         matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
