@@ -69,8 +69,13 @@ class LinearSprings:
                 along = -np.sum(borne * normal, axis=1)
                 stretch += (along / contact.normal_stiffness)[:, None] * normal
         if law.has_tangential:
-            k_t, stick = contact.tangential_stiffness, status == Status.STICK
-            stiffness += np.where(stick[:, None, None], k_t, 0.0)
+            k_t, length = contact.tangential_stiffness, np.linalg.norm(tangential, axis=1)
+            stiffness += np.where((status == Status.STICK)[:, None, None], k_t, 0.0)
+            # A slipping point's friction turns with its slip: in space that alone may hold a body.
+            side = tangential / np.where(length > 0, length, 1.0)[:, None]
+            across = np.eye(d) - np.einsum("qi,qj->qij", side, side)
+            secant = np.where(status == Status.SLIP, values.friction_secant, 0.0)
+            stiffness += secant[:, None, None] * (across @ k_t @ across)
             if is_regularised(contact.law):
                 # K_t has no inverse along the normal, where nothing acts: any stiffness will do.
                 along = np.einsum("q,qi,qj->qij", values.parameters["k_t"], normal, normal)

@@ -228,6 +228,15 @@ class PointValues:
         """Normal gap g_N = s - u_n = δ₊ - δ₋, eq. (6)."""
         return self.opening - self.penetration
 
+    @property
+    def friction_secant(self) -> Array:
+        """Share of K_t that the secant of friction is in the increment, (n_points,): 1 at stick."""
+        stuck = self.old_traction - np.einsum(
+            "qij,qj->qi", self.tangential_stiffness, self.increment
+        )
+        borne, trial = (np.linalg.norm(v, axis=1) for v in (self.traction, stuck))
+        return np.where(trial > 0, borne / np.where(trial > 0, trial, 1.0), 1.0)
+
     def springs(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> Array:
         """Return the symmetric stiffness a K_n + b K_t of the quasi-Newton method at the points.
 

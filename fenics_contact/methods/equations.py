@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.methods.active_set_monitor import ActiveSetMonitor
 from fenics_contact.methods.limit_analysis import Overload, find_overload
@@ -308,7 +307,7 @@ class Equations:
             opens[(contact.status != Status.OPEN) | ~modes.is_open[group]] = 0.0
             tangent = contact.acting.tangent().scaled(1.0 - slips)
             yield operator.tangent(tangent)
-            secant = slips * _secant(contact)
+            secant = slips * contact.values.friction_secant
             yield operator.springs(contact.values.springs(opens + slips, opens + secant))
 
     def _loose_modes(self) -> LooseModes | None:
@@ -363,13 +362,3 @@ class Equations:
         found = global_max(self._comm, added[felt] / bulk[felt])
         self._hardness = given, found
         return found
-
-
-def _secant(contact: Contact) -> Array:
-    """Secant stiffness of friction by that of sticking points, (n_points,)."""
-    values = contact.values
-    stuck = values.old_traction - np.einsum(
-        "qij,qj->qi", values.tangential_stiffness, values.increment
-    )
-    borne, trial = (np.linalg.norm(v, axis=1) for v in (values.traction, stuck))
-    return np.where(trial > 0, borne / np.where(trial > 0, trial, 1.0), 1.0)
