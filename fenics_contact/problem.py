@@ -76,10 +76,9 @@ class ContactProblem:
             bound; each step is a problem with Tresca friction, solved as a minimisation by Newton's
             method with a line search on the energy. It is not for mixed functions, whose solutions
             are saddle points. By default "newton"; for a linear bulk on all unknowns
-            "lbfgs" by multigrid, and in three dimensions if Dirichlet conditions constrain all
-            bodies and none slide on each other with finite kinematics. After a failure
-            "primal_dual" follows where it applies, "continuation", and "alternating" where that
-            applies.
+            "lbfgs" by multigrid, and in three dimensions if no bodies slide on each other with
+            finite kinematics. After a failure "primal_dual" follows where it applies,
+            "continuation", and "alternating" where that applies.
         alpha: Factor α of the normal contact stiffness in H₀, 0 to 1 (source paper: 1).
         phi: Factor φ of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
             source paper has 0; with 1 a third of the iterations suffices once points stick.
@@ -190,7 +189,7 @@ class ContactProblem:
         balance = LoadBalance(self.motions)
         self.initial_penetration = check_start(self.contacts)
         balance.find_free_modes(self.full)
-        self.full.scales.begin(self.full.operators, np.zeros_like(self.full.load))
+        self.full.scales.begin(self.full.operators)
         judge = Judge(self.full, self.motions, tolerance=tolerance, cross_check=cross_check)
         self.solver = Solver(self.full, self.motions, settings)
         self._increments = IncrementSolver(
