@@ -159,7 +159,7 @@ class IncrementSolver:
         if solver.chooses():
             return Again.UNKNOWNS
         solver.update_system(stiffness_changed)
-        self._full.scales.begin(self._full.operators, state.load)
+        self._full.scales.begin(self._full.operators)
         solver.system.begin(load)
         solver.equations.began = state.unknowns
         led = np.where(self._full.constrained, before, self._full.state())

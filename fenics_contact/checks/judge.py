@@ -119,7 +119,7 @@ class Judge:
             before = self._full.displacement_at(began)
             tunnelling = self._obstacles.evaluate(before)
             if complete:
-                ejected = find_ejected_bodies(self._full, self._motions, contacts, began)
+                ejected = find_ejected_bodies(self._full, self._motions, contacts, began, start)
         if complete:
             tunnelling |= self._bodies.evaluate(before)
         verdict = Verdict(

@@ -126,7 +126,7 @@ class Equations:
         system = self.system
         # Newton's method would end there: nothing acts on such a body.
         ejected = system is self.full and find_ejected_bodies(
-            self.full, self.motions, contacts, self.began
+            self.full, self.motions, contacts, self.began, self.start
         )
         if ejected or self._bulk.is_inverted() or system.is_twisted() or system.is_degenerate():
             total[:] = np.nan  # a line search takes a shorter step

@@ -50,7 +50,6 @@ class ReferenceScales:
             (n_contacts, n_bodies).
         held: Which parts Dirichlet conditions, or springs of the bulk, hold against every rigid
             motion, (n_parts,).
-        unloaded: Which bodies no load acted on at the start of the increment, (n_bodies,).
     """
 
     def __init__(
@@ -91,7 +90,6 @@ class ReferenceScales:
         self.least_force: Array = np.zeros(n_bodies)
         self.group: Index = np.arange(n_bodies + n_motions)
         self.touching: Mask = np.zeros((len(contacts), n_bodies), dtype=np.bool_)
-        self.unloaded: Mask = np.ones(n_bodies, dtype=np.bool_)
         counts = np.cumsum([0] + [len(contact.motions) for contact in contacts])
         self._motions = [
             n_bodies + np.arange(first, last) for first, last in itertools.pairwise(counts)
@@ -158,17 +156,15 @@ class ReferenceScales:
         found = np.bincount(self.label, np.abs(values), minlength=len(self.group))
         return global_sum(self._comm, found)[: self.n_bodies]
 
-    def begin(self, operators: Sequence[ContactOperator], load: Array) -> None:
-        """Find which parts are coupled, and which no load acted on at the last commit. Collective.
+    def begin(self, operators: Sequence[ContactOperator]) -> None:
+        """Find which parts are coupled. Collective.
 
         Args:
             operators: Of the contacts, over all unknowns, at the start of an increment.
-            load: External forces at the last commit, (n_local,) (force).
         """
         if self._coupled != (coupled := [o.contact.pairs.number for o in operators]):
             self._coupled = coupled
             self._couple(operators)
-        self.unloaded = self.is_unloaded(self.sums(load))
 
     def _couple(self, operators: Sequence[ContactOperator]) -> None:
         """Find which parts the pairs of the contacts couple. Collective."""
@@ -250,6 +246,18 @@ class ReferenceScales:
         n = len(self.group)
         mine = np.unique(np.concatenate([n * own + other for other in others]))
         return np.column_stack(divmod(np.unique(np.concatenate(self._comm.allgather(mine))), n))
+
+    def bodies_at_points(self, operator: ContactOperator, number: int) -> tuple[Index, Index]:
+        """The parts on both sides of this rank's points of a contact, (n_points,) each. Collective.
+
+        The second is the first where what lies opposite is rigid, or is nothing.
+
+        Args:
+            operator: Of the contact, over all unknowns.
+            number: Of the contact.
+        """
+        own, other = self._sides(operator, number, self.label)
+        return own, other[:, 0]
 
     def _sides(self, operator: ContactOperator, number: int, label: Index) -> tuple[Index, Index]:
         """The part on both sides of each of this rank's points. Collective.
